@@ -1,0 +1,224 @@
+"""What is said on the wire: frozen, strict, bounded models. Pure.
+
+Headers travel beside the payload (Zenoh attachment); payloads of JSON channels are the other models. Units are in the
+names; signs as in REP 103: x forward, y left, counter-clockwise positive. Times are the robot's monotonic clock.
+"""
+
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from protocol import VERSION
+
+MAX_INTEGER = 2**53 - 1  # the largest integer that every JSON reader holds exactly
+
+SessionId = Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")]
+Source = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,15}$")]
+RobotId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
+Counter = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
+Microseconds = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
+Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Planar = tuple[Number, Number]
+"""(linear_mps, angular_rad_s)."""
+Pose = tuple[Number, Number, Number]
+"""(x_m, y_m, yaw_rad) in the odometry frame."""
+
+
+class Wire(BaseModel):
+    """Base of everything on the wire. Unknown fields are ignored, so that a newer minor peer is understood."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", ser_json_inf_nan="constants")
+
+
+class Twist(Wire):
+    """A velocity: forward speed and turn rate. Finite; the robot clamps it to its own limits."""
+
+    linear_mps: Annotated[float, Field(allow_inf_nan=False)]
+    angular_rad_s: Annotated[float, Field(allow_inf_nan=False)]
+
+
+STILL = Twist(linear_mps=0.0, angular_rad_s=0.0)
+
+
+# --- headers -----------------------------------------------------------------------------------------------------
+
+
+class Stamp(Wire):
+    """Header of everything a robot publishes: its session (new at each start), a count per channel, its clock."""
+
+    v: Literal[1] = VERSION
+    session: SessionId
+    seq: Counter
+    t_us: Microseconds
+
+
+class FrameHeader(Stamp):
+    """Header of a frame. `t_us` is the capture time; the rest is what the robot did and knew at that moment."""
+
+    pose: Pose = (0.0, 0.0, 0.0)
+    """Odometry."""
+    moving: Planar = (0.0, 0.0)
+    """Twist measured from the wheels."""
+    applied: Planar = (0.0, 0.0)
+    """Twist last given to the wheels by the gate, after every limit."""
+    latency_us: Microseconds | None = None
+    """Capture to accepted command, as the robot itself measured for the last accepted command."""
+
+
+class ScanHeader(Stamp):
+    """Header of a lidar scan; the payload is little-endian float32 ranges in metres, inf for no return."""
+
+    angle_min_rad: Number
+    angle_increment_rad: Number
+    range_min_m: Number
+    range_max_m: Number
+
+
+class Echo(Wire):
+    """Names one thing the robot issued, field for field, so that the robot can judge its age by its own record."""
+
+    channel: Literal["frame", "status", "beat"]
+    session: SessionId
+    seq: Counter
+    t_us: Microseconds
+
+
+class AnswerHeader(Wire):
+    """Header of a twist and of an ack: who answers, which frame, and how long the computing took."""
+
+    v: Literal[1] = VERSION
+    source: Source
+    session: SessionId
+    seq: Counter
+    echo: Echo
+    compute_us: Microseconds = 0
+
+
+class RequestHeader(Wire):
+    """Header of a request. `echo` names the newest `status` seen; only stop, disarm and release may lack it."""
+
+    v: Literal[1] = VERSION
+    source: Source
+    session: SessionId
+    seq: Counter
+    echo: Echo | None = None
+
+
+# --- payloads ----------------------------------------------------------------------------------------------------
+
+
+class Verb(StrEnum):
+    """What can be asked of a robot."""
+
+    ARM = "arm"
+    DISARM = "disarm"
+    STOP = "stop"
+    RESET = "reset"
+    ACQUIRE = "acquire"
+    RELEASE = "release"
+
+
+class Request(Wire):
+    """A request; `id` is the asker's own and comes back in the reply."""
+
+    id: Counter
+    verb: Annotated[Verb, Field(strict=False)]
+
+
+class Reply(Wire):
+    """The answer to a request: `to` and `id` name it; `detail` is one line for a person."""
+
+    to: SessionId
+    id: Counter
+    ok: bool
+    state: str
+    detail: Annotated[str, Field(max_length=200)]
+
+
+class State(StrEnum):
+    """States of the gate."""
+
+    DISARMED = "DISARMED"
+    HOLD = "HOLD"
+    ACTIVE = "ACTIVE"
+    DEGRADED = "DEGRADED"
+    STOPPED = "STOPPED"
+    FAULT = "FAULT"
+
+
+class Holder(Wire):
+    """The driver of the moment."""
+
+    source: Source
+    session: SessionId
+
+
+class LastRefusal(Wire):
+    """The newest refusal, in words."""
+
+    source: Annotated[str, Field(max_length=32)]
+    reason: Annotated[str, Field(max_length=32)]
+    detail: Annotated[str, Field(max_length=200)]
+
+
+class StreamStatus(Wire):
+    """What the robot's stream does: frames, credit, rate."""
+
+    captured: Counter = 0
+    sent: Counter = 0
+    no_credit: Counter = 0
+    no_listener: Counter = 0
+    credit_timeouts: Counter = 0
+    window: Counter = 1
+    fps: Number = 0.0
+    dropped_commands: Counter = 0
+
+
+class Status(Wire):
+    """Everything a person needs to know why the robot moves or does not. Published at 10 Hz."""
+
+    state: Annotated[State, Field(strict=False)]
+    reason: Annotated[str, Field(max_length=200)]
+    holder: Holder | None = None
+    applied: Planar = (0.0, 0.0)
+    frame_age_us: Microseconds | None = None
+    latency_us: Microseconds | None = None
+    accepted: Counter = 0
+    refused: dict[str, Counter] = {}
+    last_refusal: LastRefusal | None = None
+    stream: StreamStatus = StreamStatus()
+    auto_arm: bool = False
+    tick_late_max_us: Microseconds = 0
+    network_restarts: Counter = 0
+    max_linear_mps: Number = 0.0
+    max_angular_rad_s: Number = 0.0
+
+
+class Odometry(Wire):
+    """Where the wheels say the robot is, and how it moves."""
+
+    pose: Pose
+    moving: Planar
+
+
+class CameraModel(Wire):
+    """Pinhole model of the encoded picture. Pixel (0, 0) is the top-left corner of the top-left pixel.
+
+    Mounting: the lens at (`x_m`, `y_m`, `z_m`) from the axle's midpoint on the floor, looking forward,
+    tilted up by `pitch_rad`.
+    """
+
+    width_px: Annotated[int, Field(ge=16, le=8192)]
+    height_px: Annotated[int, Field(ge=16, le=8192)]
+    fx_px: Annotated[float, Field(gt=0, le=1e5)]
+    fy_px: Annotated[float, Field(gt=0, le=1e5)]
+    cx_px: Number
+    cy_px: Number
+    distortion: Annotated[tuple[Number, ...], Field(max_length=8)] = ()
+    """OpenCV order k1, k2, p1, p2, k3 ...; empty when there is none."""
+    x_m: Number = 0.0
+    y_m: Number = 0.0
+    z_m: Number = 0.0
+    pitch_rad: Number = 0.0
+    calibrated: bool = False

@@ -1,0 +1,26 @@
+"""Why a message was not obeyed. One list, used by the gate, the codec and `status`. Pure."""
+
+from enum import StrEnum
+
+
+class Refusal(StrEnum):
+    """A reason a robot gives for not obeying. The names are on the wire (status counters, replies)."""
+
+    MALFORMED = "MALFORMED"  # not the protocol: grammar, size, type, range of a header field
+    UNSUPPORTED_VERSION = "UNSUPPORTED_VERSION"  # header `v` is not ours
+    NOT_FINITE = "NOT_FINITE"  # nan, inf, or a number too large for a float
+    UNKNOWN_SOURCE = "UNKNOWN_SOURCE"  # no such role, or key and header disagree, or guests are off
+    OTHER_SESSION = "OTHER_SESSION"  # echoes a frame of an earlier robot session
+    UNKNOWN_FRAME = "UNKNOWN_FRAME"  # echoes a frame this robot did not issue, or has forgotten
+    FROM_FUTURE = "FROM_FUTURE"  # echoes a capture time later than now
+    STALE = "STALE"  # the frame behind it is too old
+    OUT_OF_ORDER = "OUT_OF_ORDER"  # its `seq` is not newer than the last of that source and session
+    NOT_HOLDER = "NOT_HOLDER"  # another driver holds the lease
+    DISARMED = "DISARMED"  # judged good, but the wheels are off
+    STOPPED = "STOPPED"  # the STOP latch is set
+    FAULT = "FAULT"  # the drive reports a fault
+    NOT_ALLOWED = "NOT_ALLOWED"  # a request that this source may not make now
+
+
+CLAMPED = "CLAMPED"
+"""Counted beside the refusals: the command was accepted, but cut to the robot's limits."""

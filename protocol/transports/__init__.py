@@ -1,0 +1,1 @@
+"""Ways to carry messages. Only this package imports zenoh or websockets."""

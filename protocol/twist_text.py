@@ -1,0 +1,51 @@
+"""The twist text `linear|angular`: a strict ASCII grammar both ways. Pure.
+
+`float()` takes nan, inf, `1_0`, blanks and digits of other scripts; none of these may reach a wheel.
+Grammar: NUMBER "|" NUMBER, NUMBER = [+-] (DIGITS [. DIGITS*] | . DIGITS) [(e|E) [+-] 1*3DIGIT].
+"""
+
+import math
+import re
+
+from protocol.errors import WireError
+from protocol.messages import Twist
+from protocol.refusals import Refusal
+
+MAX_TWIST_BYTES = 64
+
+_NUMBER = rb"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
+_TWIST = re.compile(rb"(%b)\|(%b)" % (_NUMBER, _NUMBER))
+_NON_FINITE = re.compile(rb"[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
+
+
+def format_twist(twist: Twist) -> bytes:
+    """Write `twist` as `linear|angular`, four decimals, never `-0.0000`."""
+    return f"{_decimals(twist.linear_mps)}|{_decimals(twist.angular_rad_s)}".encode("ascii")
+
+
+def _decimals(value: float) -> str:
+    text = f"{value:.4f}"
+    return "0.0000" if text == "-0.0000" else text
+
+
+def parse_twist(data: bytes) -> Twist:
+    """Read `linear|angular` (m/s, rad/s).
+
+    Raises WireError MALFORMED for anything outside the grammar or over 64 bytes, NOT_FINITE for nan, inf or overflow.
+    """
+    if len(data) > MAX_TWIST_BYTES:
+        raise WireError(Refusal.MALFORMED, f"twist text is {len(data)} bytes, at most {MAX_TWIST_BYTES}")
+    match = _TWIST.fullmatch(data)
+    if match is None:
+        raise _refuse(data)
+    linear, angular = float(match[1]), float(match[2])
+    if not (math.isfinite(linear) and math.isfinite(angular)):
+        raise WireError(Refusal.NOT_FINITE, f"twist {data!r} overflows")
+    return Twist(linear_mps=linear, angular_rad_s=angular)
+
+
+def _refuse(data: bytes) -> WireError:
+    fields = data.split(b"|")
+    if len(fields) == 2 and any(_NON_FINITE.fullmatch(field) for field in fields):
+        return WireError(Refusal.NOT_FINITE, f"twist {data!r} is not finite")
+    return WireError(Refusal.MALFORMED, f"twist {data!r} is not `linear|angular`, e.g. 0.2000|-0.3500")

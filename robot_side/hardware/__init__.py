@@ -1,0 +1,1 @@
+"""Robot hardware behind the ports of `robot_side.ports`."""

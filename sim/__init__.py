@@ -1,0 +1,1 @@
+"""A PyBullet world that stands in for hardware, behind the robot's own ports."""

@@ -1,0 +1,1 @@
+"""What runs on the strong machine: a frame in, a command out."""
