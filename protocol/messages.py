@@ -163,12 +163,9 @@ class LastRefusal(Wire):
 
 
 class StreamStatus(Wire):
-    """What the robot's stream does: frames, credit, rate."""
+    """What the robot's stream does: frames sent, answers that never came, frames allowed in flight, rate."""
 
-    captured: Counter = 0
     sent: Counter = 0
-    no_credit: Counter = 0
-    no_listener: Counter = 0
     credit_timeouts: Counter = 0
     window: Counter = 1
     fps: Number = 0.0

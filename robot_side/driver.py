@@ -1,0 +1,168 @@
+"""The driver process: owns gate and motors, is the parent of the network process, has no network. Shell.
+
+Motors latch, so whoever owns them must outlive every fault beside it. The network process may hang, die or hold its
+interpreter lock for ever; this loop still reads its own clock 50 times a second and brings the wheels to zero.
+"""
+
+import secrets
+import select
+import signal
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from types import FrameType
+
+from protocol.channels import REQUEST, TWIST, check_robot_id
+from protocol.codec import decode
+from protocol.errors import ConfigError, HardwareError
+from protocol.messages import State, StreamStatus
+from robot_side import ipc
+from robot_side.child import NetworkChild
+from robot_side.config import RobotConfig
+from robot_side.driving import Driving
+from robot_side.limits import TICK_US
+from robot_side.plugins import build
+from robot_side.ports import Drive, Ranges, RangeSensor
+
+_SHUTDOWN_US = 2_000_000
+
+
+def run(config: RobotConfig) -> int:
+    """Run the robot until SIGTERM, SIGINT or SIGHUP; the wheels are at zero when it returns.
+
+    Raises ConfigError, HardwareError or LinkError before anything could move.
+    """
+    check_robot_id(config.robot)
+    with ExitStack() as ending:
+        drive: Drive = build("drives", config.drive)
+        ending.callback(drive.close)
+        ranges: RangeSensor | None = build("range_sensors", config.range_sensor) if config.range_sensor else None
+        if ranges is not None:
+            ending.callback(ranges.close)
+        driver = Driver(config, drive, ranges)
+        ending.callback(driver.child.close)
+        return driver.loop()
+
+
+class StopLatch:
+    """The STOP state on disk, so that a restart cannot clear it."""
+
+    def __init__(self, directory: Path, robot: str) -> None:
+        self._path = directory.expanduser() / f"{robot}.stopped"
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"state_dir {directory}: {error.strerror}; choose a writable directory") from None
+
+    def is_set(self) -> bool:
+        """Whether the robot was STOPPED when it last ran."""
+        return self._path.exists()
+
+    def keep(self, stopped: bool) -> None:
+        """Write or remove the mark."""
+        if stopped:
+            self._path.touch()
+        else:
+            self._path.unlink(missing_ok=True)
+
+
+class Driver:
+    """The loop and what it holds."""
+
+    def __init__(self, config: RobotConfig, drive: Drive, ranges: RangeSensor | None) -> None:
+        self._latch = StopLatch(config.state_dir, config.robot)
+        self._drive = drive
+        self._ranges = ranges
+        self._driving = Driving(config, secrets.token_hex(4), stopped=self._latch.is_set())
+        self._shown = (self._driving.gate.state, self._driving.gate.reason)
+        self._ending_since_us: int | None = None
+        self.child = NetworkChild(config, self._driving.session)
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
+        self._ending_since_us = self._ending_since_us or _now_us()
+
+    def loop(self) -> int:
+        """Tick at absolute 20 ms deadlines and whenever a command arrives, until the end is asked for and reached."""
+        deadline_us = _now_us()
+        while not self._ended():
+            self._wait(deadline_us)
+            arrived = self._drain()
+            now_us = _now_us()
+            if now_us >= deadline_us:
+                self._driving.tick_late_max_us = max(self._driving.tick_late_max_us, now_us - deadline_us)
+                deadline_us = max(deadline_us + TICK_US, now_us)
+                self._tick(now_us, punctual=True)
+            elif arrived:
+                self._tick(now_us, punctual=False)
+        return self.child.exit_code
+
+    def _ended(self) -> bool:
+        if self.child.failed_at_start:
+            return True
+        if self._ending_since_us is None:
+            return False
+        self._driving.gate.disarm("shutting down")
+        return self._driving.at_rest or _now_us() - self._ending_since_us > _SHUTDOWN_US
+
+    def _wait(self, deadline_us: int) -> None:
+        timeout_s = max(0, deadline_us - _now_us()) / 1e6
+        readable = [self.child.socket] if self.child.socket else []
+        select.select(readable, [], [], timeout_s)
+
+    def _tick(self, now_us: int, *, punctual: bool) -> None:
+        gate = self._driving.gate
+        left_rad_s, right_rad_s = self._driving.tick(now_us, self._drive.wheels(), self._read_ranges())
+        try:
+            self._drive.set(left_rad_s, right_rad_s)
+        except HardwareError as error:
+            gate.fault(str(error))
+        self.child.send(ipc.pack_motion(self._driving.motion()))
+        if punctual:
+            for message in self._driving.messages(now_us):
+                self.child.send(ipc.pack_message(ipc.Kind.PUBLISH, message))
+            self.child.keep_alive(now_us, self._driving.gate.issued.last_seq("frame") + 1)
+            self._driving.network_restarts = self.child.restarts
+            self._show(gate.state, gate.reason)
+
+    def _read_ranges(self) -> Ranges | None:
+        return self._ranges.read() if self._ranges else None
+
+    def _show(self, state: State, reason: str) -> None:
+        """One line per change of state; the latch is kept before it is said."""
+        if state is not self._shown[0]:
+            self._latch.keep(state is State.STOPPED)
+            print(f"robot {self._driving.config.robot}: {state} ({reason})", flush=True)
+            self._shown = (state, reason)
+
+    # --- packets of the network process --------------------------------------------------------------------------
+
+    def _drain(self) -> bool:
+        """Handle what the child sent; True if a command was among it."""
+        commanded = False
+        for packet in self.child.packets():
+            kind = ipc.kind_of(packet)
+            if kind is ipc.Kind.ISSUED:
+                self._driving.on_issued(*ipc.unpack_issued(packet))
+            elif kind is ipc.Kind.RAW:
+                commanded |= self._on_raw(packet)
+            elif kind is ipc.Kind.STREAM:
+                self._driving.stream = decode(StreamStatus, packet[1:])
+            elif kind is ipc.Kind.READY:
+                self.child.on_ready()
+        return commanded
+
+    def _on_raw(self, packet: bytes) -> bool:
+        message = ipc.unpack_message(packet)
+        if message.channel is TWIST:
+            judged = self._driving.on_twist(message, _now_us())
+            if judged is not None:
+                self.child.send(ipc.pack_judged(judged))
+        elif message.channel is REQUEST:
+            self._driving.on_request(message, _now_us())
+        return True
+
+
+def _now_us() -> int:
+    return time.monotonic_ns() // 1000

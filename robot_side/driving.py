@@ -1,0 +1,179 @@
+"""The driver process's own logic: messages in, wheel speeds and messages out. Pure; `driver.py` is its shell."""
+
+from collections.abc import Iterator
+
+from protocol.channels import ODOMETRY, REPLY, SCAN, STATUS, Channel
+from protocol.codec import check_sizes, decode, encode, encode_ranges
+from protocol.errors import WireError
+from protocol.messages import (
+    STILL,
+    AnswerHeader,
+    Holder,
+    Odometry,
+    Reply,
+    Request,
+    RequestHeader,
+    ScanHeader,
+    Stamp,
+    Status,
+    StreamStatus,
+    Wire,
+)
+from protocol.refusals import Refusal
+from protocol.transports.link import Message
+from protocol.twist_text import parse_twist
+from robot_side.config import RobotConfig
+from robot_side.guard import RangeGuard
+from robot_side.ipc import Judged, Motion
+from robot_side.kinematics import Odometer, wheel_speeds
+from robot_side.ports import Ranges, WheelAngles
+from robot_side.safety import SafetyGate
+
+_PERIODS_US = {STATUS.name: 100_000, ODOMETRY.name: 50_000}
+_CITES_NOTHING_OF_OURS = (Refusal.OTHER_SESSION, Refusal.UNKNOWN_FRAME, Refusal.FROM_FUTURE)
+
+
+class Driving:
+    """One robot session. The shell hands in what arrives and calls `tick` at 50 Hz."""
+
+    def __init__(self, config: RobotConfig, session: str, *, stopped: bool = False) -> None:
+        self.config = config
+        self.session = session
+        self._guard = RangeGuard(config.guard) if config.range_sensor else None
+        self.gate = SafetyGate(config.safety, session, stopped=stopped, guard=self._guard)
+        self.odometer = Odometer(config.wheels)
+        self.stream = StreamStatus()
+        self.tick_late_max_us = 0
+        self.network_restarts = 0
+        self._seqs: dict[str, int] = {}
+        self._due_us: dict[str, int] = {}
+        self._outbox: list[Message] = []
+
+    # --- what arrives --------------------------------------------------------------------------------------------
+
+    def on_issued(self, seq: int, t_us: int) -> None:
+        """The network process is about to publish frame `seq`, captured at `t_us`."""
+        self.gate.issued.add("frame", seq, t_us)
+
+    def on_twist(self, message: Message, now_us: int) -> Judged | None:
+        """Decode and offer a command. Returns the credit it gives back: whatever answers a frame of ours does."""
+        try:
+            check_sizes(message.channel, message.header, message.payload)
+            header = decode(AnswerHeader, message.header) if message.header else None
+            twist = parse_twist(message.payload)
+        except WireError as error:
+            self.gate.refuse(message.source, error)
+            return None
+        verdict = self.gate.offer(message.source, header, twist, now_us)
+        if header is None or verdict.reason in _CITES_NOTHING_OF_OURS:
+            return None
+        sender = Holder(source=header.source, session=header.session)
+        return Judged(sender, header.echo.seq, header.compute_us, self.gate.holder(now_us))
+
+    def on_request(self, message: Message, now_us: int) -> None:
+        """Carry out a request; the reply waits in `messages`."""
+        try:
+            check_sizes(message.channel, message.header, message.payload)
+            header = decode(RequestHeader, message.header)
+            request = decode(Request, message.payload)
+        except WireError as error:
+            self.gate.refuse(message.source, error)
+            return
+        try:
+            if header.source != message.source:
+                raise WireError(Refusal.UNKNOWN_SOURCE, "key and header disagree on the source")
+            detail, granted = self.gate.request(header, request, now_us), True
+        except WireError as error:
+            self.gate.refuse(message.source, error)
+            detail, granted = f"{error.reason}: {error.detail}"[:200], False
+        reply = Reply(to=header.session, id=request.id, ok=granted, state=self.gate.state, detail=detail)
+        self._post(REPLY, reply, now_us)
+
+    # --- what leaves ---------------------------------------------------------------------------------------------
+
+    def tick(self, now_us: int, wheels: WheelAngles | None, scan: Ranges | None) -> tuple[float, float]:
+        """Read the sensors' news, step the gate, and return (left, right) rad/s for the motors."""
+        if wheels is not None:
+            self.odometer.update(wheels)
+        if scan is not None:
+            self._on_scan(scan, now_us)
+        decision = self.gate.step(now_us)
+        return wheel_speeds(self.config.wheels, decision.twist)
+
+    def motion(self) -> Motion:
+        """The robot at this moment, for frame headers."""
+        applied = self.gate.applied
+        return Motion(
+            self.odometer.pose,
+            self.odometer.moving,
+            (applied.linear_mps, applied.angular_rad_s),
+            self.gate.latency_us,
+        )
+
+    def messages(self, now_us: int) -> Iterator[Message]:
+        """What is to be published now: replies and scans at once, status and odometry at their rates."""
+        if self._is_due(ODOMETRY, now_us):
+            self._post(ODOMETRY, Odometry(pose=self.odometer.pose, moving=self.odometer.moving), now_us)
+        if self._is_due(STATUS, now_us):
+            self._post(STATUS, self.status(now_us), now_us)
+        outbox, self._outbox = self._outbox, []
+        yield from outbox
+
+    def status(self, now_us: int) -> Status:
+        """Everything a person needs to know why the robot moves or does not."""
+        gate, limits = self.gate, self.config.safety
+        return Status(
+            state=gate.state,
+            reason=gate.reason[:200],
+            holder=gate.holder(now_us),
+            applied=(gate.applied.linear_mps, gate.applied.angular_rad_s),
+            frame_age_us=gate.frame_age_us(now_us),
+            latency_us=gate.latency_us,
+            accepted=gate.accepted,
+            refused=dict(gate.counters),
+            last_refusal=gate.last_refusal,
+            stream=self.stream,
+            auto_arm=limits.auto_arm,
+            tick_late_max_us=self.tick_late_max_us,
+            network_restarts=self.network_restarts,
+            max_linear_mps=limits.max_linear_mps,
+            max_angular_rad_s=limits.max_angular_rad_s,
+        )
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the wheels are told to stand still."""
+        return self.gate.applied == STILL
+
+    # --- inside --------------------------------------------------------------------------------------------------
+
+    def _on_scan(self, scan: Ranges, now_us: int) -> None:
+        if self._guard is not None:
+            self._guard.see(scan)
+        stamp = self._stamp(SCAN, now_us)
+        header = ScanHeader(
+            session=stamp.session,
+            seq=stamp.seq,
+            t_us=scan.t_us,
+            angle_min_rad=scan.angle_min_rad,
+            angle_increment_rad=scan.angle_increment_rad,
+            range_min_m=scan.range_min_m,
+            range_max_m=scan.range_max_m,
+        )
+        self._outbox.append(Message(SCAN, "", encode(header), encode_ranges(scan.ranges_m)))
+
+    def _is_due(self, channel: Channel, now_us: int) -> bool:
+        due_us = self._due_us.get(channel.name, now_us)
+        if now_us < due_us:
+            return False
+        self._due_us[channel.name] = max(due_us + _PERIODS_US[channel.name], now_us)
+        return True
+
+    def _post(self, channel: Channel, payload: Wire, now_us: int) -> None:
+        self._outbox.append(Message(channel, "", encode(self._stamp(channel, now_us)), encode(payload)))
+
+    def _stamp(self, channel: Channel, now_us: int) -> Stamp:
+        seq = self._seqs[channel.name] = self._seqs.get(channel.name, -1) + 1
+        if channel is STATUS:
+            self.gate.issued.add("status", seq, now_us)  # so that a request may cite it
+        return Stamp(session=self.session, seq=seq, t_us=now_us)

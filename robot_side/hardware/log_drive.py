@@ -1,0 +1,47 @@
+"""A drive without motors: writes what it is told to a file, and turns ideal wheels. Shell (a file and a clock)."""
+
+import time
+from pathlib import Path
+
+from protocol.config import Config
+from protocol.errors import HardwareError
+from robot_side.ports import WheelAngles
+
+
+class LogDriveConfig(Config):
+    """`path`: CSV of t_us,left_rad_s,right_rad_s, one line per command; none is written without it."""
+
+    path: Path | None = None
+
+
+class LogDrive:
+    """For trying a robot without wheels. Its encoders read as if every speed were reached at once."""
+
+    Config = LogDriveConfig
+
+    def __init__(self, config: LogDriveConfig) -> None:
+        try:
+            self._file = config.path.open("w", buffering=1) if config.path else None
+        except OSError as error:
+            raise HardwareError(f"drive log {config.path}: {error.strerror}; choose a writable file") from None
+        self._speeds = (0.0, 0.0)
+        self._angles = WheelAngles(0.0, 0.0, time.monotonic_ns() // 1000)
+
+    def set(self, left_rad_s: float, right_rad_s: float) -> None:
+        """Log the speeds and turn by them from now on."""
+        self._angles = self.wheels()
+        self._speeds = (left_rad_s, right_rad_s)
+        if self._file:
+            self._file.write(f"{self._angles.t_us},{left_rad_s:.4f},{right_rad_s:.4f}\n")
+
+    def wheels(self) -> WheelAngles:
+        """Where ideal wheels would be now."""
+        now_us = time.monotonic_ns() // 1000
+        seconds = (now_us - self._angles.t_us) / 1e6
+        left, right = self._speeds
+        return WheelAngles(self._angles.left_rad + left * seconds, self._angles.right_rad + right * seconds, now_us)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file:
+            self._file.close()

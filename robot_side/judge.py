@@ -1,0 +1,81 @@
+"""Judges what a command cites, by the robot's own record and clock alone. Pure.
+
+Nothing here trusts a sender: a frame is known because this robot issued it, and as old as the robot's clock says.
+"""
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+from protocol.errors import WireError
+from protocol.messages import AnswerHeader, Echo
+from protocol.refusals import Refusal
+
+_KEPT_PER_CHANNEL = 256  # 8 s of 30 fps frames; anything older is STALE long before
+_KEPT_SENDERS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of a command. `reason` is None when it was accepted."""
+
+    reason: Refusal | None
+    detail: str = ""
+    age_us: int | None = None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether it may move the wheels."""
+        return self.reason is None
+
+
+class IssuedRecord:
+    """(channel, seq) -> capture time of what this robot session has issued, bounded per channel."""
+
+    def __init__(self, session: str) -> None:
+        self.session = session
+        self._times: dict[str, OrderedDict[int, int]] = {}
+
+    def add(self, channel: str, seq: int, t_us: int) -> None:
+        """Remember it; the caller tells this before it publishes."""
+        times = self._times.setdefault(channel, OrderedDict())
+        times[seq] = t_us
+        if len(times) > _KEPT_PER_CHANNEL:
+            times.popitem(last=False)
+
+    def last_seq(self, channel: str) -> int:
+        """The newest seq issued on `channel`, -1 before the first."""
+        return next(reversed(self._times.get(channel, OrderedDict({-1: 0}))))
+
+    def age_us(self, echo: Echo, now_us: int, max_age_us: int) -> int:
+        """Age of what `echo` names. Raises WireError OTHER_SESSION, UNKNOWN_FRAME, FROM_FUTURE or STALE."""
+        if echo.session != self.session:
+            raise WireError(Refusal.OTHER_SESSION, f"cites robot session {echo.session}, this is {self.session}")
+        times = self._times.get(echo.channel, OrderedDict())
+        if times.get(echo.seq) != echo.t_us:
+            raise WireError(Refusal.UNKNOWN_FRAME, f"cites {echo.channel} {echo.seq}, which was not issued so")
+        age_us = now_us - echo.t_us
+        if age_us < 0:
+            raise WireError(Refusal.FROM_FUTURE, f"cites {echo.channel} {echo.seq} of {-age_us / 1e3:.0f} ms from now")
+        if age_us > max_age_us:
+            raise WireError(
+                Refusal.STALE, f"{echo.channel} {echo.seq} is {age_us / 1e3:.0f} ms old, at most {max_age_us / 1e3:.0f}"
+            )
+        return age_us
+
+
+class SequenceRecord:
+    """The newest seq per (source, session); the longest silent sender is forgotten first."""
+
+    def __init__(self) -> None:
+        self._last: OrderedDict[tuple[str, str], int] = OrderedDict()
+
+    def check(self, header: AnswerHeader) -> None:
+        """Raise WireError OUT_OF_ORDER unless `header.seq` is newer than all of its source and session; keep it."""
+        sender = (header.source, header.session)
+        last = self._last.get(sender, -1)
+        if header.seq <= last:
+            raise WireError(Refusal.OUT_OF_ORDER, f"seq {header.seq} of {header.source} is not newer than {last}")
+        self._last[sender] = header.seq
+        self._last.move_to_end(sender)
+        if len(self._last) > _KEPT_SENDERS:
+            self._last.popitem(last=False)

@@ -1,0 +1,166 @@
+"""Numbers the gate keeps, the ramp that keeps them, and the stopping bound they imply. Pure."""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from protocol.config import Config
+from protocol.messages import STILL, Twist
+
+TICK_US = 20_000
+"""The driver's period: 50 Hz."""
+STOP_TIME_BOUND_US = 700_000
+STOP_DISTANCE_BOUND_M = 0.25
+
+_SLICE_US = 20_000
+_LONGEST_STEP_US = 1_000_000
+
+Millis = Annotated[int, Field(ge=20, le=5_000)]
+
+
+class SafetyConfig(Config):
+    """Limits and times of the gate. Refused where the stop they imply breaks 700 ms or 0.25 m."""
+
+    max_linear_mps: Annotated[float, Field(gt=0, le=3.0)] = 0.5
+    max_angular_rad_s: Annotated[float, Field(gt=0, le=10.0)] = 2.5
+    max_acceleration_mps2: Annotated[float, Field(gt=0, le=20.0)] = 2.0
+    max_acceleration_rad_s2: Annotated[float, Field(gt=0, le=100.0)] = 12.0
+    max_jerk_mps3: Annotated[float, Field(gt=0, le=500.0)] = 20.0
+    max_jerk_rad_s3: Annotated[float, Field(gt=0, le=2000.0)] = 200.0
+    motor_lag_ms: Annotated[int, Field(ge=0, le=500)] = 50
+    """First-order lag of the motors, for the bound only."""
+
+    full_speed_age_ms: Millis = 150
+    """Frame age up to which the full limit holds ..."""
+    zero_speed_age_ms: Millis = 400
+    """... falling linearly to zero here; older is refused."""
+    silence_ms: Millis = 300
+    """No accepted command for this long: HOLD."""
+    lease_ms: Millis = 1_000
+    disarm_after_hold_s: Annotated[float, Field(ge=1, le=600)] = 10.0
+    live_commands_to_arm: Annotated[int, Field(ge=1, le=100)] = 5
+    auto_arm: bool = False
+    """Arm without a person once the live commands are there. For simulation."""
+
+    guests: bool = False
+    """Whether header-less commands on `twist/guest` are heard at all."""
+    guest_life_ms: Millis = 250
+    guest_max_linear_mps: Annotated[float, Field(gt=0, le=3.0)] = 0.2
+    guest_max_angular_rad_s: Annotated[float, Field(gt=0, le=10.0)] = 1.0
+
+    @model_validator(mode="after")
+    def _stops_in_time(self) -> Self:
+        if self.full_speed_age_ms >= self.zero_speed_age_ms:
+            raise ValueError("full_speed_age_ms must be below zero_speed_age_ms")
+        bound = stop_bound(self)
+        if bound.zero_us > STOP_TIME_BOUND_US or bound.distance_m > STOP_DISTANCE_BOUND_M:
+            raise ValueError(
+                f"with these limits the robot stops {bound.zero_us // 1000} ms and {bound.distance_m:.2f} m after its "
+                f"last command; allowed are {STOP_TIME_BOUND_US // 1000} ms and {STOP_DISTANCE_BOUND_M} m. Lower "
+                "max_linear_mps, max_angular_rad_s or silence_ms, or raise the accelerations if the robot can brake so"
+            )
+        return self
+
+    @property
+    def max_age_us(self) -> int:
+        """The oldest frame that a command may answer."""
+        return self.zero_speed_age_ms * 1000
+
+
+def age_factor(config: SafetyConfig, age_us: int) -> float:
+    """Share of the speed limit that a frame of `age_us` still allows: 1 when young, falling linearly to 0."""
+    full_us, zero_us = config.full_speed_age_ms * 1000, config.zero_speed_age_ms * 1000
+    return min(1.0, max(0.0, (zero_us - age_us) / (zero_us - full_us)))
+
+
+def clamp_twist(twist: Twist, max_linear_mps: float, max_angular_rad_s: float) -> Twist:
+    """Scale both axes by one factor until both limits hold, so that the curve stays."""
+    excess = 1.0
+    if max_linear_mps <= 0 or max_angular_rad_s <= 0:
+        return STILL
+    excess = max(1.0, abs(twist.linear_mps) / max_linear_mps, abs(twist.angular_rad_s) / max_angular_rad_s)
+    if excess == 1.0:
+        return twist
+    return Twist(linear_mps=twist.linear_mps / excess, angular_rad_s=twist.angular_rad_s / excess)
+
+
+class AxisRamp:
+    """One speed brought to its goal within acceleration and jerk, without overshoot."""
+
+    def __init__(self, max_acceleration: float, max_jerk: float) -> None:
+        self._max_acceleration = max_acceleration
+        self._max_jerk = max_jerk
+        self.speed = 0.0
+        self._acceleration = 0.0
+
+    def force(self, speed: float) -> None:
+        """Continue from `speed`: something stronger than the ramp has set it."""
+        self.speed, self._acceleration = speed, 0.0
+
+    def step(self, goal: float, dt_s: float) -> float:
+        """Advance by `dt_s` (at most one slice) towards `goal`."""
+        error = goal - self.speed
+        # The largest acceleration that can still be taken back to zero within jerk by the time the goal is reached.
+        wanted = math.copysign(min(self._max_acceleration, math.sqrt(2 * self._max_jerk * abs(error))), error)
+        change = max(-self._max_jerk * dt_s, min(self._max_jerk * dt_s, wanted - self._acceleration))
+        self._acceleration += change
+        moved = self._acceleration * dt_s
+        if abs(error) <= max(abs(moved), self._max_jerk * dt_s * dt_s) and moved * error >= 0:
+            self.speed, self._acceleration = goal, 0.0
+        else:
+            self.speed += moved
+        return self.speed
+
+
+class Ramp:
+    """Both axes, per elapsed time: a late step is cut in slices, so it moves as far as punctual ones would have."""
+
+    def __init__(self, config: SafetyConfig) -> None:
+        self._linear = AxisRamp(config.max_acceleration_mps2, config.max_jerk_mps3)
+        self._angular = AxisRamp(config.max_acceleration_rad_s2, config.max_jerk_rad_s3)
+
+    def step(self, goal: Twist, elapsed_us: int) -> Twist:
+        """The twist to apply after `elapsed_us` on the way to `goal`."""
+        left_us = min(elapsed_us, _LONGEST_STEP_US)
+        while left_us > 0:
+            slice_us = min(left_us, _SLICE_US)
+            self._linear.step(goal.linear_mps, slice_us / 1e6)
+            self._angular.step(goal.angular_rad_s, slice_us / 1e6)
+            left_us -= slice_us
+        return Twist(linear_mps=self._linear.speed, angular_rad_s=self._angular.speed)
+
+    def force(self, twist: Twist) -> None:
+        """Continue from `twist`."""
+        self._linear.force(twist.linear_mps)
+        self._angular.force(twist.angular_rad_s)
+
+
+@dataclass(frozen=True, slots=True)
+class StopBound:
+    """After the last valid command, from top speed: when the speed starts to fall, is zero, and the way until then."""
+
+    falls_us: int
+    zero_us: int
+    distance_m: float
+
+
+def stop_bound(config: SafetyConfig) -> StopBound:
+    """The stop that `config` implies, by running its own ramp: the worst case, a command on a frame of age zero.
+
+    One tick is added for the phase of the driver's loop, and the motors follow with their lag. `zero_us` is when the
+    ramp is at zero and the wheels, by their lag, below 2 % of top speed.
+    """
+    ramp, top = Ramp(config), Twist(linear_mps=config.max_linear_mps, angular_rad_s=config.max_angular_rad_s)
+    ramp.force(top)
+    now_us, falls_us, wheels_mps, distance_m = 0, 0, config.max_linear_mps, 0.0
+    twist = top
+    while (twist != STILL or wheels_mps > 0.02 * top.linear_mps) and now_us < 2 * _LONGEST_STEP_US:
+        now_us += TICK_US
+        factor = age_factor(config, now_us) if now_us <= config.silence_ms * 1000 else 0.0
+        twist = ramp.step(clamp_twist(top, factor * top.linear_mps, factor * top.angular_rad_s), TICK_US)
+        falls_us = falls_us or (now_us if twist.linear_mps < top.linear_mps else 0)
+        wheels_mps += (twist.linear_mps - wheels_mps) * min(1.0, TICK_US / max(TICK_US, config.motor_lag_ms * 1000))
+        distance_m += wheels_mps * TICK_US / 1e6
+    return StopBound(falls_us + TICK_US, now_us + TICK_US, distance_m + top.linear_mps * TICK_US / 1e6)

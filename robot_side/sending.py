@@ -1,0 +1,94 @@
+"""The network process's own logic: pictures in, frames out, credit. Pure; `network.py` is its shell."""
+
+from protocol.channels import CAMERA, FRAME
+from protocol.codec import decode, encode
+from protocol.messages import AnswerHeader, CameraModel, FrameHeader, Holder, Planar, Pose, Stamp, StreamStatus
+from protocol.transports.link import Message
+from robot_side.ipc import Judged, Motion
+from robot_side.ports import Picture
+from robot_side.stream import Stream, StreamConfig
+
+_CAMERA_PERIOD_US = 500_000
+
+
+class Sending:
+    """One network process of one robot session; `first_seq` continues where an earlier process ended."""
+
+    def __init__(self, config: StreamConfig, session: str, first_seq: int, max_frame_bytes: int) -> None:
+        self.motion = Motion()
+        self.refused_pictures = 0
+        self._stream = Stream(config)
+        self._session = session
+        self._seq = first_seq
+        self._max_frame_bytes = max_frame_bytes
+        self._last_t_us = -1
+        self._camera_seq = 0
+        self._camera_due_us = 0
+
+    def may_capture(self, now_us: int, listening: bool) -> bool:
+        """Whether to take a picture now."""
+        return self._stream.may_capture(now_us, listening)
+
+    def wait_us(self, now_us: int) -> int:
+        """How long to wait for time alone to change `may_capture`."""
+        return self._stream.wait_us(now_us)
+
+    def on_camera(self, picture: Picture, now_us: int) -> tuple[FrameHeader, Message] | None:
+        """The frame to publish; None, counted, for a picture too large or not newer than the last."""
+        if picture.t_us <= self._last_t_us or len(picture.jpeg) > self._max_frame_bytes:
+            self.refused_pictures += 1
+            return None
+        self._last_t_us = picture.t_us
+        header = self._header(picture.t_us)
+        self._stream.on_sent(self._seq, picture.t_us, now_us)
+        self._seq += 1
+        return header, Message(FRAME, "", encode(header), picture.jpeg)
+
+    def _header(self, t_us: int) -> FrameHeader:
+        motion = self.motion
+        return FrameHeader(
+            session=self._session,
+            seq=self._seq,
+            t_us=t_us,
+            pose=_rounded_pose(motion.pose),
+            moving=_rounded(motion.moving),
+            applied=_rounded(motion.applied),
+            latency_us=motion.latency_us,
+        )
+
+    def on_judged(self, judged: Judged, now_us: int) -> None:
+        """The driver judged a twist: credit comes back, and goes to who drives."""
+        self._stream.on_holder(judged.holder, now_us)
+        self._answer(judged.sender, judged.seq, judged.compute_us, now_us)
+
+    def on_ack(self, message: Message, now_us: int) -> None:
+        """An acknowledgement: credit comes back. Raises WireError for what is none."""
+        header = decode(AnswerHeader, message.header)
+        if header.source == message.source and header.echo.session == self._session:
+            who = Holder(source=header.source, session=header.session)
+            self._answer(who, header.echo.seq, header.compute_us, now_us)
+
+    def _answer(self, who: Holder, seq: int, compute_us: int, now_us: int) -> None:
+        if seq < self._seq:
+            self._stream.on_answer(who, seq, compute_us, now_us)
+
+    def camera_message(self, model: CameraModel, now_us: int) -> Message | None:
+        """The camera's model, twice a second."""
+        if now_us < self._camera_due_us:
+            return None
+        self._camera_due_us = now_us + _CAMERA_PERIOD_US
+        stamp = Stamp(session=self._session, seq=self._camera_seq, t_us=now_us)
+        self._camera_seq += 1
+        return Message(CAMERA, "", encode(stamp), encode(model))
+
+    def status(self, now_us: int, dropped_commands: int = 0) -> StreamStatus:
+        """Counters of the stream."""
+        return self._stream.status(now_us, dropped_commands)
+
+
+def _rounded(pair: Planar) -> Planar:
+    return round(pair[0], 4), round(pair[1], 4)
+
+
+def _rounded_pose(pose: Pose) -> Pose:
+    return round(pose[0], 4), round(pose[1], 4), round(pose[2], 5)

@@ -1,0 +1,57 @@
+"""States of the gate and the one table of their transitions. Pure.
+
+    state      wheels                         left by
+    DISARMED   zero; commands are judged      arm
+    HOLD       ramp to zero, then held        a fresh command; ten seconds; disarm
+    ACTIVE     obey the command               silence, age; disarm
+    DEGRADED   obey, speed limit lowered      silence, age; disarm
+    STOPPED    zero, latched                  reset (never starts motion: it leads to DISARMED)
+    FAULT      zero, the drive failed         reset
+"""
+
+from enum import Enum
+
+from protocol.messages import State
+
+
+class Event(Enum):
+    """What moves the gate from state to state."""
+
+    ARM = "arm"
+    DISARM = "disarm"
+    STOP = "stop"
+    RESET = "reset"
+    FAULT = "the drive fails"
+    FRESH = "a command on a young frame"
+    AGEING = "a command on an ageing frame"
+    OLD = "no young command"
+    EXPIRED = "ten seconds in HOLD"
+    HUMAN_LOST = "the human holder is lost"
+
+
+_ARMED = (State.HOLD, State.ACTIVE, State.DEGRADED)
+_ANY = tuple(State)
+
+TRANSITIONS: dict[tuple[State, Event], State] = {
+    (State.DISARMED, Event.ARM): State.HOLD,
+    (State.HOLD, Event.EXPIRED): State.DISARMED,
+    (State.STOPPED, Event.RESET): State.DISARMED,
+    (State.FAULT, Event.RESET): State.DISARMED,
+    **{(state, Event.FRESH): State.ACTIVE for state in _ARMED},
+    **{(state, Event.AGEING): State.DEGRADED for state in _ARMED},
+    **{(state, Event.OLD): State.HOLD for state in _ARMED},
+    **{(state, Event.DISARM): State.DISARMED for state in _ARMED},
+    **{(state, Event.HUMAN_LOST): State.DISARMED for state in _ARMED},
+    **{(state, Event.FAULT): State.FAULT for state in _ANY if state is not State.STOPPED},
+    **{(state, Event.STOP): State.STOPPED for state in _ANY},
+}
+
+
+def after(state: State, event: Event) -> State:
+    """The state that `event` leads to; pairs outside the table change nothing."""
+    return TRANSITIONS.get((state, event), state)
+
+
+def is_armed(state: State) -> bool:
+    """Whether the wheels may turn in `state`."""
+    return state in _ARMED
