@@ -1,72 +1,99 @@
 """Limits speed towards what the range sensor sees: held state, last before the wheels. Pure.
 
-A scan is turned once into free distances ahead and behind, along the robot's own width. Towards an obstacle the speed
-is at most sqrt(2 a (free - stop zone)): what still brakes in time. A stale sensor counts as an obstacle.
+Each near point of a scan becomes one inequality on the twist. With n the direction from the robot's outline to the
+point, the robot closes in on it at `linear * forward + angular * turning`, which may be at most
+sqrt(2 brake (clearance - stop)): what can still brake in time. Motion along a wall or away from it is free.
+A stale sensor counts as an obstacle all around.
 """
 
 import math
+from dataclasses import dataclass
 from typing import Annotated
 
 from pydantic import Field
 
 from protocol.config import Config
-from protocol.messages import Twist
+from protocol.messages import STILL, Twist
 from robot_side.ports import Ranges
+
+_PASSES = 2  # cutting speed for one point can bring a turn closer to another
 
 
 class GuardConfig(Config):
-    """Zones of the range guard. Distances are from the robot's outline along its direction of travel."""
+    """Outline of the robot from its axle's midpoint, and the zones around it."""
 
-    stop_m: Annotated[float, Field(ge=0.02, le=5)] = 0.12
-    """No motion towards anything nearer. Keep it well below every stand-off."""
-    brake_mps2: Annotated[float, Field(gt=0, le=20)] = 0.8
-    """Braking the slow zone assumes; below the robot's own, so that motor lag and scan age fit in."""
-    half_width_m: Annotated[float, Field(gt=0.01, le=2)] = 0.13
-    """Half of the lane kept free: half the robot's width and a margin."""
-    front_m: Annotated[float, Field(ge=0, le=2)] = 0.08
-    """From the axle to the front edge."""
+    front_m: Annotated[float, Field(ge=0, le=2)] = 0.07
     rear_m: Annotated[float, Field(ge=0, le=2)] = 0.10
+    half_width_m: Annotated[float, Field(gt=0.01, le=2)] = 0.09
     sensor_x_m: Annotated[float, Field(ge=-2, le=2)] = 0.055
-    """Where the sensor sits, from the axle, forward."""
+    """Where the sensor sits, forward of the axle."""
+    stop_m: Annotated[float, Field(ge=0.02, le=5)] = 0.08
+    """Clearance at which no motion towards a point is left. Keep it well below every stand-off."""
+    brake_mps2: Annotated[float, Field(gt=0, le=20)] = 0.5
+    """Braking the slow zone counts on; well below the robot's own, so that motor lag and scan age fit in."""
     max_scan_age_ms: Annotated[int, Field(ge=50, le=5_000)] = 400
 
 
+@dataclass(frozen=True, slots=True)
+class _Near:
+    """`linear * forward + angular * turning <= limit_mps`."""
+
+    forward: float
+    turning: float
+    limit_mps: float
+
+    def cut(self, linear: float, angular: float) -> tuple[float, float]:
+        """The twist that holds it: speed gives way before turning, so that the robot can turn to where it is free."""
+        if linear * self.forward + angular * self.turning <= self.limit_mps:
+            return linear, angular
+        left_mps = self.limit_mps - angular * self.turning
+        if left_mps >= 0:
+            return left_mps / self.forward, angular
+        return 0.0, self.limit_mps / self.turning
+
+
 class RangeGuard:
-    """Holds the newest scan's verdict and cuts speed with it."""
+    """Holds what the newest scan forbids, and cuts twists with it."""
 
     def __init__(self, config: GuardConfig) -> None:
         self._config = config
         self._scan_us: int | None = None
-        self.ahead_m = self.behind_m = 0.0
+        self._near: list[_Near] = []
 
     def see(self, scan: Ranges) -> None:
         """Take a scan."""
         self._scan_us = scan.t_us
-        self.ahead_m = self.behind_m = math.inf
+        angles = (scan.angle_min_rad + index * scan.angle_increment_rad for index in range(len(scan.ranges_m)))
+        self._near = [
+            self._inequality(self._config.sensor_x_m + range_m * math.cos(angle_rad), range_m * math.sin(angle_rad))
+            for range_m, angle_rad in zip(scan.ranges_m, angles, strict=True)
+            if scan.range_min_m <= range_m <= scan.range_max_m
+        ]
+
+    def _inequality(self, x_m: float, y_m: float) -> _Near:
         config = self._config
-        for index, range_m in enumerate(scan.ranges_m):
-            angle_rad = scan.angle_min_rad + index * scan.angle_increment_rad
-            if not scan.range_min_m <= range_m <= scan.range_max_m:
-                continue
-            x_m, y_m = config.sensor_x_m + range_m * math.cos(angle_rad), range_m * math.sin(angle_rad)
-            if abs(y_m) > config.half_width_m:
-                continue
-            if x_m > 0:
-                self.ahead_m = min(self.ahead_m, x_m - config.front_m)
-            else:
-                self.behind_m = min(self.behind_m, -x_m - config.rear_m)
+        nearest_x_m = max(-config.rear_m, min(config.front_m, x_m))
+        nearest_y_m = max(-config.half_width_m, min(config.half_width_m, y_m))
+        clearance_m = math.hypot(x_m - nearest_x_m, y_m - nearest_y_m)
+        # A point inside the outline (noise, or the robot's own parts) is taken as straight ahead or behind.
+        inside = clearance_m < 1e-6
+        forward = math.copysign(1.0, x_m) if inside else (x_m - nearest_x_m) / clearance_m
+        sideways = 0.0 if inside else (y_m - nearest_y_m) / clearance_m
+        limit_mps = math.sqrt(2 * config.brake_mps2 * max(0.0, clearance_m - config.stop_m))
+        # The outline's nearest spot moves at v + w x r: (linear - angular * y, angular * x).
+        return _Near(forward, sideways * nearest_x_m - forward * nearest_y_m, limit_mps)
 
     def limit(self, twist: Twist, now_us: int) -> Twist:
-        """`twist` with its forward or backward speed cut to what is safe; turning is left to it."""
-        limit_mps = self._limit_mps(self.ahead_m if twist.linear_mps > 0 else self.behind_m, now_us)
-        if abs(twist.linear_mps) <= limit_mps:
-            return twist
-        return Twist(linear_mps=math.copysign(limit_mps, twist.linear_mps), angular_rad_s=twist.angular_rad_s)
-
-    def _limit_mps(self, free_m: float, now_us: int) -> float:
+        """`twist` cut to what the scan allows; the same object when nothing was cut."""
         if not self.is_fresh(now_us):
-            return 0.0
-        return math.sqrt(2 * self._config.brake_mps2 * max(0.0, free_m - self._config.stop_m))
+            return twist if twist == STILL else Twist(linear_mps=0.0, angular_rad_s=0.0)
+        linear, angular = twist.linear_mps, twist.angular_rad_s
+        for _ in range(_PASSES):
+            for near in self._near:
+                linear, angular = near.cut(linear, angular)
+        if (linear, angular) == (twist.linear_mps, twist.angular_rad_s):
+            return twist
+        return Twist(linear_mps=linear, angular_rad_s=angular)
 
     def is_fresh(self, now_us: int) -> bool:
         """Whether the newest scan is young enough to be believed."""

@@ -102,6 +102,8 @@ class AxisRamp:
     def step(self, goal: float, dt_s: float) -> float:
         """Advance by `dt_s` (at most one slice) towards `goal`."""
         error = goal - self.speed
+        if self._acceleration * error < 0:  # letting go of the throttle is never held back by the jerk limit
+            self._acceleration = 0.0
         # The largest acceleration that can still be taken back to zero within jerk by the time the goal is reached.
         wanted = math.copysign(min(self._max_acceleration, math.sqrt(2 * self._max_jerk * abs(error))), error)
         change = max(-self._max_jerk * dt_s, min(self._max_jerk * dt_s, wanted - self._acceleration))

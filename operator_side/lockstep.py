@@ -1,0 +1,181 @@
+"""The whole line in virtual time: the services' own pure logic, a simulated world, a network in memory. Pure.
+
+Nothing here decides anything: robot, driver, stream and vision are the classes the real processes run. Every delay and
+loss is drawn from the seed, so a run repeats bit for bit, about twenty times faster than real.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from protocol.channels import ACK, FRAME, TWIST
+from protocol.codec import decode, encode
+from protocol.messages import FrameHeader, State
+from protocol.transports.link import LatestSlot, Message
+from protocol.transports.memory import MemoryNetwork
+from protocol.twist_text import format_twist
+from robot_side.config import PluginChoice, RobotConfig
+from robot_side.driving import Driving
+from robot_side.limits import TICK_US, SafetyConfig
+from robot_side.ports import Picture
+from robot_side.sending import Sending
+from sim.robot_model import RobotModel
+from sim.scenario import Scenario
+from sim.truth import Truth
+from sim.world import World
+from vision_side.config import VisionConfig
+from vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
+
+COMPUTE_US = 4_000
+"""What one frame costs the vision side in virtual time: one step of the world, above what it takes in truth."""
+_SCAN_US = 100_000
+_SAMPLE_US = 20_000
+_ROBOT_SESSION, _VISION_SESSION = "00000001", "00000002"
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What the network does: added latency in all (half on each leg), jitter in all, loss on each leg."""
+
+    latency_ms: float = 0.0
+    loss: float = 0.0
+    jitter_ms: float = 0.0
+
+
+@dataclass(slots=True)
+class Run:
+    """What a run leaves."""
+
+    samples: list[Truth] = field(default_factory=list)
+    twists: list[bytes] = field(default_factory=list)
+    """Every twist the vision side sent, in order."""
+    states: set[State] = field(default_factory=set)
+
+
+def simulation_robot(auto_arm: bool = True) -> RobotConfig:
+    """The robot's configuration in lockstep: its defaults, with a range sensor, armed without a person."""
+    return RobotConfig(range_sensor=PluginChoice(kind="sim"), safety=SafetyConfig(auto_arm=auto_arm))
+
+
+class Lockstep:
+    """One robot, one vision, one world. `step` advances all by one step of the world."""
+
+    def __init__(
+        self,
+        world: World,
+        robot: RobotConfig,
+        vision: VisionConfig,
+        conditions: Conditions,
+        seed: int,
+    ) -> None:
+        self.world = world
+        self.run = Run()
+        self.network = MemoryNetwork(
+            seed, round(conditions.latency_ms * 1000), round(conditions.jitter_ms * 1000), conditions.loss
+        )
+        self.driving = Driving(robot, _ROBOT_SESSION)
+        self._sending = Sending(robot.stream, _ROBOT_SESSION, 0, robot.max_frame_bytes)
+        self._robot_link = self.network.link(robot.robot)
+        self._robot_link.subscribe(TWIST, self._on_twist)
+        self._robot_link.subscribe(ACK, lambda message: self._sending.on_ack(message, self._now_us))
+        self._vision_link = self.network.link(robot.robot, role=SOURCE)
+        self._frames: LatestSlot[Message] = self._vision_link.latest(FRAME)
+        self._pipeline = Pipeline(vision, world.camera_model)
+        self._computed: deque[tuple[int, Message]] = deque(maxlen=1)
+        self._answers = 0
+        self._camera_tick = 0
+        self._frame_interval_us = 1e6 / world.robot.camera.fps
+        self._now_us = 0
+
+    def step(self) -> None:
+        """One step of the world, then everything that is due."""
+        self.world.step()
+        self._now_us = self.world.now_us
+        self.network.advance(self._now_us)
+        self._see()
+        self._film()
+        if self._now_us % TICK_US == 0:
+            self._tick()
+        if self._now_us % _SAMPLE_US == 0:
+            self.run.samples.append(self.world.truth())
+
+    # --- robot ---------------------------------------------------------------------------------------------------
+
+    def _film(self) -> None:
+        """The camera's next tick: a picture, if the stream wants one."""
+        if self._now_us < self._camera_tick * self._frame_interval_us:
+            return
+        self._camera_tick += 1
+        if not self._sending.may_capture(self._now_us, self._robot_link.has_listener(FRAME)):
+            return
+        sent = self._sending.on_camera(Picture(self.world.render(), self._now_us), self._now_us)
+        if sent is not None:
+            header, message = sent
+            self.driving.on_issued(header.seq, header.t_us)
+            self._robot_link.publish(message.channel, message.header, message.payload)
+
+    def _on_twist(self, message: Message) -> None:
+        judged = self.driving.on_twist(message, self._now_us)
+        if judged is not None:
+            self._sending.on_judged(judged, self._now_us)
+        self._tick()
+
+    def _tick(self) -> None:
+        scan = self.world.scan() if self._now_us % _SCAN_US == 0 else None
+        self.world.set_wheels(*self.driving.tick(self._now_us, self.world.wheel_angles(), scan))
+        self._sending.motion = self.driving.motion()
+        self.run.states.add(self.driving.gate.state)
+
+    # --- vision --------------------------------------------------------------------------------------------------
+
+    def _see(self) -> None:
+        """Send what is computed, then take the newest frame: one at a time, as the real service does."""
+        if self._computed and self._computed[0][0] > self._now_us:
+            return
+        if self._computed:
+            _, message = self._computed.popleft()
+            self._vision_link.publish(message.channel, message.header, message.payload)
+        taken = self._frames.take()
+        if taken is not None:
+            self._computed.append((self._now_us + COMPUTE_US, self._answer(taken)))
+
+    def _answer(self, message: Message) -> Message:
+        frame = Frame(decode(FrameHeader, message.header), message.payload)
+        answer = self._pipeline.step(frame)
+        header = encode(answer_header(frame.header, _VISION_SESSION, self._answers, COMPUTE_US))
+        self._answers += 1
+        if answer.twist is None:
+            return Message(ACK, SOURCE, header, b"")
+        text = format_twist(answer.twist)
+        self.run.twists.append(text)
+        return Message(TWIST, SOURCE, header, text)
+
+
+def run_lockstep(
+    scenario: Scenario,
+    model: RobotModel,
+    seed: int,
+    conditions: Conditions,
+    seconds: float | None = None,
+    *,
+    vision: VisionConfig | None = None,
+    on_progress: Callable[[int], None] = lambda _now_us: None,
+) -> Run:
+    """One run of `scenario` for `seconds` (its own length if None). `on_progress` is told the time each second."""
+    with World(scenario, model, seed) as world:
+        lockstep = Lockstep(world, simulation_robot(), vision or vision_for(scenario), conditions, seed)
+        end_us = round((seconds or scenario.seconds) * 1e6)
+        while world.now_us < end_us:
+            lockstep.step()
+            if world.now_us % 1_000_000 == 0:
+                on_progress(world.now_us)
+        return lockstep.run
+
+
+def vision_for(scenario: Scenario, base: VisionConfig | None = None) -> VisionConfig:
+    """`base` told what a person would tell it of this scenario: the ball's size and the distance to keep."""
+    base = base or VisionConfig()
+    target = base.target.model_copy(
+        update={"radius_m": scenario.target.radius_m, "stand_off_m": scenario.stand_off_m}
+    )
+    return base.model_copy(update={"target": target})
