@@ -74,7 +74,7 @@ class Driver:
         self._drive = drive
         self._ranges = ranges
         self._driving = Driving(config, secrets.token_hex(4), stopped=self._latch.is_set())
-        self._shown = (self._driving.gate.state, self._driving.gate.reason)
+        self._shown = self._driving.gate.state
         self._ending_since_us: int | None = None
         self.child = NetworkChild(config, self._driving.session)
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -131,10 +131,11 @@ class Driver:
 
     def _show(self, state: State, reason: str) -> None:
         """One line per change of state; the latch is kept before it is said."""
-        if state is not self._shown[0]:
-            self._latch.keep(state is State.STOPPED)
-            print(f"robot {self._driving.config.robot}: {state} ({reason})", flush=True)
-            self._shown = (state, reason)
+        shown, self._shown = self._shown, state
+        if state is shown or {state, shown} == {State.ACTIVE, State.DEGRADED}:
+            return  # on a lossy link these two alternate many times a second
+        self._latch.keep(state is State.STOPPED)
+        print(f"robot {self._driving.config.robot}: {state} ({reason})", flush=True)
 
     # --- packets of the network process --------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ from protocol.messages import Holder, StreamStatus
 
 _FIRST_TIMEOUT_US = 250_000
 _DELAYS_KEPT = 12
+_TIMEOUT_SLACK_US = 12_000  # with a quick peer, below one interval at 30 fps: a loss then costs one frame, not two
 
 
 class StreamConfig(Config):
@@ -122,7 +123,7 @@ class Stream:
         longest_us = self._config.max_credit_timeout_ms * 1000
         if self._answer_us is None:
             return min(_FIRST_TIMEOUT_US, longest_us)
-        return min(longest_us, round(1.5 * self._answer_us) + self._interval_us)
+        return min(longest_us, round(1.5 * self._answer_us) + _TIMEOUT_SLACK_US)
 
     def _expire(self, now_us: int) -> None:
         late = [seq for seq, flight in self._in_flight.items() if now_us >= flight.expires_us]

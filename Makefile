@@ -1,0 +1,35 @@
+# Everything a newcomer needs: `make demo` and `make test` set up their own environment in .venv.
+# PyBullet has ready-made wheels for Linux up to Python 3.11 only; elsewhere pip compiles it, which takes minutes.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: demo test slow lint lock clean
+
+demo: $(READY)
+	$(BIN)/sightline demo $(ARGS)
+
+test: $(READY)
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+$(READY): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "error: $$($(PYTHON) --version) is too old: Sightline needs Python 3.11 or newer; make PYTHON=/path/to/python3.11"; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
+	  echo "note: no Python 3.11 here, so PyBullet will be compiled for $$($(PYTHON) --version): minutes, and needs a C++ compiler. Or use docker compose."
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+lock:  ## pin every dependency of every extra, with hashes, for all platforms
+	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \
+	  --no-emit-index-url --no-header --output-file requirements.lock
+
+clean:
+	rm -rf $(VENV) runs
