@@ -14,7 +14,7 @@ from protocol.messages import FrameHeader, State
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.memory import MemoryNetwork
 from protocol.twist_text import format_twist
-from robot_side.config import PluginChoice, RobotConfig
+from robot_side.config import RobotConfig
 from robot_side.driving import Driving
 from robot_side.limits import TICK_US, SafetyConfig
 from robot_side.ports import Picture
@@ -53,8 +53,8 @@ class Run:
 
 
 def simulation_robot(auto_arm: bool = True) -> RobotConfig:
-    """The robot's configuration in lockstep: its defaults, with a range sensor, armed without a person."""
-    return RobotConfig(range_sensor=PluginChoice(kind="sim"), safety=SafetyConfig(auto_arm=auto_arm))
+    """The robot's configuration in lockstep: its defaults, armed without a person."""
+    return RobotConfig(safety=SafetyConfig(auto_arm=auto_arm))
 
 
 class Lockstep:

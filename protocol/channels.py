@@ -7,8 +7,6 @@ import re
 from dataclasses import dataclass
 from enum import Enum
 
-from pydantic import BaseModel
-
 from protocol.errors import ConfigError
 from protocol.messages import (
     AnswerHeader,
@@ -21,6 +19,7 @@ from protocol.messages import (
     ScanHeader,
     Stamp,
     Status,
+    Wire,
 )
 from protocol.twist_text import MAX_TWIST_BYTES
 
@@ -50,8 +49,8 @@ class Channel:
 
     name: str
     direction: Direction
-    header: type[BaseModel]
-    payload: type[BaseModel] | None
+    header: type[Wire]
+    payload: type[Wire] | None
     encoding: str
     priority: Priority
     rate: str
@@ -125,6 +124,6 @@ def parse_key(key: str) -> tuple[str, Channel, str] | None:
     if channel is None or channel.has_source != (len(parts) == 4) or not _ROBOT_ID.fullmatch(parts[1]):
         return None
     source = parts[3] if channel.has_source else ""
-    if source and not _SOURCE.fullmatch(source):
+    if channel.has_source and not _SOURCE.fullmatch(source):
         return None
     return parts[1], channel, source

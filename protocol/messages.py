@@ -13,6 +13,7 @@ from protocol import VERSION
 
 MAX_INTEGER = 2**53 - 1  # the largest integer that every JSON reader holds exactly
 
+Version = Annotated[int, Field(ge=VERSION, le=VERSION)]  # a Literal would let `true` and 1.0 pass as 1
 SessionId = Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")]
 Source = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,15}$")]
 RobotId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
@@ -47,7 +48,7 @@ STILL = Twist(linear_mps=0.0, angular_rad_s=0.0)
 class Stamp(Wire):
     """Header of everything a robot publishes: its session (new at each start), a count per channel, its clock."""
 
-    v: Literal[1] = VERSION
+    v: Version = VERSION
     session: SessionId
     seq: Counter
     t_us: Microseconds
@@ -87,7 +88,7 @@ class Echo(Wire):
 class AnswerHeader(Wire):
     """Header of a twist and of an ack: who answers, which frame, and how long the computing took."""
 
-    v: Literal[1] = VERSION
+    v: Version = VERSION
     source: Source
     session: SessionId
     seq: Counter
@@ -98,7 +99,7 @@ class AnswerHeader(Wire):
 class RequestHeader(Wire):
     """Header of a request. `echo` names the newest `status` seen; only stop, disarm and release may lack it."""
 
-    v: Literal[1] = VERSION
+    v: Version = VERSION
     source: Source
     session: SessionId
     seq: Counter

@@ -33,6 +33,7 @@ class RobotConfig(Config):
     camera: PluginChoice = PluginChoice(kind="sim")
     drive: PluginChoice = PluginChoice(kind="sim")
     range_sensor: PluginChoice | None = None
+    """None: the simulation's when the drive is the simulation's, else none; kind "none" switches it off."""
     safety: SafetyConfig = SafetyConfig()
     guard: GuardConfig = GuardConfig()
     wheels: DiffDriveConfig = DiffDriveConfig()
@@ -40,3 +41,10 @@ class RobotConfig(Config):
     max_frame_bytes: Annotated[int, Field(ge=1_000, le=1_000_000)] = 400_000
     state_dir: Path = Path("~/.local/state/sightline")
     """Where the STOP latch is kept over restarts."""
+
+    @property
+    def ranging(self) -> PluginChoice | None:
+        """The range sensor in use."""
+        if self.range_sensor is None and self.drive.kind == "sim":
+            return self.drive
+        return None if self.range_sensor and self.range_sensor.kind == "none" else self.range_sensor

@@ -22,7 +22,7 @@ from robot_side.config import RobotConfig
 from robot_side.driving import Driving
 from robot_side.limits import TICK_US
 from robot_side.plugins import build
-from robot_side.ports import Drive, Ranges, RangeSensor
+from robot_side.ports import Drive, RangeSensor
 
 _SHUTDOWN_US = 2_000_000
 
@@ -36,7 +36,7 @@ def run(config: RobotConfig) -> int:
     with ExitStack() as ending:
         drive: Drive = build("drives", config.drive)
         ending.callback(drive.close)
-        ranges: RangeSensor | None = build("range_sensors", config.range_sensor) if config.range_sensor else None
+        ranges: RangeSensor | None = build("range_sensors", config.ranging) if config.ranging else None
         if ranges is not None:
             ending.callback(ranges.close)
         driver = Driver(config, drive, ranges)
@@ -112,22 +112,28 @@ class Driver:
         select.select(readable, [], [], timeout_s)
 
     def _tick(self, now_us: int, *, punctual: bool) -> None:
-        gate = self._driving.gate
-        left_rad_s, right_rad_s = self._driving.tick(now_us, self._drive.wheels(), self._read_ranges())
-        try:
-            self._drive.set(left_rad_s, right_rad_s)
-        except HardwareError as error:
-            gate.fault(str(error))
+        self._move(now_us)
         self.child.send(ipc.pack_motion(self._driving.motion()))
         if punctual:
             for message in self._driving.messages(now_us):
                 self.child.send(ipc.pack_message(ipc.Kind.PUBLISH, message))
             self.child.keep_alive(now_us, self._driving.gate.issued.last_seq("frame") + 1)
             self._driving.network_restarts = self.child.restarts
-            self._show(gate.state, gate.reason)
+            self._show(self._driving.gate.state, self._driving.gate.reason)
 
-    def _read_ranges(self) -> Ranges | None:
-        return self._ranges.read() if self._ranges else None
+    def _move(self, now_us: int) -> None:
+        """Sensors, gate, motors. A device that fails stops the robot; the other devices are still served."""
+        wheels = scan = None
+        try:
+            wheels = self._drive.wheels()
+            scan = self._ranges.read() if self._ranges else None
+        except HardwareError as error:
+            self._driving.gate.fault(str(error))
+        speeds = self._driving.tick(now_us, wheels, scan)
+        try:
+            self._drive.set(*speeds)
+        except HardwareError as error:
+            self._driving.gate.fault(str(error))
 
     def _show(self, state: State, reason: str) -> None:
         """One line per change of state; the latch is kept before it is said."""

@@ -39,7 +39,7 @@ class Driving:
     def __init__(self, config: RobotConfig, session: str, *, stopped: bool = False) -> None:
         self.config = config
         self.session = session
-        self._guard = RangeGuard(config.guard) if config.range_sensor else None
+        self._guard = RangeGuard(config.guard) if config.ranging else None
         self.gate = SafetyGate(config.safety, session, stopped=stopped, guard=self._guard)
         self.odometer = Odometer(config.wheels)
         self.stream = StreamStatus()

@@ -1,0 +1,97 @@
+"""Golden vectors: what a message must be read as, or why it must be refused, for peers in any language. Pure.
+
+`golden_cases.py` states each case and its outcome by hand; a file is made only if the decoders agree. Each lies in
+`vectors/<channel>/<case>.json`:
+
+    {"purpose", "key", "header_hex", "payload_hex", "accept": {"source", "header", "payload"} or "refuse": reason}
+
+`header` and `payload` are as read, with defaults filled in; `null` is a header that may be missing. A picture's payload
+is its size, a scan's the ranges with "inf" for no return.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from protocol.channels import ACK, FRAME, SCAN, TWIST, Channel, parse_key
+from protocol.codec import check_sizes, decode, decode_ranges
+from protocol.errors import WireError
+from protocol.golden_cases import CASES, Case
+from protocol.jpeg import read_jpeg_size
+from protocol.messages import Wire
+from protocol.twist_text import parse_twist
+
+INEXACT_KEY = "INEXACT_KEY"
+"""The outcome of a key that is not exact: nobody is told, the receiver counts it."""
+Outcome = dict[str, Any]
+
+
+def outcome(key: str, header: bytes, payload: bytes) -> Outcome:
+    """What a receiver makes of a message: {"accept": {...}} or {"refuse": reason}. Never raises."""
+    parsed = parse_key(key)
+    if parsed is None:
+        return {"refuse": INEXACT_KEY}
+    _, channel, source = parsed
+    try:
+        check_sizes(channel, header, payload)
+        read_header = _read_header(channel, source, header)
+        return {"accept": {"source": source, "header": read_header, "payload": _read_payload(channel, payload)}}
+    except WireError as error:
+        return {"refuse": str(error.reason)}
+
+
+def _read_header(channel: Channel, source: str, header: bytes) -> Outcome | None:
+    if channel is TWIST and source == "guest" and not header:
+        return None
+    model = channel.header
+    read = decode(model, header)
+    return read.model_dump(mode="json")
+
+
+def _read_payload(channel: Channel, payload: bytes) -> Any:
+    if channel is FRAME:
+        size = read_jpeg_size(payload)
+        return {"width_px": size.width_px, "height_px": size.height_px, "components": size.components}
+    if channel is TWIST:
+        return parse_twist(payload).model_dump()
+    if channel is SCAN:
+        return ["inf" if math.isinf(value) else value for value in decode_ranges(payload)]
+    if channel is ACK or channel.payload is None:
+        return None
+    return decode(channel.payload, payload, channel.max_payload_bytes).model_dump(mode="json")
+
+
+def vector(case: Case) -> Outcome:
+    """The case as it is written to its file. Raises ValueError if the decoders do not do what the case states."""
+    got = outcome(case.key, case.header, case.payload)
+    if got.get("refuse") != case.refuse:
+        raise ValueError(f"{case.channel}/{case.name}: stated {case.refuse or 'accept'}, decoded to {got}")
+    return {
+        "purpose": case.purpose,
+        "key": case.key,
+        "header_hex": case.header.hex(),
+        "payload_hex": case.payload.hex(),
+        **got,
+    }
+
+
+def files() -> dict[Path, str]:
+    """Every vector file below `vectors/` and its text."""
+    return {
+        Path(case.channel, f"{case.name}.json"): json.dumps(vector(case), indent=1, ensure_ascii=False) + "\n"
+        for case in CASES
+    }
+
+
+def examples() -> str:
+    """The first vector of each channel, for the specification."""
+    first = {case.channel: case for case in reversed(CASES)}
+    blocks = [
+        f"`vectors/{case.channel}/{case.name}.json`, {case.purpose}:\n\n```json\n"
+        + json.dumps(vector(case), indent=1, ensure_ascii=False)
+        + f"\n```\n\nheader as text: `{case.header.decode()}`\n"
+        for case in reversed(first.values())
+    ]
+    return "\n".join(blocks)
+

@@ -1,0 +1,186 @@
+"""Writes, or verifies, what is generated from the models: README tables, schema.json, golden vectors. Shell.
+
+    python -m protocol.schema --verify    exit code 5 and the names of what differs, if anything does
+    python -m protocol.schema --write
+"""
+
+import argparse
+import inspect
+import json
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+
+from protocol import golden, refusals
+from protocol.channels import CHANNELS, key_for
+from protocol.refusals import CLAMPED, Refusal
+
+HERE: Final = Path(__file__).parent
+_BLOCK = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- /generated -->)", re.DOTALL)
+Schema = dict[str, Any]
+
+
+def channel_table() -> str:
+    """The channels as a Markdown table."""
+    rows = ["| channel | key | header | payload | encoding | priority | payload bytes | rate |", "|---" * 8 + "|"]
+    for channel in CHANNELS.values():
+        key = key_for("R", channel, "s" if channel.has_source else "").replace("/R/", "/<robot>/")
+        key = re.sub(r"/s$", "/<source>", key)
+        payload = (channel.payload.__name__ if channel.payload else channel.purpose).replace("|", "\\|")
+        rows.append(
+            f"| {channel.name} | `{key}` | {channel.header.__name__} | {payload} | {channel.encoding} | "
+            f"{channel.priority.value} | <= {channel.max_payload_bytes} | {channel.rate} |"
+        )
+    return "\n".join(rows) + "\n"
+
+
+def refusal_table() -> str:
+    """Every reason for not obeying and what it means, as a Markdown table."""
+    rows = ["| reason | meaning |", "|---|---|"]
+    meanings = dict(re.findall(r'"(\w+)"  # (.*)', inspect.getsource(refusals)))
+    rows += [f"| `{reason}` | {meanings[reason]} |" for reason in Refusal]
+    rows.append(f"| `{CLAMPED}` | no refusal: the command was accepted, but cut to the robot's limits |")
+    return "\n".join(rows) + "\n"
+
+
+def field_tables() -> str:
+    """One Markdown table per model, headers first."""
+    return "\n".join(_model_table(name, schema) for name, schema in _definitions().items())
+
+
+def _models() -> list[type[BaseModel]]:
+    headers = [channel.header for channel in CHANNELS.values()]
+    payloads = [channel.payload for channel in CHANNELS.values() if channel.payload]
+    return list(dict.fromkeys([*headers, *payloads]))
+
+
+def json_schema() -> Schema:
+    """JSON Schema of every header and JSON payload, under `$defs`."""
+    return models_json_schema([(model, "validation") for model in _models()], title="Sightline wire protocol 1")[1]
+
+
+def _definitions() -> Schema:
+    definitions: Schema = json_schema()["$defs"]
+    first = [model.__name__ for model in _models()]
+    rest = [name for name, schema in definitions.items() if name not in first and "properties" in schema]
+    return {name: definitions[name] for name in (*first, *rest)}
+
+
+def _model_table(name: str, schema: Schema) -> str:
+    rows = [f"**{name}**: {_first_line(schema)}", "", "| field | type | if absent |", "|---|---|---|"]
+    required = schema.get("required", [])
+    for field, definition in schema["properties"].items():
+        default = "refused" if field in required else f"`{json.dumps(definition.get('default'))}`"
+        rows.append(f"| `{field}` | {_type_of(definition)} | {default} |")
+    return "\n".join(rows) + "\n"
+
+
+def _first_line(schema: Schema) -> str:
+    return str(schema.get("description", "")).partition("\n\n")[0].replace("\n", " ")
+
+
+def _type_of(schema: Schema) -> str:
+    """A JSON Schema in a few words."""
+    if "$ref" in schema:
+        return _named(schema["$ref"].rpartition("/")[2])
+    if "anyOf" in schema:
+        return " or ".join(_type_of(option) for option in schema["anyOf"])
+    if "const" in schema or "enum" in schema:
+        return " or ".join(f"`{json.dumps(value)}`" for value in schema.get("enum", [schema.get("const")]))
+    if schema.get("type") == "array":
+        return _array(schema)
+    if schema.get("type") == "object":
+        return f"object of {_type_of(schema['additionalProperties'])}"
+    return " ".join([schema["type"], *_bounds(schema)])
+
+
+def _named(name: str) -> str:
+    definition = json_schema()["$defs"][name]
+    return name if "properties" in definition else _type_of(definition)
+
+
+def _array(schema: Schema) -> str:
+    if "prefixItems" in schema:
+        return f"array of {len(schema['prefixItems'])}: {_type_of(schema['prefixItems'][0])}"
+    most = f" (at most {schema['maxItems']})" if "maxItems" in schema else ""
+    return f"array of {_type_of(schema['items'])}{most}"
+
+
+def _bounds(schema: Schema) -> Iterator[str]:
+    if "minimum" in schema and "maximum" in schema:
+        yield f"{schema['minimum']:.17g} to {schema['maximum']:.17g}"
+    elif "exclusiveMinimum" in schema:
+        yield f"above {schema['exclusiveMinimum']:g}, at most {schema['maximum']:g}"
+    elif "minimum" in schema:
+        yield f"at least {schema['minimum']:g}"
+    if "maxLength" in schema:
+        yield f"of at most {schema['maxLength']} characters"
+    if "pattern" in schema:
+        yield f"`{schema['pattern']}`"
+
+
+GENERATED: Final = {
+    "channels": channel_table,
+    "fields": field_tables,
+    "refusals": refusal_table,
+    "examples": golden.examples,
+}
+
+
+def readme(text: str) -> str:
+    """`text` with every generated block filled in anew."""
+    return _BLOCK.sub(lambda block: block[1] + GENERATED[block[2]]() + block[3], text)
+
+
+def expected_files() -> dict[Path, str]:
+    """Every generated file, relative to this package, and what it must hold."""
+    files = {Path("README.md"): readme((HERE / "README.md").read_text("utf-8"))}
+    files[Path("schema.json")] = json.dumps(json_schema(), indent=1) + "\n"
+    return files | {Path("vectors") / path: text for path, text in golden.files().items()}
+
+
+def differing() -> list[Path]:
+    """Generated files that are missing, left over, or not as the code would write them."""
+    expected = expected_files()
+    there = {path.relative_to(HERE) for path in (HERE / "vectors").rglob("*.json")}
+    wrong = [path for path, text in expected.items() if _read(HERE / path) != text]
+    return sorted({*wrong, *(there - set(expected))})
+
+
+def _read(path: Path) -> str | None:
+    return path.read_text("utf-8") if path.is_file() else None
+
+
+def write() -> None:
+    """Bring every generated file up to date and remove vectors that no case stands for."""
+    expected = expected_files()
+    for path in differing():
+        if path not in expected:
+            (HERE / path).unlink()
+            continue
+        (HERE / path).parent.mkdir(parents=True, exist_ok=True)
+        (HERE / path).write_text(expected[path], "utf-8")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; returns the exit code: 0, or 5 if `--verify` found a difference."""
+    parser = argparse.ArgumentParser(prog="python -m protocol.schema", description=__doc__.partition("\n")[0])
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--write", action="store_true", help="bring the generated files up to date")
+    what.add_argument("--verify", action="store_true", help="exit 5 if they are not")
+    if parser.parse_args(arguments).write:
+        write()
+        return 0
+    wrong = differing()
+    for path in wrong:
+        print(f"protocol/{path} is not what the code says: python -m protocol.schema --write", file=sys.stderr)
+    return 5 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

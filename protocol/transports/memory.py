@@ -1,0 +1,274 @@
+"""A network in memory and in virtual time: seeded delay and loss, no threads, bit for bit repeatable. Pure.
+
+    network = MemoryNetwork(seed=7, delay_us=50_000, loss=0.1)
+    robot, vision = network.link("r1"), network.link("r1", role="vision")
+    robot.publish(FRAME, header, jpeg)
+    network.advance(now_us)  # callbacks run here, each at its own due time
+
+Each way between two links draws from a random stream of its own, per key: more `status` does not change which frames
+are lost. A way keeps its order, as a TCP connection does.
+"""
+
+import heapq
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from random import Random
+from types import TracebackType
+from typing import Final, NamedTuple, Self
+
+from protocol.channels import FRAME, Channel, Direction, parse_key, pattern_for
+from protocol.transports.link import LatestSlot, Message
+from protocol.transports.link_rules import LinkRules
+
+MAX_IN_FLIGHT: Final = 4096
+"""Messages under way in one network; what would go over is dropped and counted as `overflow`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """What one direction does to a message. `loss` is a share 0..1; `burst` the mean number lost in a row, >= 1."""
+
+    delay_us: int = 0
+    jitter_us: int = 0
+    loss: float = 0.0
+    burst: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what no network can do."""
+        if self.delay_us < 0 or self.jitter_us < 0 or not 0 <= self.loss <= 1 or not self.burst >= 1:
+            raise ValueError(f"{self}: delay and jitter >= 0, loss 0..1, burst >= 1")
+        if self.burst > 1 and self.loss > self.burst / (self.burst + 1):
+            raise ValueError(f"{self}: bursts of {self.burst:g} lose at most {self.burst / (self.burst + 1):.3f}")
+
+
+def split_legs(delay_us: int, jitter_us: int, loss: float, burst: float) -> dict[Direction, Leg]:
+    """Total added latency as half on each leg (an odd microsecond on the way out); loss is each leg's own."""
+    return {
+        Direction.FROM_ROBOT: Leg(delay_us - delay_us // 2, jitter_us - jitter_us // 2, loss, burst),
+        Direction.TO_ROBOT: Leg(delay_us // 2, jitter_us // 2, loss, burst),
+    }
+
+
+class _Way:
+    """One channel from one link to another: its random stream, its burst, its order."""
+
+    def __init__(self, name: str, leg: Leg) -> None:
+        self._random = Random(name)
+        self._leg = leg
+        self._losing = False
+        self._last_due_us = 0
+
+    def due_us(self, now_us: int) -> int | None:
+        """When a message sent now arrives; None if it is lost. Always draws twice, so that streams stay in step."""
+        lost, jitter_us = self._loses(self._random.random()), int(self._random.random() * (self._leg.jitter_us + 1))
+        if lost:
+            return None
+        self._last_due_us = max(self._last_due_us, now_us + self._leg.delay_us + jitter_us)
+        return self._last_due_us
+
+    def _loses(self, draw: float) -> bool:
+        loss, burst = self._leg.loss, self._leg.burst
+        if burst == 1:
+            return draw < loss
+        # Gilbert's two states: leaving "losing" with 1/burst and entering it at the rate that makes the share `loss`.
+        self._losing = draw >= 1 / burst if self._losing else draw < loss / (burst * (1 - loss))
+        return self._losing
+
+
+@dataclass(frozen=True, slots=True)
+class _Packet:
+    """What is sent, on which key, and which way; `sender` is 0 for a stranger."""
+
+    sender: int
+    direction: Direction
+    key: str
+    header: bytes
+    payload: bytes
+
+
+class _Flight(NamedTuple):
+    """A packet under way; equal due times arrive in order of sending."""
+
+    due_us: int
+    number: int
+    to: "MemoryLink"
+    packet: _Packet
+
+
+class MemoryNetwork:
+    """Links of any robots, joined by one virtual clock.
+
+    `sent`, `delivered`, `dropped` count messages per direction (`dropped` also `overflow`); a message to three links is
+    three.
+    """
+
+    def __init__(
+        self,
+        seed: int = 0,
+        delay_us: int = 0,
+        jitter_us: int = 0,
+        loss: float = 0.0,
+        *,
+        burst: float = 1.0,
+        legs: Mapping[Direction, Leg] | None = None,
+    ) -> None:
+        """`delay_us` and `jitter_us` are totals, half on each leg; `loss` and `burst` hold for each leg on its own.
+
+        `legs` replaces them with each direction's own. Raises ValueError for what no network can do.
+        """
+        self.now_us = 0
+        self.sent: Counter[str] = Counter()
+        self.delivered: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+        self._seed = seed
+        self._legs = dict(legs) if legs is not None else split_legs(delay_us, jitter_us, loss, burst)
+        self._links: list[MemoryLink] = []
+        self._joined = 0
+        self._number = 0
+        self._flights: list[_Flight] = []
+        self._ways: dict[tuple[int, int, str], _Way] = {}
+
+    def link(self, robot: str, role: str = "", max_frame_bytes: int = FRAME.max_payload_bytes) -> "MemoryLink":
+        """A new link to `robot`; `role` is the default source of what it publishes towards the robot."""
+        self._joined += 1
+        link = MemoryLink(self, self._joined, LinkRules(robot, role, max_frame_bytes))
+        self._links.append(link)
+        return link
+
+    def peers_of(self, link: "MemoryLink") -> list["MemoryLink"]:
+        """The other open links of the same robot."""
+        return [other for other in self._links if other is not link and other.robot == link.robot]
+
+    def leave(self, link: "MemoryLink") -> None:
+        """Forget `link` and what is under way to it."""
+        self._links = [other for other in self._links if other is not link]
+        self._flights = [flight for flight in self._flights if flight.to is not link]
+        heapq.heapify(self._flights)
+        self._ways = {ends: way for ends, way in self._ways.items() if link.number not in ends[:2]}
+
+    def advance(self, now_us: int) -> None:
+        """Move the clock to `now_us`, delivering all that is due on the way. Raises ValueError for going back."""
+        if now_us < self.now_us:
+            raise ValueError(f"time goes back from {self.now_us} to {now_us} us")
+        while self._flights and self._flights[0].due_us <= now_us:
+            self._arrive(heapq.heappop(self._flights))
+        self.now_us = now_us
+
+    def next_due_us(self) -> int | None:
+        """When the next message arrives; None if none is under way."""
+        return self._flights[0].due_us if self._flights else None
+
+    def put(self, key: str, header: bytes, payload: bytes, sender: "MemoryLink | None" = None) -> bool:
+        """Send raw bytes on any key, as a stranger could; False if there was no room.
+
+        A key with a wildcard reaches every link that has subscribed, as it would on Zenoh; its receivers turn it away.
+        """
+        parsed = parse_key(key)
+        takers = [link for link in self._links if link is not sender and link.hears(key)]
+        direction = parsed[1].direction if parsed else Direction.TO_ROBOT
+        packet = _Packet(sender.number if sender else 0, direction, key, header, payload)
+        results = [self._send(packet, to) for to in takers]
+        return all(results)
+
+    def _send(self, packet: _Packet, to: "MemoryLink") -> bool:
+        self.sent[packet.direction.name] += 1
+        due_us = self._way(packet, to).due_us(self.now_us)
+        if due_us is None:
+            self.dropped[packet.direction.name] += 1
+            return True  # a sender does not learn of a loss
+        if len(self._flights) >= MAX_IN_FLIGHT:
+            self.dropped["overflow"] += 1
+            return False
+        self._number += 1
+        heapq.heappush(self._flights, _Flight(due_us, self._number, to, packet))
+        return True
+
+    def _way(self, packet: _Packet, to: "MemoryLink") -> _Way:
+        ends = (packet.sender, to.number, packet.key)
+        if ends not in self._ways:
+            self._ways[ends] = _Way(f"{self._seed} {ends}", self._legs[packet.direction])
+        return self._ways[ends]
+
+    def _arrive(self, flight: _Flight) -> None:
+        self.now_us = max(self.now_us, flight.due_us)
+        packet = flight.packet
+        self.delivered[packet.direction.name] += 1
+        flight.to.receive(packet.key, packet.header, packet.payload)
+
+
+class MemoryLink:
+    """A `Link` of a `MemoryNetwork`. It does not hear what it publishes itself."""
+
+    def __init__(self, network: MemoryNetwork, number: int, rules: LinkRules) -> None:
+        """Made by `MemoryNetwork.link`."""
+        self.robot = rules.robot
+        self.number = number
+        self._rules = rules
+        self._network = network
+        self._callbacks: list[tuple[Channel, Callable[[Message], None]]] = []
+        self._closed = False
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Messages turned away, by reason (see `protocol.transports.link_rules`)."""
+        return self._rules.refused
+
+    @property
+    def callback_errors(self) -> int:
+        """How often a subscriber's callback raised."""
+        return self._rules.callback_errors
+
+    @property
+    def connected(self) -> bool:
+        """Whether another link of the same robot is open."""
+        return not self._closed and bool(self._network.peers_of(self))
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        """As `Link` says; towards the robot `source` defaults to the link's role."""
+        self._rules.check(channel, header, payload)
+        key = self._rules.key(channel, source)
+        return self.connected and self._network.put(key, header, payload, self)
+
+    def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
+        """Call `callback`, inside `MemoryNetwork.advance`, for every message with the exact key and within bounds."""
+        self._callbacks.append((channel, callback))
+
+    def latest(self, channel: Channel) -> LatestSlot[Message]:
+        """Subscribe with a slot that holds the newest message of `channel`."""
+        slot: LatestSlot[Message] = LatestSlot()
+        self.subscribe(channel, slot.put)
+        return slot
+
+    def has_listener(self, channel: Channel) -> bool:
+        """Whether another link subscribes to what this end publishes on `channel`."""
+        key = self._rules.key(channel)
+        return not self._closed and any(peer.hears(key) for peer in self._network.peers_of(self))
+
+    def hears(self, key: str) -> bool:
+        """Whether a subscription here matches `key`, as Zenoh matches: a wildcard in the key matches all."""
+        return any("*" in key or _matches(self.robot, channel, key) for channel, _ in self._callbacks)
+
+    def receive(self, key: str, header: bytes, payload: bytes) -> None:
+        """Called by the network when a message arrives: each subscription judges it, as on Zenoh."""
+        for channel, callback in tuple(self._callbacks):
+            if "*" in key or _matches(self.robot, channel, key):
+                self._rules.deliver(channel, key, header, payload, callback)
+
+    def close(self) -> None:
+        """Leave the network; what is under way to this end is lost. Idempotent."""
+        self._closed = True
+        self._network.leave(self)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _matches(robot: str, channel: Channel, key: str) -> bool:
+    pattern = pattern_for(robot, channel)
+    return key == pattern or (pattern.endswith("/*") and key.rpartition("/")[0] == pattern[:-2])

@@ -1,0 +1,251 @@
+"""Zenoh as a `Link`: payload as it is, header as attachment, exact keys; who listens is the router. Shell.
+
+    with open_zenoh("r1", listen=["tcp/127.0.0.1:7447"]) as link:
+        link.publish(STATUS, header, payload)
+
+A session that is not closed keeps the interpreter from exiting, so a link is always used in a `with`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from types import TracebackType
+from typing import TYPE_CHECKING, Final, Self
+
+from protocol.channels import FRAME, KEY_PREFIX, STATUS, Channel, parse_key, pattern_for
+from protocol.transports.endpoints import check_endpoints
+from protocol.transports.link import LatestSlot, Message
+from protocol.transports.link_rules import NOT_A_PUT, LinkRules
+from protocol.transports.zenoh_session import open_session
+
+if TYPE_CHECKING:
+    import zenoh
+
+CLOSE_S: Final = 1.5
+"""A close that takes longer is left to a daemon thread, so that no process hangs on a dead peer."""
+EXPRESS_UP_TO_BYTES: Final = 4096
+"""Channels bounded by this are sent at once, never batched."""
+MAX_ROBOTS: Final = 256
+"""`list_robots` remembers no more than this, whatever a network claims."""
+
+
+def open_zenoh(
+    robot: str,
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    role: str = "",
+    timeout_s: float = 5.0,
+    max_frame_bytes: int = FRAME.max_payload_bytes,
+) -> ZenohLink:
+    """Open a link to `robot`; use it in a `with`.
+
+    Who listens is the router, inside this process, and reaches `connect` in the background; who only connects is a
+    client and reconnects by itself. `role` is the default source of what is published towards the robot. Raises
+    ConfigError for a robot id, endpoint or limit that is none or for a missing Zenoh; LinkError for a port in use or if
+    nobody answers within `timeout_s`.
+    """
+    rules = LinkRules(robot, role, max_frame_bytes)
+    check_endpoints(listen, connect)
+    return ZenohLink(open_session(listen, connect, timeout_s), rules)
+
+
+def list_robots(connect: Sequence[str], seconds: float) -> dict[str, Message]:
+    """The newest `status` of every robot heard within `seconds` at `connect`. Raises as `open_zenoh` does."""
+    import zenoh
+
+    check_endpoints((), connect)
+    found: dict[str, Message] = {}
+
+    def note(sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        parsed = parse_key(key)
+        if parsed is not None and (parsed[0] in found or len(found) < MAX_ROBOTS):
+            robot = parsed[0]
+            LinkRules(robot).deliver(STATUS, key, *_parts(sample), lambda message: found.update({robot: message}))
+
+    with ExitStack() as ending:
+        session = open_session((), connect, seconds)
+        ending.callback(session.close)
+        handler = zenoh.handlers.Callback(note, indirect=False)
+        subscriber = session.declare_subscriber(f"{KEY_PREFIX}/*/{STATUS.name}", handler)
+        ending.callback(subscriber.undeclare)
+        time.sleep(seconds)
+    return found
+
+
+def _parts(sample: zenoh.Sample) -> tuple[bytes, bytes]:
+    attachment = sample.attachment
+    return b"" if attachment is None else attachment.to_bytes(), sample.payload.to_bytes()
+
+
+class ZenohLink:
+    """A `Link` over one Zenoh session of its own. A link does not hear what it publishes itself."""
+
+    def __init__(self, session: zenoh.Session, rules: LinkRules) -> None:
+        """Take over an open `session`; closing the link closes it."""
+        self.robot = rules.robot
+        self._session = session
+        self._rules = rules
+        self._outlets: dict[str, _Outlet] = {}
+        self._ending = ExitStack()
+        self._ending.callback(session.close)  # first in, so last to run
+        self._declaring = threading.Lock()
+        self._closed = False
+        self._in_callback = threading.local()
+        self._peers = _Peers(session, self._ending)
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Messages turned away, by reason (see `protocol.transports.link_rules`)."""
+        return self._rules.refused
+
+    @property
+    def callback_errors(self) -> int:
+        """How often a subscriber's callback raised."""
+        return self._rules.callback_errors
+
+    @property
+    def connected(self) -> bool:
+        """Whether at least one peer is connected; never blocks. A silent peer counts until its lease is over (2 s)."""
+        return not self._closed and bool(self._peers.zids)
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        """As `Link` says; towards the robot `source` defaults to the link's role."""
+        import zenoh
+
+        self._rules.check(channel, header, payload)
+        key = self._rules.key(channel, source)
+        if not self.connected:
+            return False
+        try:
+            self._outlet(key, channel).publisher.put(payload, attachment=header or None)
+        except zenoh.ZError:  # closed meanwhile
+            return False
+        return True
+
+    def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
+        """Call `callback`, on Zenoh's thread, for every message with the exact key and within bounds."""
+        import zenoh
+
+        def receive(sample: zenoh.Sample) -> None:
+            self._in_callback.now = True
+            try:
+                self._receive(channel, sample, callback)
+            finally:
+                self._in_callback.now = False
+
+        handler = zenoh.handlers.Callback(receive, indirect=False)
+        with self._declaring:
+            if not self._closed:
+                subscriber = self._session.declare_subscriber(pattern_for(self.robot, channel), handler)
+                self._ending.callback(subscriber.undeclare)
+
+    def latest(self, channel: Channel) -> LatestSlot[Message]:
+        """Subscribe with a slot that holds the newest message of `channel`."""
+        slot: LatestSlot[Message] = LatestSlot()
+        self.subscribe(channel, slot.put)
+        return slot
+
+    def has_listener(self, channel: Channel) -> bool:
+        """Whether a peer subscribes to what this end publishes on `channel`; never blocks on the network."""
+        import zenoh
+
+        try:
+            return self.connected and self._outlet(self._rules.key(channel), channel).matched
+        except zenoh.ZError:
+            return False
+
+    def close(self) -> None:
+        """Undeclare all and close the session; idempotent, over within two seconds, safe even inside a callback."""
+        with self._declaring:
+            if self._closed:
+                return
+            self._closed = True
+        ending = threading.Thread(target=self._end, name="zenoh-close", daemon=True)
+        ending.start()
+        if not getattr(self._in_callback, "now", False):  # Zenoh's close waits for its callbacks, so one cannot wait
+            ending.join(CLOSE_S)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _receive(self, channel: Channel, sample: zenoh.Sample, callback: Callable[[Message], None]) -> None:
+        if str(sample.kind) != "SampleKind.PUT":
+            self._rules.refuse(NOT_A_PUT)
+            return
+        header, payload = _parts(sample)
+        self._rules.deliver(channel, str(sample.key_expr), header, payload, callback)
+
+    def _outlet(self, key: str, channel: Channel) -> _Outlet:
+        """The publisher on `key`, declared at its first use and kept."""
+        outlet = self._outlets.get(key)
+        if outlet is not None:
+            return outlet
+        with self._declaring:
+            if key not in self._outlets:
+                self._outlets[key] = _Outlet(self._session, key, channel, self._ending)
+            return self._outlets[key]
+
+    def _end(self) -> None:
+        import zenoh
+
+        with suppress(zenoh.ZError):  # a session that broke is closed
+            self._ending.close()
+
+
+class _Outlet:
+    """A publisher and whether anybody matches it, kept up to date by Zenoh's thread."""
+
+    def __init__(self, session: zenoh.Session, key: str, channel: Channel, ending: ExitStack) -> None:
+        import zenoh
+
+        self._changed: bool | None = None
+        self.publisher = session.declare_publisher(
+            key,
+            encoding=channel.encoding,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=getattr(zenoh.Priority, channel.priority.value),
+            express=channel.max_payload_bytes <= EXPRESS_UP_TO_BYTES,
+            allowed_destination=zenoh.Locality.REMOTE,
+        )
+        ending.callback(self.publisher.undeclare)
+        listener = self.publisher.declare_matching_listener(zenoh.handlers.Callback(self._note, indirect=False))
+        ending.callback(listener.undeclare)
+        status: object = self.publisher.matching_status  # annotated as a bool, but it is a MatchingStatus: always true
+        self._at_first = bool(getattr(status, "matching", status))
+
+    @property
+    def matched(self) -> bool:
+        """Read without asking Zenoh; a change that came during the declaration outweighs what was read then."""
+        return self._at_first if self._changed is None else self._changed
+
+    def _note(self, status: zenoh.MatchingStatus) -> None:
+        self._changed = status.matching
+
+
+class _Peers:
+    """Who is connected, kept up to date by Zenoh's thread."""
+
+    def __init__(self, session: zenoh.Session, ending: ExitStack) -> None:
+        import zenoh
+
+        self.zids: set[str] = set()
+        handler = zenoh.handlers.Callback(self._note, indirect=False)
+        listener = session.info.declare_transport_events_listener(handler, history=True)
+        ending.callback(listener.undeclare)
+
+    def _note(self, event: zenoh.TransportEvent) -> None:
+        import zenoh
+
+        change = self.zids.add if event.kind == zenoh.SampleKind.PUT else self.zids.discard
+        change(str(event.transport.zid))

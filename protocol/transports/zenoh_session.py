@@ -1,0 +1,98 @@
+"""Opening a Zenoh session the way Sightline uses it, with its errors in words. Shell.
+
+Shared memory is off because it hides the network, scouting because it finds strangers; a lease of 2 s tells of a silent
+link before a person wonders; a message over 1 MiB is refused before it is buffered.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from protocol.errors import ConfigError, LinkError, SightlineError
+from protocol.transports.endpoints import check_endpoint, with_send_buffer
+from protocol.transports.port_owner import port_owner
+
+if TYPE_CHECKING:
+    import zenoh
+
+LEASE_MS: Final = 2000
+KEEP_ALIVES_PER_LEASE: Final = 4
+MAX_MESSAGE_BYTES: Final = 1_048_576
+HANDSHAKE_MS: Final = 3000
+MAX_SESSIONS: Final = 16
+RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
+
+
+def open_session(listen: Sequence[str], connect: Sequence[str], timeout_s: float) -> zenoh.Session:
+    """Open a session on checked endpoints.
+
+    Raises ConfigError if Zenoh is not installed, LinkError if an endpoint cannot be listened on, or if there is only
+    `connect` and nobody answers there within `timeout_s`.
+    """
+    try:
+        import zenoh
+    except ImportError:
+        raise ConfigError("Zenoh is not installed: pip install 'sightline[zenoh]'") from None
+    logging.getLogger("zenoh").addHandler(logging.NullHandler())  # else Python prints its warnings to the terminal
+    config = zenoh.Config.from_json5(json.dumps(session_config(listen, connect, timeout_s)))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise _explain(str(error), listen, connect, timeout_s) from None
+
+
+def session_config(listen: Sequence[str], connect: Sequence[str], timeout_s: float) -> dict[str, Any]:
+    """The Zenoh configuration. Who listens is a router and reaches `connect` in the background, else a client."""
+    return {
+        "mode": "router" if listen else "client",
+        "listen": {"endpoints": [with_send_buffer(endpoint) for endpoint in listen], "exit_on_failure": True},
+        "connect": {
+            "endpoints": [with_send_buffer(endpoint) for endpoint in connect],
+            "timeout_ms": -1 if listen else int(timeout_s * 1000),
+            "exit_on_failure": not listen,
+            "retry": RETRY,
+        },
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
+        "open": {"return_conditions": {"connect_scouted": False}},
+        "timestamping": {"enabled": False},
+        "transport": _transport_config(),
+    }
+
+
+def _transport_config() -> dict[str, Any]:
+    return {
+        "unicast": {"max_sessions": MAX_SESSIONS, "open_timeout": HANDSHAKE_MS, "accept_timeout": HANDSHAKE_MS},
+        "link": {
+            "tx": {
+                "lease": LEASE_MS,
+                "keep_alive": KEEP_ALIVES_PER_LEASE,
+                # A queue of one batch: what is behind a full link is dropped here, not sent late.
+                "queue": {"size": {"data_low": 1, "real_time": 1}},
+            },
+            "rx": {"max_message_size": MAX_MESSAGE_BYTES},
+        },
+        "shared_memory": {"enabled": False},
+    }
+
+
+def _explain(text: str, listen: Sequence[str], connect: Sequence[str], timeout_s: float) -> SightlineError:
+    """Zenoh's error as one line that names the endpoint and the fix; its source paths are left out."""
+    if not listen:
+        where = " or ".join(connect)
+        return LinkError(f"nobody answers at {where}; is the robot running? tried for {timeout_s:g} s")
+    where = next((endpoint for endpoint in listen if endpoint.partition("#")[0] in text), " or ".join(listen))
+    if "in use" in text:
+        return _port_in_use(where)
+    cause = re.split(r" at /|\(os error", text.rpartition("[")[2])[0].rpartition(": ")[2].strip(" .]")
+    return LinkError(f"cannot listen on {where}: {cause}; use an address of this machine, e.g. tcp/127.0.0.1:7447")
+
+
+def _port_in_use(endpoint: str) -> LinkError:
+    port = check_endpoint(endpoint)[2]
+    owner = port_owner(port)
+    by = f" by {owner}" if owner else " by another process"
+    return LinkError(f"cannot listen on {endpoint}: port {port} is in use{by}; end it or choose another port")

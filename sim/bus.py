@@ -1,0 +1,264 @@
+"""The robot's plug-ins that reach into a running simulation, and `TruthReader` for scores. Shell (sockets).
+
+Imported on the robot: no NumPy, no PyBullet. Each port has its own local SOCK_SEQPACKET socket, so that a slow picture
+never delays a motor. Formats, all little-endian:
+
+    motion.sock   robot -> sim  MOTION_SET      left_rad_s, right_rad_s; latched
+                  sim -> robot  MOTION_ANGLES   left_rad, right_rad, t_us; 100 Hz
+    range.sock    sim -> robot  RANGE_HEAD + float32 ranges
+    camera.sock   sim -> robot  first the CameraModel as JSON, then per request PICTURE_HEAD (t_us) + JPEG
+                  robot -> sim  one byte: a request for the next capture
+    truth.sock    sim -> reader first what is simulated, then Truth as JSON; 50 Hz
+"""
+
+from __future__ import annotations
+
+import array
+import math
+import os
+import select
+import socket
+import struct
+import tempfile
+import time
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from protocol.codec import decode
+from protocol.config import Config
+from protocol.errors import HardwareError
+from protocol.messages import CameraModel
+from robot_side.ports import Picture, Ranges, WheelAngles
+from sim.truth import Truth
+
+MOTION, RANGE, CAMERA, TRUTH = "motion.sock", "range.sock", "camera.sock", "truth.sock"
+MOTION_SET = struct.Struct("<dd")
+MOTION_ANGLES = struct.Struct("<ddq")
+RANGE_HEAD = struct.Struct("<qdddd")
+PICTURE_HEAD = struct.Struct("<q")
+REQUEST = b"\x01"
+MAX_MESSAGE_BYTES = 1 << 20
+HELLO_TIMEOUT_S = 2.0
+
+
+def default_socket_dir() -> str:
+    """A folder of this user's own, short enough for a socket's path."""
+    return str(Path(tempfile.gettempdir()) / f"sightline-sim-{os.getuid()}")
+
+
+class SimSocketConfig(Config):
+    """Where the simulation listens."""
+
+    socket_dir: Annotated[str, Field(min_length=1, max_length=90)] = Field(default_factory=default_socket_dir)
+
+
+class Connection:
+    """Comes back by itself: a call after a loss connects anew. Never blocks unless asked to wait."""
+
+    def __init__(self, socket_dir: str, name: str) -> None:
+        self._dir, self._name = socket_dir, name
+        self._socket: socket.socket | None = None
+        self._buffer = bytearray(MAX_MESSAGE_BYTES)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the connection was there at the last use."""
+        return self._socket is not None
+
+    def open(self) -> socket.socket:
+        """The connection, made now if there is none. Raises HardwareError when nothing listens."""
+        if self._socket is not None:
+            return self._socket
+        fresh = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        fresh.setblocking(False)
+        try:
+            fresh.connect(str(Path(self._dir) / self._name))
+        except OSError:
+            fresh.close()
+            raise self._absent() from None
+        self._socket = fresh
+        return fresh
+
+    def send(self, data: bytes) -> bool:
+        """Send now; False if the simulation is too busy to take it. Raises HardwareError when it is gone."""
+        connection = self.open()
+        try:
+            connection.send(data)
+        except BlockingIOError:
+            return False
+        except OSError:
+            raise self._lost() from None
+        return True
+
+    def receive(self) -> bytes | None:
+        """The oldest waiting message, None if there is none. Raises HardwareError when the simulation is gone."""
+        connection = self.open()
+        try:
+            size = connection.recv_into(self._buffer)
+        except BlockingIOError:
+            return None
+        except OSError:
+            raise self._lost() from None
+        if not size:
+            raise self._lost()
+        return bytes(memoryview(self._buffer)[:size])
+
+    def newest(self) -> bytes | None:
+        """The newest waiting message; older ones are dropped."""
+        newest = None
+        while (message := self.receive()) is not None:
+            newest = message
+        return newest
+
+    def wait(self, timeout_s: float) -> bytes | None:
+        """The oldest message, waiting for one up to `timeout_s`."""
+        message = self.receive()
+        if message is not None:
+            return message
+        poll = select.poll()
+        poll.register(self.open(), select.POLLIN)
+        poll.poll(max(0.0, timeout_s) * 1000)
+        return self.receive()
+
+    def hello(self) -> bytes:
+        """Connect and return the first message. Raises HardwareError when none comes."""
+        hello = self.wait(HELLO_TIMEOUT_S)
+        if hello is None:
+            self.close()
+            raise HardwareError(f"the simulation does not answer within {HELLO_TIMEOUT_S} s; restart `sightline sim`")
+        return hello
+
+    def close(self) -> None:
+        """Idempotent; a later call would connect again."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _lost(self) -> HardwareError:
+        self.close()
+        return self._absent()
+
+    def _absent(self) -> HardwareError:
+        return HardwareError(f"nothing simulates a robot in {self._dir}; start it with `sightline sim`")
+
+
+class SimCamera:
+    """The simulated camera. A picture is drawn only when `read` asks for one."""
+
+    class Config(SimSocketConfig):
+        """Where the simulation listens."""
+
+    def __init__(self, config: SimSocketConfig) -> None:
+        self._connection = Connection(config.socket_dir, CAMERA)
+        self.model: CameraModel
+        self._greet()
+
+    def _greet(self) -> None:
+        """Connect if need be; a new connection begins with the camera's model."""
+        if not self._connection.is_open:
+            self.model = decode(CameraModel, self._connection.hello(), max_bytes=4096)
+
+    def read(self, timeout_s: float) -> Picture | None:
+        """The next capture; None if none came within `timeout_s`. Raises HardwareError when the simulation is gone."""
+        deadline_s = time.monotonic() + timeout_s
+        self._greet()
+        self._connection.newest()  # an answer that came too late for an earlier call: old sight
+        self._connection.send(REQUEST)
+        message = self._connection.wait(deadline_s - time.monotonic())
+        if message is None:
+            return None
+        return Picture(message[PICTURE_HEAD.size :], PICTURE_HEAD.unpack_from(message)[0])
+
+    def close(self) -> None:
+        """Idempotent."""
+        self._connection.close()
+
+
+class SimDrive:
+    """The simulated wheels: they latch, whatever becomes of this process."""
+
+    class Config(SimSocketConfig):
+        """Where the simulation listens."""
+
+    def __init__(self, config: SimSocketConfig) -> None:
+        self._connection = Connection(config.socket_dir, MOTION)
+        self._connection.open()
+        self._angles: WheelAngles | None = None
+
+    def set(self, left_rad_s: float, right_rad_s: float) -> None:
+        """Give wheel speeds, forward positive; never blocks.
+
+        Raises HardwareError when the simulation is gone or does not take them, ValueError unless both are finite.
+        """
+        if not (math.isfinite(left_rad_s) and math.isfinite(right_rad_s)):
+            raise ValueError(f"wheel speeds {left_rad_s}, {right_rad_s}")
+        if not self._connection.send(MOTION_SET.pack(left_rad_s, right_rad_s)):
+            raise HardwareError("the simulation takes no motor commands; is it stopped? restart `sightline sim`")
+
+    def wheels(self) -> WheelAngles | None:
+        """The newest encoder reading received. Raises HardwareError when the simulation is gone.
+
+        Meant to be called at 20 Hz or more; after a longer pause the first reading is as old as its `t_us` says.
+        """
+        message = self._connection.newest()
+        if message is not None:
+            self._angles = WheelAngles(*MOTION_ANGLES.unpack(message))
+        return self._angles
+
+    def close(self) -> None:
+        """Idempotent; the motors keep their last speeds."""
+        self._connection.close()
+
+
+class SimRange:
+    """The simulated lidar."""
+
+    class Config(SimSocketConfig):
+        """Where the simulation listens."""
+
+    def __init__(self, config: SimSocketConfig) -> None:
+        self._connection = Connection(config.socket_dir, RANGE)
+        self._connection.open()
+
+    def read(self) -> Ranges | None:
+        """The newest scan not yet read. Raises HardwareError when the simulation is gone."""
+        message = self._connection.newest()
+        if message is None:
+            return None
+        t_us, first_rad, each_rad, least_m, most_m = RANGE_HEAD.unpack_from(message)
+        ranges_m = array.array("f", message[RANGE_HEAD.size :])
+        return Ranges(t_us, first_rad, each_rad, least_m, most_m, ranges_m)
+
+    def close(self) -> None:
+        """Idempotent."""
+        self._connection.close()
+
+
+class Simulated(Config):
+    """What a simulation says of itself: enough to load its scenario and robot again."""
+
+    scenario: str
+    robot: str
+    seed: int
+    pid: int
+
+
+class TruthReader:
+    """Reads what is really so, for displays and scores."""
+
+    def __init__(self, socket_dir: str) -> None:
+        self._connection = Connection(socket_dir, TRUTH)
+        self.simulated = Simulated.model_validate_json(self._connection.hello())
+
+    def read(self, timeout_s: float) -> Truth | None:
+        """The next report in order, None if none came in time. Raises HardwareError when the simulation is gone."""
+        while (message := self._connection.wait(timeout_s)) is not None:
+            if b'"t_us"' in message:
+                return Truth.from_json(message)
+        return None
+
+    def close(self) -> None:
+        """Idempotent."""
+        self._connection.close()

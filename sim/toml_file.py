@@ -1,0 +1,65 @@
+"""TOML text and names -> frozen models, with errors a person can act on. Pure (reads files, keeps no state)."""
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from protocol.errors import ConfigError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def find(kind: str, name: str, folder: Path) -> Path:
+    """The file that `name` means: a path when it ends in `.toml`, otherwise a file of `folder`.
+
+    Raises ConfigError with the nearest name and all names when there is none.
+    """
+    path = Path(name) if name.endswith(".toml") else folder / f"{name}.toml"
+    if path.is_file() and (name.endswith(".toml") or name in names_in(folder)):
+        return path
+    raise ConfigError(f"no {kind} called {name!r}{_nearest(name, folder)}; there are {', '.join(names_in(folder))}")
+
+
+def names_in(folder: Path) -> list[str]:
+    """The names that `folder` offers, sorted."""
+    return sorted(path.stem for path in folder.glob("*.toml"))
+
+
+def _nearest(name: str, folder: Path) -> str:
+    near = difflib.get_close_matches(name, names_in(folder), n=1, cutoff=0.4)
+    return f", did you mean {near[0]!r}?" if near else ""
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """The file as a table. Raises ConfigError naming the file and the line that is no TOML."""
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise ConfigError(f"{path}: cannot be read as TOML: {error}") from None
+
+
+def check(model: type[Model], table: dict[str, Any], path: Path) -> Model:
+    """`table` as a `model`. Raises ConfigError naming the file, the first wrong key and what is wrong with it."""
+    try:
+        return model.model_validate(table)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_first_problem(model, error)}") from None
+
+
+def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
+    first = error.errors(include_url=False, include_context=False)[0]
+    where = ".".join(str(part) for part in first["loc"]) or "file"
+    if first["type"] != "extra_forbidden":
+        return f"{where}: {first['msg']} (got {str(first['input'])[:60]})"
+    near = difflib.get_close_matches(str(first["loc"][-1]), _fields(model), n=1)
+    return f"{where}: unknown key{f', did you mean {near[0]!r}?' if near else ''}"
+
+
+def _fields(model: type[BaseModel]) -> set[str]:
+    """Every field name reachable from `model`, for suggestions."""
+    definitions = model.model_json_schema()
+    tables = [definitions, *definitions.get("$defs", {}).values()]
+    return {name for table in tables for name in table.get("properties", {})}

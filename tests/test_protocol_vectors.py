@@ -1,0 +1,80 @@
+"""Golden vectors and the specification: what lies on disk is what the code does and says."""
+
+import json
+import re
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from pydantic import TypeAdapter
+
+from protocol import golden, schema
+from protocol.channels import CHANNELS
+from protocol.golden_cases import CASES, Case
+from protocol.refusals import Refusal
+from protocol.twist_text import MAX_TWIST_BYTES
+
+VECTORS = Path(schema.__file__).parent / "vectors"
+README = (Path(schema.__file__).parent / "README.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize("path", sorted(VECTORS.rglob("*.json")), ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_a_vector_is_read_as_it_says(path):
+    """From the file alone, as a peer in another language would run it."""
+    vector = json.loads(path.read_text("utf-8"))
+    got = golden.outcome(vector["key"], bytes.fromhex(vector["header_hex"]), bytes.fromhex(vector["payload_hex"]))
+    expected = {name: vector[name] for name in ("accept", "refuse") if name in vector}
+    assert json.loads(json.dumps(got)) == expected
+
+
+def test_generated_files_are_up_to_date():
+    assert schema.differing() == []
+
+
+def test_every_channel_has_vectors_that_are_accepted_and_refused():
+    outcomes = Counter((case.channel, case.refuse is None) for case in CASES)
+    assert set(outcomes) == {(channel, accepted) for channel in CHANNELS for accepted in (True, False)}
+    assert len(CASES) == len({(case.channel, case.name) for case in CASES}) >= 60
+
+
+def test_a_case_that_the_decoders_contradict_is_no_vector():
+    good = CASES[0]
+    with pytest.raises(ValueError, match="stated MALFORMED"):
+        golden.vector(Case(good.channel, good.name, "", good.key, good.header, good.payload, "MALFORMED"))
+
+
+def test_verify_finds_what_was_changed_and_write_restores_it(tmp_path, monkeypatch, capsys):
+    package = tmp_path / "protocol"
+    shutil.copytree(VECTORS, package / "vectors")
+    for name in ("README.md", "schema.json"):
+        shutil.copy(VECTORS.parent / name, package)
+    monkeypatch.setattr(schema, "HERE", package)
+    assert schema.main(["--verify"]) == 0
+    (package / "vectors/twist/usual.json").write_text("{}")
+    (package / "vectors/twist/left_over.json").write_text("{}")
+    (package / "README.md").write_text(README.replace("| 10 Hz |", "| 11 Hz |"), "utf-8")
+    assert schema.main(["--verify"]) == 5
+    named = capsys.readouterr().err
+    assert all(part in named for part in ("README.md", "usual.json", "left_over.json"))
+    assert schema.main(["--write"]) == 0
+    assert schema.main(["--verify"]) == 0
+
+
+def test_the_specification_holds_every_generated_table_once():
+    assert re.findall(r"<!-- generated: (\w+) -->", README) == list(schema.GENERATED)
+    for name, text in schema.GENERATED.items():
+        assert f"<!-- generated: {name} -->\n{text()}<!-- /generated -->" in README
+
+
+def test_the_specification_names_every_refusal_and_bound():
+    assert all(f"`{reason}`" in README for reason in Refusal)
+    assert f"{MAX_TWIST_BYTES} bytes" in README
+
+
+def test_the_json_schema_accepts_what_the_models_accept():
+    definitions = schema.json_schema()["$defs"]
+    for channel in CHANNELS.values():
+        for model in filter(None, (channel.header, channel.payload)):
+            assert definitions[model.__name__]["type"] == "object"
+            assert set(definitions[model.__name__]["properties"]) == set(TypeAdapter(model).json_schema()["properties"])

@@ -1,0 +1,217 @@
+"""The simulation as a process behind the robot's ports: real sockets, real kills, the motors' log."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pybullet")
+
+from protocol.errors import ConfigError, HardwareError
+from protocol.jpeg import read_jpeg_size
+from robot_side.ports import Camera, Drive, RangeSensor
+from sim.bus import MOTION, MOTION_SET, SimCamera, SimDrive, SimRange, TruthReader
+from sim.robot_model import load_robot
+from sim.service import SimConfig, run
+from sim.sockets import Folder
+
+pytestmark = pytest.mark.slow
+
+SERVE = "import sys; from sim.service import SimConfig, run; sys.exit(run(SimConfig.model_validate_json(sys.argv[1])))"
+DRIVE = (
+    "import sys, time; from sim.bus import SimDrive; drive = SimDrive(SimDrive.Config(socket_dir=sys.argv[1]))\n"
+    "drive.set(6.0, 8.0); print('driving', flush=True); time.sleep(60)"
+)
+
+
+@dataclass
+class Simulator:
+    """A running simulation."""
+
+    process: subprocess.Popen[str]
+    socket_dir: str
+    log: Path
+    ready: str
+
+    def config(self) -> SimDrive.Config:
+        return SimDrive.Config(socket_dir=self.socket_dir)
+
+    def rows(self) -> list[list[float]]:
+        return [[float(cell) for cell in line.split(",")] for line in self.log.read_text().splitlines()[1:]]
+
+
+def started(socket_dir: Path, **settings) -> Simulator:
+    log = socket_dir / "motors.csv"
+    config = {"socket_dir": str(socket_dir), "scenario": "circle", "motor_log": str(log), **settings}
+    process = subprocess.Popen(
+        [sys.executable, "-c", SERVE, json.dumps(config)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    return Simulator(process, str(socket_dir), log, process.stdout.readline())
+
+
+@pytest.fixture
+def sim(tmp_path) -> Iterator[Simulator]:
+    simulator = started(tmp_path)
+    yield simulator
+    simulator.process.kill()
+    simulator.process.wait(10)
+
+
+def eventually(condition: Callable[[], object], timeout_s: float = 5.0) -> None:
+    """Wait until it holds."""
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "it never came to hold"
+        time.sleep(0.005)
+
+
+def test_ready_line_and_ports(sim):
+    assert sim.ready.startswith("simulation ready")
+    camera: Camera = SimCamera(sim.config())
+    drive: Drive = SimDrive(sim.config())
+    lidar: RangeSensor = SimRange(sim.config())
+    assert camera.model == load_robot("raspberry").camera.camera_model()
+    eventually(lambda: drive.wheels() is not None)
+    scans = []
+    eventually(lambda: scans.append(lidar.read()) or scans[-1])
+    assert len(scans[-1].ranges_m) == 360
+    assert scans[-1].angle_min_rad == pytest.approx(-3.14159, abs=1e-4)
+    for port in (camera, drive, lidar):
+        port.close()
+        port.close()
+
+
+def test_pictures_are_fresh_distinct_and_paced(sim):
+    camera = SimCamera(sim.config())
+    stamps, ages_us = [], []
+    for _ in range(15):
+        before_us = time.monotonic_ns() // 1000
+        picture = camera.read(1.0)
+        assert picture is not None
+        assert read_jpeg_size(picture.jpeg).width_px == 320
+        assert picture.t_us > before_us - 8_000  # drawn after it was asked for, but for the step under way
+        ages_us.append(time.monotonic_ns() // 1000 - picture.t_us)
+        stamps.append(picture.t_us)
+    gaps_us = [later - earlier for earlier, later in pairwise(stamps)]
+    assert min(gaps_us) >= 28_000
+    assert sorted(ages_us)[7] < 30_000
+
+
+def test_a_picture_that_came_too_late_is_not_given_to_the_next_read(sim):
+    camera = SimCamera(sim.config())
+    assert camera.read(0.0) is None
+    time.sleep(0.2)
+    asked_us = time.monotonic_ns() // 1000
+    picture = camera.read(1.0)
+    assert picture is not None
+    assert picture.t_us > asked_us - 8_000
+
+
+def test_encoders_and_truth_follow_the_wheels(sim):
+    drive, truth = SimDrive(sim.config()), TruthReader(sim.socket_dir)
+    assert (truth.simulated.scenario, truth.simulated.pid) == ("circle", sim.process.pid)
+    drive.set(6.0, 8.0)
+    eventually(lambda: (angles := drive.wheels()) and angles.right_rad > 4.0)
+    angles = drive.wheels()
+    assert 0.6 < angles.left_rad / angles.right_rad < 0.85
+    assert abs(time.monotonic_ns() // 1000 - angles.t_us) < 200_000
+    reports = []
+    eventually(lambda: reports.append(truth.read(1.0)) or reports[-1].linear_mps > 0.2)
+    assert reports[-1].t_us > reports[0].t_us
+    assert all(later.t_us - earlier.t_us == 20_000 for earlier, later in pairwise(reports))
+
+
+def test_motors_latch_and_the_log_outlives_killed_clients_and_a_killed_simulation(sim):
+    client = subprocess.Popen([sys.executable, "-c", DRIVE, sim.socket_dir], stdout=subprocess.PIPE, text=True)
+    assert client.stdout.readline() == "driving\n"
+    client.send_signal(signal.SIGKILL)
+    client.wait(10)
+    drive = SimDrive(sim.config())
+    eventually(lambda: (angles := drive.wheels()) and angles.right_rad > 8.0)  # a second and more without a driver
+    sent_us = time.monotonic_ns() // 1000
+    drive.set(1.0, 2.0)
+    eventually(lambda: len(sim.rows()) == 2)
+    sim.process.kill()
+    sim.process.wait(10)
+    first, second = sim.rows()
+    assert first[1:3] == [6.0, 8.0]
+    assert second[1:3] == [1.0, 2.0]
+    assert -1000 < second[0] - sent_us < 100_000
+    assert second[4] > 8.0 > first[4]
+
+
+def test_malformed_motor_packets_change_nothing(sim):
+    stranger = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    stranger.connect(f"{sim.socket_dir}/{MOTION}")
+    nan, inf = float("nan"), float("inf")
+    for packet in ((3.0, 3.0), (nan, 1.0), (1.0, -inf), b"short", bytes(65), b"\0" * 4096, (4.0, 4.0)):
+        stranger.send(packet if isinstance(packet, bytes) else MOTION_SET.pack(*packet))
+    eventually(lambda: len(sim.rows()) >= 2)
+    assert [row[1:3] for row in sim.rows()] == [[3.0, 3.0], [4.0, 4.0]]
+    for bad in (nan, inf):
+        with pytest.raises(ValueError, match="wheel speeds"):
+            SimDrive(sim.config()).set(bad, 1.0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_it_ends_cleanly_within_a_second_and_ports_say_so_and_come_back(sim, number, tmp_path):
+    camera, drive, lidar = SimCamera(sim.config()), SimDrive(sim.config()), SimRange(sim.config())
+    begin_s = time.monotonic()
+    sim.process.send_signal(number)
+    assert sim.process.wait(10) == 0
+    assert time.monotonic() - begin_s < 1.0
+    assert not list(tmp_path.glob("*.sock"))
+    for use in (lambda: camera.read(0.1), lambda: drive.set(1.0, 1.0), drive.wheels, lidar.read):
+        with pytest.raises(HardwareError, match="start it with `sightline sim`"):
+            use()
+    again = started(tmp_path)
+    try:
+        drive.set(1.0, 1.0)
+        assert camera.read(2.0) is not None
+        lidar.read()
+    finally:
+        again.process.kill()
+        again.process.wait(10)
+
+
+def test_a_dead_simulations_sockets_are_replaced_and_a_living_ones_are_not(sim, tmp_path):
+    with pytest.raises(ConfigError, match=f"process {sim.process.pid}"):
+        run(SimConfig(socket_dir=str(tmp_path)))
+    sim.process.kill()
+    sim.process.wait(10)
+    assert (tmp_path / "motion.sock").exists()
+    again = started(tmp_path, seconds=0.2)
+    assert again.ready.startswith("simulation ready")
+    assert again.process.wait(10) == 0
+
+
+def test_no_simulation_is_one_line_that_says_how_to_start_one(tmp_path):
+    for port in (SimCamera, SimDrive, SimRange):
+        with pytest.raises(HardwareError) as caught:
+            port(port.Config(socket_dir=str(tmp_path)))
+        assert str(caught.value) == f"nothing simulates a robot in {tmp_path}; start it with `sightline sim`"
+
+
+def test_bad_settings_are_one_line(tmp_path):
+    with pytest.raises(ConfigError, match="did you mean 'circle'"):
+        run(SimConfig(scenario="cicle", socket_dir=str(tmp_path)))
+    with pytest.raises(ConfigError, match="motor_log"):
+        run(SimConfig(socket_dir=str(tmp_path), motor_log=str(tmp_path / "no" / "log.csv")))
+    Folder(str(tmp_path)).close()  # the failed run let go of the lock
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="socket_dir"):
+        Folder(str(tmp_path / "file"))
+
+
+def test_the_robots_plug_ins_import_no_numpy_and_no_pybullet():
+    code = "import sys, sim.bus; print(sorted({'numpy', 'pybullet', 'cv2', 'simplejpeg'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

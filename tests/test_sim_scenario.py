@@ -1,0 +1,142 @@
+"""Scenario, robot and look files: what loads, what is refused and in which words; paths and motors by themselves."""
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol.errors import ConfigError
+from sim.look import look_named
+from sim.motors import Motor
+from sim.path import ClosedPath, Leg, Place
+from sim.robot_model import load_robot, robot_names
+from sim.scenario import OnPath, load_scenario, scenario_names
+from sim.service import Cadence
+
+STEP_S = 0.004
+
+
+def test_everything_shipped_loads():
+    assert {"static", "circle", "eight", "pushed", "behind", "walls"} <= set(scenario_names())
+    assert all(load_scenario(name).name == name for name in scenario_names())
+    assert all(load_robot(name).name == name for name in robot_names())
+
+
+@pytest.mark.parametrize(
+    ("load", "name", "expected"),
+    [
+        (load_scenario, "cirlce", "did you mean 'circle'"),
+        (load_scenario, "../robots/raspberry", "no scenario called"),
+        (load_scenario, "/nowhere/x.toml", "no scenario called"),
+        (load_robot, "rasberry", "did you mean 'raspberry'"),
+        (look_named, "dimm", "did you mean 'dim'"),
+    ],
+)
+def test_unknown_name_says_the_nearest_and_all(load, name, expected):
+    with pytest.raises(ConfigError, match="there are") as caught:
+        load(name)
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("seconds = 30.0", "secnds = 30.0", "secnds: unknown key, did you mean 'seconds'"),
+        ("speed_mps = 0.25", "speed_mps = nan", "speed_mps"),
+        ("speed_mps = 0.25", "speed_mps = -1", "speed_mps"),
+        ("seconds = 30.0", 'seconds = "long"', "seconds"),
+        ("turn_deg = 360.0", "turn_deg = 300.0", "does not close"),
+        ("distance_m = [0.7, 1.0]", "distance_m = [1.0, 0.7]", "lowest first"),
+        ("distance_m = [0.7, 1.0]", "distance_m = [-0.7, 1.0]", "distance_m"),
+        ("[start]", "[[walls]]\nstart_m = [1, 1]\nend_m = [1, 1]\n[start]", "no length"),
+        ('look = "plain"', 'look = "plane"', "did you mean 'plain'"),
+        ("[target]", "[target", "cannot be read as TOML"),
+    ],
+)
+def test_bad_scenario_file_is_one_line_that_names_the_key(tmp_path, old, new, expected):
+    text = (load_scenario.__globals__["SCENARIOS"] / "circle.toml").read_text()
+    assert old in text
+    file = tmp_path / "mine.toml"
+    file.write_text(text.replace(old, new, 1))
+    with pytest.raises(ConfigError) as caught:
+        load_scenario(str(file))
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scenario_may_write_its_own_look(tmp_path):
+    text = (load_scenario.__globals__["SCENARIOS"] / "static.toml").read_text()
+    lines = [line for line in text.splitlines() if not line.startswith("look")]
+    file = tmp_path / "mine.toml"
+    file.write_text("\n".join([*lines, "[look]", "exposure = 0.25"]))
+    scenario = load_scenario(str(file))
+    assert scenario.name == "mine"
+    assert scenario.look.exposure == 0.25
+
+
+@given(st.floats(0, 100), st.floats(0, 0.05))
+def test_a_target_on_a_path_never_jumps(distance_m, ahead_m):
+    for name in ("circle", "eight", "walls"):
+        target = load_scenario(name).target
+        assert isinstance(target, OnPath)
+        path = target.closed_path()
+        here, there = path.at(distance_m), path.at(distance_m + ahead_m)
+        assert math.hypot(there.x_m - here.x_m, there.y_m - here.y_m) <= ahead_m + 1e-5
+
+
+@given(st.floats(0.1, 5), st.floats(-3, 3))
+def test_a_circle_ends_where_it_began(radius_m, heading_rad):
+    path = ClosedPath(Place(1.0, 2.0, heading_rad), (Leg(length_m=math.tau * radius_m, turn_deg=360),))
+    half = path.at(path.length_m / 2)
+    assert math.hypot(half.x_m - 1.0, half.y_m - 2.0) == pytest.approx(2 * radius_m)
+    assert path.at(path.length_m * 3)[:2] == pytest.approx((1.0, 2.0), abs=1e-6)
+
+
+@given(st.lists(st.floats(-200, 200), min_size=1, max_size=20))
+def test_a_motor_keeps_its_acceleration_and_speed_limits(wanted):
+    wheels = load_robot("raspberry").wheels
+    motor, before = Motor(wheels, STEP_S, "1"), 0.0
+    most_change = wheels.max_accel_mps2 / wheels.radius_m * STEP_S
+    for speed in wanted:
+        motor.set(speed)
+        for _ in range(10):
+            now = motor.step()
+            assert abs(now - before) <= most_change + 1e-9
+            assert abs(now) <= wheels.max_rad_s + 1e-9
+            before = now
+
+
+def test_a_motor_reaches_and_keeps_what_it_was_given():
+    motor = Motor(load_robot("raspberry").wheels, STEP_S, "1")
+    motor.set(10.0)
+    speeds = [motor.step() for _ in range(500)]
+    assert speeds[-1] == pytest.approx(10.0, abs=1e-3)
+    assert speeds == sorted(speeds)
+
+
+@pytest.mark.parametrize("speed", [math.nan, math.inf, -math.inf])
+def test_a_motor_refuses_what_is_no_speed(speed):
+    with pytest.raises(ValueError, match="wheel speed"):
+        Motor(load_robot("raspberry").wheels, STEP_S, "1").set(speed)
+
+
+@given(st.floats(-100, 100))
+def test_an_encoder_counts_whole_steps_and_is_less_than_one_off(turned_rad):
+    wheels = load_robot("raspberry").wheels
+    motor = Motor(wheels, STEP_S, "1")
+    motor.rolled(turned_rad)
+    step_rad = math.tau / wheels.encoder_steps
+    assert motor.angle_rad / step_rad == pytest.approx(round(motor.angle_rad / step_rad), abs=1e-6)
+    assert -1e-9 <= turned_rad - motor.angle_rad < step_rad + 1e-9
+
+
+@pytest.mark.parametrize(("rate_hz", "seconds"), [(30, 10), (10, 10), (100, 3), (7, 10)])
+def test_a_cadence_keeps_its_rate_on_average(rate_hz, seconds):
+    cadence = Cadence(1e6 / rate_hz)
+    due = [now_us for now_us in range(4000, seconds * 1_000_000 + 4000, 4000) if cadence.due(now_us)]
+    assert abs(len(due) - rate_hz * seconds) <= 1
+    gaps_us = [b - a for a, b in pairwise(due)]
+    assert max(gaps_us) - min(gaps_us) <= 4000
