@@ -19,7 +19,6 @@ from protocol.codec import check_sizes, decode, decode_ranges
 from protocol.errors import WireError
 from protocol.golden_cases import CASES, Case
 from protocol.jpeg import read_jpeg_size
-from protocol.messages import Wire
 from protocol.twist_text import parse_twist
 
 INEXACT_KEY = "INEXACT_KEY"

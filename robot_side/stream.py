@@ -7,7 +7,6 @@ in flight is 81-83 ms old where two are 141-175.
 """
 
 from collections import OrderedDict, deque
-from dataclasses import dataclass
 from typing import Annotated
 
 from pydantic import Field
@@ -15,7 +14,8 @@ from pydantic import Field
 from protocol.config import Config
 from protocol.messages import Holder, StreamStatus
 
-_FIRST_TIMEOUT_US = 250_000
+_FIRST_TIMEOUT_US = 120_000
+_REMEMBERED = 64
 _DELAYS_KEPT = 12
 _TIMEOUT_SLACK_US = 12_000  # with a quick peer, below one interval at 30 fps: a loss then costs one frame, not two
 
@@ -31,19 +31,14 @@ class StreamConfig(Config):
     """Silence after which another peer's answers may return credit."""
 
 
-@dataclass(frozen=True, slots=True)
-class _InFlight:
-    sent_us: int
-    expires_us: int
-
-
 class Stream:
     """Decides for one camera. The caller asks `may_capture`, tells `on_sent`, and hands every answer in."""
 
     def __init__(self, config: StreamConfig) -> None:
         self._config = config
         self._interval_us = round(1e6 / config.max_fps)
-        self._in_flight: OrderedDict[int, _InFlight] = OrderedDict()
+        self._in_flight: dict[int, int] = {}  # seq -> when its credit times out
+        self._sent_at_us: OrderedDict[int, int] = OrderedDict()  # also of frames whose credit has timed out
         self._owner: Holder | None = None
         self._owner_until_us = 0
         self._delays_us: deque[int] = deque(maxlen=_DELAYS_KEPT)
@@ -61,13 +56,15 @@ class Stream:
 
     def wait_us(self, now_us: int) -> int:
         """How long until time or a credit timeout could change `may_capture`; an answer may change it sooner."""
-        expiries = [flight.expires_us for flight in self._in_flight.values()]
-        blocked_until_us = min(expiries) if len(self._in_flight) >= self.window else 0
+        blocked_until_us = min(self._in_flight.values()) if len(self._in_flight) >= self.window else 0
         return max(0, max(self._next_us, blocked_until_us) - now_us)
 
     def on_sent(self, seq: int, t_us: int, now_us: int) -> None:
         """A frame captured at `t_us` left. The next is due by capture time: a late send costs no rate."""
-        self._in_flight[seq] = _InFlight(now_us, now_us + self._timeout_us())
+        self._in_flight[seq] = now_us + self._timeout_us()
+        self._sent_at_us[seq] = now_us
+        if len(self._sent_at_us) > _REMEMBERED:
+            self._sent_at_us.popitem(last=False)
         # A tenth of slack: a camera that ticks a hair faster than `max_fps` must not be asked one tick too late.
         self._next_us = t_us + self._interval_us * 9 // 10
         self._sent += 1
@@ -79,9 +76,9 @@ class Stream:
         """An answer to frame `seq` came. Returns whether it gave credit back: only its owner's answers do."""
         if not self._owns(who, now_us):
             return False
-        flight = self._in_flight.get(seq)
-        if flight is not None:
-            self._measure(now_us - flight.sent_us, compute_us)
+        sent_us = self._sent_at_us.pop(seq, None)
+        if sent_us is not None:
+            self._measure(now_us - sent_us, compute_us)
         # Newest wins at the peer: whatever is older than the answered frame will never be answered.
         answered = [old for old in self._in_flight if old <= seq]
         for old in answered:
@@ -126,7 +123,7 @@ class Stream:
         return min(longest_us, round(1.5 * self._answer_us) + _TIMEOUT_SLACK_US)
 
     def _expire(self, now_us: int) -> None:
-        late = [seq for seq, flight in self._in_flight.items() if now_us >= flight.expires_us]
+        late = [seq for seq, expires_us in self._in_flight.items() if now_us >= expires_us]
         for seq in late:
             del self._in_flight[seq]
             self._credit_timeouts += 1

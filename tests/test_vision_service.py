@@ -1,0 +1,161 @@
+"""The service over a link in memory: every frame answered, bad ones counted, one line per change of state."""
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from protocol.channels import ACK, CAMERA, FRAME, TWIST
+from protocol.codec import decode, encode
+from protocol.messages import AnswerHeader, CameraModel, FrameHeader, Stamp
+from protocol.transports.link import LatestSlot, Message
+from protocol.transports.memory import MemoryNetwork
+from protocol.twist_text import parse_twist
+from tests.vision_rig import camera, jpeg_of, scene
+from vision_side.config import VisionConfig
+from vision_side.service import Service, serve
+
+MODEL = camera()
+BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
+EMPTY = jpeg_of(np.full((240, 320, 3), 140, np.uint8))
+
+
+class Bench:
+    """A robot's end of the link, and the service on the other."""
+
+    def __init__(self) -> None:
+        self.network = MemoryNetwork(seed=1)
+        self.robot = self.network.link("r1")
+        self.twists: LatestSlot[Message] = self.robot.latest(TWIST)
+        self.acks: LatestSlot[Message] = self.robot.latest(ACK)
+        self.said: list[str] = []
+        self.service = Service(VisionConfig(), self.network.link("r1", role="vision"), self.said.append)
+        self.now_us = 0
+
+    def camera(self, model: CameraModel = MODEL) -> None:
+        self.robot.publish(CAMERA, encode(Stamp(session="0000abcd", seq=1, t_us=self.now_us)), encode(model))
+        self.turn()
+
+    def frame(self, jpeg: bytes, seq: int, session: str = "0000abcd") -> None:
+        header = FrameHeader(session=session, seq=seq, t_us=seq * 33_333)
+        self.raw(encode(header), jpeg)
+
+    def raw(self, header: bytes, jpeg: bytes) -> None:
+        self.robot.publish(FRAME, header, jpeg)
+        self.turn()
+
+    def turn(self) -> None:
+        self.now_us += 33_333
+        self.network.advance(self.now_us)
+        self.service.turn(0.0)
+        self.network.advance(self.now_us)
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_a_frame_is_answered_by_a_twist_that_names_it(bench: Bench) -> None:
+    bench.camera()
+    for seq in range(1, 6):
+        bench.frame(BALL, seq)
+        message = bench.twists.take()
+        assert message is not None and message.source == "vision"
+        header = decode(AnswerHeader, message.header)
+        assert (header.echo.session, header.echo.seq, header.echo.t_us) == ("0000abcd", seq, seq * 33_333)
+        assert (header.seq, header.compute_us > 0) == (seq, True)
+        assert parse_twist(message.payload).angular_rad_s > 0
+
+
+def test_a_picture_that_does_not_decode_is_acknowledged_and_counted(bench: Bench) -> None:
+    bench.camera()
+    bench.frame(b"junk", 1)
+    message = bench.acks.take()
+    assert message is not None and message.payload == b"" and bench.twists.take() is None
+    assert decode(AnswerHeader, message.header).echo.seq == 1
+    assert bench.service.skipped == {"MALFORMED": 1}
+
+
+def test_before_the_camera_model_nothing_is_answered(bench: Bench) -> None:
+    bench.frame(BALL, 1)
+    assert bench.twists.take() is None and bench.acks.take() is None
+    assert any("waiting for the camera's model" in line for line in bench.said)
+
+
+@pytest.mark.parametrize("header", [b"", b"{", b"{}", b"[1]", b'{"v":1,"session":"x","seq":1,"t_us":1}', b"\xff" * 40])
+def test_broken_headers_are_counted_and_end_nothing(bench: Bench, header: bytes) -> None:
+    bench.camera()
+    bench.raw(header, BALL)
+    assert bench.service.skipped["MALFORMED"] == 1
+    bench.frame(BALL, 2)
+    assert bench.twists.take() is not None
+
+
+def test_a_robot_of_another_version_is_told_once(bench: Bench) -> None:
+    bench.camera()
+    for _ in range(5):
+        bench.raw(b'{"v":2,"session":"0000abcd","seq":1,"t_us":1}', BALL)
+    assert len([line for line in bench.said if "version 2" in line]) == 1
+    assert bench.service.skipped["UNSUPPORTED_VERSION"] == 5
+
+
+def test_another_camera_is_taken_over(bench: Bench) -> None:
+    bench.camera()
+    bench.frame(BALL, 1)
+    large = camera(640, 480)
+    bench.camera(large)
+    bench.frame(jpeg_of(scene(large, 1.0, 0.2)), 2)
+    bench.twists.take()
+    bench.frame(jpeg_of(scene(large, 1.0, 0.2)), 3)
+    assert bench.twists.take() is not None
+    assert any("640x480" in line for line in bench.said)
+
+
+def test_lines_are_said_per_change_and_never_per_frame(bench: Bench) -> None:
+    bench.camera()
+    for seq in range(1, 50):
+        bench.frame(BALL, seq)
+    for seq in range(50, 130):
+        bench.frame(EMPTY, seq)
+    for seq in range(130, 230):
+        bench.frame(b"junk", seq)
+    assert [line.split(": ", 1)[1].split(" at ")[0] for line in bench.said] == [
+        "camera is 320x240, fx 190.7 px, calibrated", "frames from robot r1, session 0000abcd", "target seen",
+        "target lost", "target not in sight, searching",
+        *(f"pictures skipped so far: {count}; this one: picture: does not start with SOI; is it a JPEG?"
+          for count in (1, 10, 100)),
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_the_process_ends_within_a_second_of_a_signal(number: signal.Signals) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    code = (f"from vision_side.config import VisionConfig; from vision_side.service import run; "
+            f"raise SystemExit(run(VisionConfig(connect=(), listen=('{endpoint}',))))")
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert "looking for robot r1" in process.stdout.readline()
+        started = time.monotonic()
+        process.send_signal(number)
+        assert process.wait(5) == 0
+        assert time.monotonic() - started < 1.0
+
+
+def test_serve_ends_when_asked(bench: Bench) -> None:
+    ending, said = threading.Event(), list[str]()
+    link = bench.network.link("r1", role="vision")
+    running = threading.Thread(target=serve, args=(VisionConfig(), link, ending, said.append))
+    running.start()
+    ending.set()
+    running.join(1.0)
+    assert not running.is_alive()
+    assert said[-1].startswith("vision: ended after 0 frames")

@@ -1,0 +1,129 @@
+"""Every number of the vision side, with its unit, bounds and reason. Pure."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from protocol.channels import FRAME
+from protocol.config import Config
+from protocol.messages import RobotId
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+HueDeg = Annotated[float, Field(ge=0, le=360)]
+Seconds = Annotated[float, Field(ge=0, le=60)]
+
+
+class HsvRange(Config):
+    """One two-sided colour range. A hue range whose low end is above its high end goes through red (360 = 0)."""
+
+    hue_low_deg: HueDeg
+    hue_high_deg: HueDeg
+    saturation_low: Fraction = 0.45
+    saturation_high: Fraction = 1.0
+    value_low: Fraction = 0.15
+    value_high: Fraction = 1.0
+
+
+class HsvConfig(Config):
+    """The colour detector."""
+
+    ranges: Annotated[tuple[HsvRange, ...], Field(min_length=1, max_length=8)] = (
+        HsvRange(hue_low_deg=36, hue_high_deg=68, saturation_low=0.5),
+    )
+    min_radius_px: Annotated[float, Field(gt=1, le=200)] = 3.0
+    max_contours: Annotated[int, Field(ge=1, le=256)] = 16
+    """Security limit: no more blobs than this are measured in one picture, the longest outlines first."""
+    max_roughness: Annotated[float, Field(gt=0, le=0.5)] = 0.07
+    """RMS distance of the outline from a circle, in radii; a square has 0.10."""
+    min_outline_kept: Annotated[float, Field(ge=0.2, le=1)] = 0.55
+    """Share of the outline that must lie on the circle; the rest may be cut off by something in front."""
+
+
+class TargetConfig(Config):
+    """What is followed, and from how far."""
+
+    radius_m: Annotated[float, Field(gt=0.005, le=2)] = 0.1
+    stand_off_m: Annotated[float, Field(gt=0.1, le=10)] = 0.8
+    """Distance to keep from the lens to the target's centre, over the floor."""
+    max_range_m: Annotated[float, Field(gt=0.2, le=50)] = 6.0
+
+
+class TrackConfig(Config):
+    """Memory of the target in the odometry frame."""
+
+    acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 0.35
+    """How hard the target is expected to change its velocity (1 sigma); more follows faster and smooths less."""
+    range_noise: Annotated[float, Field(gt=0, le=1)] = 0.008
+    """1 sigma of one position measured at one metre, in metres; grows with the square of the distance."""
+    gate_m: Annotated[float, Field(gt=0, le=5)] = 0.35
+    """A sighting further than this from where the target should be is another object ..."""
+    gate_growth_mps: Annotated[float, Field(ge=0, le=10)] = 1.5
+    """... and the gate widens by this for every second without a sighting."""
+    coast_s: Annotated[float, Field(ge=0, le=5)] = 0.5
+    """Without a sighting, drive on for this long where the target should be; then only turn towards it."""
+    give_up_s: Annotated[float, Field(gt=0, le=10)] = 1.2
+    """Without a sighting for this long the target is lost, and nothing of it is kept but its side."""
+    confirm: Annotated[int, Field(ge=1, le=30)] = 2
+    """Sightings before the robot drives towards it; it turns at once."""
+
+
+class SteerConfig(Config):
+    """Bearing and distance controllers. Gains are per second; kp times latency never exceeds `max_gain_latency`."""
+
+    bearing_kp: Annotated[float, Field(gt=0, le=20)] = 6.0
+    bearing_ki: Annotated[float, Field(ge=0, le=20)] = 1.5
+    distance_kp: Annotated[float, Field(gt=0, le=10)] = 3.0
+    distance_ki: Annotated[float, Field(ge=0, le=10)] = 0.3
+    max_gain_latency: Annotated[float, Field(gt=0, le=0.9)] = 0.9
+    max_linear_mps: Annotated[float, Field(gt=0, le=5)] = 0.5
+    max_reverse_mps: Annotated[float, Field(ge=0, le=5)] = 0.3
+    max_angular_rad_s: Annotated[float, Field(gt=0, le=10)] = 2.5
+    integral_linear_mps: Annotated[float, Field(ge=0, le=1)] = 0.05
+    """Bound of the distance integral: what wheel and friction errors need, no more."""
+    integral_angular_rad_s: Annotated[float, Field(ge=0, le=2)] = 0.05
+    back_calculation_hz: Annotated[float, Field(ge=0, le=50)] = 5.0
+    """How fast an integral gives way to what the robot did not carry out."""
+    drive_within_rad: Annotated[float, Field(gt=0, le=1.5)] = 0.9
+    """Forward speed fades to zero as the bearing grows to this."""
+
+
+class LatencyConfig(Config):
+    """What is known of the delay from capture to wheels. If unsure, low: too low is slow, too high is unstable."""
+
+    first_guess_s: Annotated[float, Field(ge=0, le=0.5)] = 0.03
+    max_s: Annotated[float, Field(gt=0, le=1)] = 0.4
+    smoothing_s: Annotated[float, Field(gt=0, le=10)] = 0.5
+    actuation_s: Annotated[float, Field(ge=0, le=0.3)] = 0.03
+    """From an accepted command to wheels that follow it; the robot cannot measure this part."""
+    linear_acceleration_mps2: Annotated[float, Field(gt=0, le=50)] = 2.0
+    angular_acceleration_rad_s2: Annotated[float, Field(gt=0, le=200)] = 10.0
+    """The robot's own limits, for foretelling where the commands under way will take it."""
+
+
+class SearchConfig(Config):
+    """Turning on the spot after "saw nothing"; bounded by time spent turning and by angle."""
+
+    enabled: bool = True
+    rate_rad_s: Annotated[float, Field(gt=0, le=1.2)] = 1.2
+    max_turn_rad: Annotated[float, Field(gt=0, le=50)] = 14.0
+    max_turning_s: Seconds = 20.0
+    after_s: Annotated[float, Field(ge=0, le=10)] = 0.2
+    """Pictures without the target must last this long before the robot turns for it."""
+
+
+class VisionConfig(Config):
+    """The vision service."""
+
+    robot: RobotId = "r1"
+    connect: Annotated[tuple[str, ...], Field(max_length=16)] = ("tcp/127.0.0.1:7447",)
+    listen: Annotated[tuple[str, ...], Field(max_length=16)] = ()
+    max_frame_bytes: Annotated[int, Field(ge=1_000, le=FRAME.max_payload_bytes)] = 400_000
+    """Security limit: larger frames are refused by the link."""
+    max_pixels: Annotated[int, Field(ge=256, le=4096 * 4096)] = 1920 * 1080
+    """Security limit: larger pictures are never decoded."""
+    hsv: HsvConfig = HsvConfig()
+    target: TargetConfig = TargetConfig()
+    track: TrackConfig = TrackConfig()
+    steer: SteerConfig = SteerConfig()
+    latency: LatencyConfig = LatencyConfig()
+    search: SearchConfig = SearchConfig()

@@ -1,0 +1,66 @@
+"""Which pixels have the target's colour: one table look-up per pixel, then an opening. Pure.
+
+The table is over BGR565, so any number of ranges, and a hue range through red, cost the same.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision_side.config import HsvRange
+
+MARGIN_PX = 6
+COARSE = 2
+"""Where to look is decided on every second pixel of every second row; the mask itself is of full resolution."""
+_KERNEL = np.ones((3, 3), np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """The part of a picture that holds everything of the colour, a margin around it, and where it lies."""
+
+    bgr: NDArray[np.uint8]
+    mask: NDArray[Any]
+    origin_px: tuple[int, int]
+
+
+class ColourMask:
+    """Marks the configured colours."""
+
+    def __init__(self, ranges: tuple[HsvRange, ...]) -> None:
+        self._table = colour_table(ranges)
+        self._codes = np.zeros((0, 0, 2), np.uint8)
+
+    def region(self, bgr: NDArray[np.uint8]) -> Region | None:
+        """Where the colour is, speckle removed; None if nowhere."""
+        if self._codes.shape[:2] != bgr.shape[:2]:
+            self._codes = np.zeros((*bgr.shape[:2], 2), np.uint8)
+        cv2.cvtColor(bgr, cv2.COLOR_BGR2BGR565, dst=self._codes)
+        codes = self._codes.view(np.uint16)[..., 0]
+        coarse = cv2.LUT(codes[::COARSE, ::COARSE].copy(), self._table)
+        x, y, width, height = (one * COARSE for one in cv2.boundingRect(coarse))
+        if not width:
+            return None
+        x1, y1 = max(0, x - MARGIN_PX), max(0, y - MARGIN_PX)
+        part = slice(y1, y + height + MARGIN_PX), slice(x1, x + width + MARGIN_PX)
+        # Speckle would cost findContours a hundredfold; a 3x3 opening removes it and keeps discs.
+        mask = cv2.morphologyEx(cv2.LUT(codes[part], self._table), cv2.MORPH_OPEN, _KERNEL)
+        return Region(bgr[part], mask, (x1, y1))
+
+
+def colour_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
+    """255 for every BGR565 code whose colour is within one of `ranges`, 0 elsewhere; 65536 entries."""
+    codes = np.arange(65536, dtype=np.uint32)
+    blue, green, red = (codes & 31) * 8 + 3.5, (codes >> 5 & 63) * 4 + 1.5, (codes >> 11) * 8 + 3.5
+    bgr = (np.stack([blue, green, red], axis=-1) / 255).astype(np.float32)[None]
+    hue, saturation, value = cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV)[0].T
+    inside = np.zeros(65536, bool)
+    for one in ranges:
+        above, below = hue >= one.hue_low_deg, hue <= one.hue_high_deg
+        turn = above & below if one.hue_low_deg <= one.hue_high_deg else above | below
+        inside |= (turn & (saturation >= one.saturation_low) & (saturation <= one.saturation_high)
+                   & (value >= one.value_low) & (value <= one.value_high))
+    return np.where(inside, 255, 0).astype(np.uint8)

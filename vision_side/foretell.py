@@ -1,0 +1,100 @@
+"""How late a command acts, and where the commands under way will have taken the robot by then. Pure.
+
+A command computed now meets a robot that has meanwhile obeyed the commands sent before it. Steering from the picture
+alone corrects the same error several times over; steering from where the robot will be does not.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from protocol.messages import Pose, Twist
+from vision_side.config import LatencyConfig
+
+_STEP_S = 0.015
+_STILL = 1e-6
+_REMEMBERED = 64  # commands: two seconds at 30 fps, five times the longest latency
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Pose in the odometry frame and twist about the robot."""
+
+    pose: Pose
+    linear_mps: float
+    angular_rad_s: float
+
+
+class Foretelling:
+    """Keeps the latency and the commands sent."""
+
+    def __init__(self, config: LatencyConfig) -> None:
+        self._config = config
+        self._measured_s = config.first_guess_s
+        self._sent: deque[tuple[int, float, float]] = deque(maxlen=_REMEMBERED)
+
+    @property
+    def latency_s(self) -> float:
+        """From capture to wheels that follow."""
+        return min(self._measured_s, self._config.max_s) + self._config.actuation_s
+
+    def measure(self, latency_us: int | None, dt_s: float) -> None:
+        """Take in what the robot measured from capture to accepted command; None changes nothing."""
+        if latency_us is None:
+            return
+        share = min(1.0, dt_s / self._config.smoothing_s)
+        self._measured_s += share * (min(latency_us / 1e6, self._config.max_s) - self._measured_s)
+
+    def sent(self, t_us: int, twist: Twist) -> None:
+        """Note the command that answers the frame captured at `t_us`."""
+        self._sent.append((t_us, twist.linear_mps, twist.angular_rad_s))
+
+    def expected(self, t_us: int) -> tuple[float, float] | None:
+        """The twist that should have been in force at `t_us`; None before the first."""
+        for sent_us, linear, angular in reversed(self._sent):
+            if sent_us + self._measured_s * 1e6 <= t_us:
+                return linear, angular
+        return None
+
+    def motion(self, t_us: int, pose: Pose, moving: tuple[float, float], applied: tuple[float, float]) -> Motion:
+        """The robot at `t_us` plus the latency, if it carries out what is under way.
+
+        A robot that is held (applies nothing though it was told to move) is expected to stay where it is.
+        """
+        if self._is_held(t_us, applied):
+            return Motion(pose, 0.0, 0.0)
+        (x, y, yaw), (linear, angular) = pose, moving
+        for length_s, goal in self._under_way(t_us, moving):
+            steps = max(1, round(length_s / _STEP_S))
+            for _ in range(steps):
+                step_s = length_s / steps
+                linear += _bounded(goal[0] - linear, self._config.linear_acceleration_mps2 * step_s)
+                angular += _bounded(goal[1] - angular, self._config.angular_acceleration_rad_s2 * step_s)
+                middle = yaw + angular * step_s / 2
+                x, y = x + linear * math.cos(middle) * step_s, y + linear * math.sin(middle) * step_s
+                yaw += angular * step_s
+        return Motion((x, y, yaw), linear, angular)
+
+    def _under_way(self, t_us: int, moving: tuple[float, float]) -> list[tuple[float, tuple[float, float]]]:
+        """(seconds, twist) of what the wheels follow from `t_us` until a command computed now acts, oldest first."""
+        spans: list[tuple[float, tuple[float, float]]] = []
+        until_s = latency_s = self.latency_s
+        for sent_us, linear, angular in reversed(self._sent):
+            from_s = max(0.0, latency_s - (t_us - sent_us) / 1e6)
+            if from_s < until_s:
+                spans.append((until_s - from_s, (linear, angular)))
+                until_s = from_s
+            if from_s == 0.0:
+                break
+        if until_s > 0.0:
+            spans.append((until_s, moving))
+        return spans[::-1]
+
+    def _is_held(self, t_us: int, applied: tuple[float, float]) -> bool:
+        expected = self.expected(t_us)
+        told = expected is not None and max(map(abs, expected)) > _STILL
+        return told and max(map(abs, applied)) <= _STILL
+
+
+def _bounded(value: float, limit: float) -> float:
+    return max(-limit, min(limit, value))

@@ -1,0 +1,166 @@
+"""The vision service: newest frame in, twist or acknowledgement out, over a `Link`. Shell.
+
+One printed line per change of state, never one per frame. Ends within a second of SIGTERM or SIGINT.
+"""
+
+import secrets
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import TypeVar
+
+from protocol.channels import ACK, CAMERA, FRAME, MAX_HEADER_BYTES, TWIST
+from protocol.codec import decode, encode
+from protocol.errors import WireError
+from protocol.messages import CameraModel, FrameHeader
+from protocol.refusals import Refusal
+from protocol.transports.link import LatestSlot, Link, Message
+from protocol.twist_text import format_twist
+from vision_side.config import VisionConfig
+from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, answer_header
+
+_WAIT_S = 0.2  # how long a stop signal may go unnoticed
+_SILENCE_S = 3.0
+_TOLD_COUNTS = tuple(10**power for power in range(10))  # a camera gone bad is told at 1, 10, 100 ... pictures
+Say = Callable[[str], None]
+Model = TypeVar("Model", CameraModel, FrameHeader)
+
+
+def run(config: VisionConfig) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code 0.
+
+    Raises ConfigError for an endpoint that is none, LinkError if the link cannot be opened.
+    """
+    from protocol.transports.zenoh import open_zenoh
+
+    ending = threading.Event()
+    opened = open_zenoh(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
+                        max_frame_bytes=config.max_frame_bytes)
+    # Signals are caught only from here on: until the link is open, they end the process by themselves.
+    with opened as link, _ends_on_signal(ending):
+        _say(f"vision: looking for robot {config.robot} at {_endpoints(config)}")
+        serve(config, link, ending, _say)
+    return 0
+
+
+def serve(config: VisionConfig, link: Link, ending: threading.Event, say: Say) -> None:
+    """Answer frames that come over `link` until `ending` is set."""
+    service = Service(config, link, say)
+    while not ending.is_set():
+        service.turn(_WAIT_S)
+    say(f"vision: ended after {service.answered} frames; skipped: {dict(service.skipped) or 'none'}")
+
+
+class Service:
+    """What is known of the robot on the other end, and the pipeline that fits it."""
+
+    def __init__(self, config: VisionConfig, link: Link, say: Say) -> None:
+        self._config, self._link, self._say = config, link, say
+        self._cameras: LatestSlot[Message] = link.latest(CAMERA)
+        self._frames: LatestSlot[Message] = link.latest(FRAME)
+        self._camera: CameraModel | None = None
+        self._pipeline: Pipeline | None = None
+        self._session = secrets.token_hex(4)
+        self._robot_session = ""
+        self._said: dict[str, str] = {}
+        self._heard_s = time.monotonic()
+        self.answered = 0
+        self.skipped: Counter[str] = Counter()
+
+    def turn(self, wait_s: float) -> None:
+        """Wait up to `wait_s` for a frame and answer it."""
+        message = self._frames.take(wait_s)
+        started_ns = time.perf_counter_ns()
+        self._look_at_camera()
+        if message is not None:
+            self._frame(message, started_ns)
+        elif time.monotonic() - self._heard_s > _SILENCE_S:
+            self._tell("link", f"no frames from robot {self._config.robot} at {_endpoints(self._config)}; is "
+                               "`sightline robot` running there, with this robot id?")
+
+    def _look_at_camera(self) -> None:
+        """Take in the camera's model; a new one needs a new pipeline."""
+        message = self._cameras.take()
+        camera = self._decoded(CameraModel, message.payload, CAMERA.max_payload_bytes) if message else None
+        if camera is None or camera == self._camera:
+            return
+        self._camera = camera
+        self._pipeline = Pipeline(self._config, camera)
+        lens = "calibrated" if camera.calibrated else "not calibrated"
+        self._tell("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")
+
+    def _frame(self, message: Message, started_ns: int) -> None:
+        header = self._decoded(FrameHeader, message.header, MAX_HEADER_BYTES)
+        if header is None:
+            return
+        self._heard_s = time.monotonic()
+        self._tell("link", f"frames from robot {self._config.robot}, session {header.session}")
+        if self._pipeline is None:
+            self._tell("camera", "frames come, waiting for the camera's model")
+            return
+        before = self._pipeline.skipped.copy()
+        answer = self._pipeline.step(Frame(header, message.payload))
+        self.skipped.update(self._pipeline.skipped - before)
+        self._publish(header, answer, (time.perf_counter_ns() - started_ns) // 1000)
+        self._tell_phase(answer)
+
+    def _publish(self, header: FrameHeader, answer: Answer, compute_us: int) -> None:
+        self.answered += 1
+        stamp = encode(answer_header(header, self._session, self.answered, compute_us))
+        if answer.twist is None:
+            self._link.publish(ACK, stamp, b"")
+        else:
+            self._link.publish(TWIST, stamp, format_twist(answer.twist))
+
+    def _decoded(self, model: type[Model], data: bytes, max_bytes: int) -> Model | None:
+        try:
+            return decode(model, data, max_bytes)
+        except WireError as error:
+            self.skipped[error.reason] += 1
+            if error.reason is Refusal.UNSUPPORTED_VERSION:
+                self._tell("version", error.detail)
+            return None
+
+    def _tell_phase(self, answer: Answer) -> None:
+        seen = answer.seen
+        if answer.twist is None:
+            count = self.skipped.total()
+            if count in _TOLD_COUNTS:
+                self._say(f"vision: pictures skipped so far: {count}; this one: {seen.note}")
+        elif seen.distance_m is None:
+            self._tell("phase", "target not in sight, searching" if seen.phase == "searching" else "target lost")
+        elif seen.phase == "tracking":
+            self._tell("phase", f"target seen at {seen.distance_m:.2f} m", "seen")
+
+    def _tell(self, about: str, line: str, state: str = "") -> None:
+        """Print `line` if what it is about changed since it was last told."""
+        if self._said.get(about) != (state or line):
+            self._said[about] = state or line
+            self._say(f"vision: {line}")
+
+
+def _endpoints(config: VisionConfig) -> str:
+    return ", ".join([*config.connect, *(f"{one} (listening)" for one in config.listen)]) or "nowhere"
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+@contextmanager
+def _ends_on_signal(ending: threading.Event) -> Iterator[None]:
+    """SIGTERM and SIGINT set `ending` while inside."""
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        ending.set()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
