@@ -4,6 +4,7 @@ Nothing here decides anything: robot, driver, stream and vision are the classes 
 loss is drawn from the seed, so a run repeats bit for bit, about twenty times faster than real.
 """
 
+import zlib
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -111,7 +112,7 @@ class Lockstep:
         sent = self._sending.on_camera(Picture(self.world.render(), self._now_us), self._now_us)
         if sent is not None:
             header, message = sent
-            self.driving.on_issued(header.seq, header.t_us)
+            self.driving.on_issued(header.seq, header.t_us, zlib.crc32(message.payload))
             self._robot_link.publish(message.channel, message.header, message.payload)
 
     def _on_twist(self, message: Message) -> None:

@@ -171,6 +171,7 @@ class StreamStatus(Wire):
     window: Counter = 1
     fps: Number = 0.0
     dropped_commands: Counter = 0
+    refused_pictures: Counter = 0
 
 
 class Status(Wire):

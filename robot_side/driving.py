@@ -51,9 +51,10 @@ class Driving:
 
     # --- what arrives --------------------------------------------------------------------------------------------
 
-    def on_issued(self, seq: int, t_us: int) -> None:
-        """The network process is about to publish frame `seq`, captured at `t_us`."""
+    def on_issued(self, seq: int, t_us: int, fingerprint: int) -> None:
+        """The network process is about to publish frame `seq`, captured at `t_us`; 0 is no fingerprint."""
         self.gate.issued.add("frame", seq, t_us)
+        self.gate.pictures.add(t_us, fingerprint)
 
     def on_twist(self, message: Message, now_us: int) -> Judged | None:
         """Decode and offer a command. Returns the credit it gives back: whatever answers a frame of ours does."""

@@ -1,6 +1,6 @@
 """What the driver process and its network child say to each other, one SOCK_SEQPACKET packet each. Pure.
 
-    network -> driver   ISSUED  a frame is about to be published: seq, capture time
+    network -> driver   ISSUED  a frame is about to be published: seq, capture time, fingerprint
                         RAW     bytes of a twist or request as they came: channel, source, header, payload
                         STREAM  stream counters, JSON
                         READY   the endpoint is open
@@ -18,7 +18,7 @@ from protocol.messages import Holder, Planar, Pose
 from protocol.transports.link import Message
 
 MAX_PACKET_BYTES = 65_536
-_ISSUED = struct.Struct("<BQQ")
+_ISSUED = struct.Struct("<BQQI")
 _MOTION = struct.Struct("<B7dq")
 _VERDICT = struct.Struct("<BQQ16s8s16s8s")
 _PARTS = struct.Struct("<B16s16sH")
@@ -61,15 +61,15 @@ def kind_of(packet: bytes) -> Kind:
     return Kind(packet[0])
 
 
-def pack_issued(seq: int, t_us: int) -> bytes:
+def pack_issued(seq: int, t_us: int, fingerprint: int) -> bytes:
     """A frame is about to be published."""
-    return _ISSUED.pack(Kind.ISSUED, seq, t_us)
+    return _ISSUED.pack(Kind.ISSUED, seq, t_us, fingerprint)
 
 
-def unpack_issued(packet: bytes) -> tuple[int, int]:
-    """(seq, t_us)."""
-    _, seq, t_us = _ISSUED.unpack(packet)
-    return seq, t_us
+def unpack_issued(packet: bytes) -> tuple[int, int, int]:
+    """(seq, t_us, fingerprint)."""
+    _, seq, t_us, fingerprint = _ISSUED.unpack(packet)
+    return seq, t_us, fingerprint
 
 
 def pack_motion(motion: Motion) -> bytes:

@@ -63,6 +63,24 @@ class IssuedRecord:
         return age_us
 
 
+class FreshnessRecord:
+    """Since when the camera's picture has been the same, byte for byte. A live sensor's noise never repeats."""
+
+    def __init__(self) -> None:
+        self._fingerprint = 0
+        self._newest_us = self._changed_us = 0
+
+    def add(self, t_us: int, fingerprint: int) -> None:
+        """A frame captured at `t_us` was issued; `fingerprint` 0 is never judged (a source that is not live)."""
+        if fingerprint == 0 or fingerprint != self._fingerprint:
+            self._changed_us = t_us
+        self._fingerprint, self._newest_us = fingerprint, t_us
+
+    def unchanged_us(self) -> int:
+        """For how long the picture has not changed."""
+        return self._newest_us - self._changed_us
+
+
 class SequenceRecord:
     """The newest seq per (source, session); the longest silent sender is forgotten first."""
 

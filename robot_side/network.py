@@ -9,6 +9,7 @@ import socket
 import sys
 import threading
 import time
+import zlib
 from contextlib import ExitStack
 
 from protocol.channels import ACK, FRAME, REQUEST, TWIST
@@ -90,7 +91,8 @@ class Network:
             return
         header, message = sent
         # The driver must know a frame before anybody can answer it.
-        if self._to_driver(ipc.pack_issued(header.seq, header.t_us)):
+        fingerprint = zlib.crc32(picture.jpeg) if self._camera.live else 0
+        if self._to_driver(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
             self._link.publish(message.channel, message.header, message.payload)
 
     # --- the driver ----------------------------------------------------------------------------------------------

@@ -46,9 +46,13 @@ class Ranges:
 
 
 class Camera(Protocol):
-    """Gives JPEGs. A frame is captured only when `read` asks for one."""
+    """Gives JPEGs. A frame is captured only when `read` asks for one.
+
+    `live` is False for a source that may repeat a picture (files); a live one that does so is taken as frozen.
+    """
 
     model: CameraModel
+    live: bool
 
     def read(self, timeout_s: float) -> Picture | None:
         """The next capture; None if none came in time."""

@@ -12,7 +12,7 @@ from protocol.errors import WireError
 from protocol.messages import STILL, AnswerHeader, Holder, LastRefusal, Request, RequestHeader, State, Twist, Verb
 from protocol.refusals import CLAMPED, Refusal
 from robot_side.guard import RangeGuard
-from robot_side.judge import IssuedRecord, SequenceRecord, Verdict
+from robot_side.judge import FreshnessRecord, IssuedRecord, SequenceRecord, Verdict
 from robot_side.lease import HUMANS, RANKS, Lease
 from robot_side.limits import Ramp, SafetyConfig, age_factor, clamp_twist
 from robot_side.states import Event, after, is_armed
@@ -49,6 +49,7 @@ class SafetyGate:
     ) -> None:
         self.config = config
         self.issued = IssuedRecord(session)
+        self.pictures = FreshnessRecord()
         self.counters: Counter[str] = Counter()
         self.accepted = 0
         self.last_refusal: LastRefusal | None = None
@@ -162,6 +163,8 @@ class SafetyGate:
         silent_us, age_us = now_us - command.arrival_us, now_us - command.echo_us
         if silent_us > command.life_us:
             return self._hold(f"no accepted command for more than {command.life_us // 1000} ms", now_us)
+        if self.pictures.unchanged_us() > self.config.frozen_ms * 1000:
+            return self._hold("the camera's picture does not change", now_us)
         factor = age_factor(self.config, age_us)
         if factor == 0.0:
             return self._hold(f"the frame behind the command is {self.config.zero_speed_age_ms} ms old", now_us)

@@ -16,7 +16,7 @@ class Sending:
 
     def __init__(self, config: StreamConfig, session: str, first_seq: int, max_frame_bytes: int) -> None:
         self.motion = Motion()
-        self.refused_pictures = 0
+        self._refused_pictures = 0
         self._stream = Stream(config)
         self._session = session
         self._seq = first_seq
@@ -36,7 +36,7 @@ class Sending:
     def on_camera(self, picture: Picture, now_us: int) -> tuple[FrameHeader, Message] | None:
         """The frame to publish; None, counted, for a picture too large or not newer than the last."""
         if picture.t_us <= self._last_t_us or len(picture.jpeg) > self._max_frame_bytes:
-            self.refused_pictures += 1
+            self._refused_pictures += 1
             return None
         self._last_t_us = picture.t_us
         header = self._header(picture.t_us)
@@ -83,7 +83,8 @@ class Sending:
 
     def status(self, now_us: int, dropped_commands: int = 0) -> StreamStatus:
         """Counters of the stream."""
-        return self._stream.status(now_us, dropped_commands)
+        status = self._stream.status(now_us, dropped_commands)
+        return status.model_copy(update={"refused_pictures": self._refused_pictures})
 
 
 def _rounded(pair: Planar) -> Planar:

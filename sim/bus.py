@@ -150,6 +150,8 @@ class SimCamera:
     class Config(SimSocketConfig):
         """Where the simulation listens."""
 
+    live = True
+
     def __init__(self, config: SimSocketConfig) -> None:
         self._connection = Connection(config.socket_dir, CAMERA)
         self.model: CameraModel

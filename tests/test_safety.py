@@ -439,6 +439,28 @@ def test_wheels_turn_only_on_a_live_command_in_an_armed_state(actions):
             assert abs(decision.twist.linear_mps) <= speed_before, "never faster while off"
 
 
+# --- a frozen camera ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("unchanged_us", "holds"), [(400_000, False), (400_001, True)])
+def test_a_picture_that_does_not_change_holds_the_robot(unchanged_us, holds):
+    rig = Rig().armed().drive(400)
+    rig.gate.pictures.add(rig.now_us, 7)
+    rig.gate.pictures.add(rig.now_us + unchanged_us, 7)
+    rig.drive(40)
+    assert (rig.gate.state is State.HOLD) == holds
+    assert ("does not change" in rig.gate.reason) == holds
+    rig.gate.pictures.add(rig.now_us + unchanged_us + 1, 8)
+    assert rig.drive(40).gate.state is State.ACTIVE
+
+
+def test_a_source_that_is_not_live_is_never_frozen():
+    rig = Rig().armed()
+    for step in range(100):
+        rig.gate.pictures.add(step * 33_333, 0)
+    assert rig.gate.pictures.unchanged_us() == 0
+
+
 # --- range guard -------------------------------------------------------------------------------------------------
 
 

@@ -26,6 +26,7 @@ class FolderCamera:
     """Pictures are read once, at start; the stamps are this machine's clock, as if they were seen now."""
 
     Config = FolderCameraConfig
+    live = False
 
     def __init__(self, config: FolderCameraConfig) -> None:
         paths = sorted(path for path in config.path.expanduser().glob("*") if path.suffix.lower() in (".jpg", ".jpeg"))
