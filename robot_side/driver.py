@@ -9,22 +9,28 @@ import select
 import signal
 import time
 from contextlib import ExitStack
-from pathlib import Path
 from types import FrameType
 
 from protocol.channels import REQUEST, TWIST, check_robot_id
 from protocol.codec import decode
-from protocol.errors import ConfigError, HardwareError
+from protocol.errors import HardwareError
 from protocol.messages import State, StreamStatus
 from robot_side import ipc
 from robot_side.child import NetworkChild
 from robot_side.config import RobotConfig
 from robot_side.driving import Driving
+from robot_side.latch import StopLatch
 from robot_side.limits import TICK_US
 from robot_side.plugins import build
 from robot_side.ports import Drive, RangeSensor
+from robot_side.supervision import ServiceManager, become_punctual
 
 _SHUTDOWN_US = 2_000_000
+_WATCHDOG_PERIOD_US = 100_000
+_WARNING = (
+    "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
+    "(docs/safety.md)"
+)
 
 
 def run(config: RobotConfig) -> int:
@@ -44,26 +50,12 @@ def run(config: RobotConfig) -> int:
         return driver.loop()
 
 
-class StopLatch:
-    """The STOP state on disk, so that a restart cannot clear it."""
-
-    def __init__(self, directory: Path, robot: str) -> None:
-        self._path = directory.expanduser() / f"{robot}.stopped"
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(f"state_dir {directory}: {error.strerror}; choose a writable directory") from None
-
-    def is_set(self) -> bool:
-        """Whether the robot was STOPPED when it last ran."""
-        return self._path.exists()
-
-    def keep(self, stopped: bool) -> None:
-        """Write or remove the mark."""
-        if stopped:
-            self._path.touch()
-        else:
-            self._path.unlink(missing_ok=True)
+def zero_motors(config: RobotConfig) -> int:
+    """Tell the motors to stand still, without gate or network: for whoever cleans up after a dead driver."""
+    drive: Drive = build("drives", config.drive)
+    drive.set(0.0, 0.0)
+    drive.close()
+    return 0
 
 
 class Driver:
@@ -76,6 +68,8 @@ class Driver:
         self._driving = Driving(config, secrets.token_hex(4), stopped=self._latch.is_set())
         self._shown = self._driving.gate.state
         self._ending_since_us: int | None = None
+        self._manager = ServiceManager()
+        self._watchdog_due_us = 0
         self.child = NetworkChild(config, self._driving.session)
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, self._on_signal)
@@ -85,6 +79,7 @@ class Driver:
 
     def loop(self) -> int:
         """Tick at absolute 20 ms deadlines and whenever a command arrives, until the end is asked for and reached."""
+        self._greet()
         deadline_us = _now_us()
         while not self._ended():
             self._wait(deadline_us)
@@ -96,7 +91,14 @@ class Driver:
                 self._tick(now_us, punctual=True)
             elif arrived:
                 self._tick(now_us, punctual=False)
+        self._manager.tell("STOPPING=1")
         return self.child.exit_code
+
+    def _greet(self) -> None:
+        """What this robot lacks is said before it moves."""
+        missing = list(become_punctual())
+        for line in [*missing, *([] if self._manager.is_there else [_WARNING])]:
+            print(f"robot {self._driving.config.robot}: {line}", flush=True)
 
     def _ended(self) -> bool:
         if self.child.failed_at_start:
@@ -120,6 +122,12 @@ class Driver:
             self.child.keep_alive(now_us, self._driving.gate.issued.last_seq("frame") + 1)
             self._driving.network_restarts = self.child.restarts
             self._show(self._driving.gate.state, self._driving.gate.reason)
+            self._feed_watchdog(now_us)
+
+    def _feed_watchdog(self, now_us: int) -> None:
+        if now_us >= self._watchdog_due_us:
+            self._manager.tell("READY=1\nWATCHDOG=1")
+            self._watchdog_due_us = now_us + _WATCHDOG_PERIOD_US
 
     def _move(self, now_us: int) -> None:
         """Sensors, gate, motors. A device that fails stops the robot; the other devices are still served."""

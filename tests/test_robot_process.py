@@ -11,7 +11,7 @@ import time
 import pytest
 
 from protocol.messages import State
-from robot_side.driver import StopLatch
+from robot_side.latch import StopLatch
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess, Vision, driving, now_us, stop_after
 
