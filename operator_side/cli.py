@@ -1,0 +1,89 @@
+"""The command line: `sightline COMMAND`. Shell; heavy imports are inside the commands.
+
+Whatever goes wrong is one line on stderr that says what, where and how to fix it, and the exit code of the design:
+0 ok, 2 bad usage or configuration, 3 hardware, 4 cannot connect, 5 a check failed.
+"""
+
+import os
+import re
+import sys
+from collections.abc import Sequence
+from typing import Final
+
+import typer
+
+from operator_side import cli_config, cli_judge, cli_people, cli_services
+from operator_side.settings_errors import no_such_name
+from protocol.errors import SightlineError
+
+INTERRUPTED: Final = 130
+UNEXPECTED: Final = 1
+_UNKNOWN_COMMAND = re.compile(r"No such command '([^']*)'")
+
+app = typer.Typer(
+    name="sightline",
+    help="Let a small robot use eyes and judgement that live on another machine, and never obey old sight.\n\n"
+    "Begin with: sightline demo",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+for module in (cli_services, cli_judge, cli_people, cli_config):
+    module.register(app)
+
+
+@app.callback(invoke_without_command=True)
+def _help_by_default(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command and return its exit code; never raises."""
+    try:
+        code = app(list(arguments), standalone_mode=False, prog_name="sightline")
+        return code if isinstance(code, int) else 0
+    except SightlineError as error:
+        return _say(str(error), error.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        return INTERRUPTED
+    except BrokenPipeError:  # `sightline status --watch | head`: whoever read has gone, and knows
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNEXPECTED
+    except Exception as error:
+        return _unexpected(error)
+
+
+def _unexpected(error: Exception) -> int:
+    """A usage error of the command line, or a fault of the program; either way one line."""
+    usage = getattr(error, "format_message", None)
+    if usage is not None:
+        return _say(_usage_line(" ".join(usage().split())), getattr(error, "exit_code", 2))
+    if os.environ.get("SIGHTLINE_DEBUG") == "1":
+        raise error
+    where = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    return _say(f"unexpected {where}; SIGHTLINE_DEBUG=1 shows where, please report it", UNEXPECTED)
+
+
+def _usage_line(text: str) -> str:
+    """A usage error with the nearest command, where it is about one."""
+    unknown = _UNKNOWN_COMMAND.match(text)
+    if unknown is None:
+        return f"{text.rstrip('.')}; see --help"
+    names = list(getattr(typer.main.get_command(app), "commands", ()))
+    return no_such_name("command", unknown[1], names) + "; see sightline --help"
+
+
+def _say(line: str, code: int) -> int:
+    typer.echo(f"error: {line}", err=True)
+    return code
+
+
+def main() -> None:
+    """Entry point of the `sightline` command."""
+    sys.exit(run(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

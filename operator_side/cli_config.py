@@ -1,0 +1,60 @@
+"""Commands about configuration: `config check | show | schema`. Shell."""
+
+import json
+import os
+from typing import Annotated
+
+import typer
+
+from operator_side.cli_services import Sets
+from operator_side.service_settings import load_service
+from operator_side.settings import model_of
+from operator_side.toml_text import toml_text
+
+ServiceName = Annotated[str, typer.Argument(metavar="SERVICE", help="robot, vision or sim.")]
+File = Annotated[str | None, typer.Argument(metavar="[FILE]", help="The service's TOML file.")]
+Profile = Annotated[str | None, typer.Option(help="Lay this profile under it, e.g. sim.")]
+
+
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    group = typer.Typer(
+        help="Check, show and describe a service's configuration: defaults < profile < file < environment < --set.",
+        no_args_is_help=False, rich_markup_mode=None,
+    )
+    group.command(epilog="Example: sightline config check robot robot.toml")(check)
+    group.command(epilog="Example: sightline config show robot robot.toml --origin")(show)
+    group.command(epilog="Example: sightline config schema vision")(schema)
+    app.add_typer(group, name="config")
+
+
+def check(service: ServiceName, file: File = None, profile: Profile = None, sets: Sets = None) -> None:
+    """Say whether a configuration is good; exit 2 and name what is wrong if not."""
+    loaded = load_service(service, profile=profile, file=file, sets=sets or (), environ=os.environ)
+    typer.echo(f"{file or service}: ok, {len(loaded.given)} values set, the rest by default")
+
+
+def show(
+    *,
+    service: ServiceName,
+    file: File = None,
+    profile: Profile = None,
+    sets: Sets = None,
+    origin: Annotated[bool, typer.Option("--origin", help="Say where each value comes from.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """Print the configuration that a service would run with, as a TOML file that it would accept."""
+    loaded = load_service(service, profile=profile, file=file, sets=sets or (), environ=os.environ)
+    table = loaded.config.model_dump(mode="json")
+    if as_json:
+        origins = {".".join(key): given.origin for key, given in loaded.given.items()}
+        typer.echo(json.dumps({"config": table, "origins": origins} if origin else table, indent=2))
+    else:
+        typer.echo(toml_text(table, loaded.origin if origin else lambda _key: ""), nl=False)
+
+
+def schema(service: ServiceName) -> None:
+    """Print a service's configuration as JSON Schema, for editors."""
+    typer.echo(json.dumps(model_of(service).model_json_schema(), indent=2))

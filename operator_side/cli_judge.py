@@ -1,0 +1,141 @@
+"""Commands that judge: `demo`, `score`, `bench`. Shell. Exit code 5 when a check is outside its bound."""
+
+import json
+import os
+import webbrowser
+from collections.abc import Callable
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+
+from operator_side.extras import needs
+from protocol.errors import ConfigError
+
+if TYPE_CHECKING:
+    from operator_side.score import Check
+
+CHECK_FAILED = 5
+Number = TypeVar("Number", int, float)
+
+Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    app.command(epilog="Example: sightline demo --scenario eight --latency-ms 100 --loss 0.1")(demo)
+    app.command(epilog="Example: sightline score --scenario circle,eight --seeds 101,102,103")(score)
+    group = typer.Typer(help="Measure what things cost on this machine.", rich_markup_mode=None)
+    group.command(epilog="Example: sightline bench codec --json")(codec)
+    group.command(epilog="Example: sightline bench pipeline")(pipeline)
+    app.add_typer(group, name="bench")
+
+
+def demo(
+    *,
+    scenario: Annotated[str, typer.Option(help="static, circle, eight, pushed, behind, walls, or a .toml.")] = "circle",
+    seconds: Annotated[float, typer.Option(help="How long to drive; 0: until Ctrl-C.")] = 20.0,
+    seed: Annotated[int, typer.Option(help="Draws the start and the noise.")] = 1,
+    latency_ms: Annotated[float, typer.Option(help="Added from capture to command, half on each leg.")] = 0.0,
+    loss: Annotated[float, typer.Option(help="Share of messages lost on each leg, e.g. 0.1.")] = 0.0,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Run folder [default: runs/TIME-...].")] = None,
+    open_it: Annotated[bool, typer.Option("--open", help="Show the film when it is over.")] = False,
+    as_json: Json = False,
+) -> int:
+    """Follow a ball by sight: simulation, robot and vision as three real processes over Zenoh, scored and filmed."""
+    _check_installed("pybullet", "av", "matplotlib", "mcap")
+    with needs("all"):
+        from operator_side.demo import DemoOptions, run_demo
+        from operator_side.demo_report import report, summary
+    say = _to_stderr if as_json else typer.echo
+    run = run_demo(DemoOptions(scenario, seconds, seed, latency_ms, loss, out), say)
+    say("all three have ended; the run is being scored, replayed and filmed")
+    judged = report(run)
+    if as_json:
+        typer.echo(json.dumps(judged.to_dict()))
+    else:
+        typer.echo("\n".join(summary(judged)))
+    if open_it:
+        webbrowser.open((judged.run.folder / "run.mp4").as_uri())
+    return 0 if judged.ok else CHECK_FAILED
+
+
+def _check_installed(*packages: str) -> None:
+    """So that what the end needs is missed at the beginning. Raises ConfigError."""
+    with needs("all"):
+        for package in packages:
+            if find_spec(package) is None:
+                raise ModuleNotFoundError(package, name=package)
+
+
+def _to_stderr(line: str) -> None:
+    typer.echo(line, err=True)
+
+
+def score(
+    *,
+    scenario: Annotated[str, typer.Option(help="`all`, or names separated by commas.")] = "all",
+    seeds: Annotated[str, typer.Option(help="Separated by commas; judge with seeds nobody tuned on.")] = "1,2,3",
+    latency_ms: Annotated[str, typer.Option(help="Added latencies, separated by commas.")] = "50",
+    loss: Annotated[str, typer.Option(help="Losses on each leg, separated by commas.")] = "0.1",
+    seconds: Annotated[float | None, typer.Option(min=1, max=3600, help="[default: the scenario's own]")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Runs at once [default: one per core].")] = None,
+    as_json: Json = False,
+) -> int:
+    """Follow in virtual time, many times, and judge: the services' own logic, world truth, median and worst."""
+    with needs("all"):
+        from operator_side.score_runs import cases, run_cases
+        from operator_side.score_table import progress, score_text
+        from sim.scenario import scenario_names
+    wanted = cases(
+        scenario_names() if scenario == "all" else scenario.split(","),
+        _numbers("--seeds", seeds, int), _numbers("--latency-ms", latency_ms, float), _numbers("--loss", loss, float),
+        seconds,
+    )
+    with progress(len(wanted)) as advance:
+        report = run_cases(wanted, jobs or os.cpu_count() or 1, lambda _case: advance())
+    typer.echo(json.dumps(report.to_dict()) if as_json else score_text(report))
+    return 0 if report.ok else CHECK_FAILED
+
+
+def _numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:
+    try:
+        return [kind(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"{option} {text!r}: numbers separated by commas, e.g. {option} 1,2,3") from None
+
+
+def codec(*, as_json: Json = False) -> int:
+    """Encode and decode a frame header and a twist."""
+    from benchmarks.codec import measure_codec
+    from operator_side.score import Check
+
+    costs = measure_codec()
+    return _print_checks([Check(cost.name, cost.median_us, "us", cost.bound_us, cost.ok) for cost in costs], as_json)
+
+
+def pipeline(*, as_json: Json = False) -> int:
+    """Picture in, command out: decode, detect, track, steer."""
+    with needs("vision"):
+        from benchmarks.pipeline import time_steps
+    from operator_side.score import Check
+
+    checks = [
+        Check(f"step at {one.width_px}x{one.height_px}", one.median_us, "us", one.bound_us,
+              one.median_us <= one.bound_us and one.phase == "tracking")
+        for one in time_steps()
+    ]
+    return _print_checks(checks, as_json)
+
+
+def _print_checks(checks: "list[Check]", as_json: bool) -> int:
+    from operator_side.check_text import check_line
+
+    ok = all(check.ok for check in checks)
+    if as_json:
+        typer.echo(json.dumps({"ok": ok, "checks": [asdict(check) for check in checks]}))
+    else:
+        typer.echo("\n".join(check_line(check) for check in checks))
+    return 0 if ok else CHECK_FAILED

@@ -1,0 +1,107 @@
+"""Commands that run a service: `sim`, `robot`, `vision`. Shell."""
+
+import os
+from typing import Annotated, Any
+
+import typer
+
+from operator_side.extras import needs
+from operator_side.service_settings import load_service
+
+ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help="TOML file; see `sightline config`.")]
+Sets = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set one value, e.g. safety.auto_arm=true.")
+]
+Listen = Annotated[
+    list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Listen here, e.g. tcp/0.0.0.0:7447.")
+]
+Connect = Annotated[
+    list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Connect here, e.g. tcp/192.168.1.20:7447.")
+]
+RobotName = Annotated[str | None, typer.Option("--robot", metavar="ID", help="The robot's id [default: r1].")]
+SocketDir = Annotated[
+    str | None, typer.Option("--socket-dir", metavar="DIR", help="Where the simulation's sockets are.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    app.command(epilog="Example: sightline sim --scenario eight --seed 3")(sim)
+    app.command(epilog="Example: sightline robot --listen tcp/0.0.0.0:7447 --set safety.max_linear_mps=0.3")(robot)
+    app.command(epilog="Example: sightline vision --connect tcp/192.168.1.20:7447")(vision)
+
+
+def sim(
+    *,
+    scenario: Annotated[
+        str | None, typer.Option(help="static, circle, eight, pushed, behind, walls, or a .toml file.")
+    ] = None,
+    robot_model: Annotated[str | None, typer.Option(help="raspberry, or a .toml file.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Draws the start and the noise.")] = None,
+    motor_log: Annotated[str | None, typer.Option(metavar="FILE", help="CSV of every motor command.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="End by itself after this long.")] = None,
+    socket_dir: SocketDir = None,
+    config: ConfigFile = None,
+    sets: Sets = None,
+) -> int:
+    """Simulate a robot's hardware, in place of a real one, until Ctrl-C."""
+    from sim.service import run
+
+    options = {
+        "scenario": scenario, "robot": robot_model, "seed": seed, "motor_log": motor_log, "seconds": seconds,
+        "socket_dir": socket_dir,
+    }
+    loaded = load_service("sim", file=config, sets=sets or (), options=options, environ=os.environ)
+    with needs("sim"):
+        return run(loaded.config)  # type: ignore[arg-type]
+
+
+def robot(
+    *,
+    robot: RobotName = None,
+    listen: Listen = None,
+    connect: Connect = None,
+    profile: Annotated[str | None, typer.Option(help="`sim`: simulated, armed without a person.")] = None,
+    socket_dir: SocketDir = None,
+    config: ConfigFile = None,
+    sets: Sets = None,
+) -> int:
+    """Run a robot: its wheels, its camera, its link, until Ctrl-C. Listens on this machine only unless told otherwise.
+
+    With no configuration its hardware is the simulation (`sightline sim`).
+    """
+    from robot_side.driver import run
+
+    options: dict[str, Any] = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect)}
+    options |= {f"{device}.options.socket_dir": socket_dir for device in ("camera", "drive")}
+    loaded = load_service(
+        "robot", profile=profile, file=config, sets=sets or (), options=options, environ=os.environ
+    )
+    with needs("zenoh"):
+        return run(loaded.config)  # type: ignore[arg-type]
+
+
+def vision(
+    *,
+    robot: RobotName = None,
+    listen: Listen = None,
+    connect: Connect = None,
+    config: ConfigFile = None,
+    sets: Sets = None,
+    shape: Annotated[str | None, typer.Option("--shape", hidden=True)] = None,
+) -> int:
+    """Look at a robot's pictures and steer it, until Ctrl-C."""
+    options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect)}
+    loaded = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
+    with needs("vision"):
+        if shape is not None:
+            from operator_side.shaped_vision import run_shaped
+
+            return run_shaped(loaded.config, shape)  # type: ignore[arg-type]
+        from vision_side.service import run
+
+        return run(loaded.config)  # type: ignore[arg-type]
+
+
+def _ends(endpoints: list[str] | None) -> tuple[str, ...] | None:
+    return tuple(endpoints) if endpoints else None

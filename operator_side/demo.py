@@ -1,0 +1,223 @@
+"""`sightline demo`: simulation, robot and vision as processes of their own, armed, watched, ended. Shell.
+
+The three run what `sightline sim`, `robot` and `vision` run by hand; their configuration lies in the run folder.
+"""
+
+import os
+import signal
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+from operator_side.live_block import Display, display
+from operator_side.processes import Processes
+from operator_side.recording import Recorder
+from operator_side.replay import VISION_CONFIG
+from operator_side.requests import SOURCE, Operator
+from operator_side.service_settings import load_service
+from operator_side.shaped_vision import Shape
+from operator_side.toml_text import toml_text
+from protocol.errors import ConfigError, HardwareError, SightlineError
+from protocol.transports.zenoh import open_zenoh
+from sim.bus import TruthReader
+from sim.scenario import Scenario, load_scenario
+from sim.truth import Truth
+
+ROBOT: Final = "r1"
+READY_S: Final = 30.0
+"""For one process to say that it is ready; a first start reads hundreds of megabytes from disk."""
+ARM_S: Final = 15.0
+_DYING_S: Final = 1.0
+RECORDING: Final = "run.mcap"
+MOTOR_LOG: Final = "motors.csv"
+
+
+@dataclass(frozen=True, slots=True)
+class DemoOptions:
+    """What a person asked for. `seconds` 0 runs until Ctrl-C."""
+
+    scenario: str = "circle"
+    seconds: float = 20.0
+    seed: int = 1
+    latency_ms: float = 0.0
+    loss: float = 0.0
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for what cannot be run."""
+        if not 0 <= self.seconds <= 3600 or not 0 <= self.latency_ms <= 10_000 or not 0 <= self.loss < 1:
+            raise ConfigError("--seconds 0 to 3600, --latency-ms 0 to 10000 and --loss 0 to below 1, e.g. --loss 0.1")
+        if not 0 <= self.seed < 2**32:
+            raise ConfigError(f"--seed {self.seed}: 0 to 4294967295")
+
+
+@dataclass(slots=True)
+class DemoRun:
+    """What a run left, beside the files in `folder`."""
+
+    options: DemoOptions
+    scenario: Scenario
+    folder: Path
+    samples: list[Truth] = field(default_factory=list)
+    dropped_by_recorder: int = 0
+    killed: list[str] = field(default_factory=list)
+    interrupted: bool = False
+
+
+def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
+    """Run it. Raises ConfigError, LinkError or the failure of a process; nothing is left running in any case."""
+    scenario = load_scenario(options.scenario)
+    run = DemoRun(options, scenario, _run_folder(options, scenario))
+    with ExitStack() as ending:
+        ending.enter_context(_terminated_like_interrupted())
+        sockets = ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
+        processes = ending.enter_context(Processes(run.folder))
+        try:
+            _drive(run, processes, sockets, say)
+        except KeyboardInterrupt:
+            run.interrupted = True
+        except SightlineError:
+            processes.check(_DYING_S)  # who ended is the cause; what it broke here is not
+            raise
+        run.killed = processes.end()
+    return run
+
+
+def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str], None]) -> None:
+    options, endpoint = run.options, f"tcp/127.0.0.1:{_free_port()}"
+    _write_configuration(run, sockets)
+    say(f"simulation, robot and vision start as three processes; their logs are in {run.folder}")
+    processes.start("sim", ["sim", "--config", str(run.folder / "sim.toml")])
+    processes.wait_line("sim", "simulation ready", READY_S)
+    processes.start("robot", ["robot", "--config", str(run.folder / "robot.toml"), "--listen", endpoint])
+    processes.wait_line("robot", f"robot {ROBOT}: on", READY_S)
+    with (
+        open_zenoh(ROBOT, connect=[endpoint], role=SOURCE) as link,
+        Recorder(link, run.folder / RECORDING, _about(run)) as recorder,
+        _truth(sockets) as truth,
+        display(options.seconds, run.scenario.stand_off_m) as block,
+    ):
+        operator = Operator(link)
+        processes.start("vision", _vision_arguments(run, endpoint))
+        _arm(operator, processes)
+        try:
+            _watch(run, processes, operator, truth, block)
+        finally:
+            recorder.close()
+            run.dropped_by_recorder = recorder.dropped
+
+
+def _arm(operator: Operator, processes: Processes) -> None:
+    """As a person would: ask until the robot sees live commands, and give up with its own reason."""
+    deadline_s = time.monotonic() + ARM_S
+    while True:
+        processes.check()
+        operator.wait_report()
+        reply = operator.arm(patience_s=0.5)
+        if reply.ok:
+            return
+        if time.monotonic() > deadline_s:
+            raise SightlineError(f"the robot would not be armed: {reply.detail}")
+
+
+def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthReader, block: Display) -> None:
+    """Collect truth and show it until the time is over."""
+    _discard_old(truth)
+    started_s = time.monotonic()
+    end_s = started_s + run.options.seconds if run.options.seconds else float("inf")
+    while time.monotonic() < end_s:
+        processes.check()
+        sample = truth.read(timeout_s=0.5)
+        if sample is None:
+            raise HardwareError("the simulation says nothing any more; see sim.log in the run folder")
+        run.samples.append(sample)
+        report = operator.report
+        block.show(time.monotonic() - started_s, report.status if report else None, sample)
+
+
+def _discard_old(truth: TruthReader) -> None:
+    while truth.read(timeout_s=0.0) is not None:
+        pass
+
+
+# --- what the processes are given --------------------------------------------------------------------------------
+
+
+def _write_configuration(run: DemoRun, sockets: str) -> None:
+    """Leave each service's file in the run folder, so that a person can start the same by hand."""
+    device = {"kind": "sim", "options": {"socket_dir": sockets}}
+    files: dict[str, dict[str, Any]] = {
+        "sim": {
+            "scenario": run.options.scenario, "seed": run.options.seed, "socket_dir": sockets,
+            "motor_log": str(run.folder / MOTOR_LOG),
+        },
+        "robot": {
+            "robot": ROBOT, "state_dir": str(run.folder / "state"), "camera": device, "drive": device,
+            "range_sensor": device,
+        },
+        "vision": {
+            "robot": ROBOT,
+            "target": {"radius_m": run.scenario.target.radius_m, "stand_off_m": run.scenario.stand_off_m},
+        },
+    }
+    for name, table in files.items():
+        (run.folder / f"{name}.toml").write_text(toml_text(table), "utf-8")
+
+
+def _vision_arguments(run: DemoRun, endpoint: str) -> list[str]:
+    options = run.options
+    arguments = ["vision", "--config", str(run.folder / "vision.toml"), "--connect", endpoint]
+    if options.latency_ms or options.loss:
+        arguments += ["--shape", Shape(options.latency_ms, options.loss, options.seed).text()]
+    return arguments
+
+
+def _about(run: DemoRun) -> dict[str, str]:
+    loaded = load_service("vision", file=str(run.folder / "vision.toml"), environ=os.environ)
+    return {VISION_CONFIG: loaded.config.model_dump_json(), "scenario": run.options.scenario}
+
+
+def _run_folder(options: DemoOptions, scenario: Scenario) -> Path:
+    name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{scenario.name}-{options.seed}"
+    folder = (options.out or Path("runs") / name).expanduser().absolute()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"run folder {folder}: {error.strerror}; choose another with --out") from None
+    return folder
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def _truth(sockets: str) -> Iterator[TruthReader]:
+    reader = TruthReader(sockets)
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+@contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """SIGTERM ends a run as Ctrl-C does."""
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,122 @@
+"""What a demo leaves and says when it is over: score.json, trajectory.png, run.mp4, a table. Shell (writes files)."""
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from operator_side.check_text import check_line
+from operator_side.demo import RECORDING, DemoRun
+from operator_side.extras import needs
+from operator_side.processes import last_line
+from operator_side.replay import Replayed, replay
+from operator_side.score import Check, Score, judge, score
+from operator_side.shaped_vision import INJECTED
+from protocol.errors import SightlineError
+
+REAL_TIME_FACTOR: Final = 1.5
+"""The bounds are those of lockstep; a real machine is granted this much more."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoReport:
+    """The judgement of a run."""
+
+    run: DemoRun
+    score: Score
+    checks: list[Check]
+    replayed: Replayed
+    injected: dict[str, Any] | None
+
+    @property
+    def ok(self) -> bool:
+        """Whether every check holds."""
+        return all(check.ok for check in self.checks)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `--json` prints and score.json holds."""
+        options = self.run.options
+        return {
+            "ok": self.ok,
+            "checks": [asdict(check) for check in self.checks],
+            "score": asdict(self.score),
+            "scenario": options.scenario, "seed": options.seed, "latency_ms": options.latency_ms, "loss": options.loss,
+            "replayed": asdict(self.replayed), "injected": self.injected,
+            "recorder_dropped": self.run.dropped_by_recorder, "interrupted": self.run.interrupted,
+            "folder": str(self.run.folder),
+        }
+
+
+def report(run: DemoRun) -> DemoReport:
+    """Judge `run` and write its files. Raises SightlineError for a run that was ended before it began."""
+    if not run.samples:
+        raise SightlineError(f"ended before the robot drove; the logs are in {run.folder}")
+    result = score(run.samples, run.scenario.stand_off_m)
+    checks = judge(run.scenario.name, result, run.options.latency_ms, REAL_TIME_FACTOR)
+    injected = _injected(run)
+    recording = run.folder / RECORDING
+    judged = DemoReport(run, result, checks + _injection_checks(run, injected), replay(recording), injected)
+    (run.folder / "score.json").write_text(json.dumps(judged.to_dict(), indent=2) + "\n", "utf-8")
+    _draw(run, recording)
+    return judged
+
+
+def _draw(run: DemoRun, recording: Path) -> None:
+    with needs("report"):
+        from operator_side.plot import plot_run
+        from operator_side.video import film_run
+    options = run.options
+    title = f"{run.scenario.name}, seed {options.seed}, +{options.latency_ms:g} ms, {options.loss:.0%} loss"
+    plot_run(run.folder / "trajectory.png", run.samples, run.scenario, title)
+    film_run(run.folder / "run.mp4", recording, run.samples, run.scenario)
+
+
+def _injected(run: DemoRun) -> dict[str, Any] | None:
+    """What the shaped link says it did; None if it was not asked for or did not say."""
+    line = last_line(run.folder / "vision.log")
+    if not line.startswith(INJECTED):
+        return None
+    counts: dict[str, Any] = json.loads(line.removeprefix(INJECTED))
+    return counts
+
+
+def _injection_checks(run: DemoRun, injected: dict[str, Any] | None) -> list[Check]:
+    """A run that was to lose messages and lost none has shown nothing."""
+    if not run.options.loss:
+        return []
+    lost = sum(leg["lost"] for leg in injected.values()) if injected else 0
+    sent = sum(leg["sent"] for leg in injected.values()) if injected else 0
+    share = lost / sent if sent else 0.0
+    wanted = run.options.loss
+    # Three standard deviations of a fair draw: outside of that the loss was not what was asked for.
+    near = 3 * math.sqrt(wanted * (1 - wanted) / sent) if sent else 0.0
+    return [Check("injected_loss", share, "share", wanted, sent > 0 and abs(share - wanted) <= near + 1e-9)]
+
+
+def summary(judged: DemoReport) -> list[str]:
+    """The closing lines: the score with its bounds, where everything lies, what to try next."""
+    run, replayed = judged.run, judged.replayed
+    lines = [check_line(check) for check in judged.checks]
+    lines.append(_replay_line(replayed))
+    if run.dropped_by_recorder:
+        lines.append(f"the recorder dropped {run.dropped_by_recorder} messages: the disk was too slow")
+    if run.killed:
+        lines.append(f"had to be killed: {', '.join(run.killed)}; see their logs")
+    lines.append(f"left in {run.folder}: score.json trajectory.png run.mp4 run.mcap motors.csv *.log")
+    return [*lines, _next_thing(run)]
+
+
+def _replay_line(replayed: Replayed) -> str:
+    if replayed.gaps or replayed.missing_frames:
+        lost = f"{replayed.gaps} answers and {replayed.missing_frames} frames are not in the recording"
+        return f"replay: cannot be compared, for {lost}; run without loss to compare"
+    return f"replay: {replayed.equal} of {replayed.total} answers equal byte for byte"
+
+
+def _next_thing(run: DemoRun) -> str:
+    options = run.options
+    if not options.latency_ms and not options.loss:
+        return f"next: sightline demo --scenario {run.scenario.name} --latency-ms 100 --loss 0.1"
+    other = "pushed" if run.scenario.name == "eight" else "eight"
+    return f"next: sightline demo --scenario {other} --latency-ms {options.latency_ms:g} --loss {options.loss:g}"

@@ -1,0 +1,129 @@
+"""`sightline score`: lockstep runs over scenarios, seeds, latencies and losses, judged. Shell (processes).
+
+Each run is a process's own, so that they share the machine's cores; a run itself repeats bit for bit.
+"""
+
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from itertools import groupby, product
+from typing import Any
+
+from operator_side.lockstep import Conditions, run_lockstep
+from operator_side.score import Check, Score, judge, median_and_worst, score
+from protocol.errors import ConfigError
+from sim.robot_model import load_robot
+from sim.scenario import load_scenario
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One run to make. `seconds` None is the scenario's own length."""
+
+    scenario: str
+    latency_ms: float
+    loss: float
+    seed: int
+    seconds: float | None
+
+    @property
+    def group(self) -> str:
+        """What it shares with the runs of other seeds."""
+        return f"{self.scenario} +{self.latency_ms:g} ms {self.loss:.0%} loss"
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """One figure of one group: its median and its worst over the seeds; the worst is what is judged."""
+
+    group: str
+    name: str
+    median: float | None
+    worst: float | None
+    unit: str
+    bound: float
+    ok: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreReport:
+    """All runs, and what was demanded of them."""
+
+    runs: list[tuple[Case, Score]]
+    judged: list[Judged]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every run is within every bound."""
+        return all(one.ok for one in self.judged)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {
+            "ok": self.ok,
+            "checks": [
+                {"name": f"{one.group}: {one.name}", "value": one.worst, "median": one.median, "unit": one.unit,
+                 "bound": one.bound, "ok": one.ok}
+                for one in self.judged
+            ],
+            "runs": [{**asdict(case), "score": asdict(result)} for case, result in self.runs],
+        }
+
+
+def cases(
+    scenarios: Sequence[str], seeds: Sequence[int], latencies_ms: Sequence[float], losses: Sequence[float],
+    seconds: float | None,
+) -> list[Case]:
+    """Every combination, those of one group together. Raises ConfigError for a scenario or number that is none."""
+    for name in scenarios:
+        load_scenario(name)
+    if not seeds or any(not 0 <= seed < 2**32 for seed in seeds):
+        raise ConfigError("--seeds needs whole numbers from 0, e.g. --seeds 101,102,103")
+    if any(not 0 <= one <= 10_000 for one in latencies_ms) or any(not 0 <= one < 1 for one in losses):
+        raise ConfigError("--latency-ms is 0 to 10000 and --loss 0 to below 1, e.g. --latency-ms 0,50 --loss 0.1")
+    return [
+        Case(name, latency_ms, loss, seed, seconds)
+        for name, latency_ms, loss, seed in product(scenarios, latencies_ms, losses, seeds)
+    ]
+
+
+def run_case(case: Case) -> Score:
+    """One run in lockstep, scored."""
+    scenario = load_scenario(case.scenario)
+    conditions = Conditions(case.latency_ms, case.loss)
+    run = run_lockstep(scenario, load_robot("raspberry"), case.seed, conditions, case.seconds)
+    return score(run.samples, scenario.stand_off_m)
+
+
+def run_cases(wanted: Sequence[Case], jobs: int, on_done: Callable[[Case], None]) -> ScoreReport:
+    """Run `wanted` on `jobs` processes, in any order, and judge them. `on_done` is called as each is done."""
+    results: dict[Case, Score] = {}
+    with ProcessPoolExecutor(min(jobs, len(wanted)), multiprocessing.get_context("spawn")) as pool:
+        futures = {pool.submit(run_case, case): case for case in wanted}
+        try:
+            for future in as_completed(futures):
+                results[futures[future]] = future.result()
+                on_done(futures[future])
+        except BaseException:  # Ctrl-C or a failed run: what has not begun is not worth waiting for
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    runs = [(case, results[case]) for case in wanted]
+    return ScoreReport(runs, judge_runs(runs))
+
+
+def judge_runs(runs: Sequence[tuple[Case, Score]]) -> list[Judged]:
+    """Each group's figures: median, worst, and whether every run of it is within the bound."""
+    judged = []
+    for name, members in groupby(runs, key=lambda run: run[0].group):
+        group = list(members)
+        checks = [judge(case.scenario, result, case.latency_ms) for case, result in group]
+        results = [result for _, result in group]
+        judged += [_judge_figure(name, list(same), results) for same in zip(*checks, strict=True)]
+    return judged
+
+
+def _judge_figure(group: str, checks: list[Check], results: list[Score]) -> Judged:
+    first = checks[0]
+    median, worst = median_and_worst(results, first.name)
+    return Judged(group, first.name, median, worst, first.unit, first.bound, all(check.ok for check in checks))

@@ -1,0 +1,145 @@
+"""A worse network than the real one: delay and seeded loss on each leg of any `Link`. Shell (one thread, a lock).
+
+`DelayLine` is the pure part: a bounded queue in the time it is told. `ShapedLink` puts one on each leg and releases
+what is due on a thread of its own. What it did is counted, so that a run in which nothing was injected shows.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from random import Random
+from types import TracebackType
+from typing import Any, Final, Self
+
+from protocol.channels import Channel, Direction
+from protocol.transports.link import LatestSlot, Link, Message
+from protocol.transports.memory import Leg, split_legs
+
+MAX_WAITING: Final = 256
+"""Messages under way on one leg; more are dropped and counted: 8 s of frames at 30 fps."""
+
+
+@dataclass(slots=True)
+class Count:
+    """What one leg was given and what it lost."""
+
+    sent: int = 0
+    lost: int = 0
+    overflow: int = 0
+
+
+class DelayLine:
+    """One leg. Order is kept; loss is drawn for each message from `seed`."""
+
+    def __init__(self, leg: Leg, seed: str) -> None:
+        self._leg = leg
+        self._random = Random(seed)
+        self._waiting: deque[tuple[int, Callable[[], Any]]] = deque()
+        self.count = Count()
+
+    def put(self, deliver: Callable[[], Any], now_us: int) -> None:
+        """Send: `deliver` becomes due after the leg's delay, or never."""
+        self.count.sent += 1
+        if self._random.random() < self._leg.loss:
+            self.count.lost += 1
+        elif len(self._waiting) >= MAX_WAITING:
+            self.count.overflow += 1
+        else:
+            self._waiting.append((now_us + self._leg.delay_us, deliver))
+
+    def take_due(self, now_us: int) -> list[Callable[[], Any]]:
+        """Remove and return what is due, in order."""
+        due = []
+        while self._waiting and self._waiting[0][0] <= now_us:
+            due.append(self._waiting.popleft()[1])
+        return due
+
+    @property
+    def next_us(self) -> int | None:
+        """When the next message is due; None if none waits."""
+        return self._waiting[0][0] if self._waiting else None
+
+
+class ShapedLink:
+    """`link` with `latency_ms` added in all, half on each leg, and `loss` (0..1) on each leg by itself.
+
+    Raises ValueError for a delay or loss that no network has. Closing it closes `link`.
+    """
+
+    def __init__(self, link: Link, latency_ms: float, loss: float, seed: int) -> None:
+        self.robot = link.robot
+        self._link = link
+        self._lines = {
+            direction: DelayLine(leg, f"{seed} {direction.value}")
+            for direction, leg in split_legs(round(latency_ms * 1000), 0, loss, 1.0).items()
+        }
+        self._changed = threading.Condition()
+        self._closed = False
+        self._releasing = threading.Thread(target=self._release, name="shaped-link", daemon=True)
+        self._releasing.start()
+
+    @property
+    def counts(self) -> dict[str, Count]:
+        """What each leg did: `from_robot` and `to_robot`."""
+        return {direction.name.lower(): line.count for direction, line in self._lines.items()}
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        """True although it may be lost: no sender on a bad network knows."""
+        self._put(Direction.TO_ROBOT, lambda: self._link.publish(channel, header, payload, source))
+        return True
+
+    def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
+        """As the link does, later, and not every message."""
+        self._link.subscribe(
+            channel, lambda message: self._put(Direction.FROM_ROBOT, lambda: callback(message))
+        )
+
+    def latest(self, channel: Channel) -> LatestSlot[Message]:
+        """A slot at the far end of the delay."""
+        slot: LatestSlot[Message] = LatestSlot()
+        self.subscribe(channel, slot.put)
+        return slot
+
+    def has_listener(self, channel: Channel) -> bool:
+        """As the link says."""
+        return self._link.has_listener(channel)
+
+    def close(self) -> None:
+        """End it; what is under way is lost."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._releasing.join(1.0)
+        self._link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _put(self, direction: Direction, deliver: Callable[[], Any]) -> None:
+        with self._changed:
+            self._lines[direction].put(deliver, _now_us())
+            self._changed.notify()
+
+    def _release(self) -> None:
+        while not self._closed:
+            for deliver in self._wait_due():
+                deliver()
+
+    def _wait_due(self) -> list[Callable[[], Any]]:
+        with self._changed:
+            due = [deliver for line in self._lines.values() for deliver in line.take_due(_now_us())]
+            if not due and not self._closed:
+                next_us = min((line.next_us for line in self._lines.values() if line.next_us is not None), default=None)
+                self._changed.wait(None if next_us is None else max(0.0, (next_us - _now_us()) / 1e6))
+            return due
+
+
+def _now_us() -> int:
+    return time.monotonic_ns() // 1000

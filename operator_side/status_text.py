@@ -1,0 +1,46 @@
+"""A robot's status in words. Pure."""
+
+from collections.abc import Iterator
+
+from protocol.messages import Status
+
+
+def status_line(robot: str, status: Status) -> str:
+    """One line: who, in which state, why, driven by whom."""
+    holder = f", driven by {status.holder.source}" if status.holder else ""
+    return f"{robot}: {status.state} ({status.reason}){holder}"
+
+
+def status_lines(robot: str, status: Status) -> Iterator[str]:
+    """Everything a person needs to know why the robot moves or does not."""
+    stream = status.stream
+    holder = f"{status.holder.source} {status.holder.session}" if status.holder else "nobody"
+    yield f"robot     {robot}"
+    yield f"state     {status.state}: {status.reason}"
+    yield f"driver    {holder}" + ("; arms by itself" if status.auto_arm else "")
+    yield f"wheels    {twist_text(status.applied)}"
+    yield f"limits    {status.max_linear_mps:.2f} m/s, {status.max_angular_rad_s:.2f} rad/s"
+    yield f"sight     frame age {millis(status.frame_age_us)}, capture to command {millis(status.latency_us)}"
+    counts = f"{stream.sent} sent, {stream.credit_timeouts} unanswered"
+    yield f"stream    {stream.fps:.0f} fps, {counts}, window {stream.window}"
+    yield f"commands  {status.accepted} accepted, {refusals_text(status)}, {stream.dropped_commands} dropped"
+    if status.last_refusal:
+        last = status.last_refusal
+        yield f"refused   last: {last.reason} from {last.source}: {last.detail}"
+    yield f"driver loop late by at most {millis(status.tick_late_max_us)}; network restarts {status.network_restarts}"
+
+
+def refusals_text(status: Status) -> str:
+    """Every refusal counter, most frequent first."""
+    counted = sorted(status.refused.items(), key=lambda item: -item[1])
+    return "refused: " + ", ".join(f"{name} {count}" for name, count in counted) if counted else "none refused"
+
+
+def twist_text(twist: tuple[float, float]) -> str:
+    """(m/s, rad/s) with signs, so that forward and left are seen."""
+    return f"{twist[0]:+.2f} m/s {twist[1]:+.2f} rad/s"
+
+
+def millis(time_us: int | None) -> str:
+    """Microseconds as milliseconds, `-` for none."""
+    return "-" if time_us is None else f"{time_us / 1000:.0f} ms"

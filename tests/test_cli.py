@@ -1,0 +1,167 @@
+"""The command line: help everywhere, every mistake one line and its exit code, nothing heavy before it is needed."""
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+
+import pytest
+import typer
+
+from operator_side import cli
+from operator_side.extras import needs
+from protocol.errors import ConfigError
+
+
+def commands(group=None, path=()):
+    group = group or typer.main.get_command(cli.app)
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, (*path, name))
+        else:
+            yield (*path, name), command
+
+
+COMMANDS = dict(commands())
+
+
+def run(capsys, *arguments):
+    code = cli.run(arguments)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_the_commands_of_this_version_exist():
+    expected = {"sim", "robot", "vision", "demo", "robots", "status", "arm", "disarm", "stop", "reset", "score"}
+    assert expected == {path[0] for path in COMMANDS if len(path) == 1}
+    assert {path for path in COMMANDS if len(path) == 2} == {
+        ("config", "check"), ("config", "show"), ("config", "schema"), ("bench", "codec"), ("bench", "pipeline"),
+    }
+
+
+@pytest.mark.parametrize("path", COMMANDS, ids=" ".join)
+def test_every_command_says_what_it_does_and_gives_an_example(capsys, path):
+    code, out, err = run(capsys, *path, "--help")
+    assert (code, err) == (0, "")
+    assert f"Usage: sightline {' '.join(path)}" in out
+    assert f"Example: sightline {' '.join(path)}" in out
+    for parameter in COMMANDS[path].params:
+        assert getattr(parameter, "hidden", False) or parameter.help, parameter.name
+
+
+def test_alone_it_shows_its_help(capsys):
+    code, out, err = run(capsys)
+    assert (code, err) == (0, "")
+    assert "Usage: sightline" in out
+    assert "sightline demo" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "expected"),
+    [
+        (["dmeo"], 2, "did you mean 'demo'"),
+        (["config", "chekc"], 2, "no command called 'chekc'"),
+        (["config"], 2, "Missing command"),
+        (["config", "check"], 2, "SERVICE"),
+        (["config", "check", "robto"], 2, "did you mean 'robot'"),
+        (["config", "check", "robot", "no such file.toml"], 2, "no such file.toml"),
+        (["config", "check", "vision", "--set", "targt.radius_m=1"], 2, "did you mean 'target.radius_m'"),
+        (["robot", "--robot", "a/b"], 2, "'a/b'"),
+        (["robot", "--robot", "*"], 2, "'*'"),
+        (["robot", "--listen", "7447"], 2, "tcp/127.0.0.1:7447"),
+        (["robot", "--listn", "x"], 2, "--listen"),
+        (["robot", "--set", "safety.max_linear_mps=nan"], 2, "nan"),
+        (["robot", "--set", "drive.kind=lgo"], 2, "did you mean 'log'"),
+        (["robot", "--socket-dir", "/nowhere"], 3, "sightline sim"),
+        (["vision", "--robot", "r1/"], 2, "'r1/'"),
+        (["vision", "--set", "hsv.min_radius_px=-1"], 2, "-1"),
+        (["sim", "--scenario", "cirle"], 2, "'circle'"),
+        (["sim", "--robot-model", "rasberry"], 2, "'raspberry'"),
+        (["sim", "--seed", "-1"], 2, "--seed"),
+        (["demo", "--scenario", "egiht"], 2, "'eight'"),
+        (["demo", "--loss", "1.5"], 2, "--loss 0.1"),
+        (["score", "--scenario", "cirle"], 2, "'circle'"),
+        (["score", "--seeds", "a,b"], 2, "--seeds 1,2,3"),
+        (["score", "--latency-ms", "-5"], 2, "0 to 10000"),
+        (["status", "--connect", "here"], 2, "tcp/127.0.0.1:7447"),
+        (["arm", "--robot", "a b"], 2, "'a b'"),
+        (["robots", "--connect", "tcp/127.0.0.1:1", "--seconds", "0.3"], 4, "nobody answers at tcp/127.0.0.1:1"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_mistake_is_one_line_and_its_exit_code(capsys, arguments, code, expected):
+    got, out, err = run(capsys, *arguments)
+    assert (got, out) == (code, "")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1, err
+    assert expected in err
+
+
+def test_a_misspelt_environment_name_stops_any_service(capsys, monkeypatch):
+    monkeypatch.setenv("SIGHTLINE_ROBOT__SAFETY__MAX_LINER_MPS", "0.1")
+    for service in ("robot", "vision", "sim"):
+        code, _, err = run(capsys, service)
+        assert code == 2
+        assert "SIGHTLINE_ROBOT__SAFETY__MAX_LINEAR_MPS" in err
+
+
+def test_a_fault_of_the_program_is_one_line_and_a_traceback_only_on_request(capsys, monkeypatch):
+    def broken(*_arguments: object, **_options: object) -> None:
+        raise ZeroDivisionError("two\nlines")
+
+    monkeypatch.setattr("operator_side.cli_config.load_service", broken)
+    code, out, err = run(capsys, "config", "check", "robot")
+    assert (code, out) == (1, "")
+    assert err.count("\n") == 1
+    assert "SIGHTLINE_DEBUG=1" in err
+    monkeypatch.setenv("SIGHTLINE_DEBUG", "1")
+    with pytest.raises(ZeroDivisionError):
+        cli.run(["config", "check", "robot"])
+
+
+def test_config_commands_print_what_a_script_can_read(capsys, tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text('robot = "r9"\n')
+    code, out, _ = run(capsys, "config", "check", "robot", str(path))
+    assert (code, str(path) in out) == (0, True)
+    code, out, _ = run(capsys, "config", "show", "robot", str(path), "--origin")
+    assert code == 0
+    assert tomllib.loads(out)["robot"] == "r9"
+    assert next(line for line in out.splitlines() if line.startswith("robot =")).endswith(f"# {path}")
+    code, out, _ = run(capsys, "config", "show", "robot", str(path), "--json", "--origin")
+    assert json.loads(out)["origins"]["robot"] == str(path)
+    code, out, _ = run(capsys, "config", "schema", "vision")
+    assert "target" in json.loads(out)["properties"]
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["config", "show", "robot"], ["arm", "--robot", "a/b"]])
+def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
+    script = (
+        "import sys; from operator_side import cli; cli.run(sys.argv[1:]);"
+        "heavy = {'numpy', 'cv2', 'pybullet', 'matplotlib', 'av', 'mcap', 'zenoh'} & set(sys.modules);"
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=False, env=dict(os.environ)
+    )
+    assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize(
+    ("package", "version", "expected"),
+    [
+        ("av.video", (3, 11), "av is not installed: pip install 'sightline[sim]'"),
+        ("pybullet", (3, 11), "pip install 'sightline[sim]'"),
+        ("pybullet", (3, 13), "Python 3.13: use Python 3.11, or `docker compose up`"),
+    ],
+)
+def test_a_missing_package_names_the_command_that_installs_it(package, version, expected):
+    with pytest.raises(ConfigError) as error, needs("sim", version):
+        raise ModuleNotFoundError(name=package)
+    assert expected in str(error.value)
+
+
+def test_a_missing_module_of_ours_is_a_fault_and_stays_one():
+    with pytest.raises(ModuleNotFoundError), needs("sim"):
+        raise ModuleNotFoundError(name="sim.nothing")

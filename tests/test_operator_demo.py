@@ -1,0 +1,151 @@
+"""The demo as a person runs it: real processes, real files, and nothing left behind however it ends."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import av
+import pytest
+
+from operator_side.processes import ProcessError, Processes
+from protocol.errors import SightlineError
+
+pytestmark = pytest.mark.slow
+
+COMMAND = [sys.executable, "-m", "operator_side.cli", "demo"]
+
+
+def running_in(folder: Path) -> list[str]:
+    """Command lines of living processes that name `folder`."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            command = entry.read_bytes().replace(b"\0", b" ").decode()
+        except OSError:
+            continue
+        if str(folder) in command:
+            found.append(command)
+    return found
+
+
+def demo(folder: Path, *options: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*COMMAND, "--out", str(folder), *options],
+        capture_output=True, text=True, timeout=100, check=False, env={**os.environ, **environment},
+    )
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo") / "run"
+    return folder, demo(folder, "--scenario", "circle", "--seconds", "5", "--json")
+
+
+def test_it_drives_and_says_so_to_a_script(driven):
+    folder, result = driven
+    said = json.loads(result.stdout)
+    assert result.returncode == (0 if said["ok"] else 5), result.stderr
+    assert said["ok"], said["checks"]
+    assert {"name", "value", "unit", "bound", "ok"} <= set(said["checks"][0])
+    assert said["score"]["travelled_m"] > 0.5
+    assert said == json.loads((folder / "score.json").read_text())
+    assert running_in(folder) == []
+
+
+def test_the_twists_on_the_wire_come_again_from_the_recording(driven):
+    folder, _ = driven
+    script = (
+        "import sys; from pathlib import Path; from operator_side.replay import replay;"
+        "result = replay(Path(sys.argv[1])); print(result); sys.exit(0 if result.ok and result.total > 60 else 1)"
+    )
+    fresh = subprocess.run(
+        [sys.executable, "-c", script, str(folder / "run.mcap")], capture_output=True, text=True, check=False
+    )
+    assert fresh.returncode == 0, fresh.stdout + fresh.stderr
+
+
+def test_it_leaves_pictures_that_open(driven):
+    folder, _ = driven
+    assert (folder / "trajectory.png").read_bytes().startswith(b"\x89PNG")
+    film = (folder / "run.mp4").read_bytes()
+    assert 0 < film.index(b"moov") < film.index(b"mdat"), "a browser starts before it has all"
+    with av.open(str(folder / "run.mp4")) as container:
+        stream = container.streams.video[0]
+        frames = sum(1 for _ in container.decode(stream))
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert stream.width % 2 == stream.height % 2 == 0
+        assert frames > 40
+        assert float(stream.duration * stream.time_base) == pytest.approx(5, abs=0.5)
+
+
+def test_the_motors_end_at_zero_in_their_own_log(driven):
+    folder, _ = driven
+    with (folder / "motors.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert max(float(row["left_rad_s"]) for row in rows) > 5
+    assert float(rows[-1]["left_rad_s"]) == float(rows[-1]["right_rad_s"]) == 0
+    assert all((folder / f"{name}.log").stat().st_size for name in ("sim", "robot", "vision"))
+
+
+def test_injected_loss_is_counted_and_checked(tmp_path):
+    result = demo(tmp_path / "run", "--seconds", "5", "--latency-ms", "50", "--loss", "0.1", "--json")
+    said = json.loads(result.stdout)
+    assert said["injected"]["to_robot"]["lost"] > 0
+    assert said["injected"]["from_robot"]["lost"] > 0
+    assert "injected_loss" in [check["name"] for check in said["checks"]]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_all_and_the_run_is_still_scored(tmp_path, number):
+    folder = tmp_path / "run"
+    process = subprocess.Popen([*COMMAND, "--out", str(folder), "--seconds", "0", "--json"], stdout=subprocess.PIPE,
+                               stderr=subprocess.PIPE, text=True)
+    for line in process.stderr:
+        if "ACTIVE" in line:
+            break
+    assert len(running_in(folder)) == 4
+    process.send_signal(number)
+    said, _ = process.communicate(timeout=40)
+    assert json.loads(said)["interrupted"]
+    assert process.returncode in (0, 5)
+    assert running_in(folder) == []
+
+
+@pytest.mark.parametrize(
+    ("environment", "code", "expected"),
+    [
+        ({"SIGHTLINE_ROBOT__SAFETY__MAX_LINEAR_MPS": "-1"}, 2, "SIGHTLINE_ROBOT__SAFETY__MAX_LINEAR_MPS = -1"),
+        ({"SIGHTLINE_SIM__SECONDS": "0.5"}, None, "ended by itself"),
+    ],
+)
+def test_a_process_that_fails_is_quoted_and_the_others_end(tmp_path, environment, code, expected):
+    folder = tmp_path / "run"
+    result = demo(folder, "--seconds", "20", **environment)
+    error = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    assert len(error) == 1
+    assert expected in error[0]
+    assert result.returncode == code if code else result.returncode != 0
+    assert "Traceback" not in result.stderr
+    assert running_in(folder) == []
+
+
+def test_a_process_that_never_says_it_is_ready_is_given_up(tmp_path):
+    with Processes(tmp_path) as processes:
+        processes.start("sim", ["sim", "--socket-dir", str(tmp_path / "s")])
+        with pytest.raises(SightlineError, match=r"not ready within 0\.1 s"):
+            processes.wait_line("sim", "something else", 0.1)
+        pid = processes.pid("sim")
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def test_the_last_word_of_a_process_and_its_exit_code_are_passed_on(tmp_path):
+    with Processes(tmp_path) as processes:
+        processes.start("robot", ["robot", "--socket-dir", "/nowhere"])
+        with pytest.raises(ProcessError, match="nothing simulates a robot in /nowhere") as error:
+            processes.wait_line("robot", "on tcp", 20.0)
+    assert error.value.exit_code == 3

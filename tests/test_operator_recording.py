@@ -1,0 +1,169 @@
+"""Recording and replay: what went over a link comes back, and the pipeline says the same again, byte for byte."""
+
+import threading
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from operator_side.lockstep import Conditions, Lockstep, simulation_robot, vision_for
+from operator_side.recording import CHUNK_BYTES, MAX_WAITING, Recorder, read_about, read_recording
+from operator_side.replay import VISION_CONFIG, replay, replay_steps
+from protocol.channels import CAMERA, CHANNELS, FRAME, STATUS, TWIST
+from protocol.codec import encode
+from protocol.errors import ConfigError
+from protocol.messages import Stamp
+from protocol.transports.link import Message
+from protocol.transports.memory import MemoryNetwork
+from sim.robot_model import load_robot
+from sim.scenario import load_scenario
+from sim.world import World
+
+MESSAGES = st.builds(
+    lambda channel, header, payload: Message(channel, "vision" if channel.has_source else "", header, payload),
+    st.sampled_from(list(CHANNELS.values())), st.binary(max_size=512), st.binary(max_size=64),
+).filter(lambda message: len(message.payload) <= message.channel.max_payload_bytes)
+
+
+class Wire:
+    """A link that gives its subscribers what it is told, at once."""
+
+    def __init__(self) -> None:
+        self.callbacks = {}
+
+    def subscribe(self, channel, callback) -> None:
+        self.callbacks[channel.name] = callback
+
+    def deliver(self, message: Message) -> None:
+        self.callbacks[message.channel.name](message)
+
+
+def record(path: Path, messages, **about: str) -> Recorder:
+    wire = Wire()
+    with Recorder(wire, path, about, CHANNELS.values()) as recorder:
+        for message in messages:
+            wire.deliver(message)
+    return recorder
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(MESSAGES, max_size=30))
+def test_everything_comes_back_in_order(tmp_path_factory, messages):
+    path = tmp_path_factory.mktemp("recording") / "run.mcap"
+    recorder = record(path, messages, scenario="circle")
+    assert [one.message for one in read_recording(path)] == messages
+    assert read_about(path) == {"scenario": "circle"}
+    assert sum(recorder.counts.values()) == len(messages)
+
+
+def test_a_recording_cut_short_reads_up_to_the_cut(tmp_path):
+    whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
+    messages = [Message(FRAME, "", b"%d" % at, bytes(CHUNK_BYTES // 8)) for at in range(100)]
+    record(whole, messages)
+    data = whole.read_bytes()
+    lengths = set()
+    for share in range(0, 100, 7):
+        cut.write_bytes(data[: len(data) * share // 100])
+        read = [one.message for one in read_recording(cut)]
+        assert read == messages[: len(read)]
+        lengths.add(len(read))
+    assert len(lengths) > 5, "the cut must have been in different places"
+
+
+def test_a_slow_disk_drops_and_counts_and_never_blocks_the_link(tmp_path):
+    wire, gate = Wire(), threading.Event()
+    recorder = Recorder(wire, tmp_path / "run.mcap", {}, [FRAME])
+    write = recorder._write
+    recorder._write = lambda *item: (gate.wait(10), write(*item))
+    sent = MAX_WAITING + 100
+    for at in range(sent):
+        wire.deliver(Message(FRAME, "", b"%d" % at, b""))
+    gate.set()
+    recorder.close()
+    kept = sum(1 for _ in read_recording(tmp_path / "run.mcap"))
+    assert kept + recorder.dropped == sent
+    assert recorder.dropped >= 99
+
+
+def test_what_is_no_recording_is_said(tmp_path):
+    with pytest.raises(ConfigError, match="nothing here"):
+        list(read_recording(tmp_path / "nothing here"))
+    (tmp_path / "text").write_text("hello, this is a text and no recording at all")
+    with pytest.raises(ConfigError, match="no recording"):
+        read_about(tmp_path / "text")
+
+
+# --- replay ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """Three seconds of the real line in virtual time, recorded from its network."""
+    path = tmp_path_factory.mktemp("replay") / "run.mcap"
+    scenario = load_scenario("circle")
+    config = vision_for(scenario)
+    with World(scenario, load_robot("raspberry"), 7) as world:
+        lockstep = Lockstep(world, simulation_robot(), config, Conditions(latency_ms=20), 7)
+        link, camera = lockstep.network.link("r1"), lockstep.network.link("r1")
+        with Recorder(link, path, {VISION_CONFIG: config.model_dump_json()}):
+            stamp = Stamp(session="00000001", seq=0, t_us=0)
+            camera.publish(CAMERA, encode(stamp), encode(world.camera_model))
+            while world.now_us < 3_000_000:
+                lockstep.step()
+    return path
+
+
+def rewritten(recorded: Path, path: Path, change) -> Path:
+    """A copy with each message changed, or left out where `change` gives None."""
+    messages = [change(at, one.message) for at, one in enumerate(read_recording(recorded))]
+    record(path, [message for message in messages if message is not None], **read_about(recorded))
+    return path
+
+
+def test_replay_gives_the_twists_that_were_sent(recorded):
+    result = replay(recorded)
+    assert result.ok
+    assert result.total > 60
+    assert any(step.sent not in (None, b"0.0000|0.0000") for step in replay_steps(recorded))
+
+
+def test_replay_names_the_first_difference(recorded, tmp_path):
+    twists = [at for at, one in enumerate(read_recording(recorded)) if one.message.channel is TWIST]
+
+    def change(at: int, message: Message) -> Message:
+        if at in twists[10:12]:
+            return Message(TWIST, message.source, message.header, b"0.1234|0.0000")
+        return message
+
+    result = replay(rewritten(recorded, tmp_path / "run.mcap", change))
+    assert not result.ok
+    assert result.total - result.equal == 2
+    assert "0.1234|0.0000" in result.first_difference
+
+
+def test_replay_reports_what_is_not_in_the_recording(recorded, tmp_path):
+    whole = replay(recorded)
+    frames = [at for at, one in enumerate(read_recording(recorded)) if one.message.channel is FRAME]
+    result = replay(rewritten(recorded, tmp_path / "a.mcap", lambda at, one: None if at == frames[5] else one))
+    assert (result.missing_frames, result.total, result.ok) == (1, whole.total - 1, False)
+    twists = [at for at, one in enumerate(read_recording(recorded)) if one.message.channel is TWIST]
+    result = replay(rewritten(recorded, tmp_path / "b.mcap", lambda at, one: None if at == twists[5] else one))
+    assert (result.gaps, result.total, result.ok) == (1, whole.total - 1, False)
+
+
+def test_replay_needs_the_configuration_of_vision(recorded, tmp_path):
+    record(tmp_path / "run.mcap", [one.message for one in read_recording(recorded)], other="thing")
+    with pytest.raises(ConfigError, match="how vision was configured"):
+        replay(tmp_path / "run.mcap")
+
+
+def test_recording_takes_nothing_from_the_network_it_listens_to(tmp_path):
+    network = MemoryNetwork()
+    robot, heard = network.link("r1"), []
+    network.link("r1").subscribe(STATUS, heard.append)
+    with Recorder(network.link("r1"), tmp_path / "run.mcap", {}):
+        robot.publish(STATUS, b"{}", b"{}")
+        network.advance(1)
+    assert len(heard) == 1
+    assert [one.message for one in read_recording(tmp_path / "run.mcap")] == heard

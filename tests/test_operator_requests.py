@@ -1,0 +1,159 @@
+"""The operator against a real gate: `Driving` on a network in memory, pumped by a thread in real time."""
+
+import threading
+import time
+
+import pytest
+
+from operator_side.requests import Operator, read_report
+from operator_side.status_text import status_line, status_lines
+from protocol.channels import REQUEST, STATUS, TWIST
+from protocol.codec import encode
+from protocol.errors import LinkError
+from protocol.messages import AnswerHeader, Echo, Status, Verb
+from protocol.transports.link import Message
+from protocol.transports.memory import MemoryNetwork
+from robot_side.config import PluginChoice, RobotConfig
+from robot_side.driving import Driving
+
+
+class PumpedRobot:
+    """A robot session on a `MemoryNetwork`, ticked by a thread; `drives` makes vision answer every tick."""
+
+    def __init__(self, *, drives: bool = True, hears: bool = True, says: str = "") -> None:
+        config = RobotConfig(drive=PluginChoice(kind="log"), camera=PluginChoice(kind="folder"))
+        self.network = MemoryNetwork()
+        self.driving = Driving(config, "0000000a")
+        self.drives, self.version = drives, says
+        self.link = self.network.link("r1")
+        self.operator = Operator(self.network.link("r1", role="operator"))
+        if hears:
+            self.link.subscribe(REQUEST, lambda message: self.driving.on_request(message, self.now_us))
+        self.now_us = self.network.now_us
+        self._ending = threading.Event()
+        self._seq = 0
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        while not self._ending.wait(0.002):
+            self.now_us += 20_000  # ten times faster than real
+            self.network.advance(self.now_us)
+            if self.drives:
+                self._answer()
+            self.driving.tick(self.now_us, None, None)
+            for message in self.driving.messages(self.now_us):
+                header = message.header.replace(b'"v":1', self.version.encode()) if self.version else message.header
+                self.link.publish(message.channel, header, message.payload)
+
+    def _answer(self) -> None:
+        self._seq += 1
+        self.driving.gate.issued.add("frame", self._seq, self.now_us)
+        echo = Echo(channel="frame", session="0000000a", seq=self._seq, t_us=self.now_us)
+        header = AnswerHeader(source="vision", session="0000000b", seq=self._seq, echo=echo)
+        self.driving.on_twist(Message(TWIST, "vision", encode(header), b"0.1|0"), self.now_us)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_error):
+        self._ending.set()
+        self._thread.join()
+
+
+def fail_if_slow() -> None:
+    pytest.fail("STOP took longer than 300 ms")
+
+
+def test_arm_drive_stop_reset():
+    with PumpedRobot() as robot:
+        operator = robot.operator
+        assert operator.arm(patience_s=2.0).ok
+        assert operator.wait_report().status.state in ("HOLD", "ACTIVE")
+        assert operator.stop(fail_if_slow).state == "STOPPED"
+        refused = operator.arm(patience_s=2.0)
+        assert not refused.ok
+        assert "reset" in refused.detail
+        assert operator.ask(Verb.RESET).ok or operator.ask(Verb.RESET).ok  # the first may still find turning wheels
+        assert operator.wait_report().status.state == "DISARMED"
+        assert operator.ask(Verb.DISARM).ok
+
+
+def test_arm_waits_for_live_commands_and_says_what_is_missing():
+    with PumpedRobot(drives=False) as robot:
+        reply = robot.operator.arm(patience_s=0.05)
+        assert not reply.ok
+        assert "is vision running?" in reply.detail
+        threading.Timer(0.1, lambda: setattr(robot, "drives", True)).start()
+        assert robot.operator.arm(patience_s=3.0).ok
+
+
+def test_requests_without_an_answer_end_in_time_and_say_so():
+    with PumpedRobot(hears=False) as robot:
+        robot.operator.wait_report()
+        with pytest.raises(LinkError, match="does not answer arm"):
+            robot.operator.ask(Verb.ARM, timeout_s=0.3)
+
+
+def test_stop_is_repeated_at_20_hz_and_tells_when_it_is_slow():
+    with PumpedRobot(hears=False) as robot:
+        heard, told = [], []
+        robot.network.link("r1").subscribe(REQUEST, heard.append)
+        started_s = time.monotonic()
+        with pytest.raises(LinkError, match="cut its power"):
+            robot.operator.stop(lambda: told.append(time.monotonic() - started_s), timeout_s=0.6)
+        assert len(told) == 1
+        assert 0.3 <= told[0] < 0.5
+        assert 6 <= len(heard) <= 13
+
+
+def test_silence_and_another_version_are_told_apart():
+    robot = PumpedRobot()
+    with pytest.raises(LinkError, match="is not heard"):
+        robot.operator.wait_report(timeout_s=0.1)
+    with PumpedRobot(says='"v":2') as other, pytest.raises(LinkError, match="version 2; this peer speaks 1"):
+        other.operator.wait_report(timeout_s=1.0)
+
+
+def test_replies_to_others_are_not_taken():
+    with PumpedRobot() as robot:
+        other = Operator(robot.network.link("r1", role="operator"))
+        other.wait_report()
+        replies = [None, None]
+
+        def ask(at: int, operator: Operator, verb: Verb) -> None:
+            replies[at] = operator.ask(verb)
+
+        threads = [
+            threading.Thread(target=ask, args=(0, robot.operator, Verb.DISARM)),
+            threading.Thread(target=ask, args=(1, other, Verb.RESET)),
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert replies[0].detail == "disarmed"
+        assert replies[1].detail.startswith("nothing to reset")
+
+
+def test_status_says_every_counter_and_the_last_refusal():
+    with PumpedRobot(drives=False) as robot:
+        robot.operator.arm(patience_s=0)
+        for payload in (b"nan|1", b"nonsense", b"1|2|3"):
+            robot.driving.on_twist(Message(TWIST, "vision", b"", payload), robot.now_us)
+        status = robot.operator.wait_report().status
+        while status.refused.get("MALFORMED", 0) < 2:
+            status = robot.operator.wait_report().status
+    text = "\n".join(status_lines("r1", status))
+    for reason, count in status.refused.items():
+        assert f"{reason} {count}" in text
+    assert status.last_refusal.detail in text
+    assert status_line("r1", status) == "r1: DISARMED (not armed)"
+
+
+def test_a_report_is_what_was_published():
+    driving = Driving(RobotConfig(), "0000000a")
+    message = next(one for one in driving.messages(5) if one.channel is STATUS)
+    report = read_report(message)
+    assert report.stamp.t_us == 5
+    assert report.status == Status.model_validate_json(message.payload)

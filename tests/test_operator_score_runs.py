@@ -1,0 +1,67 @@
+"""`sightline score`: every combination runs, the worst is what is judged, and the verdict is the exit code."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from operator_side import cli
+from operator_side.score import Score
+from operator_side.score_runs import Case, ScoreReport, cases, judge_runs, run_case, run_cases
+from operator_side.score_table import score_text
+from protocol.errors import ConfigError
+
+GOOD = Score(
+    acquired_s=1.0, found_s=0.0, bearing_rms_deg=0.2, distance_rms_m=0.01, lost_percent=0.0, wall_contacts=0,
+    travelled_m=1.0, seconds=5.0,
+)
+
+
+def test_every_combination_is_a_case_and_groups_lie_together():
+    wanted = cases(["static", "eight"], [1, 2], [0, 50], [0.0, 0.1], None)
+    assert len(set(wanted)) == 16
+    groups = [case.group for case in wanted]
+    assert all(groups.index(name) + groups.count(name) - 1 == len(groups) - 1 - groups[::-1].index(name)
+               for name in groups)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(["cirle"], [1], [0], [0]), (["circle"], [], [0], [0]), (["circle"], [-1], [0], [0]),
+     (["circle"], [1], [-1], [0]), (["circle"], [1], [0], [1.0]), (["circle"], [1], [0], [float("nan")])],
+)
+def test_what_cannot_be_run_is_refused_before_anything_runs(arguments):
+    with pytest.raises(ConfigError):
+        cases(*arguments, None)
+
+
+@pytest.mark.parametrize("at", range(3))
+@pytest.mark.parametrize("bad", [{"bearing_rms_deg": 0.9}, {"acquired_s": None}, {"wall_contacts": 1}])
+def test_one_bad_run_of_three_fails_its_figure_and_no_other(at, bad):
+    runs = [(Case("static", 50, 0.1, seed, 5.0), GOOD) for seed in range(3)]
+    assert all(one.ok for one in judge_runs(runs))
+    runs[at] = (runs[at][0], replace(GOOD, **bad))
+    judged = judge_runs(runs)
+    assert [one.name for one in judged if not one.ok] == list(bad)
+    failed = next(one for one in judged if not one.ok)
+    assert failed.worst == next(iter(bad.values()))
+    assert "FAIL" in score_text(ScoreReport(runs, judged))
+
+
+def test_runs_on_several_processes_are_those_of_one():
+    wanted = cases(["static", "behind"], [301], [50], [0.1], 1.5)
+    done = []
+    report = run_cases(wanted, 2, done.append)
+    assert sorted(done, key=str) == sorted(wanted, key=str)
+    assert report.runs == [(case, run_case(case)) for case in wanted]
+
+
+def test_the_command_prints_one_object_and_exits_5_when_not_ok(capsys):
+    options = ["--scenario", "static", "--seeds", "302", "--json", "--seconds"]
+    assert cli.run(["score", *options, "4"]) == 0
+    good = json.loads(capsys.readouterr().out)
+    assert good["ok"] and good["checks"] and len(good["runs"]) == 1
+    assert cli.run(["score", *options, "1", "--latency-ms", "300"]) == 5, "nobody acquires a target in this time"
+    bad = json.loads(capsys.readouterr().out)
+    assert not bad["ok"]
+    assert "acquired_s" in next(check["name"] for check in bad["checks"] if not check["ok"])

@@ -1,0 +1,180 @@
+"""Settings: precedence, origins, and every mistake as one line that names it."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from operator_side.service_settings import load_service
+from operator_side.settings import ENV_PREFIX, SERVICES, load, model_of
+from operator_side.settings_keys import is_known, known_keys
+from operator_side.toml_text import toml_text
+from protocol.errors import ConfigError
+
+KEY = "safety.max_linear_mps"
+ENV = "SIGHTLINE_ROBOT__SAFETY__MAX_LINEAR_MPS"
+SOURCES = ("file", "environ", "sets", "options")
+
+
+def one_line(error: pytest.ExceptionInfo[ConfigError]) -> str:
+    text = str(error.value)
+    assert "\n" not in text
+    return text
+
+
+def given_by(sources: dict[str, float], folder: Path) -> dict[str, object]:
+    """Arguments of `load` in which each source gives KEY its own value."""
+    arguments: dict[str, object] = {"environ": {}}
+    for source, value in sources.items():
+        if source == "file":
+            path = folder / "robot.toml"
+            path.write_text(f"[safety]\nmax_linear_mps = {value}\n")
+            arguments["file"] = str(path)
+        elif source == "environ":
+            arguments["environ"] = {ENV: str(value), "PATH": "/bin"}
+        elif source == "sets":
+            arguments["sets"] = [f"{KEY}={value}"]
+        else:
+            arguments["options"] = {KEY: value, "robot": None}
+    return arguments
+
+
+@given(st.dictionaries(st.sampled_from(SOURCES), st.sampled_from([0.11, 0.22, 0.33, 0.44])))
+def test_the_strongest_source_wins_and_is_named(tmp_path_factory, sources):
+    folder = tmp_path_factory.mktemp("settings")
+    loaded = load("robot", **given_by(sources, folder))
+    strongest = max(sources, key=SOURCES.index, default=None)
+    assert loaded.config.safety.max_linear_mps == (sources[strongest] if strongest else 0.5)
+    origins = {
+        None: "default", "file": str(folder / "robot.toml"), "environ": ENV, "sets": "--set",
+        "options": "--max-linear-mps",
+    }
+    assert loaded.origin(("safety", "max_linear_mps")) == origins[strongest]
+    assert loaded.origin(("safety", "silence_ms")) == "default"
+
+
+def test_one_key_of_a_table_leaves_the_others_at_their_defaults():
+    loaded = load("robot", sets=["camera.options.folder=/pictures"], environ={})
+    assert loaded.config.camera.kind == "sim"
+    assert loaded.config.camera.options == {"folder": "/pictures"}
+
+
+@pytest.mark.parametrize("service", SERVICES)
+def test_every_key_can_be_given_in_the_environment(service):
+    keys = list(known_keys(model_of(service)))
+    assert keys
+    for key in keys:
+        assert is_known(model_of(service), key)
+        name = ENV_PREFIX + "__".join((service, *key)).upper()
+        with pytest.raises(ConfigError) as error:
+            load(service, environ={name[:-1] + "QQ": "1"})
+        assert "no environment variable called" in one_line(error)
+
+
+@pytest.mark.parametrize("name", ["SIGHTLINE_ROBOT__SAFETY__MAX_LINEAR_MPSS", "SIGHTLINE_ROBOT__SAFTY__MAX_LINEAR_MPS"])
+def test_a_misspelt_environment_name_is_refused_with_the_nearest(name):
+    for service in SERVICES:  # whatever is started: nobody must believe that it was heard
+        with pytest.raises(ConfigError, match=f"did you mean '{ENV}'"):
+            load(service, environ={name: "0.3"})
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ("safety.max_linear_mps=nan", ["--set safety.max_linear_mps", "nan", "finite"]),
+        ("safety.max_linear_mps=-1", ["--set safety.max_linear_mps", "-1", "above 0 to 3"]),
+        ("safety.max_linear_mps=fast", ["--set safety.max_linear_mps", "'fast'", "a number"]),
+        ("safety.auto_arm=7", ["--set safety.auto_arm", "7", "true or false"]),
+        ("safety.max_linear_mp=1", ["unknown key", "'safety.max_linear_mps'"]),
+        ("max_linear_mps=1", ["unknown key", "'safety.max_linear_mps'"]),
+        ("camera=3", ["--set camera", "3", "a table"]),
+        ("listen=nowhere", ["'nowhere'", "tcp/127.0.0.1:7447"]),
+        ("listen=tcp/127.0.0.1:99999", ["99999", "65535"]),
+        ("robot=a/b", ["'a/b'", "letters"]),
+        ("safety.full_speed_age_ms=400", ["safety: ", "below zero_speed_age_ms"]),
+        ("no equals sign", ["key=value"]),
+    ],
+)
+def test_a_bad_value_is_one_line_that_names_it_and_what_is_allowed(setting, expected):
+    with pytest.raises(ConfigError) as error:
+        load("robot", sets=[setting], environ={})
+    for part in expected:
+        assert part in one_line(error)
+
+
+def test_several_errors_are_the_first_and_a_count(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text("foo = 1\n[safety]\nmax_linear_mps = -1\nsilence_ms = 'x'\n")
+    with pytest.raises(ConfigError) as error:
+        load("robot", file=str(path), environ={})
+    assert str(path) in one_line(error)
+    assert one_line(error).endswith("(and 2 more)")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("= 1", "is no TOML"), ("[safety]\nmax_linear_mps = inf", "= inf: should be a finite number")],
+)
+def test_a_bad_file_is_named(tmp_path, text, expected):
+    path = tmp_path / "robot.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        load("robot", file=str(path), environ={})
+    assert one_line(error).startswith(str(path))
+    assert expected in one_line(error)
+
+
+def test_text_that_looks_like_a_number_is_text_where_text_belongs():
+    loaded = load("robot", sets=["robot=7"], environ={"SIGHTLINE_ROBOT__LISTEN": "tcp/127.0.0.1:1,tcp/127.0.0.1:2"})
+    assert loaded.config.robot == "7"
+    assert loaded.config.listen == ("tcp/127.0.0.1:1", "tcp/127.0.0.1:2")
+
+
+def test_what_is_implied_yields_to_what_is_said():
+    plain = load_service("robot", environ={})
+    assert plain.config.range_sensor.kind == "sim"
+    assert plain.origin(("range_sensor", "kind")) == "implied by drive"
+    assert load_service("robot", environ={}, sets=["drive.kind=log"]).config.range_sensor is None
+    connects = {"options": {"connect": ("tcp/127.0.0.1:1",)}, "environ": {}}
+    assert load_service("robot", **connects).config.listen == ()
+    assert load_service("robot", sets=["listen=tcp/127.0.0.1:2"], **connects).config.listen == ("tcp/127.0.0.1:2",)
+    assert load_service("vision", environ={}, options={"listen": ("tcp/127.0.0.1:1",)}).config.connect == ()
+
+
+@pytest.mark.parametrize("profile", [None, "sim"])
+def test_one_folder_of_sockets_is_enough_for_the_whole_simulated_robot(profile):
+    options = {f"{device}.options.socket_dir": "/s" for device in ("camera", "drive")}
+    config = load_service("robot", profile=profile, options=options, environ={}).config
+    assert config.range_sensor == config.drive == config.camera
+    other = load_service("robot", options=options, sets=["range_sensor.kind=other"], environ={}).config
+    assert other.range_sensor.kind == "other"
+
+
+def test_the_simulation_profile_arms_by_itself_and_nothing_else_does():
+    assert load("robot", profile="sim", environ={}).config.safety.auto_arm
+    assert not load("robot", environ={}).config.safety.auto_arm
+    with pytest.raises(ConfigError, match="did you mean 'sim'"):
+        load("robot", profile="simm", environ={})
+
+
+@pytest.mark.parametrize("service", SERVICES)
+def test_what_show_prints_is_a_file_that_gives_the_same(service, tmp_path):
+    config = load(service, environ={}).config
+    path = tmp_path / "shown.toml"
+    path.write_text(toml_text(config.model_dump(mode="json"), lambda _key: "where it came from"))
+    assert load(service, file=str(path), environ={}).config == config
+
+
+NAMES = st.text(st.characters(codec="utf-8", exclude_categories=["Cs"]), min_size=1, max_size=8)
+VALUES = st.recursive(
+    st.booleans() | st.integers(-(2**53), 2**53) | st.text(max_size=8) | st.floats(-1e6, 1e6),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(NAMES, inner, min_size=1, max_size=3),
+    max_leaves=10,
+)
+
+
+@given(st.dictionaries(NAMES, VALUES, max_size=4))
+def test_any_table_survives_as_toml(table):
+    assert tomllib.loads(toml_text(table)) == table
