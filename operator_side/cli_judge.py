@@ -1,21 +1,17 @@
-"""Commands that judge: `demo`, `score`, `bench`. Shell. Exit code 5 when a check is outside its bound."""
+"""Commands that judge: `demo`, `score`. Shell. Exit code 5 when a check is outside its bound."""
 
 import json
 import os
 import webbrowser
 from collections.abc import Callable
-from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import Annotated, TypeVar
 
 import typer
 
 from operator_side.extras import needs
 from protocol.errors import ConfigError
-
-if TYPE_CHECKING:
-    from operator_side.score import Check
 
 CHECK_FAILED = 5
 Number = TypeVar("Number", int, float)
@@ -27,10 +23,6 @@ def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline demo --scenario eight --latency-ms 100 --loss 0.1")(demo)
     app.command(epilog="Example: sightline score --scenario circle,eight --seeds 101,102,103")(score)
-    group = typer.Typer(help="Measure what things cost on this machine.", rich_markup_mode=None)
-    group.command(epilog="Example: sightline bench codec --json")(codec)
-    group.command(epilog="Example: sightline bench pipeline")(pipeline)
-    app.add_typer(group, name="bench")
 
 
 def demo(
@@ -91,7 +83,7 @@ def score(
         from sim.scenario import scenario_names
     wanted = cases(
         scenario_names() if scenario == "all" else scenario.split(","),
-        _numbers("--seeds", seeds, int), _numbers("--latency-ms", latency_ms, float), _numbers("--loss", loss, float),
+        numbers("--seeds", seeds, int), numbers("--latency-ms", latency_ms, float), numbers("--loss", loss, float),
         seconds,
     )
     with progress(len(wanted)) as advance:
@@ -100,42 +92,9 @@ def score(
     return 0 if report.ok else CHECK_FAILED
 
 
-def _numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:
+def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:
+    """The numbers of an option, separated by commas. Raises ConfigError with an example."""
     try:
         return [kind(part) for part in text.split(",")]
     except ValueError:
         raise ConfigError(f"{option} {text!r}: numbers separated by commas, e.g. {option} 1,2,3") from None
-
-
-def codec(*, as_json: Json = False) -> int:
-    """Encode and decode a frame header and a twist."""
-    from benchmarks.codec import measure_codec
-    from operator_side.score import Check
-
-    costs = measure_codec()
-    return _print_checks([Check(cost.name, cost.median_us, "us", cost.bound_us, cost.ok) for cost in costs], as_json)
-
-
-def pipeline(*, as_json: Json = False) -> int:
-    """Picture in, command out: decode, detect, track, steer."""
-    with needs("vision"):
-        from benchmarks.pipeline import time_steps
-    from operator_side.score import Check
-
-    checks = [
-        Check(f"step at {one.width_px}x{one.height_px}", one.median_us, "us", one.bound_us,
-              one.median_us <= one.bound_us and one.phase == "tracking")
-        for one in time_steps()
-    ]
-    return _print_checks(checks, as_json)
-
-
-def _print_checks(checks: "list[Check]", as_json: bool) -> int:
-    from operator_side.check_text import check_line
-
-    ok = all(check.ok for check in checks)
-    if as_json:
-        typer.echo(json.dumps({"ok": ok, "checks": [asdict(check) for check in checks]}))
-    else:
-        typer.echo("\n".join(check_line(check) for check in checks))
-    return 0 if ok else CHECK_FAILED

@@ -18,7 +18,7 @@ from robot_side.config import DEFAULT_ENDPOINT
 
 REFUSED_EXIT = 5
 
-Robot = Annotated[str, typer.Option("--robot", metavar="ID", help="The robot's id.")]
+Robot = Annotated[str, typer.Argument(metavar="[ROBOT]", help="The robot's id.")]
 Connect = Annotated[list[str], typer.Option("--connect", metavar="ENDPOINT", help="Where the robot or router listens.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
 DEFAULT_CONNECT = [DEFAULT_ENDPOINT]
@@ -27,8 +27,8 @@ DEFAULT_CONNECT = [DEFAULT_ENDPOINT]
 def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline robots --connect tcp/192.168.1.20:7447")(robots)
-    app.command(epilog="Example: sightline status --watch")(status)
-    app.command(epilog="Example: sightline arm --robot r1")(arm)
+    app.command(epilog="Example: sightline status r1 --watch")(status)
+    app.command(epilog="Example: sightline arm r1 --connect tcp/192.168.1.20:7447")(arm)
     app.command(epilog="Example: sightline disarm")(disarm)
     app.command(epilog="Example: sightline stop")(stop)
     app.command(epilog="Example: sightline reset && sightline arm")(reset)

@@ -62,6 +62,9 @@ def robot(
     listen: Listen = None,
     connect: Connect = None,
     profile: Annotated[str | None, typer.Option(help="`sim`: simulated, armed without a person.")] = None,
+    zero_motors: Annotated[
+        bool, typer.Option("--zero-motors", help="Only set the motors to zero, e.g. after a crash, and end.")
+    ] = False,
     socket_dir: SocketDir = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -71,6 +74,7 @@ def robot(
     With no configuration its hardware is the simulation (`sightline sim`).
     """
     from robot_side.driver import run
+    from robot_side.driver import zero_motors as set_to_zero
 
     options: dict[str, Any] = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect)}
     options |= {f"{device}.options.socket_dir": socket_dir for device in ("camera", "drive")}
@@ -78,7 +82,7 @@ def robot(
         "robot", profile=profile, file=config, sets=sets or (), options=options, environ=os.environ
     )
     with needs("zenoh"):
-        return run(loaded.config)  # type: ignore[arg-type]
+        return (set_to_zero if zero_motors else run)(loaded.config)  # type: ignore[arg-type]
 
 
 def vision(

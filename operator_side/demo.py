@@ -160,7 +160,6 @@ def _write_configuration(run: DemoRun, sockets: str) -> None:
         },
         "robot": {
             "robot": ROBOT, "state_dir": str(run.folder / "state"), "camera": device, "drive": device,
-            "range_sensor": device,
         },
         "vision": {
             "robot": ROBOT,

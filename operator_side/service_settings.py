@@ -25,22 +25,11 @@ def load_service(
 
 
 def _implied(loaded: Loaded) -> Iterator[Given]:
-    """A robot told where to connect need not listen, nor a vision box told to listen connect; a simulated drive has a
-    simulated range sensor, so that the guard is on wherever there are walls."""
-    service, config = loaded.service, loaded.config
+    """A robot told where to connect need not listen, nor a vision box told to listen connect."""
+    service = loaded.service
     listens, connects = (loaded.origin((name,)) != "default" for name in ("listen", "connect"))
     if service == "robot" and connects and not listens:
         yield Given(("listen",), (), "implied by connect")
     if service == "vision" and listens and not connects:
         yield Given(("connect",), (), "implied by listen")
-    if service == "robot":
-        yield from _implied_range_sensor(config.model_dump())
 
-
-def _implied_range_sensor(robot: Mapping[str, Any]) -> Iterator[Given]:
-    drive, sensor = robot["drive"], robot["range_sensor"]
-    if drive["kind"] == "sim" and (sensor is None or sensor["kind"] == "sim"):
-        origin = "implied by drive"
-        yield Given(("range_sensor", "kind"), "sim", origin)
-        for name, value in drive["options"].items():  # the same simulation
-            yield Given(("range_sensor", "options", name), value, origin)

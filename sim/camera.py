@@ -10,10 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-import pybullet
 import simplejpeg
 
 from protocol.messages import CameraModel
+from sim.engine import pybullet
 from sim.look import Look
 from sim.scenario import Wall
 from sim.wall_painter import WallPainter

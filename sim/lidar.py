@@ -6,9 +6,9 @@ import array
 import math
 
 import numpy as np
-import pybullet
 
 from robot_side.ports import Ranges
+from sim.engine import pybullet
 from sim.physics import TARGET, WALL, Vector
 from sim.robot_model import LidarModel
 

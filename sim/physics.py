@@ -9,9 +9,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import pybullet
-
 from sim.body import CASTER_JOINT, LEFT_JOINT, RIGHT_JOINT, urdf
+from sim.engine import pybullet
 from sim.robot_model import RobotModel
 from sim.scenario import Ball, Pushed, Wall
 

@@ -4,8 +4,8 @@ import math
 from typing import Protocol
 
 import numpy as np
-import pybullet
 
+from sim.engine import pybullet
 from sim.path import Place
 from sim.physics import Vector
 from sim.scenario import OnPath, Pushed, Static

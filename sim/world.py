@@ -9,10 +9,10 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-import pybullet
 
 from robot_side.ports import Ranges, WheelAngles
 from sim.camera import Defects, SceneCamera
+from sim.engine import pybullet
 from sim.lidar import Lidar
 from sim.motors import Motor
 from sim.path import Place

@@ -85,7 +85,7 @@ def test_alone_it_shows_its_help(capsys):
         (["score", "--seeds", "a,b"], 2, "--seeds 1,2,3"),
         (["score", "--latency-ms", "-5"], 2, "0 to 10000"),
         (["status", "--connect", "here"], 2, "tcp/127.0.0.1:7447"),
-        (["arm", "--robot", "a b"], 2, "'a b'"),
+        (["arm", "a b"], 2, "'a b'"),
         (["robots", "--connect", "tcp/127.0.0.1:1", "--seconds", "0.3"], 4, "nobody answers at tcp/127.0.0.1:1"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -135,7 +135,7 @@ def test_config_commands_print_what_a_script_can_read(capsys, tmp_path):
     assert "target" in json.loads(out)["properties"]
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["config", "show", "robot"], ["arm", "--robot", "a/b"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["config", "show", "robot"], ["arm", "a/b"]])
 def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
     script = (
         "import sys; from operator_side import cli; cli.run(sys.argv[1:]);"

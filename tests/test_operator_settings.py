@@ -134,9 +134,9 @@ def test_text_that_looks_like_a_number_is_text_where_text_belongs():
 
 def test_what_is_implied_yields_to_what_is_said():
     plain = load_service("robot", environ={})
-    assert plain.config.range_sensor.kind == "sim"
-    assert plain.origin(("range_sensor", "kind")) == "implied by drive"
-    assert load_service("robot", environ={}, sets=["drive.kind=log"]).config.range_sensor is None
+    assert plain.config.ranging.kind == "sim"
+    assert load_service("robot", environ={}, sets=["drive.kind=log"]).config.ranging is None
+    assert load_service("robot", environ={}, sets=["range_sensor.kind=none"]).config.ranging is None
     connects = {"options": {"connect": ("tcp/127.0.0.1:1",)}, "environ": {}}
     assert load_service("robot", **connects).config.listen == ()
     assert load_service("robot", sets=["listen=tcp/127.0.0.1:2"], **connects).config.listen == ("tcp/127.0.0.1:2",)
@@ -147,9 +147,9 @@ def test_what_is_implied_yields_to_what_is_said():
 def test_one_folder_of_sockets_is_enough_for_the_whole_simulated_robot(profile):
     options = {f"{device}.options.socket_dir": "/s" for device in ("camera", "drive")}
     config = load_service("robot", profile=profile, options=options, environ={}).config
-    assert config.range_sensor == config.drive == config.camera
+    assert config.ranging == config.drive == config.camera
     other = load_service("robot", options=options, sets=["range_sensor.kind=other"], environ={}).config
-    assert other.range_sensor.kind == "other"
+    assert other.ranging.kind == "other"
 
 
 def test_the_simulation_profile_arms_by_itself_and_nothing_else_does():

@@ -21,10 +21,11 @@ from protocol.refusals import Refusal
 from protocol.transports.link import LatestSlot, Link, Message
 from protocol.twist_text import format_twist
 from vision_side.config import VisionConfig
-from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, answer_header
+from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, Seen, answer_header
 
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 _SILENCE_S = 3.0
+_CAMERA_PATIENCE_S = 1.5
 _TOLD_COUNTS = tuple(10**power for power in range(10))  # a camera gone bad is told at 1, 10, 100 ... pictures
 Say = Callable[[str], None]
 Model = TypeVar("Model", CameraModel, FrameHeader)
@@ -68,6 +69,7 @@ class Service:
         self._robot_session = ""
         self._said: dict[str, str] = {}
         self._heard_s = time.monotonic()
+        self._blind_since_s = 0.0
         self.answered = 0
         self.skipped: Counter[str] = Counter()
 
@@ -100,13 +102,20 @@ class Service:
         self._heard_s = time.monotonic()
         self._tell("link", f"frames from robot {self._config.robot}, session {header.session}")
         if self._pipeline is None:
-            self._tell("camera", "frames come, waiting for the camera's model")
+            self._wait_for_camera()
+            self._publish(header, Answer(None, Seen("no picture", note="no camera model yet")), 0)
             return
         before = self._pipeline.skipped.copy()
         answer = self._pipeline.step(Frame(header, message.payload))
         self.skipped.update(self._pipeline.skipped - before)
         self._publish(header, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._tell_phase(answer)
+
+    def _wait_for_camera(self) -> None:
+        """The model comes twice a second; only a longer wait is worth a word."""
+        self._blind_since_s = self._blind_since_s or time.monotonic()
+        if time.monotonic() - self._blind_since_s > _CAMERA_PATIENCE_S:
+            self._tell("camera", "frames come, but no camera model; is the robot of another version?")
 
     def _publish(self, header: FrameHeader, answer: Answer, compute_us: int) -> None:
         self.answered += 1

@@ -1,0 +1,126 @@
+"""`sightline bench`: what things cost on this machine. Shell. Exit code 5 when a check is outside its bound."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from operator_side.cli_judge import CHECK_FAILED, Json, numbers
+from operator_side.extras import needs
+
+if TYPE_CHECKING:
+    from operator_side.score import Check
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    group = typer.Typer(help="Measure what things cost on this machine.", rich_markup_mode=None)
+    group.command(epilog="Example: sightline bench codec --json")(codec)
+    group.command(epilog="Example: sightline bench pipeline")(pipeline)
+    group.command(epilog="Example: sightline bench odometry")(odometry)
+    group.command(epilog="Example: sightline bench robot --seconds 60")(robot)
+    group.command(epilog="Example: sightline bench demo --scenario circle --seeds 201,202,203")(demo)
+    group.command(epilog="Example: sightline bench report --out docs/performance.md")(report)
+    app.add_typer(group, name="bench")
+
+
+def codec(*, as_json: Json = False) -> int:
+    """Encode and decode a frame header and a twist."""
+    from benchmarks.codec import measure_codec
+    from operator_side.score import Check
+
+    costs = measure_codec()
+    return _print_checks([Check(cost.name, cost.median_us, "us", cost.bound_us, cost.ok) for cost in costs], as_json)
+
+
+def pipeline(*, as_json: Json = False) -> int:
+    """Picture in, command out: decode, detect, track, steer."""
+    with needs("vision"):
+        from benchmarks.pipeline import time_steps
+    from operator_side.score import Check
+
+    checks = [
+        Check(f"step at {one.width_px}x{one.height_px}", one.median_us, "us", one.bound_us,
+              one.median_us <= one.bound_us and one.phase == "tracking")
+        for one in time_steps()
+    ]
+    return _print_checks(checks, as_json)
+
+
+def odometry(*, as_json: Json = False) -> int:
+    """Dead reckoning against the simulated world's truth."""
+    with needs("sim"):
+        from benchmarks.odometry import measure_odometry
+    from operator_side.score import Check
+
+    errors = measure_odometry()
+    checks = [Check(one.name, one.percent, "%", one.bound_percent, one.percent <= one.bound_percent) for one in errors]
+    return _print_checks(checks, as_json)
+
+
+def robot(
+    *, seconds: Annotated[float, typer.Option(min=5, max=600, help="How long to drive.")] = 60.0, as_json: Json = False
+) -> int:
+    """The robot service in a bare environment of its own: frame rate and memory. Needs a checkout and pip."""
+    with needs("all"):
+        from benchmarks.light_robot import NETWORK_BOUND_MB, measure_light_robot
+    from operator_side.score import Check
+
+    seen = measure_light_robot(seconds)
+    checks = [
+        Check("heavy packages installed", len(seen.heavy_packages), "", 0, not seen.heavy_packages),
+        Check("missing from 30 fps", 30 - seen.fps, "fps", 0.6, seen.fps >= 29.4),
+        Check("time not driving", 100 - seen.driving_percent, "%", 2.0, seen.driving_percent >= 98),
+        Check("memory, network process", seen.network_mb, "MB", NETWORK_BOUND_MB, seen.network_mb <= NETWORK_BOUND_MB),
+        Check("memory, driver", seen.driver_mb, "MB", NETWORK_BOUND_MB, seen.driver_mb <= NETWORK_BOUND_MB),
+    ]
+    return _print_checks(checks, as_json)
+
+
+def demo(
+    *,
+    scenario: Annotated[str, typer.Option(help="`all`, or names separated by commas.")] = "all",
+    seeds: Annotated[str, typer.Option(help="Separated by commas.")] = "201,202,203",
+    seconds: Annotated[float, typer.Option(min=5, max=3600, help="Of each demo.")] = 20.0,
+    as_json: Json = False,
+) -> int:
+    """Many demos in real time; the median over seeds is judged."""
+    with needs("all"):
+        from benchmarks.real_time import measure_demos
+        from operator_side.check_text import number
+        from sim.scenario import load_scenario, scenario_names
+    names = scenario_names() if scenario == "all" else scenario.split(",")
+    for name in names:
+        load_scenario(name)
+    figures = measure_demos(names, numbers("--seeds", seeds, int), seconds, lambda line: typer.echo(line, err=True))
+    ok = all(figure.ok for figure in figures)
+    if as_json:
+        checks = [{**asdict(figure), "value": figure.worst} for figure in figures]
+        typer.echo(json.dumps({"ok": ok, "checks": checks}))
+    for one in () if as_json else figures:
+        said = "ok" if one.ok else "FAIL"
+        typer.echo(f"{one.name:44} median {number(one.median)}  worst {number(one.worst)} {one.unit}"
+                   f"  bound {number(one.bound)}  {said}")
+    return 0 if ok else CHECK_FAILED
+
+
+def report(
+    *, out: Annotated[Path, typer.Option(metavar="FILE", help="The page to write.")] = Path("docs/performance.md")
+) -> int:
+    """Run every measurement that the performance page shows, and write the page. Takes about an hour."""
+    from benchmarks.report import SECTIONS, write_report
+
+    return 0 if write_report(out, SECTIONS, typer.echo) else CHECK_FAILED
+
+
+def _print_checks(checks: "list[Check]", as_json: bool) -> int:
+    from operator_side.check_text import check_line
+
+    ok = all(check.ok for check in checks)
+    if as_json:
+        typer.echo(json.dumps({"ok": ok, "checks": [asdict(check) for check in checks]}))
+    else:
+        typer.echo("\n".join(check_line(check) for check in checks))
+    return 0 if ok else CHECK_FAILED

@@ -1,0 +1,1 @@
+"""The fault bench: real processes, injected faults, judged from the simulated motors' own log."""

@@ -1,0 +1,41 @@
+"""What the bench's own processes note while they run, whatever becomes of them: one line per event. Shell (files).
+
+    good,T_US,FRAME_US      a command that the robot should obey was sent, citing the frame captured at FRAME_US
+    injected,T_US,0         the fault was done once more
+    told,T_US,0             a person's request was sent
+"""
+
+import os
+import time
+from pathlib import Path
+from typing import Final
+
+from operator_side.faults.judge import Sent
+
+GOOD: Final = "good"
+INJECTED: Final = "injected"
+TOLD: Final = "told"
+
+
+class Ledger:
+    """Appends; a line is in the file when `note` returns."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+
+    def note(self, kind: str, frame_us: int = 0) -> None:
+        """Note one event, now."""
+        os.write(self._file, f"{kind},{now_us()},{frame_us}\n".encode())
+
+
+def read_ledger(path: Path, kind: str) -> list[Sent]:
+    """The events of `kind`, oldest first; none while there is no file."""
+    if not path.exists():
+        return []
+    rows = [line.split(",") for line in path.read_text("ascii").split("\n")[:-1]]
+    return [Sent(int(t), int(frame)) for what, t, frame in rows if what == kind]
+
+
+def now_us() -> int:
+    """The clock of this machine's processes, the simulated robot's among them."""
+    return time.monotonic_ns() // 1000

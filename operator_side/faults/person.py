@@ -1,0 +1,28 @@
+"""A person at the robot, as a process: asks for STOP (and for reset while it still moves) when triggered. Shell."""
+
+import threading
+from typing import TYPE_CHECKING
+
+from operator_side.faults.ledger import INJECTED, TOLD, Ledger
+from operator_side.requests import SOURCE, Operator
+from protocol.messages import Verb
+from protocol.transports.zenoh import open_zenoh
+
+if TYPE_CHECKING:
+    from operator_side.faults.peer import PeerOptions
+
+
+def run_person(options: "PeerOptions", pulled: threading.Event, ledger: Ledger) -> int:
+    """Wait for the trigger, ask, and say what was answered."""
+    with open_zenoh(options.robot, connect=[options.endpoint], role=SOURCE, timeout_s=15) as link:
+        operator = Operator(link)
+        operator.wait_report(10.0)
+        print("person ready", flush=True)
+        pulled.wait()
+        ledger.note(TOLD)
+        ledger.note(INJECTED)
+        print(f"state {operator.stop(lambda: None).state}", flush=True)
+        if options.fault == "reset":
+            reply = operator.ask(Verb.RESET)
+            print(f"reset {reply.ok}: {reply.detail}", flush=True)
+    return 0
