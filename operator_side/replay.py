@@ -96,6 +96,8 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
             continue
         frame = Frame(decode(FrameHeader, message.header), message.payload)
         for header, sent in answers.by_frame.pop((frame.header.session, frame.header.seq), ()):
+            if sent is None and header.session not in pipelines:
+                continue  # before its first twist vision may not have had the camera's model: it only acknowledged
             pipeline = pipelines.setdefault(header.session, Pipeline(config, camera))
             yield Step(frame, sent, pipeline.step(frame))
 

@@ -18,11 +18,15 @@ MODE: Final = "camera.mode"
 LEDGER: Final = "camera.ledger"
 GIL_HELD_S: Final = 1
 SLOW_S: Final = 0.2
+HEAVY_BYTES: Final = 16_700
+"""At 30 fps, 4 Mbit/s."""
+SPARE: Final = {"black": (320, 240), "resized": (160, 120), "bomb": (64, 64)}
+"""Pictures that `write_spares` leaves in the folder, so that the robot's process needs no encoder."""
 _SOF0: Final = b"\xff\xc0\x00\x11\x08"
 
 
 class FaultyCamera:
-    """A `Camera`. Modes: gil, unplugged, frozen, black, slow, bomb, resized; anything else leaves it as it is."""
+    """A `Camera`. Modes: see FAULTS; anything else leaves it as it is."""
 
     class Config(SimSocketConfig):
         """`folder` holds the mode and the ledger."""
@@ -34,6 +38,7 @@ class FaultyCamera:
         self.model = self._camera.model
         self._mode = config.folder / MODE
         self._ledger = Ledger(config.folder / LEDGER)
+        self._spares = {name: (config.folder / f"{name}.jpg").read_bytes() for name in SPARE}
         self._last: Picture | None = None
         self._held = False
 
@@ -41,13 +46,13 @@ class FaultyCamera:
         """As `Camera` says, after what the mode does."""
         mode = self._mode.read_text("ascii") if self._mode.exists() else ""
         picture = self._camera.read(timeout_s)
-        if picture is None or mode not in FAULTS:
+        if picture is None or mode not in (*FAULTS, *SPARE) or (mode == "gil" and self._held):
             self._last = picture or self._last
-            return picture
-        if mode == "gil" and self._held:
             return picture
         self._held = mode == "gil"
         self._ledger.note(INJECTED)
+        if mode in SPARE:
+            return replace(picture, jpeg=self._spares[mode])
         return FAULTS[mode](picture, self._last or picture)
 
     def close(self) -> None:
@@ -73,29 +78,21 @@ def _slow(now: Picture, _last: Picture) -> Picture:
     return now
 
 
-def _black(now: Picture, _last: Picture) -> Picture:
-    return replace(now, jpeg=_picture(320, 240))
+def _heavy(now: Picture, _last: Picture) -> Picture:
+    return replace(now, jpeg=now.jpeg.ljust(HEAVY_BYTES, b"\0"))
 
 
-def _resized(now: Picture, _last: Picture) -> Picture:
-    return replace(now, jpeg=_picture(160, 120))
+FAULTS: Final = {"gil": _hold_gil, "unplugged": _unplugged, "frozen": _frozen, "slow": _slow, "heavy": _heavy}
 
 
-def _bomb(now: Picture, _last: Picture) -> Picture:
-    """A small file that claims 65500 x 65500 pixels: its decoder would fill the memory."""
-    jpeg = _picture(64, 64)
-    at = jpeg.index(_SOF0) + len(_SOF0)
-    return replace(now, jpeg=jpeg[:at] + b"\xff\xdc\xff\xdc" + jpeg[at + 4 :])
-
-
-def _picture(width_px: int, height_px: int) -> bytes:
+def write_spares(folder: Path) -> None:
+    """The pictures that are shown in place of what the camera sees; the bomb claims 65500 x 65500 pixels."""
     import cv2
     import numpy as np
 
-    return bytes(cv2.imencode(".jpg", np.zeros((height_px, width_px, 3), np.uint8))[1])
-
-
-FAULTS: Final = {
-    "gil": _hold_gil, "unplugged": _unplugged, "frozen": _frozen, "slow": _slow, "black": _black, "bomb": _bomb,
-    "resized": _resized,
-}
+    for name, (width_px, height_px) in SPARE.items():
+        jpeg = bytes(cv2.imencode(".jpg", np.zeros((height_px, width_px, 3), np.uint8))[1])
+        if name == "bomb":
+            at = jpeg.index(_SOF0) + len(_SOF0)
+            jpeg = jpeg[:at] + b"\xff\xdc\xff\xdc" + jpeg[at + 4 :]
+        (folder / f"{name}.jpg").write_bytes(jpeg)

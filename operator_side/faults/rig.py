@@ -1,0 +1,231 @@
+"""One robot at speed, about to be hurt: simulation, robot and who drives, as processes of their own. Shell."""
+
+import os
+import signal
+import socket
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+from operator_side.faults import camera, judge
+from operator_side.faults.fleet import COMMAND_LINE, Fleet, raise_priority
+from operator_side.faults.judge import Motors, Sent, wheel_mps
+from operator_side.faults.ledger import GOOD, INJECTED, now_us, read_ledger
+from operator_side.faults.peer import PeerOptions, Role
+from operator_side.faults.sampler import stalled_us
+from operator_side.faults.wires import BenchWire
+from operator_side.toml_text import toml_text
+from protocol.errors import SightlineError
+from sim.wire_tun import ADDRESS_A
+
+ROBOT: Final = "r1"
+READY_S: Final = 30.0
+AT_SPEED_S: Final = 25.0
+STEADY_US: Final = 500_000
+PORT: Final = 7447
+_POLL_S: Final = 0.01
+_CHASE: Final[dict[str, Any]] = {
+    "summary": "a ball on a circle at 0.4 m/s", "stand_off_m": 0.8, "look": "plain",
+    "target": {"kind": "path", "speed_mps": 0.4, "path": [{"length_m": 12.566371, "turn_deg": 360.0}]},
+    "start": {"distance_m": [0.8, 0.9], "bearing_deg": [-5.0, 5.0], "approach_deg": [170.0, 190.0]},
+}
+_EMPTY: Final[dict[str, Any]] = {
+    "summary": "an empty floor", "look": "plain", "target": {"kind": "static"},
+    "start": {"distance_m": [30.0, 30.0], "bearing_deg": [180.0, 180.0], "approach_deg": [0.0, 0.0]},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """Who drives and through what. `fault` is what the driving peer does when triggered."""
+
+    driver: Role = "driver"
+    fault: str = ""
+    wired: bool = False
+    clock: str = ""
+    """Python expression that is added to the wall clock of vision and robot, in seconds; "" leaves it."""
+    camera: str = ""
+    """Camera mode from the beginning."""
+
+    @property
+    def at_speed_mps(self) -> float:
+        """A scripted driver asks for 0.5 m/s; vision follows a ball at 0.4 m/s."""
+        return 0.3 if self.driver == "vision" else 0.48
+
+
+class Rig:
+    """Use it in a `with`: everything runs, and the wheels are at speed, once inside."""
+
+    def __init__(self, folder: Path, setup: Setup) -> None:
+        self.folder, self.setup = folder, setup
+        self._ending = ExitStack()
+        self.fleet = Fleet(folder)
+        self.wire: BenchWire | None = None
+        self.endpoint = ""
+        self._peers: list[str] = []
+        self._before_kib: dict[int, int] = {}
+
+    def __enter__(self) -> Self:
+        with self._ending:
+            self._start()
+            self._ending = self._ending.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.close()
+
+    def _start(self) -> None:
+        self.folder.mkdir(parents=True)
+        sockets = self._ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
+        self._ending.enter_context(self.fleet)
+        if self.setup.wired:
+            self.wire = self._ending.enter_context(BenchWire(self.folder / "wire.log"))
+        self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"tcp/127.0.0.1:{_free_port()}"
+        self._write_files(sockets)
+        self.fleet.run("sim", COMMAND_LINE, ["sim", "--config", str(self.folder / "sim.toml")])
+        self.fleet.run("sampler", "operator_side.faults.sampler", [str(self.folder / "holes.csv")])
+        self.fleet.wait_line("sim", "simulation ready", READY_S)
+        self.fleet.wait_line("sampler", "sampling", READY_S)
+        for name in ("sim", "sampler"):
+            raise_priority(self.fleet.pid(name))
+        self.start_robot()
+        self.start_peer("peer", self.setup.driver, fault=self.setup.fault)
+        self.wait_speed(self.setup.at_speed_mps)
+        self._before_kib = self.fleet.memory_kib()
+
+    def _write_files(self, sockets: str) -> None:
+        device = {"kind": "sim", "options": {"socket_dir": sockets}}
+        eye = {"kind": "operator_side.faults.camera:FaultyCamera",
+               "options": {"socket_dir": sockets, "folder": str(self.folder)}}
+        camera.write_spares(self.folder)
+        self.camera_mode(self.setup.camera)
+        files: dict[str, dict[str, Any]] = {
+            "scenario": _CHASE if self.setup.driver == "vision" else _EMPTY,
+            "sim": {"scenario": str(self.folder / "scenario.toml"), "socket_dir": sockets, "seed": 1,
+                    "motor_log": str(self.folder / "motors.csv")},
+            "robot": {"robot": ROBOT, "state_dir": str(self.folder / "state"), "camera": eye, "drive": device,
+                      "range_sensor": device, "safety": {"auto_arm": True}},
+            "vision": {"robot": ROBOT},
+        }
+        for name, table in files.items():
+            (self.folder / f"{name}.toml").write_text(toml_text(table), "utf-8")
+        (self.folder / "sitecustomize.py").write_text(_clock_text(self.setup.clock, self.folder), "utf-8")
+
+    # --- processes -----------------------------------------------------------------------------------------------
+
+    def start_robot(self) -> None:
+        """Start the robot and wait until it listens."""
+        arguments = ["robot", "--config", str(self.folder / "robot.toml"), "--listen", self.endpoint]
+        self.fleet.log("robot").unlink(missing_ok=True)
+        self.fleet.run("robot", COMMAND_LINE, arguments, namespace=self.wire.robot_side if self.wire else "",
+                       environment=self._environment())
+        self.fleet.wait_line("robot", f"robot {ROBOT}: on", READY_S)
+
+    def start_peer(self, name: str, role: Role, **changes: Any) -> None:
+        """Start a vision, a scripted driver or a person."""
+        options = PeerOptions(
+            role=role, endpoint=self.endpoint, ledger=self.folder / f"{name}.ledger",
+            config=self.folder / "vision.toml" if role == "vision" else None, **changes,
+        )
+        self._peers.append(name)
+        self.fleet.run(name, "operator_side.faults.peer", [options.model_dump_json()],
+                       namespace=self.wire.far_side if self.wire else "", environment=self._environment())
+
+    def _environment(self) -> dict[str, str]:
+        return {"PYTHONPATH": str(self.folder)} if self.setup.clock else {}
+
+    def trigger(self, name: str = "peer") -> int:
+        """Let a peer's fault begin; returns when that was."""
+        at_us = now_us()
+        self.fleet.signal(name, signal.SIGUSR1)
+        return at_us
+
+    def camera_mode(self, mode: str) -> int:
+        """From the next picture on the camera does this; returns when it was told."""
+        at_us, new = now_us(), self.folder / "camera.new"
+        new.write_text(mode, "ascii")
+        new.replace(self.folder / camera.MODE)
+        return at_us
+
+    def signal_network(self, number: signal.Signals) -> int:
+        """Send the robot's network process a signal; returns when that was."""
+        at_us = now_us()
+        os.kill(self.fleet.child("robot"), number)
+        return at_us
+
+    # --- waiting -------------------------------------------------------------------------------------------------
+
+    def watch(self, seconds: float) -> None:
+        """Let it run on."""
+        time.sleep(seconds)
+
+    def until(self, happened: Callable[[], bool], seconds: float, what: str) -> None:
+        """Wait for a fact. Raises SightlineError naming `what` when it takes longer."""
+        deadline_s = time.monotonic() + seconds
+        while not happened():
+            if time.monotonic() > deadline_s:
+                raise SightlineError(f"fault bench: {what} did not happen within {seconds:g} s; see {self.folder}")
+            time.sleep(_POLL_S)
+
+    def wait_speed(self, mps: float, seconds: float = AT_SPEED_S) -> None:
+        """Wait until the wheels have turned at `mps` or faster for half a second."""
+        self.until(lambda: self._is_steady(mps), seconds, f"{mps} m/s")
+
+    def _is_steady(self, mps: float) -> bool:
+        late = [row for row in self.motors() if row.t_us > now_us() - STEADY_US]
+        return len(late) > STEADY_US / 40_000 and all(wheel_mps(row) >= mps for row in late)
+
+    # --- evidence ------------------------------------------------------------------------------------------------
+
+    def motors(self) -> list[Motors]:
+        """The motors' log so far."""
+        path = self.folder / "motors.csv"
+        return judge.read_motors(path.read_text("ascii")) if path.exists() else []
+
+    def sent(self, name: str | None = None) -> list[Sent]:
+        """Good commands by one peer, or by all, oldest first."""
+        names = self._peers if name is None else [name]
+        return sorted((one for peer in names for one in self.noted(peer, GOOD)), key=lambda one: one.t_us)
+
+    def noted(self, name: str, kind: str) -> list[Sent]:
+        """What a peer, `camera` or `clock` noted of one kind."""
+        return read_ledger(self.folder / f"{name}.ledger", kind)
+
+    def injected(self, name: str = "peer") -> int:
+        """How often the fault was done."""
+        return len(self.noted(name, INJECTED))
+
+    def grown_mb(self) -> float:
+        """The most that any process has grown since the wheels were at speed."""
+        after_kib = self.fleet.memory_kib()
+        grown_kib = (after_kib[pid] - before for pid, before in self._before_kib.items() if pid in after_kib)
+        return max(grown_kib, default=0) / 1024
+
+    def stalled_us(self, from_us: int, to_us: int) -> int:
+        """The longest time in the window for which stamps cannot be trusted."""
+        return stalled_us(self.folder / "holes.csv", from_us, to_us)
+
+
+def _clock_text(expression: str, folder: Path) -> str:
+    """A `sitecustomize` that puts Python's wall clock wrong in every process that starts with this folder on its path."""
+    return f"""import os, pathlib, sys, time
+if {bool(expression)} and "operator_side.faults.sampler" not in sys.argv:
+    right, right_ns = time.time, time.time_ns
+    time.time = lambda: right() + ({expression or 0})
+    time.time_ns = lambda: right_ns() + int(({expression or 0}) * 1e9)
+    with open({str(folder / "clock.ledger")!r}, "a") as ledger:
+        ledger.write(f"{INJECTED},{{time.monotonic_ns() // 1000}},0\\n")
+"""
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
