@@ -64,12 +64,12 @@ def test_every_file_says_what_it_is_and_pure_files_are_pure(path):
     head = docstring.split("\n\n")[0]
     assert ("Pure" in head) != ("Shell" in head), "the first paragraph says Pure or Shell"
     if "Pure" in head:
-        # `Random(seed)` is a pure function of its seed; the module's own functions are not.
-        used = roots(path) & SHELL_MODULES
-        assert used <= {"random"}
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "random":
-                assert node.attr == "Random"
+        assert not roots(path) & SHELL_MODULES - {"random"}
+        for node in ast.walk(tree):  # `Random(seed)` is a function of its seed; the module's own functions are not
+            if isinstance(node, ast.Import):
+                assert "random" not in {alias.name for alias in node.names}
+            if isinstance(node, ast.ImportFrom) and node.module == "random":
+                assert {alias.name for alias in node.names} == {"Random"}
 
 
 @pytest.mark.parametrize(
