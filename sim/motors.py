@@ -1,7 +1,7 @@
 """A wheel's motor and encoder: acceleration limit, lag, slip, steps. Pure."""
 
 import math
-import random
+from random import Random
 
 from sim.robot_model import Wheels
 
@@ -15,7 +15,7 @@ class Motor:
         self._model = model
         self._most_change_rad_s = model.max_accel_mps2 / model.radius_m * step_s
         self._follow = 1.0 - math.exp(-step_s / model.lag_s) if model.lag_s else 1.0
-        self._draw = random.Random(seed)
+        self._draw = Random(seed)
         self._wanted_rad_s = self._ramped_rad_s = self._speed_rad_s = 0.0
         self._steps = 0
         self._kept = 1.0

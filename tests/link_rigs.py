@@ -3,14 +3,19 @@
 A rig opens links to robot "r1", puts raw bytes as a stranger could, and lets time pass.
 """
 
+import json
 import socket
 import time
 from collections.abc import Callable
 
+import pytest
 import zenoh
+from websockets.sync.client import ClientConnection, connect
 
+from protocol.errors import LinkError
 from protocol.transports.link import Link
 from protocol.transports.memory import MemoryNetwork
+from protocol.transports.websocket import open_websocket
 from protocol.transports.zenoh import open_zenoh
 from protocol.transports.zenoh_session import open_session
 
@@ -130,4 +135,56 @@ class ChainedZenohRig(RelayedZenohRig):
         return link
 
 
-RIGS = {"memory": MemoryRig, "zenoh": ZenohRig, "zenoh-relayed": RelayedZenohRig, "zenoh-chained": ChainedZenohRig}
+class WebSocketRig(ZenohRig):
+    """Real connections over loopback: the robot listens, all others connect to it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.endpoint = self.endpoint.replace("tcp/", "ws://")
+        self._claimant: ClientConnection | None = None
+
+    def robot(self, robot: str = "r1") -> Link:
+        return self._opened(open_websocket(robot, listen=self.endpoint))
+
+    def peer(self, role: str = "vision", robot: str = "r1") -> Link:
+        if robot == "r1":
+            return self._opened(open_websocket(robot, connect=self.endpoint, role=role))
+        with pytest.raises(LinkError, match=f"this is robot r1, not {robot}"):  # one endpoint serves one robot
+            open_websocket(robot, connect=self.endpoint, role=role)
+        return self._opened(open_websocket(robot, listen=free_endpoint().replace("tcp/", "ws://"), role=role))
+
+    def stranger_puts(self, key: str, header: bytes, payload: bytes) -> None:
+        if self._claimant is None:
+            self._claimant = hail(self.endpoint, role="vision")
+        self._claimant.send(claim(key, header, payload))
+
+    def close(self) -> None:
+        super().close()
+        if self._claimant is not None:
+            self._claimant.close()
+
+
+def hail(endpoint: str, **hello: object) -> ClientConnection:
+    """A bare client of `sightline.v1` that has said hello and been answered."""
+    connection = connect(endpoint, subprotocols=["sightline.v1"], compression=None, legacy=True)
+    connection.send(json.dumps({"robot": "r1", "session": "0000beef"} | hello))
+    connection.recv(5)
+    return connection
+
+
+def claim(key: str, header: bytes, payload: bytes) -> bytes:
+    """A binary message that claims to be of `key`, as far as the framing has words for it."""
+    channel, _, source = key.removeprefix("sightline/r1/").partition("/")
+    if not key.startswith("sightline/r1/"):
+        channel, source = key, ""
+    block = json.dumps({"channel": channel, "source": source}, separators=(",", ":")).encode() + header
+    return len(block).to_bytes(2) + block + payload
+
+
+RIGS = {
+    "memory": MemoryRig,
+    "websocket": WebSocketRig,
+    "zenoh": ZenohRig,
+    "zenoh-relayed": RelayedZenohRig,
+    "zenoh-chained": ChainedZenohRig,
+}

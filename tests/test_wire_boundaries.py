@@ -1,6 +1,5 @@
 """Every number of the twist grammar and of the JPEG bound: just inside, at it, just outside. No hypothesis: fast and exact."""
 
-import math
 
 import pytest
 
@@ -111,14 +110,18 @@ def test_the_bound_is_exact_in_pixels(width, height, bound, fits):
         assert f"{width}x{height}" in error.detail and error.reason is Refusal.MALFORMED
 
 
-@pytest.mark.parametrize(("width", "height", "fits"), [(1920, 1080, True), (1920, 1081, False), (1921, 1080, False), (2_073_600 // 64, 64, True), (2_073_601 // 37, 37, False)])
+@pytest.mark.parametrize(("width", "height", "fits"), [(1920, 1080, True), (1920, 1081, False), (1921, 1080, False), (2_073_600 // 64, 64, True), (14_918, 139, False), (15_829, 131, True)])
 def test_the_default_bound_is_full_hd(width, height, fits):
     data = picture(frame_header(width, height))
     assert read_jpeg_size(data).width_px == width if fits else refusal(read_jpeg_size, data)
 
 
-@pytest.mark.parametrize("marker", range(256))
-def test_each_marker_is_a_frame_header_refused_alone_or_a_segment(marker):
+def test_each_marker_is_a_frame_header_refused_alone_or_a_segment():
+    for marker in range(256):
+        check_marker(marker)
+
+
+def check_marker(marker):
     behind = frame_header(7, 5)
     if marker in (0xC0, 0xC1, 0xC2):
         assert read_jpeg_size(picture(frame_header(9, 4, marker=marker), behind)) == JpegSize(9, 4, 3)

@@ -15,13 +15,10 @@ from pathlib import Path
 import pytest
 
 # Everything that no judged file is imported by: loaded once here, shared by all children.
-import protocol.config
-import protocol.errors
-import protocol.messages
 import robot_side.ports  # noqa: F401
 from tests.mutation.mutants import Mutant
 
-_CPU_SECONDS = 10  # a table takes well under one; a mutant that loops for ever is ended here
+_CPU_SECONDS = 5  # a table takes well under one; a mutant that loops for ever is ended here
 _WALL_SECONDS = 60.0
 _MEMORY_BYTES = 4 << 30
 

@@ -1,0 +1,259 @@
+"""Every number of the range guard: just inside, at it, just outside, for an outline in binary fractions."""
+
+import array
+import math
+
+import pytest
+from pydantic import ValidationError
+
+from protocol.messages import STILL, Twist
+from robot_side.guard import GuardConfig, RangeGuard
+from robot_side.ports import Ranges
+
+DEFAULTS = {
+    "front_m": 0.07,
+    "rear_m": 0.10,
+    "half_width_m": 0.09,
+    "sensor_x_m": 0.055,
+    "stop_m": 0.08,
+    "brake_mps2": 0.5,
+    "max_scan_age_ms": 400,
+}
+# With brake 0.5 the limit is sqrt(clearance - stop): clearance 0.5 leaves sqrt(0.25) = 0.5 m/s.
+BOX = {"front_m": 0.5, "rear_m": 1.0, "half_width_m": 0.25, "sensor_x_m": 0.0, "stop_m": 0.25, "brake_mps2": 0.5}
+
+
+def twist(linear_mps, angular_rad_s=0.0):
+    return Twist(linear_mps=linear_mps, angular_rad_s=angular_rad_s)
+
+
+def seeing(*points, t_us=0, **changes):
+    """A guard that sees one or two points (x_m, y_m) from the axle's midpoint, in this order."""
+    guard = RangeGuard(GuardConfig(**{**BOX, **changes}))
+    bearings_rad = [math.atan2(y_m, x_m) for x_m, y_m in points]
+    ranges_m = array.array("d", [math.hypot(*point) for point in points])
+    guard.see(Ranges(t_us, bearings_rad[0], bearings_rad[-1] - bearings_rad[0], 0.0, 100.0, ranges_m))
+    return guard
+
+
+def cut(guard, linear_mps, angular_rad_s=0.0):
+    got = guard.limit(twist(linear_mps, angular_rad_s), 0)
+    return got.linear_mps, got.angular_rad_s
+
+
+def near(*values):
+    return pytest.approx(values, rel=1e-6, abs=1e-9)
+
+
+# --- configuration -----------------------------------------------------------------------------------------------
+
+
+def test_the_defaults_are_as_documented():
+    assert GuardConfig().model_dump() == DEFAULTS
+
+
+@pytest.mark.parametrize(
+    ("field", "lower_allowed", "lower", "upper"),
+    [
+        ("front_m", True, 0.0, 2.0),
+        ("rear_m", True, 0.0, 2.0),
+        ("half_width_m", False, 0.01, 2.0),
+        ("sensor_x_m", True, -2.0, 2.0),
+        ("stop_m", True, 0.02, 5.0),
+        ("brake_mps2", False, 0.0, 20.0),
+        ("max_scan_age_ms", True, 50, 5_000),
+    ],
+)
+def test_each_field_is_bounded(field, lower_allowed, lower, upper):
+    step = 1 if field == "max_scan_age_ms" else 1e-6
+    allowed = [lower + step, upper - step, upper, *([lower] if lower_allowed else [])]
+    for value in allowed:
+        assert getattr(GuardConfig(**{field: value}), field) == value
+    for value in [lower - step, upper + step, *([] if lower_allowed else [lower])]:
+        with pytest.raises(ValidationError):
+            GuardConfig(**{field: value})
+
+
+# --- towards a point ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("clearance_m", "limit_mps"),
+    [(0.0001, 0.0), (0.2499, 0.0), (0.25, 0.0), (0.26, 0.1), (0.5, 0.5), (1.25, 1.0), (4.25, 2.0)],
+)
+def test_speed_towards_a_point_is_what_can_still_brake(clearance_m, limit_mps):
+    ahead, behind = seeing((0.5 + clearance_m, 0.0)), seeing((-1.0 - clearance_m, 0.0))
+    assert cut(ahead, 3.0) == near(limit_mps, 0.0)
+    assert cut(behind, -3.0) == near(-limit_mps, 0.0)
+    assert cut(ahead, -3.0) == (-3.0, 0.0), "away is free"
+    assert cut(behind, 3.0) == (3.0, 0.0)
+    assert cut(ahead, 0.9 * limit_mps) == (0.9 * limit_mps, 0.0), "slower than that is left alone"
+
+
+def test_the_braking_sets_the_limit():
+    assert cut(seeing((1.25, 0.0), brake_mps2=2.0), 3.0) == near(math.sqrt(2 * 2.0 * 0.5), 0.0)
+
+
+def test_what_is_not_cut_is_the_same_object():
+    guard, slow, fast = seeing((1.0, 0.0)), twist(0.49), twist(0.51)
+    assert guard.limit(slow, 0) is slow
+    assert guard.limit(fast, 0) is not fast
+    turning = seeing((0.25, 0.5))
+    assert turning.limit(spin := twist(0.0, -3.0), 0) is spin
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_along_a_wall_is_free_and_turning_into_it_is_not(side):
+    # Beside the outline at x = 0.25, 0.25 + 0.01 m off: closing speed is angular x 0.25, at most sqrt(0.01) = 0.1.
+    guard = seeing((0.25, side * 0.51))
+    assert cut(guard, 3.0) == (3.0, 0.0) and cut(guard, -3.0) == (-3.0, 0.0)
+    assert cut(guard, 0.0, side * 3.0) == near(0.0, side * 0.4)
+    assert cut(guard, 2.0, side * 3.0) == near(0.0, side * 0.4), "the speed gives way before the turn"
+    assert cut(guard, 2.0, side * -3.0) == (2.0, side * -3.0)
+    assert cut(guard, 2.0, side * 0.39) == (2.0, side * 0.39)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_behind_the_axle_a_turn_swings_the_other_way(side):
+    guard = seeing((-0.5, side * 0.51))
+    assert cut(guard, 0.0, side * -3.0) == near(0.0, side * -0.2)
+    assert cut(guard, 0.0, side * 3.0) == (0.0, side * 3.0)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_corner_closes_in_by_both(side):
+    # From the corner (0.5, 0.25) the point lies 0.3 forward, 0.4 sideways: clearance 0.5, limit 0.5, n = (0.6, 0.8).
+    guard = seeing((0.8, side * 0.65))
+    turning = 0.8 * 0.5 - 0.6 * 0.25
+    assert cut(guard, 3.0) == near(0.5 / 0.6, 0.0)
+    assert cut(guard, 3.0, side * 1.0) == near((0.5 - turning) / 0.6, side * 1.0)
+    assert cut(guard, 3.0, side * -1.0) == near((0.5 + turning) / 0.6, side * -1.0)
+    assert cut(guard, 3.0, side * 5.0) == near(0.0, side * 0.5 / turning)
+    assert cut(guard, 0.0, side * 3.0) == near(0.0, side * 0.5 / turning)
+    rear = seeing((-1.3, side * 0.65))
+    # n = (-0.6, 0.8) at (-1, 0.25): turning = -0.8 + 0.15.
+    assert cut(rear, -3.0, side * -0.5) == near(-(0.5 - 0.5 * 0.65) / 0.6, side * -0.5)
+
+
+def test_a_turn_that_uses_the_whole_limit_leaves_no_speed():
+    guard = seeing((1.0, 0.0), (0.8, 0.65))
+    turning = 0.8 * 0.5 - 0.6 * 0.25
+    linear, angular = cut(guard, 3.0, 0.5 / turning)
+    assert linear == pytest.approx(0.0, abs=1e-9) and angular == pytest.approx(0.5 / turning)
+
+
+def test_exactly_the_limit_is_left_alone():
+    guard = seeing((1.0, 0.0))
+    assert cut(guard, 0.5) == (0.5, 0.0)
+    exact = twist(0.5)
+    assert guard.limit(exact, 0) is exact
+
+
+def test_cutting_for_one_point_is_looked_at_again_for_those_before_it():
+    # Driving on takes the tail out of the turn's way; once a wall ahead cuts the speed the turn must give way too.
+    tail, wall = (-1.3, -0.65), (0.76, 0.0)
+    # tail: n = (-0.6, -0.8) at (-1, -0.25), turning = 0.8 - 0.15 = 0.65, limit 0.5; wall: limit 0.1.
+    assert cut(seeing(tail), 2.0, 2.0) == (2.0, 2.0)
+    assert cut(seeing(tail, wall), 2.0, 2.0) == near(0.0, 0.5 / 0.65)
+    assert cut(seeing(wall, tail), 2.0, 2.0) == near(0.0, 0.5 / 0.65)
+
+
+# --- inside the outline ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("y_m", [0.0, 0.2, -0.2, 0.25, -0.25])
+@pytest.mark.parametrize("x_m", [0.5, 0.01, 0.4999, 0.5 + 5e-7])
+def test_a_point_inside_the_outline_is_straight_ahead_or_behind(x_m, y_m):
+    ahead = seeing((x_m, y_m))
+    assert cut(ahead, 3.0) == near(0.0, 0.0) and cut(ahead, -3.0) == (-3.0, 0.0)
+    behind = seeing((-x_m, y_m))
+    assert cut(behind, -3.0) == near(0.0, 0.0) and cut(behind, 3.0) == (3.0, 0.0)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_point_inside_forbids_the_turn_that_moves_its_spot_forward(side):
+    guard = seeing((0.25, side * 0.2))
+    assert cut(guard, 0.0, side * 3.0) == (0.0, side * 3.0)
+    assert cut(guard, 0.0, side * -3.0) == near(0.0, 0.0)
+
+
+@pytest.mark.parametrize(("clearance_m", "inside"), [(0.99e-6, True), (1.005e-6, False)])
+def test_inside_ends_a_micrometre_off_the_outline(clearance_m, inside):
+    guard = seeing((0.25, 0.25 + clearance_m))
+    assert (cut(guard, 3.0)[0] < 1e-3) == inside, "beside the outline driving on is free"
+
+
+# --- scans -------------------------------------------------------------------------------------------------------
+
+
+def scan(ranges_m, *, first_rad=0.0, each_rad=0.0, t_us=0, least_m=0.0, most_m=100.0):
+    return Ranges(t_us, first_rad, each_rad, least_m, most_m, array.array("d", ranges_m))
+
+
+def box(**changes):
+    return RangeGuard(GuardConfig(**{**BOX, **changes}))
+
+
+@pytest.mark.parametrize(
+    ("range_m", "counts"),
+    [(0.59, False), (0.6, True), (0.61, True), (0.7, True), (0.71, False), (math.inf, False), (math.nan, False)],
+)
+def test_only_ranges_that_the_sensor_can_measure_count(range_m, counts):
+    guard = box()
+    guard.see(scan([range_m], least_m=0.6, most_m=0.7))
+    assert (cut(guard, 3.0) != (3.0, 0.0)) == counts
+
+
+@pytest.mark.parametrize(
+    ("ranges_m", "quarter"),
+    [([1.0, math.inf, math.inf], 0), ([math.inf, 1.0, math.inf], 1), ([math.inf, math.inf, 1.25], 2)],
+)
+def test_each_range_lies_at_its_own_angle(ranges_m, quarter):
+    guard = box()
+    guard.see(scan(ranges_m, each_rad=math.pi / 2))
+    expected = [near(0.5, 0.0), (3.0, 0.0), (3.0, 0.0)][quarter]
+    assert cut(guard, 3.0) == expected
+    expected_back = [(-3.0, 0.0), (-3.0, 0.0), near(0.0, 0.0)][quarter]
+    assert cut(guard, -3.0) == expected_back
+    guard.see(scan([1.0], first_rad=math.pi, each_rad=1.0))
+    assert cut(guard, 3.0) == (3.0, 0.0) and cut(guard, -3.0) == near(0.0, 0.0)
+
+
+def test_angles_are_counter_clockwise():
+    guard = box()
+    guard.see(scan([math.hypot(0.25, 0.51)], first_rad=math.atan2(0.51, 0.25)))
+    assert cut(guard, 0.0, 3.0) == near(0.0, 0.4)
+    assert cut(guard, 0.0, -3.0) == (0.0, -3.0)
+
+
+@pytest.mark.parametrize("sensor_x_m", [-0.25, 0.0, 0.25])
+def test_the_sensor_sits_forward_of_the_axle(sensor_x_m):
+    guard = box(sensor_x_m=sensor_x_m)
+    guard.see(scan([1.0 - sensor_x_m]))
+    assert cut(guard, 3.0) == near(0.5, 0.0)
+
+
+def test_a_new_scan_replaces_the_last():
+    guard = box()
+    guard.see(scan([0.6]))
+    guard.see(scan([50.0]))
+    assert cut(guard, 3.0) == (3.0, 0.0)
+    guard.see(scan([]))
+    assert cut(guard, 3.0) == (3.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("age_us", "fresh"), [(-1, False), (0, True), (1, True), (399_999, True), (400_000, True), (400_001, False)]
+)
+def test_a_scan_is_believed_for_its_age(age_us, fresh):
+    guard = seeing((50.0, 0.0), t_us=1_000)
+    asked = twist(0.5, -1.0)
+    assert guard.is_fresh(1_000 + age_us) == fresh
+    assert guard.limit(asked, 1_000 + age_us) == (asked if fresh else STILL)
+
+
+def test_without_any_scan_nothing_moves():
+    guard = RangeGuard(GuardConfig())
+    assert not guard.is_fresh(0)
+    assert guard.limit(twist(0.5), 0) == guard.limit(twist(0.0, 0.5), 0) == STILL
+    assert guard.limit(STILL, 0) is STILL

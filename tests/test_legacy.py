@@ -1,0 +1,111 @@
+"""The older write-up's dialects: strict readers, and writers whose text the write-up's own code reads."""
+
+import base64
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol.errors import WireError
+from protocol.legacy import (
+    MAX_BOXES,
+    Box,
+    decode_picture,
+    encode_picture,
+    format_boxes,
+    parse_boxes,
+    parse_dashed,
+    text_bound,
+)
+from protocol.refusals import Refusal
+from protocol.twist_text import parse_twist
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+UNIT = st.floats(0, 1)
+
+
+@given(st.binary(max_size=2000))
+def test_a_picture_is_written_as_the_write_up_wrote_it(jpeg):
+    assert encode_picture(jpeg) == base64.encodebytes(jpeg)
+    assert encode_picture(jpeg, newlines=False) == base64.b64encode(jpeg)
+
+
+@given(st.binary(max_size=2000), st.sampled_from([b"\n", b"\r\n", b""]))
+def test_a_picture_is_read_with_any_line_ends_and_within_its_bound(jpeg, line_end):
+    text = encode_picture(jpeg).replace(b"\n", line_end)
+    assert len(text) <= text_bound(len(jpeg))
+    assert decode_picture(text, len(jpeg)) == jpeg
+    if jpeg:
+        with pytest.raises(WireError, match="at most"):
+            decode_picture(text, len(jpeg) - 1)
+
+
+@pytest.mark.parametrize(
+    "text", [b"====", b"AAA", b"AA=A", b"AAAA AAAA", b"AAAA\x00", b"AA==AAAA", "ＡＡＡＡ".encode(), b"AAA_", b"-1|0", b"\xff"]
+)
+def test_what_is_no_base64_is_refused(text):
+    with pytest.raises(WireError) as refusal:
+        decode_picture(text, 1000)
+    assert refusal.value.reason is Refusal.MALFORMED
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_a_picture_or_a_wire_error(text):
+    try:
+        assert len(decode_picture(text, 100)) <= 100
+    except WireError as refusal:
+        assert refusal.reason is Refusal.MALFORMED
+
+
+@given(FINITE, FINITE)
+def test_dashed_twists_read_what_the_write_up_writes(linear, angular):
+    text = f"{linear}-{angular}".encode()
+    twist = parse_dashed(text)
+    assert (twist.linear_mps, twist.angular_rad_s) == (linear, angular)
+    assert twist == parse_twist(f"{linear}|{angular}".encode())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"", b"-", b"1", b"1-", b"-1", b"1-2-3", b"1---2", b"1|2", b"1 - 2", b"nan-1", b"1-inf", b"1_0-2", b"1-" + b"0" * 63],
+)
+def test_what_is_no_dashed_twist_is_refused(text):
+    with pytest.raises(WireError) as refusal:
+        parse_dashed(text)
+    assert refusal.value.reason is Refusal.MALFORMED
+
+
+def test_a_dashed_twist_that_overflows_is_not_finite():
+    with pytest.raises(WireError) as refusal:
+        parse_dashed(b"1e999-0")
+    assert refusal.value.reason is Refusal.NOT_FINITE
+
+
+@given(st.lists(st.tuples(UNIT, UNIT, UNIT, UNIT), max_size=MAX_BOXES))
+def test_boxes_survive_the_way_there_and_back(corners):
+    boxes = [Box(min(a, b), min(c, d), max(a, b), max(c, d)) for a, b, c, d in corners]
+    read = parse_boxes(format_boxes(boxes))
+    assert len(read) == len(boxes)
+    for box, got in zip(boxes, read, strict=True):
+        assert (got.y_min, got.x_min, got.y_max, got.x_max) == pytest.approx(
+            (box.y_min, box.x_min, box.y_max, box.x_max), abs=5e-5
+        )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"-", b"0,0,1", b"0,0,1,1-", b"0,0,1,1.1", b"0,0,1,-1", b"0.5,0,0.4,1", b"0,1,1,0", b"0,0,1,1e-5", b"nan,0,1,1",
+     b"0,0,1,1,1", b" 0,0,1,1", b"-".join([b"0,0,1,1"] * (MAX_BOXES + 1)), b"0,0,1,1." + b"0" * 1024],
+)  # fmt: skip
+def test_what_is_no_list_of_boxes_is_refused(text):
+    with pytest.raises(WireError) as refusal:
+        parse_boxes(text)
+    assert refusal.value.reason is Refusal.MALFORMED
+
+
+def test_a_box_outside_the_picture_cannot_exist():
+    for corners in ((0, 0, 1, 1.01), (-0.1, 0, 1, 1), (0.5, 0, 0.4, 1), (float("nan"), 0, 1, 1)):
+        with pytest.raises(ValueError, match="does not lie"):
+            Box(*corners)
+    with pytest.raises(ValueError, match="at most 16"):
+        format_boxes([Box(0, 0, 1, 1)] * (MAX_BOXES + 1))

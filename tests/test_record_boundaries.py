@@ -1,0 +1,227 @@
+"""Every number of what the gate remembers (issued frames, pictures, sequence numbers) and of the lease: at, before, after."""
+
+import pytest
+
+from protocol.errors import WireError
+from protocol.messages import AnswerHeader, Echo, Holder
+from protocol.refusals import Refusal
+from robot_side.judge import FreshnessRecord, IssuedRecord, SequenceRecord, Verdict
+from robot_side.lease import HUMANS, RANKS, Lease
+
+ROBOT, OTHER = "0000aaaa", "0000cccc"
+VISION, OTHER_VISION = Holder(source="vision", session="0000bbbb"), Holder(source="vision", session="0000cccc")
+HUMAN, OTHER_HUMAN = Holder(source="teleop", session="0000dddd"), Holder(source="teleop", session="0000eeee")
+GUEST = Holder(source="guest", session="00000000")
+
+
+def echo(seq=7, t_us=1_000, *, channel="frame", session=ROBOT):
+    return Echo(channel=channel, session=session, seq=seq, t_us=t_us)
+
+
+def refusal(judge, *args):
+    with pytest.raises(WireError) as caught:
+        judge(*args)
+    return caught.value
+
+
+# --- verdict -----------------------------------------------------------------------------------------------------
+
+
+def test_a_verdict_is_accepted_when_it_has_no_reason():
+    assert Verdict(None).accepted and Verdict(None) == Verdict(None, "", None)
+    assert not Verdict(Refusal.STALE).accepted
+
+
+# --- issued frames -----------------------------------------------------------------------------------------------
+
+
+def issued(*frames, channel="frame"):
+    record = IssuedRecord(ROBOT)
+    for seq, t_us in frames:
+        record.add(channel, seq, t_us)
+    return record
+
+
+@pytest.mark.parametrize(
+    ("age_us", "reason"),
+    [(-1, Refusal.FROM_FUTURE), (0, None), (1, None), (399, None), (400, None), (401, Refusal.STALE)],
+)
+def test_age_is_from_now_up_to_the_limit(age_us, reason):
+    record = issued((7, 1_000))
+    if reason is None:
+        assert record.age_us(echo(), 1_000 + age_us, 400) == age_us
+    else:
+        assert refusal(record.age_us, echo(), 1_000 + age_us, 400).reason is reason
+
+
+def test_the_refusal_of_an_age_says_the_milliseconds():
+    record = issued((7, 1_000_000))
+    assert refusal(record.age_us, echo(t_us=1_000_000), 999_000 - 1_000_000 + 1_000, 400).detail == (
+        "cites frame 7 of 1000 ms from now"
+    )
+    assert refusal(record.age_us, echo(t_us=1_000_000), 1_500_000, 400_000).detail == (
+        "frame 7 is 500 ms old, at most 400"
+    )
+
+
+@pytest.mark.parametrize("cited", [echo(6), echo(8), echo(t_us=999), echo(t_us=1_001), echo(channel="status")])
+def test_only_what_was_issued_so_is_known(cited):
+    assert refusal(issued((7, 1_000)).age_us, cited, 1_000, 400).reason is Refusal.UNKNOWN_FRAME
+
+
+def test_only_this_session_counts():
+    error = refusal(issued((7, 1_000)).age_us, echo(session=OTHER), 1_000, 400)
+    assert error.reason is Refusal.OTHER_SESSION and OTHER in error.detail and ROBOT in error.detail
+
+
+@pytest.mark.parametrize(("count", "first_is_known"), [(255, True), (256, True), (257, False)])
+def test_256_frames_are_kept_per_channel(count, first_is_known):
+    record = issued(*((seq, 1_000) for seq in range(count)))
+    record.add("status", 0, 5)
+    if first_is_known:
+        assert record.age_us(echo(0), 1_000, 0) == 0
+    else:
+        assert refusal(record.age_us, echo(0), 1_000, 0).reason is Refusal.UNKNOWN_FRAME
+    assert record.age_us(echo(1), 1_000, 0) == record.age_us(echo(count - 1), 1_000, 0) == 0
+
+
+def test_the_newest_seq_is_per_channel_and_minus_one_before_the_first():
+    record = issued((7, 1_000), (9, 1_000))
+    assert (record.last_seq("frame"), record.last_seq("status")) == (9, -1)
+
+
+# --- pictures ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("pictures", "unchanged_us"),
+    [
+        ([], 0),
+        ([(10, 5)], 0),
+        ([(10, 5), (30, 5)], 20),
+        ([(10, 5), (30, 5), (60, 5)], 50),
+        ([(10, 5), (30, 6)], 0),
+        ([(10, 5), (30, 6), (60, 6)], 30),
+        ([(10, 5), (30, 6), (60, 5)], 0),
+        ([(10, 0), (30, 0)], 0),
+        ([(10, 5), (30, 0), (60, 5)], 0),
+        ([(10, 1), (30, 1)], 20),
+        ([(10, -1), (30, -1)], 20),
+    ],
+)
+def test_a_picture_is_unchanged_since_it_was_first_seen(pictures, unchanged_us):
+    record = FreshnessRecord()
+    for t_us, fingerprint in pictures:
+        record.add(t_us, fingerprint)
+    assert record.unchanged_us() == unchanged_us
+
+
+# --- sequence numbers --------------------------------------------------------------------------------------------
+
+
+def header(seq, session="0000bbbb", source="vision"):
+    return AnswerHeader(source=source, session=session, seq=seq, echo=echo())
+
+
+@pytest.mark.parametrize(("first", "then", "accepted"), [(0, 0, False), (0, 1, True), (5, 4, False), (5, 5, False), (5, 6, True)])
+def test_sequence_numbers_only_grow(first, then, accepted):
+    record = SequenceRecord()
+    record.check(header(first))
+    if accepted:
+        record.check(header(then))
+    else:
+        error = refusal(record.check, header(then))
+        assert error.reason is Refusal.OUT_OF_ORDER
+        assert error.detail == f"seq {then} of vision is not newer than {first}"
+
+
+def test_a_refused_number_is_not_kept():
+    record = SequenceRecord()
+    record.check(header(5))
+    refusal(record.check, header(3))
+    assert refusal(record.check, header(4)).reason is Refusal.OUT_OF_ORDER
+
+
+def test_each_source_and_session_counts_for_itself():
+    record = SequenceRecord()
+    for sender in [("0000bbbb", "vision"), ("0000cccc", "vision"), ("0000bbbb", "teleop")]:
+        record.check(header(0, *sender))
+
+
+@pytest.mark.parametrize(("others", "remembered"), [(62, True), (63, True), (64, False)])
+def test_64_senders_are_remembered(others, remembered):
+    record = SequenceRecord()
+    record.check(header(5))
+    for index in range(others):
+        record.check(header(5, f"{index:08x}"))
+    if remembered:
+        refusal(record.check, header(5))
+    else:
+        record.check(header(5))
+
+
+def test_the_longest_silent_sender_is_forgotten_first():
+    record = SequenceRecord()
+    for index in range(64):
+        record.check(header(5, f"{index:08x}"))
+    record.check(header(6, "00000000"))
+    record.check(header(5, "0000ffff"))
+    refusal(record.check, header(6, "00000000"))
+    record.check(header(5, "00000001"))
+
+
+# --- lease -------------------------------------------------------------------------------------------------------
+
+
+def held_by(who, now_us=1_000, life_us=500):
+    lease = Lease(life_us)
+    lease.take(who, now_us)
+    return lease
+
+
+def test_the_roles_and_who_of_them_is_human():
+    assert sorted(RANKS, key=RANKS.__getitem__) == ["guest", "vision", "teleop"]
+    assert len(set(RANKS.values())) == 3
+    assert HUMANS == {"teleop"}
+
+
+@pytest.mark.parametrize(("now_us", "held"), [(1_000, True), (1_499, True), (1_500, False), (1_501, False)])
+@pytest.mark.parametrize("who", [VISION, HUMAN, GUEST])
+def test_a_lease_lives_its_time(who, now_us, held):
+    lease = held_by(who)
+    assert lease.live_holder(now_us) == (who if held else None)
+    assert lease.lost_human(now_us) == (who is HUMAN and not held)
+    assert lease.may_take(OTHER_VISION, now_us) == (not held or who is GUEST)
+
+
+def test_a_new_lease_is_held_by_nobody():
+    lease = Lease(500)
+    assert lease == Lease(500, None, 0)
+    for now_us in (-1, 0, 1):
+        assert lease.live_holder(now_us) is None and not lease.lost_human(now_us) and lease.may_take(GUEST, now_us)
+
+
+@pytest.mark.parametrize("who", [VISION, HUMAN])
+def test_a_dropped_lease_was_not_lost(who):
+    lease = held_by(who)
+    lease.drop()
+    assert lease == Lease(500, None, 0)
+    assert lease.live_holder(1_001) is None and not lease.lost_human(9_000)
+
+
+def test_taking_again_renews():
+    lease = held_by(VISION)
+    lease.take(VISION, 1_400)
+    assert lease.live_holder(1_899) == VISION and lease.live_holder(1_900) is None
+
+
+@pytest.mark.parametrize(
+    ("holder", "who", "may"),
+    [
+        (VISION, VISION, True), (VISION, OTHER_VISION, False), (VISION, HUMAN, True), (VISION, GUEST, False),
+        (HUMAN, HUMAN, True), (HUMAN, OTHER_HUMAN, False), (HUMAN, VISION, False), (HUMAN, GUEST, False),
+        (GUEST, GUEST, True), (GUEST, VISION, True), (GUEST, HUMAN, True),
+    ],
+)  # fmt: skip
+def test_the_holder_and_whoever_outranks_it_may_take_the_lease(holder, who, may):
+    assert held_by(holder).may_take(who, 1_200) == may

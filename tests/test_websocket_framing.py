@@ -1,0 +1,105 @@
+"""`sightline.v1` framing: byte for byte both ways, any field order in, and nothing but WireError for nonsense."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol.channels import CHANNELS, MAX_HEADER_BYTES, TWIST, key_for
+from protocol.errors import WireError
+from protocol.refusals import Refusal
+from protocol.transports.websocket_framing import MAX_BLOCK_BYTES, Packet, pack, parse_hello, unpack
+
+ROLES = st.from_regex(r"[a-z][a-z0-9_]{0,15}", fullmatch=True)
+HEADERS = st.one_of(
+    st.binary(max_size=MAX_HEADER_BYTES),
+    st.just(b"{}"),
+    st.dictionaries(st.text(max_size=8), st.integers() | st.text(max_size=8), max_size=5).map(lambda d: json.dumps(d).encode()),
+    st.binary(max_size=60).map(lambda tail: b'{"' + tail),
+)  # fmt: skip
+BLOCK = b'{"channel":"twist","v":1,"source":"vision","session":"4e5f6071","seq":7}'
+
+
+def framed(block: bytes, payload: bytes = b"0|0") -> bytes:
+    return len(block).to_bytes(2) + block + payload
+
+
+@given(st.sampled_from(list(CHANNELS.values())), ROLES, ROLES, HEADERS, st.binary(max_size=99))
+def test_a_message_arrives_as_it_was_sent(channel, role, source, header, payload):
+    if channel.has_source and b'"source"' in header:
+        header = b""  # the source in a header is the message's; that has a test of its own
+    source = source if channel.has_source else ""
+    message = pack(channel, source, role, header, payload)
+    assert unpack(message, "r1", role) == Packet(key_for("r1", channel, source), header, payload)
+    assert len(message) <= 2 + MAX_BLOCK_BYTES + len(payload)
+
+
+def test_a_usual_header_is_one_json_object_with_the_channel_first():
+    header = b'{"v":1,"source":"vision","session":"4e5f6071","seq":7}'
+    assert pack(TWIST, "vision", "vision", header, b"0|0") == framed(BLOCK)
+    assert pack(TWIST, "guest", "vision", b"", b"0|0") == framed(b'{"channel":"twist","source":"guest"}')
+
+
+def test_fields_may_come_in_any_order_and_with_blanks():
+    block = b'{ "v": 1, "session": "4e5f6071", "source": "teleop", "seq": 7, "channel": "twist" }'
+    assert unpack(framed(block), "r1", "vision") == Packet("sightline/r1/twist/teleop", block, b"0|0")
+
+
+def test_the_source_is_that_of_the_header_else_that_of_the_hello():
+    assert unpack(framed(BLOCK), "r1", "teleop").key == "sightline/r1/twist/vision"
+    assert unpack(framed(b'{"channel":"twist"}'), "r1", "guest").key == "sightline/r1/twist/guest"
+    assert unpack(framed(b'{"channel":"twist","source":7,"v":1}'), "r1", "guest").key == "sightline/r1/twist"
+
+
+def test_a_source_in_the_header_of_what_comes_from_a_robot_means_nothing():
+    assert unpack(framed(b'{"channel":"frame","v":1,"source":"vision"}'), "r1", "").key == "sightline/r1/frame"
+
+
+def test_a_header_that_cannot_be_read_is_for_the_receiver_to_refuse():
+    packet = unpack(framed(b'{"channel":"twist","v":1,'), "r1", "vision")
+    assert packet == Packet("sightline/r1/twist/vision", b'{"v":1,', b"0|0")
+
+
+@pytest.mark.parametrize(
+    "message",
+    [b"", b"\0", b"\0\5{}", b"\xff\xff", framed(b""), framed(b"{}"), framed(b"[1]"), framed(b'{"channel":7}'), framed(b"\xff"),
+     framed(b'{"v":1}'), framed(b"[" * 500), framed(b'{"channel":"twist","x":"' + b"a" * MAX_BLOCK_BYTES + b'"}')],
+)  # fmt: skip
+def test_broken_framing_is_refused(message):
+    with pytest.raises(WireError) as refusal:
+        unpack(message, "r1", "vision")
+    assert refusal.value.reason is Refusal.MALFORMED
+
+
+@given(st.binary(max_size=200) | st.binary(max_size=100).map(framed))
+def test_any_bytes_are_a_packet_or_a_wire_error(message):
+    try:
+        assert unpack(message, "r1", "vision").key.startswith("sightline/r1/")
+    except WireError as refusal:
+        assert refusal.reason is Refusal.MALFORMED
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "MALFORMED"),
+        ("0.1|0", "MALFORMED"),
+        ('{"robot":"r1"}', "session"),
+        ('{"robot":"r/1","session":"0000beef"}', "robot"),
+        ('{"robot":"r1","session":"0000beef","role":"V"}', "role"),
+        ('{"robot":"r1","session":"0000beef","v":2}', "UNSUPPORTED_VERSION"),
+        ('{"robot":"r1","session":"0000beef","wants":["' + "a" * 33 + '"]}', "wants"),
+        ('{"robot":"r1","session":"0000beef","wants":' + json.dumps(["a"] * 33) + "}", "wants"),
+        ('{"robot":"r1","session":"0000beef","x":"' + "a" * 1024 + '"}', "at most 1024"),
+        ("\ud800", "MALFORMED"),
+    ],
+)
+def test_what_is_no_hello_is_refused_with_the_field(text, said):
+    with pytest.raises(WireError, match=said):
+        parse_hello(text)
+
+
+def test_a_hello_of_a_newer_peer_is_read():
+    hello = parse_hello('{"robot":"r1","session":"0000beef","wants":["frame","smell"],"nose":true}')
+    assert (hello.role, hello.wants) == ("", ("frame", "smell"))
