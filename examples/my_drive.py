@@ -1,0 +1,51 @@
+"""A drive plug-in to copy: two wheels on a motor controller that takes `left right` lines over a serial port.
+
+A drive is a class with a `Config`, `set`, `wheels` and `close` (robot_side/ports.py says what each promises).
+"""
+
+import time
+from pathlib import Path
+
+from protocol.config import Config
+from protocol.errors import HardwareError
+from robot_side.ports import WheelAngles
+
+
+class MyDriveConfig(Config):
+    """`port` is where the motor controller listens."""
+
+    port: Path
+
+
+class MyDrive:
+    """Without encoders: the wheels are taken to turn as they are told."""
+
+    Config = MyDriveConfig
+
+    def __init__(self, config: MyDriveConfig) -> None:
+        try:
+            self._port = config.port.open("w", buffering=1)
+        except OSError as error:
+            raise HardwareError(f"motor controller {config.port}: {error.strerror}; is it plugged in?") from None
+        self._speeds = (0.0, 0.0)
+        self._angles = WheelAngles(0.0, 0.0, time.monotonic_ns() // 1000)
+
+    def set(self, left_rad_s: float, right_rad_s: float) -> None:
+        """Send both speeds."""
+        self._angles = self.wheels()
+        self._speeds = (left_rad_s, right_rad_s)
+        try:
+            self._port.write(f"{left_rad_s:.3f} {right_rad_s:.3f}\n")
+        except OSError as error:
+            raise HardwareError(f"motor controller: {error.strerror}; check its cable") from None
+
+    def wheels(self) -> WheelAngles:
+        """Where the wheels should be by now."""
+        now_us = time.monotonic_ns() // 1000
+        seconds = (now_us - self._angles.t_us) / 1e6
+        left, right = self._speeds
+        return WheelAngles(self._angles.left_rad + left * seconds, self._angles.right_rad + right * seconds, now_us)
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._port.close()
