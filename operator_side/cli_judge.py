@@ -32,6 +32,7 @@ def demo(
     seed: Annotated[int, typer.Option(help="Draws the start and the noise.")] = 1,
     latency_ms: Annotated[float, typer.Option(help="Added from capture to command, half on each leg.")] = 0.0,
     loss: Annotated[float, typer.Option(help="Share of messages lost on each leg, e.g. 0.1.")] = 0.0,
+    transport: Annotated[str, typer.Option(help="How vision reaches the robot: zenoh, websocket, legacy.")] = "zenoh",
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Run folder [default: runs/TIME-...].")] = None,
     open_it: Annotated[bool, typer.Option("--open", help="Show the film when it is over.")] = False,
     as_json: Json = False,
@@ -42,7 +43,7 @@ def demo(
         from operator_side.demo import DemoOptions, run_demo
         from operator_side.demo_report import report, summary
     say = _to_stderr if as_json else typer.echo
-    run = run_demo(DemoOptions(scenario, seconds, seed, latency_ms, loss, out), say)
+    run = run_demo(DemoOptions(scenario, seconds, seed, latency_ms, loss, out, transport), say)
     say("all three have ended; the run is being scored, replayed and filmed")
     judged = report(run)
     if as_json:

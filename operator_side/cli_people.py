@@ -13,7 +13,8 @@ from operator_side.status_text import status_line, status_lines
 from protocol.errors import LinkError, WireError
 from protocol.messages import Reply, Status, Verb
 from protocol.transports.link import Message
-from protocol.transports.zenoh import list_robots, open_zenoh
+from protocol.transports.opening import open_link
+from protocol.transports.zenoh import list_robots
 from robot_side.config import DEFAULT_ENDPOINT
 
 REFUSED_EXIT = 5
@@ -136,5 +137,5 @@ def _tell(robot: str, reply: Reply, as_json: bool) -> int:
 
 @contextmanager
 def _operator(robot: str, connect: list[str]) -> Iterator[Operator]:
-    with open_zenoh(robot, connect=connect, role=SOURCE) as link:
+    with open_link(robot, connect=connect, role=SOURCE) as link:
         yield Operator(link)

@@ -25,8 +25,9 @@ from operator_side.service_settings import load_service
 from operator_side.shaped_vision import Shape
 from operator_side.toml_text import toml_text
 from protocol.errors import ConfigError, HardwareError, SightlineError
-from protocol.transports.zenoh import open_zenoh
+from protocol.transports.opening import open_link
 from sim.bus import TruthReader
+from sim.robot_model import load_robot
 from sim.scenario import Scenario, load_scenario
 from sim.truth import Truth
 
@@ -37,6 +38,8 @@ ARM_S: Final = 15.0
 _DYING_S: Final = 1.0
 RECORDING: Final = "run.mcap"
 MOTOR_LOG: Final = "motors.csv"
+TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{}", "legacy": "ws-legacy://127.0.0.1:{}"}
+"""How vision reaches the robot; the person and the recorder are on Zenoh in any case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +52,7 @@ class DemoOptions:
     latency_ms: float = 0.0
     loss: float = 0.0
     out: Path | None = None
+    transport: str = "zenoh"
 
     def __post_init__(self) -> None:
         """Raise ConfigError for what cannot be run."""
@@ -56,6 +60,8 @@ class DemoOptions:
             raise ConfigError("--seconds 0 to 3600, --latency-ms 0 to 10000 and --loss 0 to below 1, e.g. --loss 0.1")
         if not 0 <= self.seed < 2**32:
             raise ConfigError(f"--seed {self.seed}: 0 to 4294967295")
+        if self.transport not in TRANSPORTS:
+            raise ConfigError(f"--transport {self.transport!r}: {', '.join(TRANSPORTS)}")
 
 
 @dataclass(slots=True)
@@ -91,21 +97,23 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
 
 
 def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str], None]) -> None:
-    options, endpoint = run.options, f"tcp/127.0.0.1:{_free_port()}"
+    options, endpoint = run.options, TRANSPORTS["zenoh"].format(_free_port())
+    for_vision = endpoint if options.transport == "zenoh" else TRANSPORTS[options.transport].format(_free_port())
+    listen = [part for end in dict.fromkeys((endpoint, for_vision)) for part in ("--listen", end)]
     _write_configuration(run, sockets)
     say(f"simulation, robot and vision start as three processes; their logs are in {run.folder}")
     processes.start("sim", ["sim", "--config", str(run.folder / "sim.toml")])
     processes.wait_line("sim", "simulation ready", READY_S)
-    processes.start("robot", ["robot", "--config", str(run.folder / "robot.toml"), "--listen", endpoint])
+    processes.start("robot", ["robot", "--config", str(run.folder / "robot.toml"), *listen])
     processes.wait_line("robot", f"robot {ROBOT}: on", READY_S)
     with (
-        open_zenoh(ROBOT, connect=[endpoint], role=SOURCE) as link,
+        open_link(ROBOT, connect=[endpoint], role=SOURCE) as link,
         Recorder(link, run.folder / RECORDING, _about(run)) as recorder,
         _truth(sockets) as truth,
         display(options.seconds, run.scenario.stand_off_m) as block,
     ):
         operator = Operator(link)
-        processes.start("vision", _vision_arguments(run, endpoint))
+        processes.start("vision", _vision_arguments(run, for_vision))
         _arm(operator, processes)
         try:
             _watch(run, processes, operator, truth, block)
@@ -153,6 +161,7 @@ def _discard_old(truth: TruthReader) -> None:
 def _write_configuration(run: DemoRun, sockets: str) -> None:
     """Leave each service's file in the run folder, so that a person can start the same by hand."""
     device = {"kind": "sim", "options": {"socket_dir": sockets}}
+    legacy = run.options.transport == "legacy"
     files: dict[str, dict[str, Any]] = {
         "sim": {
             "scenario": run.options.scenario, "seed": run.options.seed, "socket_dir": sockets,
@@ -160,10 +169,13 @@ def _write_configuration(run: DemoRun, sockets: str) -> None:
         },
         "robot": {
             "robot": ROBOT, "state_dir": str(run.folder / "state"), "camera": device, "drive": device,
+            "safety": {"guests": legacy},
         },
         "vision": {
             "robot": ROBOT,
             "target": {"radius_m": run.scenario.target.radius_m, "stand_off_m": run.scenario.stand_off_m},
+            # The older dialect carries no camera model.
+            **({"camera": load_robot("raspberry").camera.camera_model().model_dump()} if legacy else {}),
         },
     }
     for name, table in files.items():

@@ -53,7 +53,7 @@ def report(run: DemoRun) -> DemoReport:
     if not run.samples:
         raise SightlineError(f"ended before the robot drove; the logs are in {run.folder}")
     result = score(run.samples, run.scenario.stand_off_m)
-    checks = judge(run.scenario.name, result, run.options.latency_ms, REAL_TIME_FACTOR)
+    checks = _checks(run, result)
     injected = _injected(run)
     recording = run.folder / RECORDING
     judged = DemoReport(run, result, checks + _injection_checks(run, injected), replay(recording), injected)
@@ -94,6 +94,17 @@ def _injection_checks(run: DemoRun, injected: dict[str, Any] | None) -> list[Che
     return [Check("injected_loss", share, "share", wanted, sent > 0 and abs(share - wanted) <= near + 1e-9)]
 
 
+def _checks(run: DemoRun, result: Score) -> list[Check]:
+    """The scenario's bounds; of the older dialect, slow and without odometry, only that it follows is demanded."""
+    if run.options.transport != "legacy":
+        return judge(run.scenario.name, result, run.options.latency_ms, REAL_TIME_FACTOR)
+    unseen = 100 * sum(not sample.visible for sample in run.samples) / len(run.samples)
+    return [
+        Check("out of view", unseen, "%", 0.0, unseen == 0),
+        Check("wall_contacts", result.wall_contacts, "steps", 0.0, result.wall_contacts == 0),
+    ]
+
+
 def summary(judged: DemoReport) -> list[str]:
     """The closing lines: the score with its bounds, where everything lies, what to try next."""
     run, replayed = judged.run, judged.replayed
@@ -108,6 +119,8 @@ def summary(judged: DemoReport) -> list[str]:
 
 
 def _replay_line(replayed: Replayed) -> str:
+    if not replayed.total:
+        return "replay: vision's answers did not cross the recorder's transport, so there is nothing to compare"
     if replayed.gaps or replayed.missing_frames:
         lost = f"{replayed.gaps} answers and {replayed.missing_frames} frames are not in the recording"
         return f"replay: cannot be compared, for {lost}; run without loss to compare"

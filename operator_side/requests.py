@@ -1,6 +1,6 @@
 """What an operator asks of a robot, and the robot's answer, over any `Link`. Shell (waits, threads).
 
-    with open_zenoh("r1", connect=[...], role="operator") as link:
+    with open_link("r1", connect=[...], role="operator") as link:
         Operator(link).arm()
 """
 

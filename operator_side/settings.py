@@ -19,7 +19,7 @@ from operator_side.settings_keys import is_known, known_keys
 from protocol.channels import check_robot_id
 from protocol.config import Config
 from protocol.errors import ConfigError
-from protocol.transports.endpoints import check_endpoint
+from protocol.transports.opening import check_endpoint
 
 SERVICES: Final = ("robot", "vision", "sim")
 ENV_PREFIX: Final = "SIGHTLINE_"

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 from operator_side.shaped_link import ShapedLink
 from protocol.errors import ConfigError
-from protocol.transports.zenoh import open_zenoh
+from protocol.transports.opening import open_link
 from vision_side.config import VisionConfig
 from vision_side.pipeline import SOURCE
 from vision_side.service import serve
@@ -48,7 +48,7 @@ def run_shaped(config: VisionConfig, shape: str) -> int:
         ending.set()
 
     with ShapedLink(
-        open_zenoh(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
+        open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                    max_frame_bytes=config.max_frame_bytes),
         wanted.latency_ms, wanted.loss, wanted.seed,
     ) as link:

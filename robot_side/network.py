@@ -16,7 +16,7 @@ from protocol.channels import ACK, FRAME, REQUEST, TWIST
 from protocol.codec import encode
 from protocol.errors import HardwareError, SightlineError, WireError
 from protocol.transports.link import Link, Message
-from protocol.transports.zenoh import open_zenoh
+from protocol.transports.opening import open_link
 from robot_side import ipc
 from robot_side.child import Setup
 from robot_side.plugins import build
@@ -167,7 +167,7 @@ def _run(driver: socket.socket) -> None:
         camera: Camera = build("cameras", config.camera)
         ending.callback(camera.close)
         link = ending.enter_context(
-            open_zenoh(config.robot, listen=config.listen, connect=config.connect, role="robot")
+            open_link(config.robot, listen=config.listen, connect=config.connect, role="robot")
         )
         where = ", ".join(config.listen) or "connected to " + ", ".join(config.connect)
         print(f"robot {config.robot}: on {where}, camera {config.camera.kind}", flush=True)

@@ -1,12 +1,12 @@
 """Every number of the vision side, with its unit, bounds and reason. Pure."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from protocol.channels import FRAME
 from protocol.config import Config
-from protocol.messages import RobotId
+from protocol.messages import CameraModel, RobotId
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 HueDeg = Annotated[float, Field(ge=0, le=360)]
@@ -111,6 +111,11 @@ class SearchConfig(Config):
     """Pictures without the target must last this long before the robot turns for it."""
 
 
+def _camera_of_file(value: Any) -> Any:
+    """A file's lists are as good as the tuples that the wire's strict model asks for."""
+    return CameraModel.model_validate(value, strict=False) if isinstance(value, dict) else value
+
+
 class VisionConfig(Config):
     """The vision service."""
 
@@ -127,3 +132,5 @@ class VisionConfig(Config):
     steer: SteerConfig = SteerConfig()
     latency: LatencyConfig = LatencyConfig()
     search: SearchConfig = SearchConfig()
+    camera: Annotated[CameraModel | None, BeforeValidator(_camera_of_file)] = None
+    """For robots that do not say what camera they have (the older dialect); one that says is believed."""

@@ -36,10 +36,10 @@ def run(config: VisionConfig) -> int:
 
     Raises ConfigError for an endpoint that is none, LinkError if the link cannot be opened.
     """
-    from protocol.transports.zenoh import open_zenoh
+    from protocol.transports.opening import open_link
 
     ending = threading.Event()
-    opened = open_zenoh(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
+    opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                         max_frame_bytes=config.max_frame_bytes)
     # Signals are caught only from here on: until the link is open, they end the process by themselves.
     with opened as link, _ends_on_signal(ending):
@@ -68,6 +68,8 @@ class Service:
         self._session = secrets.token_hex(4)
         self._robot_session = ""
         self._said: dict[str, str] = {}
+        if config.camera is not None:
+            self._use(config.camera)
         self._heard_s = time.monotonic()
         self._blind_since_s = 0.0
         self.answered = 0
@@ -88,8 +90,10 @@ class Service:
         """Take in the camera's model; a new one needs a new pipeline."""
         message = self._cameras.take()
         camera = self._decoded(CameraModel, message.payload, CAMERA.max_payload_bytes) if message else None
-        if camera is None or camera == self._camera:
-            return
+        if camera is not None and camera != self._camera:
+            self._use(camera)
+
+    def _use(self, camera: CameraModel) -> None:
         self._camera = camera
         self._pipeline = Pipeline(self._config, camera)
         lens = "calibrated" if camera.calibrated else "not calibrated"

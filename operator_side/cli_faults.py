@@ -1,0 +1,71 @@
+"""The command `faults`: break things on purpose and judge what the wheels did. Shell. Exit code 5 when a row fails."""
+
+import json
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from operator_side.extras import needs
+from protocol.errors import ConfigError
+
+if TYPE_CHECKING:
+    from operator_side.faults.report import Results
+
+CHECK_FAILED = 5
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command(epilog="Example: sightline faults --only vision.kill --only wire")(faults)
+
+
+def faults(
+    *,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", metavar="ID", help="A row, or a group such as `wire`; may be repeated.")
+    ] = None,
+    short: Annotated[bool, typer.Option("--short", help="The short set, as in CI.")] = False,
+    repeat: Annotated[int, typer.Option(min=1, max=100, help="Run each row so often.")] = 1,
+    listing: Annotated[bool, typer.Option("--list", help="Name the rows and what each demands; run nothing.")] = False,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the report here, e.g. docs/faults.md.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> int:
+    """Start real processes, break one thing at a time, and judge from the simulated motors' own log."""
+    with needs("all"):
+        from operator_side.faults.bench import run_rows
+        from operator_side.faults.machine import describe_machine
+        from operator_side.faults.report import markdown, passed, run_line, to_dict
+        from operator_side.faults.rows import chosen
+    rows = chosen(only or (), short=short)
+    if listing:
+        typer.echo("\n".join(f"{row.id:<22} {row.what}: {row.demanded}" for row in rows))
+        return 0
+    if out is not None and not out.absolute().parent.is_dir():
+        raise ConfigError(f"--out {out}: there is no folder {out.parent}; name a file in one that exists")
+    machine, folder = describe_machine(), Path(tempfile.mkdtemp(prefix="sightline-faults-"))
+    results = run_rows(rows, repeat, folder, lambda one: typer.echo(run_line(one), err=as_json))
+    _remove_if_empty(folder)
+    if out is not None:
+        out.write_text(markdown(results, machine, _command(only, short, repeat)), "utf-8")
+    typer.echo(json.dumps(to_dict(results)) if as_json else _summary(results, folder))
+    return 0 if passed(results) else CHECK_FAILED
+
+
+def _command(only: list[str] | None, short: bool, repeat: int) -> str:
+    options = [*(f" --only {name}" for name in only or ()), " --short" * short, f" --repeat {repeat}"]
+    return "sightline faults" + "".join(options)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with suppress(OSError):  # a row that failed left its logs
+        folder.rmdir()
+
+
+def _summary(results: "Results", folder: Path) -> str:
+    ran = [outcomes for outcomes in results if not outcomes[0].skipped]
+    good = sum(all(one.ok for one in outcomes) for outcomes in ran)
+    left = f"; logs of what failed are in {folder}" if folder.exists() else ""
+    return f"{good} of {len(ran)} rows passed, {len(results) - len(ran)} could not run here{left}"

@@ -1,0 +1,42 @@
+"""A camera plug-in opened by the command line, without a robot around it. Shell (opens a device).
+
+    --camera v4l2 --camera-set device=/dev/video2 --camera-set width_px=1280
+"""
+
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from protocol.errors import ConfigError
+from robot_side.config import PluginChoice
+from robot_side.plugins import build
+from robot_side.ports import Camera
+
+
+@contextmanager
+def local_camera(kind: str, sets: Sequence[str]) -> Iterator[Camera]:
+    """The camera plug-in `kind` with the options of `sets` (`key=value`), closed at the end.
+
+    Raises ConfigError for a bad kind or option, HardwareError when there is no such camera.
+    """
+    camera: Camera = build("cameras", PluginChoice(kind=kind, options=dict(_option(text) for text in sets)))
+    try:
+        yield camera
+    finally:
+        camera.close()
+
+
+def _option(text: str) -> tuple[str, Any]:
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise ConfigError(f"--camera-set {text!r} is no option: write key=value, e.g. --camera-set device=/dev/video2")
+    return name.strip(), _value(value)
+
+
+def _value(text: str) -> Any:
+    """`text` read as a TOML value; as a string if it is none."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

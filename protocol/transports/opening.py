@@ -1,0 +1,101 @@
+"""Opens a link by what its endpoints say: `tcp/host:port` is Zenoh, `ws://` and `ws-legacy://` are WebSocket. Shell.
+
+A robot may listen on several at once; then its link is all of them, and what any peer says is heard alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Any, Self
+
+from protocol.channels import FRAME, Channel
+from protocol.errors import ConfigError
+from protocol.transports import endpoints, websocket_endpoints
+from protocol.transports.link import LatestSlot, Link, Message
+
+
+def check_endpoint(endpoint: str) -> None:
+    """Raise ConfigError, with the right form, unless `endpoint` is one of some transport."""
+    if "://" in endpoint:
+        websocket_endpoints.parse_endpoint(endpoint)
+    else:
+        endpoints.check_endpoint(endpoint)
+
+
+def open_link(
+    robot: str,
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    role: str = "",
+    timeout_s: float = 5.0,
+    max_frame_bytes: int = FRAME.max_payload_bytes,
+) -> Link:
+    """Open `robot`'s link on every endpoint given; use it in a `with`.
+
+    Raises ConfigError and LinkError as `open_zenoh` and `open_websocket` do; nothing stays open then.
+    """
+    options: dict[str, Any] = {"role": role, "timeout_s": timeout_s, "max_frame_bytes": max_frame_bytes}
+    web, zenoh = ([_of_kind(ends, is_web) for ends in (listen, connect)] for is_web in (True, False))
+    links: list[Link] = []
+    with ExitStack() as undo:
+        if any(zenoh) or not any(web):
+            from protocol.transports.zenoh import open_zenoh
+
+            links.append(undo.enter_context(open_zenoh(robot, listen=zenoh[0], connect=zenoh[1], **options)))
+        if any(web):
+            from protocol.transports.websocket import open_websocket
+
+            links.append(undo.enter_context(open_websocket(robot, listen=web[0], connect=web[1], **options)))
+        undo.pop_all()
+    return links[0] if len(links) == 1 else ManyLinks(links)
+
+
+def _of_kind(ends: Sequence[str], is_web: bool) -> list[str]:
+    return [endpoint for endpoint in ends if ("://" in endpoint) == is_web]
+
+
+class ManyLinks:
+    """Several links of one robot as one. They do not hear one another."""
+
+    def __init__(self, links: Sequence[Link]) -> None:
+        """Take over `links`, all of one robot. Raises ConfigError for none or for several robots."""
+        if len({link.robot for link in links}) != 1:
+            raise ConfigError("links of one robot can be joined, and at least one is needed")
+        self.robot = links[0].robot
+        self._links = tuple(links)
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        """As `Link` says, on all of them; True if any took it."""
+        taken = [link.publish(channel, header, payload, source) for link in self._links]
+        return any(taken)
+
+    def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
+        """As `Link` says, on all of them."""
+        for link in self._links:
+            link.subscribe(channel, callback)
+
+    def latest(self, channel: Channel) -> LatestSlot[Message]:
+        """Subscribe with one slot for all of them."""
+        slot: LatestSlot[Message] = LatestSlot()
+        self.subscribe(channel, slot.put)
+        return slot
+
+    def has_listener(self, channel: Channel) -> bool:
+        """Whether somebody listens on any of them."""
+        return any(link.has_listener(channel) for link in self._links)
+
+    def close(self) -> None:
+        """Close all, the last opened first."""
+        for link in reversed(self._links):
+            link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,153 @@
+"""Looks and tells, and drives nothing: a robot's pictures, or a camera of this machine without any robot. Shell.
+
+A robot's frames are acknowledged, so that it goes on sending; no twist is ever published.
+"""
+
+import secrets
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from protocol.errors import HardwareError
+from protocol.messages import CameraModel, FrameHeader
+from protocol.transports.link import Link
+from vision_side.config import VisionConfig
+from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, Seen
+from vision_side.service import Service
+
+_TELL_EVERY_S = 0.5
+_WAIT_S = 0.2
+_RETRY_S = 0.5
+_DEGREES = 57.29577951308232
+Say = Callable[[str], None]
+
+
+class Capture(Protocol):
+    """One JPEG and when it was captured, in microseconds of a monotonic clock."""
+
+    @property
+    def jpeg(self) -> bytes: ...
+
+    @property
+    def t_us(self) -> int: ...
+
+
+class LocalCamera(Protocol):
+    """Any camera plug-in of the robot side."""
+
+    model: CameraModel
+
+    def read(self, timeout_s: float) -> Capture | None:
+        """The next capture, None if none came in time; raises HardwareError while there is no camera."""
+        ...
+
+
+def watch_robot(config: VisionConfig, say: Say, seconds: float | None = None) -> int:
+    """Tell what is seen in the robot's pictures, until Ctrl-C or for `seconds`; returns the exit code 0.
+
+    Raises ConfigError for an endpoint that is none, LinkError if the link cannot be opened.
+    """
+    from protocol.transports.opening import open_link
+
+    opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
+                       max_frame_bytes=config.max_frame_bytes)
+    with opened as link:
+        say(f"vision: dry run with robot {config.robot}; nothing is driven")
+        service = AckingService(config, link, say)
+        return _repeat(lambda: service.turn(_WAIT_S), seconds)
+
+
+def watch_camera(config: VisionConfig, camera: LocalCamera, say: Say, seconds: float | None = None) -> int:
+    """Tell what is seen by a camera of this machine, until Ctrl-C or for `seconds`; returns the exit code 0."""
+    model = camera.model
+    lens = "calibrated" if model.calibrated else "not calibrated, so distances are a guess"
+    say(f"vision: dry run, camera {model.width_px}x{model.height_px}, {lens}; nothing is driven")
+    return _repeat(Watching(config, camera, say).turn, seconds)
+
+
+def _repeat(turn: Callable[[], None], seconds: float | None) -> int:
+    ends_s = time.monotonic() + seconds if seconds is not None else None
+    try:
+        while ends_s is None or time.monotonic() < ends_s:
+            turn()
+    except KeyboardInterrupt:
+        return 0
+    return 0
+
+
+class AckingService(Service):
+    """The vision service as it is, but every answer goes out as an acknowledgement."""
+
+    def __init__(self, config: VisionConfig, link: Link, say: Say) -> None:
+        super().__init__(config, link, say)
+        self._telling = Telling(say)
+
+    def _publish(self, header: FrameHeader, answer: Answer, compute_us: int) -> None:
+        super()._publish(header, Answer(None, answer.seen), compute_us)
+        self._telling.step(answer, time.monotonic())
+
+
+class Watching:
+    """A local camera straight into the pipeline, as if its robot stood still."""
+
+    def __init__(self, config: VisionConfig, camera: LocalCamera, say: Say) -> None:
+        self._camera, self._say = camera, say
+        self._pipeline = Pipeline(config, camera.model)
+        self._telling = Telling(say)
+        self._session = secrets.token_hex(4)
+        self._seq = 0
+        self._fault = ""
+
+    def turn(self) -> None:
+        """Look at the next picture; a camera that is gone is said once and tried again."""
+        try:
+            picture = self._camera.read(_WAIT_S)
+        except HardwareError as error:
+            self._complain(str(error))
+            time.sleep(_RETRY_S)
+            return
+        if picture is not None:
+            self._complain("")
+            self._seq += 1
+            header = FrameHeader(session=self._session, seq=self._seq, t_us=picture.t_us)
+            self._telling.step(self._pipeline.step(Frame(header, picture.jpeg)), time.monotonic())
+
+    def _complain(self, fault: str) -> None:
+        if fault != self._fault:
+            self._say(f"camera: {fault or 'back'}")
+        self._fault = fault
+
+
+class Telling:
+    """One line at most every half second, with the pictures per second since the last."""
+
+    def __init__(self, say: Say) -> None:
+        self._say = say
+        self._told_s: float | None = None
+        self._pictures = 0
+
+    def step(self, answer: Answer, now_s: float) -> None:
+        """Count a picture; tell of it if it is time."""
+        self._pictures += 1
+        if self._told_s is None:
+            self._tell(answer, "", now_s)
+        elif now_s - self._told_s >= _TELL_EVERY_S:
+            self._tell(answer, f" ({self._pictures / (now_s - self._told_s):.0f} pictures/s)", now_s)
+
+    def _tell(self, answer: Answer, rate: str, now_s: float) -> None:
+        self._say(f"{seen_text(answer.seen)}{_would_text(answer)}{rate}")
+        self._told_s, self._pictures = now_s, 0
+
+
+def seen_text(seen: Seen) -> str:
+    """One line for a person: phase, bearing (left positive), distance."""
+    if seen.bearing_rad is None or seen.distance_m is None:
+        return f"{seen.phase}: {seen.note or 'no target in sight'}"
+    return f"{seen.phase}: bearing {seen.bearing_rad * _DEGREES:+.1f} degrees, distance {seen.distance_m:.2f} m"
+
+
+def _would_text(answer: Answer) -> str:
+    twist = answer.twist
+    if twist is None or answer.seen.bearing_rad is None:
+        return ""
+    return f"; would steer {twist.linear_mps:+.2f} m/s, {twist.angular_rad_s:+.2f} rad/s"
