@@ -41,7 +41,8 @@ def test_a_picture_is_read_with_any_line_ends_and_within_its_bound(jpeg, line_en
 
 
 @pytest.mark.parametrize(
-    "text", [b"====", b"AAA", b"AA=A", b"AAAA AAAA", b"AAAA\x00", b"AA==AAAA", "ＡＡＡＡ".encode(), b"AAA_", b"-1|0", b"\xff"]
+    "text",
+    [b"====", b"AAA", b"AA=A", b"AA AAAA", b"AAAA\0", b"AA==AAAA", "ＡＡＡＡ".encode(), b"AAA_", b"-1|0", b"\xff"],
 )
 def test_what_is_no_base64_is_refused(text):
     with pytest.raises(WireError) as refusal:
@@ -67,8 +68,9 @@ def test_dashed_twists_read_what_the_write_up_writes(linear, angular):
 
 @pytest.mark.parametrize(
     "text",
-    [b"", b"-", b"1", b"1-", b"-1", b"1-2-3", b"1---2", b"1|2", b"1 - 2", b"nan-1", b"1-inf", b"1_0-2", b"1-" + b"0" * 63],
-)
+    [b"", b"-", b"1", b"1-", b"-1", b"1-2-3", b"1---2", b"1|2", b"1 - 2", b"nan-1", b"1-inf", b"1_0-2",
+     b"1-" + b"0" * 63],
+)  # fmt: skip
 def test_what_is_no_dashed_twist_is_refused(text):
     with pytest.raises(WireError) as refusal:
         parse_dashed(text)

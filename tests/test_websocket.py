@@ -1,5 +1,6 @@
 """`sightline.v1` over real sockets: every bad peer is counted, told why and dropped; the others notice nothing."""
 
+import gc
 import json
 import os
 import re
@@ -12,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
 from protocol.channels import ACK, FRAME, REPLY, REQUEST, SCAN, STATUS, TWIST
@@ -230,7 +231,7 @@ def test_names_that_no_foreign_site_can_own_are_hosts(host):
     assert origin_problem([f"http://{host}x"], host)
 
 
-@pytest.mark.parametrize("hosts", [[], ["a", "b"], ["evil.example"], ["127.0.0.1.evil.example:1"], ["evil.local.example"]])
+@pytest.mark.parametrize("hosts", [[], ["a", "b"], ["evil.example"], ["127.0.0.1.evil.example:1"], ["a.local.example"]])
 def test_other_hosts_are_a_problem(hosts):
     assert host_problem(hosts, "127.0.0.1")
 
@@ -252,7 +253,7 @@ def test_more_clients_than_the_limit_are_sent_away(robot):
 def _comes_in(robot: Robot) -> bool:
     try:
         hail(robot.endpoint).close()
-    except InvalidStatus:
+    except (InvalidHandshake, ConnectionClosed, OSError):  # no place yet
         return False
     return True
 
@@ -307,7 +308,7 @@ def test_a_bad_hello_is_refused_with_a_reason(robot, first, code, reason, counte
     stranger.send(first)
     got = closed_with(stranger)
     assert (got[0], got[1][: len(reason)]) == (code, reason)
-    assert until(lambda: counted == OVERSIZE or robot.refused == {counted: 1})
+    assert until(lambda: robot.refused == {counted: 1})
     robot.still_serves()
 
 
@@ -379,16 +380,14 @@ def test_a_connection_that_breaks_off_is_forgotten(robot):
     robot.still_serves()
 
 
-def test_a_smaller_bound_on_frames_ends_the_link_to_who_sends_more():
-    endpoint = free_ws()
-    with open_websocket("r1", listen=endpoint) as robot:
-        with open_websocket("r1", connect=endpoint, max_frame_bytes=99) as peer:
-            frames = peer.latest(FRAME)
-            assert until(lambda: robot.has_listener(FRAME))
-            robot.publish(FRAME, b"", bytes(100))
-            assert until(lambda: peer.refused[OVERSIZE] == 1)
-            robot.publish(FRAME, b"", bytes(99))
-            assert len(frames.take(2).payload) == 99
+def test_a_frame_over_a_smaller_bound_is_counted_and_the_peer_stays(robot):
+    with open_websocket("r1", connect=robot.endpoint, max_frame_bytes=999) as peer:
+        frames = peer.latest(FRAME)
+        assert until(lambda: len(robot.link._peers) == 2 and all(each.hears(FRAME) for each in robot.link._peers))
+        robot.link.publish(FRAME, b"", bytes(1000))
+        assert until(lambda: peer.refused == {OVERSIZE: 1})
+        robot.link.publish(FRAME, b"", bytes(999))
+        assert len(frames.take(2).payload) == 999
 
 
 # --- who reads slowly or never ---------------------------------------------------------------------------------------
@@ -457,7 +456,7 @@ def test_an_outbox_gives_the_newest_and_the_most_urgent_first():
     ]
     assert outbox.take() is None
     assert not outbox.wait(0)
-    assert outbox.dropped == {"scan": 2, "frame": 2, "reply": 2, "request": 4}
+    assert +outbox.dropped == {"scan": 2, "frame": 2, "reply": 2, "request": 4}
 
 
 # --- cost ------------------------------------------------------------------------------------------------------------
@@ -503,8 +502,10 @@ def test_no_thread_or_descriptor_is_left_behind():
             assert until(lambda: robot.has_listener(FRAME))
 
     open_and_close()
+    gc.collect()
     before = _count("fd"), _count("task")
     for _ in range(5):
         open_and_close()
-    assert until(lambda: _count("fd") <= before[0], 3)
+    # websockets leaves the selector of a closed server to the garbage collector.
+    assert until(lambda: gc.collect() >= 0 and _count("fd") <= before[0], 3)
     assert until(lambda: _count("task") <= before[1], 3)

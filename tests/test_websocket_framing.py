@@ -15,7 +15,9 @@ ROLES = st.from_regex(r"[a-z][a-z0-9_]{0,15}", fullmatch=True)
 HEADERS = st.one_of(
     st.binary(max_size=MAX_HEADER_BYTES),
     st.just(b"{}"),
-    st.dictionaries(st.text(max_size=8), st.integers() | st.text(max_size=8), max_size=5).map(lambda d: json.dumps(d).encode()),
+    st.dictionaries(st.text(max_size=8), st.integers() | st.text(max_size=8), max_size=5).map(json.dumps).map(
+        str.encode
+    ),
     st.binary(max_size=60).map(lambda tail: b'{"' + tail),
 )  # fmt: skip
 BLOCK = b'{"channel":"twist","v":1,"source":"vision","session":"4e5f6071","seq":7}'
@@ -63,8 +65,9 @@ def test_a_header_that_cannot_be_read_is_for_the_receiver_to_refuse():
 
 @pytest.mark.parametrize(
     "message",
-    [b"", b"\0", b"\0\5{}", b"\xff\xff", framed(b""), framed(b"{}"), framed(b"[1]"), framed(b'{"channel":7}'), framed(b"\xff"),
-     framed(b'{"v":1}'), framed(b"[" * 500), framed(b'{"channel":"twist","x":"' + b"a" * MAX_BLOCK_BYTES + b'"}')],
+    [b"", b"\0", b"\0\5{}", b"\xff\xff", framed(b""), framed(b"{}"), framed(b"[1]"), framed(b'{"channel":7}'),
+     framed(b"\xff"), framed(b'{"v":1}'), framed(b"[" * 500),
+     framed(b'{"channel":"twist","x":"' + b"a" * MAX_BLOCK_BYTES + b'"}')],
 )  # fmt: skip
 def test_broken_framing_is_refused(message):
     with pytest.raises(WireError) as refusal:

@@ -1,0 +1,106 @@
+"""The older write-up's text dialects: base64 pictures, `linear|angular`, and two that must be asked for. Pure.
+
+    picture   base64 of the JPEG, a newline after every 76 characters and at the end
+    twist     `linear|angular`, as in `protocol.twist_text`
+    dashed    `linear-angular`, opt-in: the older robot read the two the wrong way round, so ask which one is meant
+    boxes     `y_min,x_min,y_max,x_max` joined by `-`, opt-in: fractions of the picture's height and width
+"""
+
+import binascii
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from protocol.errors import WireError
+from protocol.messages import Twist
+from protocol.refusals import Refusal
+from protocol.twist_text import MAX_TWIST_BYTES, parse_twist
+
+LINE_CHARACTERS: Final = 76
+MAX_BOXES: Final = 16
+MAX_BOXES_BYTES: Final = 1024
+
+_NUMBER: Final = rb"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
+_DASHED: Final = re.compile(rb"(%b)-(%b)" % (_NUMBER, _NUMBER))
+_FRACTION: Final = rb"(0(?:\.[0-9]{1,17})?|1(?:\.0{1,17})?)"
+_BOX: Final = re.compile(rb",".join([_FRACTION] * 4))
+
+
+def text_bound(picture_bytes: int) -> int:
+    """The most characters that a picture of `picture_bytes` takes as text, line ends of two characters included."""
+    characters = (picture_bytes + 2) // 3 * 4
+    return characters + 2 * (characters // LINE_CHARACTERS + 1)
+
+
+def encode_picture(jpeg: bytes, newlines: bool = True) -> bytes:
+    """`jpeg` as base64 text; with `newlines` one after every 76 characters and at the end, as the write-up sends it."""
+    text = binascii.b2a_base64(jpeg, newline=False)
+    if not newlines:
+        return text
+    return b"".join(text[at : at + LINE_CHARACTERS] + b"\n" for at in range(0, len(text), LINE_CHARACTERS))
+
+
+def decode_picture(text: bytes, max_bytes: int) -> bytes:
+    """The bytes behind base64 `text`, with or without line ends.
+
+    Security limit: `max_bytes` of picture. Raises WireError MALFORMED for anything else than base64 within it.
+    """
+    if len(text) > text_bound(max_bytes):
+        raise WireError(Refusal.MALFORMED, f"picture text is {len(text)} characters, at most {text_bound(max_bytes)}")
+    try:
+        jpeg = binascii.a2b_base64(text.replace(b"\r", b"").replace(b"\n", b""), strict_mode=True)
+    except binascii.Error as error:
+        raise WireError(Refusal.MALFORMED, f"picture text is no base64: {error}") from None
+    if len(jpeg) > max_bytes:
+        raise WireError(Refusal.MALFORMED, f"picture is {len(jpeg)} bytes, at most {max_bytes}")
+    return jpeg
+
+
+def parse_dashed(text: bytes) -> Twist:
+    """Read `linear-angular` (m/s, rad/s); either may be negative: `0.2--0.35`.
+
+    Raises WireError as `parse_twist` does.
+    """
+    match = _DASHED.fullmatch(text) if len(text) <= MAX_TWIST_BYTES else None
+    if match is None:
+        raise WireError(Refusal.MALFORMED, f"twist {text[:MAX_TWIST_BYTES]!r} is not `linear-angular`, e.g. 0.2--0.35")
+    return parse_twist(match[1] + b"|" + match[2])
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A bounding box as fractions 0..1 of the picture, from its top-left corner."""
+
+    y_min: float
+    x_min: float
+    y_max: float
+    x_max: float
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what is no box inside the picture."""
+        if not (0 <= self.y_min <= self.y_max <= 1 and 0 <= self.x_min <= self.x_max <= 1):
+            raise ValueError(f"{self} does not lie in the picture")
+
+
+def format_boxes(boxes: Sequence[Box]) -> bytes:
+    """`boxes` as text with four decimals; empty for none. Raises ValueError for more than 16."""
+    if len(boxes) > MAX_BOXES:
+        raise ValueError(f"{len(boxes)} boxes, at most {MAX_BOXES}")
+    return "-".join(f"{box.y_min:.4f},{box.x_min:.4f},{box.y_max:.4f},{box.x_max:.4f}" for box in boxes).encode("ascii")
+
+
+def parse_boxes(text: bytes) -> tuple[Box, ...]:
+    """Read boxes joined by `-`. Raises WireError MALFORMED for anything outside the grammar or over a bound."""
+    parts = text.split(b"-") if text else []
+    if len(text) > MAX_BOXES_BYTES or len(parts) > MAX_BOXES:
+        raise WireError(Refusal.MALFORMED, f"{len(parts)} boxes in {len(text)} bytes, at most {MAX_BOXES}")
+    return tuple(_parse_box(part) for part in parts)
+
+
+def _parse_box(text: bytes) -> Box:
+    match = _BOX.fullmatch(text)
+    try:
+        return Box(*(float(number) for number in match.groups())) if match else Box(-1, 0, 0, 0)
+    except ValueError:
+        raise WireError(Refusal.MALFORMED, f"box {text[:80]!r} is not y_min,x_min,y_max,x_max within 0..1") from None

@@ -1,0 +1,103 @@
+"""The sub-protocol `sightline.v1`: `hello`, and channel messages as one binary message each. Pure.
+
+    uint16 BE length of the header block | header block | payload
+
+The header block is the message's header, a JSON object, with `"channel"` put in as its first field. A header that is no
+object with fields (most of all none) follows an object of its own: `{"channel":"twist","source":"guest"}`.
+"""
+
+import json
+import re
+from typing import Annotated, Any, Final, NamedTuple
+
+from pydantic import Field
+
+from protocol import VERSION
+from protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, Channel
+from protocol.codec import decode
+from protocol.errors import WireError
+from protocol.messages import RobotId, SessionId, Version, Wire
+from protocol.refusals import Refusal
+
+SUBPROTOCOL: Final = "sightline.v1"
+MAX_BLOCK_BYTES: Final = MAX_HEADER_BYTES + 64
+"""Security limit: a header and the names in front of it."""
+MAX_HELLO_BYTES: Final = 1024
+"""Security limit: the text of a hello; also the least that a peer must be ready to receive as one message."""
+
+_LENGTH_BYTES: Final = 2
+_FIRST: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})",(?=")')
+_ALONE: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{0,64})")?\}')
+
+
+class Hello(Wire):
+    """Who a peer is and what it wants; the first message each way, as JSON text, sent again when `wants` changes."""
+
+    v: Version = VERSION
+    robot: RobotId
+    role: Annotated[str, Field(pattern=r"^([a-z][a-z0-9_]{0,15})?$")] = ""
+    """The source of what it sends towards the robot; empty for a robot and for who only watches."""
+    session: SessionId
+    wants: Annotated[tuple[Annotated[str, Field(max_length=32)], ...], Field(max_length=32)] = ()
+    """Names of channels; unknown ones are ignored."""
+
+
+class Packet(NamedTuple):
+    """What came off the wire; the key is made of what the peer claimed and is still to be checked."""
+
+    key: str
+    header: bytes
+    payload: bytes
+
+
+def parse_hello(text: str) -> Hello:
+    """Read a hello. Raises WireError MALFORMED or UNSUPPORTED_VERSION."""
+    return decode(Hello, text.encode("utf-8", "surrogatepass"), MAX_HELLO_BYTES)
+
+
+def pack(channel: Channel, source: str, role: str, header: bytes, payload: bytes) -> bytes:
+    """One binary message from a peer whose hello said `role`."""
+    if header[:2] == b'{"' and source in ("", role):
+        block = b'{"channel":"%b",%b' % (channel.name.encode("ascii"), header[1:])
+    else:
+        named = f',"source":"{source}"' if source else ""
+        block = f'{{"channel":"{channel.name}"{named}}}'.encode("ascii") + header
+    return b"".join((len(block).to_bytes(_LENGTH_BYTES), block, payload))
+
+
+def unpack(message: bytes, robot: str, role: str) -> Packet:
+    """Take a binary message of a peer apart; `robot` and `role` are those of its hello.
+
+    The source of a message is its header's, else that of the hello. Raises WireError MALFORMED for broken framing.
+    """
+    size = int.from_bytes(message[:_LENGTH_BYTES])
+    if len(message) < _LENGTH_BYTES + size or size > MAX_BLOCK_BYTES:
+        raise WireError(Refusal.MALFORMED, f"header block of {size} bytes in a message of {len(message)}")
+    block, payload = message[_LENGTH_BYTES : _LENGTH_BYTES + size], message[_LENGTH_BYTES + size :]
+    alone = _ALONE.match(block)
+    if alone is not None:
+        source = role if alone[2] is None else alone[2].decode("utf-8", "replace")
+        return Packet(_key(robot, alone[1].decode("utf-8", "replace"), source), block[alone.end() :], payload)
+    first = _FIRST.match(block)
+    fields = _fields(block)
+    name = fields.get("channel") if first is None else first[1].decode("utf-8", "replace")
+    if not isinstance(name, str):
+        raise WireError(Refusal.MALFORMED, "the header block is no JSON object that names its channel")
+    source = fields.get("source", role)
+    header = block if first is None else b"{" + block[first.end() :]
+    return Packet(_key(robot, name, source if isinstance(source, str) else ""), header, payload)
+
+
+def _fields(block: bytes) -> dict[str, Any]:
+    """The block as an object; empty for what is none, which who decodes the header will refuse with a reason."""
+    try:
+        fields = json.loads(block)
+    except (ValueError, RecursionError):
+        return {}
+    return fields if isinstance(fields, dict) else {}
+
+
+def _key(robot: str, name: str, source: str) -> str:
+    channel = CHANNELS.get(name)
+    tail = f"/{source}" if channel is not None and channel.has_source and source else ""
+    return f"{KEY_PREFIX}/{robot}/{name}{tail}"
