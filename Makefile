@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test slow lint lock clean
+.PHONY: demo test mutation lint lock clean
 
 demo: $(READY)
 	$(BIN)/sightline demo $(ARGS)
@@ -26,6 +26,9 @@ $(READY): requirements.lock pyproject.toml
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
+
+mutation: $(READY)
+	$(BIN)/python -m tests.mutation $(ARGS)
 
 lock:  ## pin every dependency of every extra, with hashes, for all platforms
 	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \

@@ -16,7 +16,9 @@ from protocol.config import Config
 from protocol.messages import STILL, Twist
 from robot_side.ports import Ranges
 
-_PASSES = 2  # cutting speed for one point can bring a turn closer to another
+# First the speed gives way; without it a turn can come too close to a point looked at before, so it gives way in the
+# second pass, and for all points in the third. At zero speed a smaller turn is safe for every point: no fourth.
+_PASSES = 3
 
 
 class GuardConfig(Config):
@@ -61,7 +63,9 @@ class RangeGuard:
         self._near: list[_Near] = []
 
     def see(self, scan: Ranges) -> None:
-        """Take a scan."""
+        """Take a scan. One with a nan is a broken sensor's and is not taken: soon it counts as an obstacle."""
+        if any(map(math.isnan, scan.ranges_m)):
+            return
         self._scan_us = scan.t_us
         angles = (scan.angle_min_rad + index * scan.angle_increment_rad for index in range(len(scan.ranges_m)))
         self._near = [

@@ -7,7 +7,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 
 from protocol.errors import WireError
-from protocol.messages import AnswerHeader, Echo
+from protocol.messages import AnswerHeader, Echo, Twist
 from protocol.refusals import Refusal
 
 _KEPT_PER_CHANNEL = 256  # 8 s of 30 fps frames; anything older is STALE long before
@@ -26,6 +26,16 @@ class Verdict:
     def accepted(self) -> bool:
         """Whether it may move the wheels."""
         return self.reason is None
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """An accepted command. `echo_us` is when the frame behind it was captured (arrival for a guest)."""
+
+    twist: Twist
+    echo_us: int
+    arrival_us: int
+    life_us: int
 
 
 class IssuedRecord:

@@ -59,7 +59,7 @@ class SafetyConfig(Config):
         bound = stop_bound(self)
         if bound.zero_us > STOP_TIME_BOUND_US or bound.distance_m > STOP_DISTANCE_BOUND_M:
             raise ValueError(
-                f"with these limits the robot stops {bound.zero_us // 1000} ms and {bound.distance_m:.2f} m after its "
+                f"with these limits the robot stops {bound.zero_us // 1000} ms and {bound.distance_m:.3f} m after its "
                 f"last command; allowed are {STOP_TIME_BOUND_US // 1000} ms and {STOP_DISTANCE_BOUND_M} m. Lower "
                 "max_linear_mps, max_angular_rad_s or silence_ms, or raise the accelerations if the robot can brake so"
             )
@@ -79,7 +79,6 @@ def age_factor(config: SafetyConfig, age_us: int) -> float:
 
 def clamp_twist(twist: Twist, max_linear_mps: float, max_angular_rad_s: float) -> Twist:
     """Scale both axes by one factor until both limits hold, so that the curve stays."""
-    excess = 1.0
     if max_linear_mps <= 0 or max_angular_rad_s <= 0:
         return STILL
     excess = max(1.0, abs(twist.linear_mps) / max_linear_mps, abs(twist.angular_rad_s) / max_angular_rad_s)
@@ -111,7 +110,8 @@ class AxisRamp:
         change = max(-self._max_jerk * dt_s, min(self._max_jerk * dt_s, wanted - self._acceleration))
         self._acceleration += change
         moved = self._acceleration * dt_s
-        if abs(error) <= max(abs(moved), self._max_jerk * dt_s * dt_s) and moved * error >= 0:
+        reach = min(self._max_jerk * dt_s, self._max_acceleration) * dt_s
+        if abs(error) <= max(abs(moved), reach):
             self.speed, self._acceleration = goal, 0.0
         else:
             self.speed += moved

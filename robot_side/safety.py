@@ -12,7 +12,7 @@ from protocol.errors import WireError
 from protocol.messages import STILL, AnswerHeader, Holder, LastRefusal, Request, RequestHeader, State, Twist, Verb
 from protocol.refusals import CLAMPED, Refusal
 from robot_side.guard import RangeGuard
-from robot_side.judge import FreshnessRecord, IssuedRecord, SequenceRecord, Verdict
+from robot_side.judge import Accepted, FreshnessRecord, IssuedRecord, SequenceRecord, Verdict
 from robot_side.lease import HUMANS, RANKS, Lease
 from robot_side.limits import Ramp, SafetyConfig, age_factor, clamp_twist
 from robot_side.states import Event, after, is_armed
@@ -29,16 +29,6 @@ class Decision:
     twist: Twist
     state: State
     reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class _Accepted:
-    """The newest accepted command. `echo_us` is when the frame behind it was captured (arrival for a guest)."""
-
-    twist: Twist
-    echo_us: int
-    arrival_us: int
-    life_us: int
 
 
 class SafetyGate:
@@ -61,7 +51,7 @@ class SafetyGate:
         self._lease = Lease(config.lease_ms * 1000)
         self._ramp = Ramp(config)
         self._guard = guard
-        self._command: _Accepted | None = None
+        self._command: Accepted | None = None
         self._live_commands = 0
         self._auto_arm = config.auto_arm and not stopped
         self._last_step_us: int | None = None
@@ -90,6 +80,7 @@ class SafetyGate:
         who, age_us = self._identify(source, header, now_us)
         if self.state in (State.STOPPED, State.FAULT):
             raise WireError(Refusal(self.state), self.reason)
+        self._notice_lost_human(now_us)
         holder = self._lease.live_holder(now_us)
         if not self._lease.may_take(who, now_us):
             raise WireError(Refusal.NOT_HOLDER, f"{holder.source} {holder.session} drives" if holder else "")
@@ -104,11 +95,11 @@ class SafetyGate:
         """Who sends, and how old the frame behind it is."""
         if source not in RANKS or (header is not None and header.source != source):
             raise WireError(Refusal.UNKNOWN_SOURCE, f"no driver is called {source!r}, or key and header disagree")
+        if source == "guest" and not self.config.guests:
+            raise WireError(Refusal.UNKNOWN_SOURCE, "guests are switched off (safety.guests)")
         if header is None:
             if source != "guest":
                 raise WireError(Refusal.MALFORMED, f"a twist of {source} needs a header that cites a frame")
-            if not self.config.guests:
-                raise WireError(Refusal.UNKNOWN_SOURCE, "guests are switched off (safety.guests)")
             return _GUEST, 0
         if header.echo.channel == "status":
             raise WireError(Refusal.UNKNOWN_FRAME, "a twist must cite a frame, not a status")
@@ -126,7 +117,7 @@ class SafetyGate:
         if limited != twist:
             self.counters[CLAMPED] += 1
         life_ms = min(config.silence_ms, config.guest_life_ms) if guest else config.silence_ms
-        self._command = _Accepted(limited, now_us - age_us, now_us, life_ms * 1000)
+        self._command = Accepted(limited, now_us - age_us, now_us, life_ms * 1000)
         if not guest:
             self.latency_us = age_us
 
@@ -134,9 +125,7 @@ class SafetyGate:
 
     def step(self, now_us: int) -> Decision:
         """Decide what the wheels do from now until the next step. Limits hold per elapsed time, not per call."""
-        if self._lease.lost_human(now_us):
-            self._lease.drop()
-            self._leave(Event.HUMAN_LOST, "the person driving was lost; arm again")
+        self._notice_lost_human(now_us)
         self._arm_by_itself(now_us)
         goal = self._goal(now_us) if is_armed(self.state) else STILL
         elapsed_us = 0 if self._last_step_us is None else max(0, now_us - self._last_step_us)
@@ -191,6 +180,7 @@ class SafetyGate:
             if header.echo is None:
                 raise WireError(Refusal.MALFORMED, f"{request.verb} must cite a status")
             self.issued.age_us(header.echo, now_us, _MAX_REQUEST_AGE_US)
+        self._notice_lost_human(now_us)
         who = Holder(source=header.source, session=header.session)
         if request.verb is Verb.STOP:
             return self.stop(f"STOP by {who.source}")
@@ -243,6 +233,8 @@ class SafetyGate:
         if who.source not in RANKS or not self._lease.may_take(who, now_us):
             holder = self._lease.live_holder(now_us)
             raise WireError(Refusal.NOT_HOLDER, f"{holder.source if holder else 'nobody'} drives")
+        if self._lease.live_holder(now_us) != who:
+            self._live_commands = 0  # those of the driver before do not arm for this one
         self._lease.take(who, now_us)
         return "acquired"
 
@@ -279,6 +271,12 @@ class SafetyGate:
         if self._live_commands < needed:
             return f"{self._live_commands} of {needed} live commands seen; ask again"
         return "" if self.applied == STILL else "the wheels are not at zero yet; ask again"
+
+    def _notice_lost_human(self, now_us: int) -> None:
+        """Before anybody else may take the lease: a tick later a successor's command would have hidden the loss."""
+        if self._lease.lost_human(now_us):
+            self._lease.drop()
+            self._leave(Event.HUMAN_LOST, "the person driving was lost; arm again")
 
     def _arm_by_itself(self, now_us: int) -> None:
         if self._auto_arm and self.state is State.DISARMED and not self._missing_to_arm(now_us):

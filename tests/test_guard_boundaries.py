@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from protocol.messages import STILL, Twist
-from robot_side.guard import GuardConfig, RangeGuard
+from robot_side.guard import GuardConfig, RangeGuard, _Near
 from robot_side.ports import Ranges
 
 DEFAULTS = {
@@ -158,6 +158,14 @@ def test_cutting_for_one_point_is_looked_at_again_for_those_before_it():
     assert cut(seeing(wall, tail), 2.0, 2.0) == near(0.0, 0.5 / 0.65)
 
 
+def test_a_turn_that_gives_way_late_gives_way_for_the_points_before_it_too():
+    guard = seeing((50.0, 0.0))
+    # Two behind the tail that only the speed keeps away, the nearer one first; then a wall that cuts the speed to 0.45.
+    guard._near = [_Near(-1.0, 0.5, 0.06), _Near(-1.0, 0.6, 0.1), _Near(1.0, 0.0, 0.45)]
+    assert cut(guard, 1.0, 1.0) == near(0.0, 0.12)
+    assert cut(guard, 0.5, 0.5) == near(0.45, 0.5)
+
+
 # --- inside the outline ------------------------------------------------------------------------------------------
 
 
@@ -175,9 +183,10 @@ def test_a_point_inside_forbids_the_turn_that_moves_its_spot_forward(side):
     guard = seeing((0.25, side * 0.2))
     assert cut(guard, 0.0, side * 3.0) == (0.0, side * 3.0)
     assert cut(guard, 0.0, side * -3.0) == near(0.0, 0.0)
+    assert cut(guard, 3.0, side * 1.0) == near(0.2, side * 1.0), "its spot moves at 3 - 0.2 x 1"
 
 
-@pytest.mark.parametrize(("clearance_m", "inside"), [(0.99e-6, True), (1.005e-6, False)])
+@pytest.mark.parametrize(("clearance_m", "inside"), [(0.995e-6, True), (1.005e-6, False)])
 def test_inside_ends_a_micrometre_off_the_outline(clearance_m, inside):
     guard = seeing((0.25, 0.25 + clearance_m))
     assert (cut(guard, 3.0)[0] < 1e-3) == inside, "beside the outline driving on is free"
@@ -196,12 +205,21 @@ def box(**changes):
 
 @pytest.mark.parametrize(
     ("range_m", "counts"),
-    [(0.59, False), (0.6, True), (0.61, True), (0.7, True), (0.71, False), (math.inf, False), (math.nan, False)],
+    [(0.59, False), (0.6, True), (0.61, True), (0.7, True), (0.71, False), (math.inf, False)],
 )
 def test_only_ranges_that_the_sensor_can_measure_count(range_m, counts):
     guard = box()
     guard.see(scan([range_m], least_m=0.6, most_m=0.7))
     assert (cut(guard, 3.0) != (3.0, 0.0)) == counts
+
+
+@pytest.mark.parametrize("at", [0, 1])
+def test_a_scan_with_a_nan_is_not_taken(at):
+    guard, ranges_m = box(max_scan_age_ms=50), [math.inf, math.inf]
+    guard.see(scan(ranges_m))
+    ranges_m[at] = math.nan
+    guard.see(scan(ranges_m, t_us=10_000))
+    assert guard.is_fresh(50_000) and not guard.is_fresh(50_001)
 
 
 @pytest.mark.parametrize(

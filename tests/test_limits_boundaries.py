@@ -120,7 +120,7 @@ def test_a_configuration_that_stops_late_is_refused_with_its_bound():
     bound = stop_bound(late)
     with pytest.raises(ValidationError) as caught:
         SafetyConfig(max_acceleration_mps2=0.5)
-    assert f"stops {bound.zero_us // 1000} ms and {bound.distance_m:.2f} m after its last command" in str(caught.value)
+    assert f"stops {bound.zero_us // 1000} ms and {bound.distance_m:.3f} m after its last command" in str(caught.value)
     assert "allowed are 700 ms and 0.25 m" in str(caught.value)
 
 
@@ -135,7 +135,9 @@ def test_a_configuration_that_stops_late_is_refused_with_its_bound():
     ],
 )
 def test_the_stop_bound_itself_is_allowed_and_no_more(monkeypatch, zero_us, distance_m, allowed):
-    monkeypatch.setitem(SafetyConfig._stops_in_time.__globals__, "stop_bound", lambda _: StopBound(0, zero_us, distance_m))
+    monkeypatch.setitem(
+        SafetyConfig._stops_in_time.__globals__, "stop_bound", lambda _: StopBound(0, zero_us, distance_m)
+    )
     try:
         SafetyConfig()
     except ValidationError:
@@ -247,9 +249,7 @@ def test_the_wanted_acceleration_is_a_square_root():
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize(
-    ("error", "reached"), [(0.007, True), (0.008, True), (0.0081, False), (0.009, False)]
-)
+@pytest.mark.parametrize(("error", "reached"), [(0.007, True), (0.008, True), (0.0081, False), (0.009, False)])
 def test_a_goal_within_one_jerk_step_is_reached_at_once(sign, error, reached):
     axis = AxisRamp(2.0, 20.0)  # 20 x 0.02^2 = 0.008
     axis.force(sign * 0.1)
@@ -264,6 +264,12 @@ def test_a_goal_within_this_step_of_a_moving_axis_is_reached_without_overshoot(s
     goal = axis.speed + sign * 0.02
     assert axis.step(goal, 0.02) == goal
     assert axis.step(goal, 0.02) == goal, "and it stays"
+
+
+def test_a_goal_is_never_reached_faster_than_the_acceleration_allows():
+    axis = AxisRamp(0.125, 500.0)  # a jerk step would be 0.2 m/s, the acceleration allows 0.0025 m/s in a slice
+    assert steps(axis, 0.15, 2) == pytest.approx([0.0025, 0.005])
+    assert axis.step(axis.speed + 0.0024, 0.02) == pytest.approx(0.0074)
 
 
 def test_reaching_the_goal_ends_the_acceleration():
@@ -320,7 +326,9 @@ def test_at_the_goal_nothing_moves():
 
 
 def test_each_axis_has_its_own_limits():
-    ramp = Ramp(config(max_acceleration_mps2=0.3, max_jerk_mps3=10.0, max_acceleration_rad_s2=3.0, max_jerk_rad_s3=50.0))
+    ramp = Ramp(
+        config(max_acceleration_mps2=0.3, max_jerk_mps3=10.0, max_acceleration_rad_s2=3.0, max_jerk_rad_s3=50.0)
+    )
     assert_twist(ramp.step(twist(5.0, 50.0), 20_000), 0.004, 0.02)
     assert_twist(ramp.step(twist(5.0, 50.0), 20_000), 0.01, 0.06)
     assert_twist(ramp.step(twist(5.0, 50.0), 20_000), 0.016, 0.12)

@@ -1,4 +1,4 @@
-"""Every number of what the gate remembers (issued frames, pictures, sequence numbers) and of the lease: at, before, after."""
+"""Every number of what the gate remembers (frames, pictures, sequence numbers) and of the lease: at, before, after."""
 
 import pytest
 
@@ -123,7 +123,9 @@ def header(seq, session="0000bbbb", source="vision"):
     return AnswerHeader(source=source, session=session, seq=seq, echo=echo())
 
 
-@pytest.mark.parametrize(("first", "then", "accepted"), [(0, 0, False), (0, 1, True), (5, 4, False), (5, 5, False), (5, 6, True)])
+@pytest.mark.parametrize(
+    ("first", "then", "accepted"), [(0, 0, False), (0, 1, True), (5, 4, False), (5, 5, False), (5, 6, True)]
+)
 def test_sequence_numbers_only_grow(first, then, accepted):
     record = SequenceRecord()
     record.check(header(first))
@@ -182,7 +184,7 @@ def held_by(who, now_us=1_000, life_us=500):
 def test_the_roles_and_who_of_them_is_human():
     assert sorted(RANKS, key=RANKS.__getitem__) == ["guest", "vision", "teleop"]
     assert len(set(RANKS.values())) == 3
-    assert HUMANS == {"teleop"}
+    assert set(HUMANS) == {"teleop"}
 
 
 @pytest.mark.parametrize(("now_us", "held"), [(1_000, True), (1_499, True), (1_500, False), (1_501, False)])

@@ -138,6 +138,8 @@ def test_guests_are_off_unless_switched_on_and_slow_then():
     guest = Twist(linear_mps=0.5, angular_rad_s=0.0)
     assert Rig().gate.offer("guest", None, guest, 0).reason is Refusal.UNKNOWN_SOURCE
     assert Rig().gate.offer("vision", None, guest, 0).reason is Refusal.MALFORMED
+    rig = Rig().armed()
+    assert rig.offer(source="guest", session=OTHER).reason is Refusal.UNKNOWN_SOURCE, "with a header too"
     rig = Rig(guests=True)
     for _ in range(5):
         rig.gate.offer("guest", None, guest, rig.now_us)
@@ -490,6 +492,12 @@ def test_the_guard_slows_towards_what_it_sees_and_only_towards_it():
     assert guard_with([(0, 0.09)]).limit(AHEAD, 0).linear_mps == 0.0
     assert guard_with([(0, 2.0)]).limit(AHEAD, 0) == AHEAD
     assert guard_with([]).limit(AHEAD, 0) == AHEAD
+
+
+def test_a_scan_with_a_nan_is_not_believed():
+    guard = guard_with([])
+    guard.see(scan(300_000, [(0, math.nan)]))
+    assert guard.is_fresh(400_000) and not guard.is_fresh(400_001)
 
 
 def test_the_guard_lets_the_robot_drive_along_a_wall_but_not_turn_into_it():

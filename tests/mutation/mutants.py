@@ -39,7 +39,8 @@ class _Slot:
     @property
     def node(self) -> ast.AST:
         held = getattr(self.owner, self.field)
-        return held if self.index is None else held[self.index]
+        node: ast.AST = held if self.index is None else held[self.index]
+        return node
 
     def put(self, node: ast.AST) -> None:
         if self.index is None:
@@ -62,7 +63,8 @@ def mutants(file: str, source: str) -> Iterator[Mutant]:
                 key = slot.where, _text(original), _text(changed)
                 count[key] += 1
                 code = compile(ast.fix_missing_locations(tree), file, "exec")
-                yield Mutant(file, key[0], original.lineno if hasattr(original, "lineno") else 0, *key[1:], count[key], code)
+                line = getattr(original, "lineno", 0)
+                yield Mutant(file, slot.where, line, *key[1:], count[key], code)
             slot.put(original)
 
 

@@ -1,7 +1,7 @@
 """Small wrong changes of one syntax node: the mutants of the gate. Pure.
 
-`replacements(node)` gives what could stand in a node's place: the next comparison, a constant one off, the other branch,
-`min` for `max`, another member of an enum, a pattern with one byte less ...
+`replacements(node)` gives what could stand in a node's place: the next comparison, a constant one off, the other
+branch, `min` for `max`, another member of an enum, a pattern with one byte less ...
 """
 
 import ast
@@ -39,7 +39,7 @@ _ENUMS = {
     "State": tuple(State.__members__),
     "Verb": tuple(Verb.__members__),
     "Refusal": tuple(Refusal.__members__),
-    "Event": _EVENTS,  # spelt out: the file that declares it is itself judged, and must not be imported before its mutants
+    "Event": _EVENTS,  # spelt out: its file is judged too, and may not be imported before its mutants
 }
 _WORD = re.compile(r"[a-z0-9]{0,16}")
 
@@ -91,7 +91,7 @@ def _constant(node: ast.Constant) -> Iterator[ast.AST]:
     yield from (ast.Constant(value) for value in _near(node.value))
 
 
-def _near(value: object) -> Iterator[object]:
+def _near(value: object) -> Iterator[bool | int | float | bytes | str]:
     match value:
         case bool():
             yield not value
@@ -110,7 +110,8 @@ def _near_bytes(value: bytes) -> Iterator[bytes]:
     for at in range(len(value)):
         yield value[:at] + value[at + 1 :]
         if value[at : at + 1].isdigit():
-            yield from (value[:at] + b"%d" % digit + value[at + 1 :] for digit in (value[at] - 49, value[at] - 47) if digit in range(10))
+            digits = (digit for digit in (value[at] - 49, value[at] - 47) if 0 <= digit <= 9)
+            yield from (value[:at] + b"%d" % digit + value[at + 1 :] for digit in digits)
 
 
 def _conditional(node: ast.IfExp) -> Iterator[ast.AST]:

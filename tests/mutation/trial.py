@@ -36,8 +36,8 @@ def module_name(file: str) -> str:
     return file.removesuffix(".py").replace("/", ".")
 
 
-def start(mutant: Mutant | None, suites: Sequence[str]) -> int:
-    """Fork a child that runs `suites` with `mutant` in place (None: the files as they are); return its pid."""
+def start(mutant: Mutant, suites: Sequence[str]) -> int:
+    """Fork a child that runs `suites` with `mutant` in place; return its pid."""
     pid = os.fork()
     if pid:
         return pid
@@ -69,11 +69,14 @@ def _bound() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _run(mutant: Mutant | None, suites: Sequence[str]) -> int:
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
+def _run(mutant: Mutant, suites: Sequence[str]) -> int:
+    with (
+        Path(os.devnull).open("w") as nowhere,
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+    ):
         try:
-            if mutant is not None:
-                _install(mutant)
+            _install(mutant)
             options = ["-x", "-q", "--tb=no", "--assert=plain", "-p", "no:cacheprovider", "-p", "no:hypothesispytest"]
             return int(pytest.main([*options, *suites]))
         except BaseException:  # a mutant may raise anything at import; that is noticed, so killed
