@@ -25,7 +25,8 @@ from vision_side.sphere import locate
 MIN_BOARDS = 5
 MAX_RMS_PX = 1.0
 MAX_FOCAL_SIGMA = 0.02
-"""Boards that all face the camera fit any focal length; its standard deviation tells."""
+TILT_RAD, MIN_TILTED = math.radians(15), 3
+"""Boards that all face the camera fit any focal length, even with a small standard deviation."""
 MAX_BALL_SPREAD = 0.05
 MAX_PIXELS = 4096 * 4096
 _FOCAL_RANGE = (0.2, 8.0)  # focal length in picture widths: 136 degrees to 7 degrees
@@ -100,10 +101,10 @@ def from_boards(
     if len(found) < MIN_BOARDS:
         raise ConfigError(_too_few(len(found), given, board))
     pixels = (size.width_px, size.height_px)
-    rms_px, matrix, distortion, _, _, sigma, *_ = cv2.calibrateCameraExtended(
+    rms_px, matrix, distortion, turns, _, sigma, *_ = cv2.calibrateCameraExtended(
         [board.points_m()] * len(found), list(found), pixels, np.eye(3), np.zeros(5), flags=_FLAGS
     )
-    _check_fit(rms_px, float(sigma[0, 0]) / float(matrix[0, 0]))
+    _check_fit(rms_px, float(sigma[0, 0]) / float(matrix[0, 0]), sum(_tilt_rad(one) >= TILT_RAD for one in turns))
     model = _model(size, matrix, [float(one) for one in distortion.ravel()[:4]], mounting)
     return Calibration(model, len(found), given, float(rms_px), "px RMS")
 
@@ -118,13 +119,19 @@ def _too_few(found: int, given: int, board: Board) -> str:
     return f"{what} is in {found} of {given} pictures, at least {MIN_BOARDS} are needed; take more from other angles"
 
 
-def _check_fit(rms_px: float, focal_sigma: float) -> None:
+def _tilt_rad(turn: Any) -> float:
+    """How far a board of this rotation vector is turned away from facing the camera."""
+    return math.acos(min(1.0, abs(float(cv2.Rodrigues(turn)[0][2, 2]))))
+
+
+def _check_fit(rms_px: float, focal_sigma: float, tilted: int) -> None:
     if not rms_px <= MAX_RMS_PX:
         raise ConfigError(f"the fit is off by {rms_px:.2f} px RMS, at most {MAX_RMS_PX:g}: is the board flat, are the "
                           "pictures sharp and all of one camera at one zoom?")
-    if not focal_sigma <= MAX_FOCAL_SIGMA:
-        raise ConfigError(f"the focal length is known to {focal_sigma:.1%} only, {MAX_FOCAL_SIGMA:.0%} is needed: take "
-                          "pictures with the board tilted by 20 to 40 degrees, both ways, and in the corners")
+    if tilted < MIN_TILTED or not focal_sigma <= MAX_FOCAL_SIGMA:
+        raise ConfigError(f"{tilted} boards were tilted by more than 15 degrees, the focal length is known to "
+                          f"{focal_sigma:.1%}: take pictures with the board tilted by 20 to 40 degrees, both ways, and "
+                          "in the corners")
 
 
 def _model(size: JpegSize, matrix: Any, distortion: Sequence[float], mounting: Mounting) -> CameraModel:

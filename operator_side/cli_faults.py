@@ -25,12 +25,12 @@ def register(app: typer.Typer) -> None:
 def faults(
     *,
     only: Annotated[
-        list[str] | None, typer.Option("--only", metavar="ID", help="A row, or a group such as `wire`; may be repeated.")
+        list[str] | None, typer.Option("--only", metavar="ID", help="A row, or a group such as `wire`; repeatable.")
     ] = None,
     short: Annotated[bool, typer.Option("--short", help="The short set, as in CI.")] = False,
     repeat: Annotated[int, typer.Option(min=1, max=100, help="Run each row so often.")] = 1,
     listing: Annotated[bool, typer.Option("--list", help="Name the rows and what each demands; run nothing.")] = False,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the report here, e.g. docs/faults.md.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the report, e.g. docs/faults.md.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> int:
     """Start real processes, break one thing at a time, and judge from the simulated motors' own log."""
@@ -49,7 +49,7 @@ def faults(
     results = run_rows(rows, repeat, folder, lambda one: typer.echo(run_line(one), err=as_json))
     _remove_if_empty(folder)
     if out is not None:
-        out.write_text(markdown(results, machine, _command(only, short, repeat)), "utf-8")
+        out.write_text(markdown(results, machine, _command(only, short, repeat), repeat), "utf-8")
     typer.echo(json.dumps(to_dict(results)) if as_json else _summary(results, folder))
     return 0 if passed(results) else CHECK_FAILED
 

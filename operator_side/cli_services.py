@@ -7,6 +7,7 @@ import typer
 
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
+from protocol.errors import ConfigError
 
 ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help="TOML file; see `sightline config`.")]
 Sets = Annotated[
@@ -92,12 +93,23 @@ def vision(
     connect: Connect = None,
     config: ConfigFile = None,
     sets: Sets = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what is seen and steer nothing.")] = False,
+    camera: Annotated[
+        str | None, typer.Option("--camera", metavar="KIND", help="With --dry-run: look through this machine's own camera.")
+    ] = None,
+    camera_sets: Annotated[
+        list[str] | None, typer.Option("--camera-set", metavar="KEY=VALUE", help="An option of that camera, e.g. fps=15.")
+    ] = None,
     shape: Annotated[str | None, typer.Option("--shape", hidden=True)] = None,
 ) -> int:
     """Look at a robot's pictures and steer it, until Ctrl-C."""
+    if camera is not None and not dry_run:
+        raise ConfigError("--camera looks without a robot, so there is nothing to steer: add --dry-run")
     options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect)}
     loaded = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
     with needs("vision"):
+        if dry_run:
+            return _only_look(loaded.config, camera, camera_sets or [])
         if shape is not None:
             from operator_side.shaped_vision import run_shaped
 
@@ -105,6 +117,16 @@ def vision(
         from vision_side.service import run
 
         return run(loaded.config)  # type: ignore[arg-type]
+
+
+def _only_look(config: Any, camera: str | None, camera_sets: list[str]) -> int:
+    from operator_side.local_camera import local_camera
+    from vision_side.dry_run import watch_camera, watch_robot
+
+    if camera is None:
+        return watch_robot(config, typer.echo, None)
+    with local_camera(camera, camera_sets) as opened:
+        return watch_camera(config, opened, typer.echo, None)
 
 
 def _ends(endpoints: list[str] | None) -> tuple[str, ...] | None:

@@ -21,8 +21,9 @@ def status_lines(robot: str, status: Status) -> Iterator[str]:
     yield f"wheels    {twist_text(status.applied)}"
     yield f"limits    {status.max_linear_mps:.2f} m/s, {status.max_angular_rad_s:.2f} rad/s"
     yield f"sight     frame age {millis(status.frame_age_us)}, capture to command {millis(status.latency_us)}"
+    camera = "calibrated" if stream.calibrated else "not calibrated"
     counts = f"{stream.sent} sent, {stream.credit_timeouts} unanswered"
-    yield f"stream    {stream.fps:.0f} fps, {counts}, window {stream.window}"
+    yield f"stream    {stream.fps:.0f} fps, {counts}, window {stream.window}, camera {camera}"
     yield f"commands  {status.accepted} accepted, {refusals_text(status)}, {stream.dropped_commands} dropped"
     if status.last_refusal:
         last = status.last_refusal

@@ -172,6 +172,8 @@ class StreamStatus(Wire):
     fps: Number = 0.0
     dropped_commands: Counter = 0
     refused_pictures: Counter = 0
+    calibrated: bool = False
+    """Whether the camera's model was measured."""
 
 
 class Status(Wire):

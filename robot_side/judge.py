@@ -77,7 +77,7 @@ class FreshnessRecord:
     """Since when the camera's picture has been the same, byte for byte. A live sensor's noise never repeats."""
 
     def __init__(self) -> None:
-        self._fingerprint = 0
+        self._fingerprint: int | None = None
         self._newest_us = self._changed_us = 0
 
     def add(self, t_us: int, fingerprint: int) -> None:
@@ -89,6 +89,10 @@ class FreshnessRecord:
     def unchanged_us(self) -> int:
         """For how long the picture has not changed."""
         return self._newest_us - self._changed_us
+
+    def shown_since_us(self, t_us: int) -> int:
+        """Since when that has been seen which a frame captured at `t_us` shows: a repeated picture is old sight."""
+        return t_us if self._fingerprint is None else min(t_us, self._changed_us)
 
 
 class SequenceRecord:

@@ -38,8 +38,6 @@ class SafetyConfig(Config):
     """... falling linearly to zero here; older is refused."""
     silence_ms: Millis = 300
     """No accepted command for this long: HOLD."""
-    frozen_ms: Millis = 400
-    """The camera's picture has not changed by one byte for this long, though its stamps advance: HOLD."""
     lease_ms: Millis = 1_000
     disarm_after_hold_s: Annotated[float, Field(ge=1, le=600)] = 10.0
     live_commands_to_arm: Annotated[int, Field(ge=1, le=100)] = 5

@@ -141,7 +141,7 @@ class Network:
     def _report(self, now_us: int) -> None:
         """Tell the driver how the stream does, and everybody what the camera is."""
         with self._lock:
-            status = self._sending.status(now_us, self._dropped_commands)
+            status = self._sending.status(now_us, self._dropped_commands, self._camera.model.calibrated)
             camera = self._sending.camera_message(self._camera.model, now_us)
         self._to_driver(bytes([ipc.Kind.STREAM]) + encode(status))
         if camera is not None:

@@ -103,7 +103,10 @@ class SafetyGate:
             return _GUEST, 0
         if header.echo.channel == "status":
             raise WireError(Refusal.UNKNOWN_FRAME, "a twist must cite a frame, not a status")
-        age_us = self.issued.age_us(header.echo, now_us, self.config.max_age_us)
+        self.issued.age_us(header.echo, now_us, self.config.max_age_us)
+        age_us = now_us - self.pictures.shown_since_us(header.echo.t_us)
+        if age_us > self.config.max_age_us:
+            raise WireError(Refusal.STALE, f"the camera's picture has not changed for {age_us / 1e3:.0f} ms")
         self._sequence.check(header)
         return Holder(source=header.source, session=header.session), age_us
 
@@ -146,14 +149,14 @@ class SafetyGate:
 
     def _goal(self, now_us: int) -> Twist:
         """The commanded twist under the limit that the frame's age leaves; zero, and HOLD, without a young one."""
+        if self.pictures.unchanged_us() > self.config.max_age_us:
+            return self._hold("the camera's picture does not change", now_us)
         command = self._command
         if command is None:
             return self._hold("armed; no command yet", now_us)
         silent_us, age_us = now_us - command.arrival_us, now_us - command.echo_us
         if silent_us > command.life_us:
             return self._hold(f"no accepted command for more than {command.life_us // 1000} ms", now_us)
-        if self.pictures.unchanged_us() > self.config.frozen_ms * 1000:
-            return self._hold("the camera's picture does not change", now_us)
         factor = age_factor(self.config, age_us)
         if factor == 0.0:
             return self._hold(f"the frame behind the command is {self.config.zero_speed_age_ms} ms old", now_us)
@@ -255,8 +258,6 @@ class SafetyGate:
     def frame_age_us(self, now_us: int) -> int | None:
         """Age of the frame behind the command in force; None without one."""
         return None if self._command is None else max(0, now_us - self._command.echo_us)
-
-    # --- inside --------------------------------------------------------------------------------------------------
 
     def _refuse_beside_human(self, who: Holder, now_us: int) -> None:
         holder = self._lease.live_holder(now_us)

@@ -81,10 +81,10 @@ class Sending:
         self._camera_seq += 1
         return Message(CAMERA, "", encode(stamp), encode(model))
 
-    def status(self, now_us: int, dropped_commands: int = 0) -> StreamStatus:
+    def status(self, now_us: int, dropped_commands: int = 0, calibrated: bool = False) -> StreamStatus:
         """Counters of the stream."""
         status = self._stream.status(now_us, dropped_commands)
-        return status.model_copy(update={"refused_pictures": self._refused_pictures})
+        return status.model_copy(update={"refused_pictures": self._refused_pictures, "calibrated": calibrated})
 
 
 def _rounded(pair: Planar) -> Planar:

@@ -41,6 +41,21 @@ def imported_modules(tree):
             yield node.module or ""
 
 
+def on_import(body):
+    """The statements that run when a module is imported: not those inside functions."""
+    for node in body:
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node
+            for part in ("body", "orelse", "finalbody", "handlers"):
+                yield from on_import(getattr(node, part, []))
+
+
+def roots_on_import(path):
+    statements = on_import(ast.parse(path.read_text()).body)
+    imports = [node for node in statements if isinstance(node, ast.Import | ast.ImportFrom)]
+    return {module.split(".")[0] for module in imported_modules(ast.Module(imports, []))}
+
+
 def roots(path):
     return {module.split(".")[0] for module in imported_modules(ast.parse(path.read_text()))}
 
@@ -50,7 +65,7 @@ def test_imports_follow_the_rule(path):
     package = path.relative_to(ROOT).parts[0]
     ours = roots(path) & set(PACKAGES) - {package}
     assert ours <= MAY_IMPORT[package]
-    if path.parent.name != "transports":
+    if path.parent.name not in ("transports", "peers"):  # benchmarks/peers builds what others would build
         assert not roots(path) & TRANSPORT_MODULES
 
 
@@ -76,7 +91,9 @@ def test_every_file_says_what_it_is_and_pure_files_are_pure(path):
     "path", [path for path in FILES if path.parts[-2] in ("robot_side", "hardware") or path.name == "bus.py"], ids=str
 )
 def test_the_robot_needs_no_heavy_package(path):
-    assert not roots(path) & HEAVY_MODULES
+    # A camera plug-in may import OpenCV when it is opened: only who chose that camera needs it installed.
+    found = roots_on_import(path) if path.parent.name == "hardware" else roots(path)
+    assert not found & HEAVY_MODULES
 
 
 @pytest.mark.parametrize("path", FILES, ids=IDS)

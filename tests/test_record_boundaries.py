@@ -116,6 +116,26 @@ def test_a_picture_is_unchanged_since_it_was_first_seen(pictures, unchanged_us):
     assert record.unchanged_us() == unchanged_us
 
 
+@pytest.mark.parametrize(
+    ("pictures", "t_us", "since_us"),
+    [
+        ([], 5, 5),
+        ([(10, 7)], 10, 10),
+        ([(10, 7)], 9, 9),
+        ([(10, 7)], 11, 10),
+        ([(10, 7), (20, 7)], 20, 10),
+        ([(10, 7), (20, 8)], 20, 20),
+        ([(10, 7), (20, 8)], 15, 15),
+        ([(10, 0), (20, 0)], 20, 20),
+    ],
+)
+def test_a_frame_shows_what_was_first_seen_at_the_last_change(pictures, t_us, since_us):
+    record = FreshnessRecord()
+    for at_us, fingerprint in pictures:
+        record.add(at_us, fingerprint)
+    assert record.shown_since_us(t_us) == since_us
+
+
 # --- sequence numbers --------------------------------------------------------------------------------------------
 
 

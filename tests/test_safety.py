@@ -456,6 +456,24 @@ def test_a_picture_that_does_not_change_holds_the_robot(unchanged_us, holds):
     assert rig.drive(40).gate.state is State.ACTIVE
 
 
+@pytest.mark.parametrize(("shown_ms", "reason"), [(400, None), (401, Refusal.STALE)])
+def test_a_repeated_picture_is_as_old_as_when_it_was_first_shown(shown_ms, reason):
+    rig = Rig(silence_ms=300).armed().drive(400)
+    rig.gate.pictures.add(rig.now_us, 7)
+    rig.now_us += shown_ms * MS
+    rig.gate.pictures.add(rig.now_us, 7)
+    verdict = rig.offer()
+    assert verdict.reason is reason
+    assert verdict.age_us == 400 * MS if reason is None else "has not changed for 401 ms" in verdict.detail
+
+
+def test_a_frame_from_before_the_last_change_keeps_its_own_age():
+    rig = Rig().armed()
+    old = rig.frame(age_ms=50)
+    rig.gate.pictures.add(rig.now_us, 8)
+    assert rig.offer(header=rig.header(old)).age_us == 50 * MS
+
+
 def test_a_source_that_is_not_live_is_never_frozen():
     rig = Rig().armed()
     for step in range(100):

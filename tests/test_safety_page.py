@@ -32,7 +32,7 @@ def test_the_page_shows_the_table_of_the_code():
 
 def test_the_page_states_the_default_numbers():
     text, config = PAGE.read_text(), SafetyConfig()
-    for number in (config.full_speed_age_ms, config.zero_speed_age_ms, config.silence_ms, config.frozen_ms):
+    for number in (config.full_speed_age_ms, config.zero_speed_age_ms, config.silence_ms):
         assert f"{number} ms" in text
 
 

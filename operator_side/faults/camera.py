@@ -35,7 +35,7 @@ class FaultyCamera:
 
     def __init__(self, config: Config) -> None:
         self._camera = SimCamera(SimSocketConfig(socket_dir=config.socket_dir))
-        self.model = self._camera.model
+        self.model, self.live = self._camera.model, self._camera.live
         self._mode = config.folder / MODE
         self._ledger = Ledger(config.folder / LEDGER)
         self._spares = {name: (config.folder / f"{name}.jpg").read_bytes() for name in SPARE}

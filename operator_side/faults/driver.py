@@ -34,9 +34,9 @@ class Script:
         self._frames: LatestSlot[Message] = link.latest(FRAME)
         self._recording = options.recording.open("a") if options.recording and not options.fault else None
 
-    def frame(self) -> FrameHeader | None:
-        """The newest frame's header, waiting a little for one."""
-        message = self._frames.take(WAIT_S)
+    def frame(self, wait_s: float = WAIT_S) -> FrameHeader | None:
+        """The header of the newest frame not yet taken, waiting a little for one."""
+        message = self._frames.take(wait_s)
         return decode(FrameHeader, message.header) if message else None
 
     def answer(self, frame: FrameHeader, **changes: object) -> AnswerHeader:

@@ -4,12 +4,12 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from operator_side.processes import Processes
+from operator_side.processes import END_S, Processes
 
 COMMAND_LINE: Final = "operator_side.cli"
 _RESIDENT: Final = "RssAnon:"
@@ -41,6 +41,12 @@ class Fleet(Processes):
         process.kill()
         process.wait()
 
+    def end_one(self, name: str) -> None:
+        """SIGTERM, and forget it."""
+        self._running[name].terminate()
+        if self.exit_code(name, END_S) is None:
+            self.kill(name)
+
     def exit_code(self, name: str, timeout_s: float) -> int | None:
         """Its exit code once it has ended, None if it does not in time; an ended one is forgotten."""
         try:
@@ -56,9 +62,10 @@ class Fleet(Processes):
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii").split()
         return int(children[-1]) if children else 0
 
-    def memory_kib(self) -> dict[int, int]:
-        """Memory that each process, and each one's child, holds for itself."""
-        pids = [pid for name in self._running for pid in (self.pid(name), self.child(name)) if pid]
+    def memory_kib(self, names: Iterable[str]) -> dict[int, int]:
+        """Memory that each of these that runs, and each one's child, holds for itself."""
+        running = self._running.keys() & names
+        pids = [pid for name in running for pid in (self.pid(name), self.child(name)) if pid]
         return {pid: held for pid in pids if (held := _resident_kib(pid)) is not None}
 
     def end(self) -> list[str]:

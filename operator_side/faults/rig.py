@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from operator_side.faults import camera, judge
+from operator_side.faults.clock import write_wrong_clock
 from operator_side.faults.fleet import COMMAND_LINE, Fleet, raise_priority
 from operator_side.faults.judge import Motors, Sent, wheel_mps
 from operator_side.faults.ledger import GOOD, INJECTED, now_us, read_ledger
@@ -21,6 +22,8 @@ from operator_side.faults.sampler import stalled_us
 from operator_side.faults.wires import BenchWire
 from operator_side.toml_text import toml_text
 from protocol.errors import SightlineError
+from robot_side.limits import TICK_US
+from sim.bus import SimDrive, SimSocketConfig
 from sim.wire_tun import ADDRESS_A
 
 ROBOT: Final = "r1"
@@ -29,6 +32,7 @@ AT_SPEED_S: Final = 25.0
 STEADY_US: Final = 500_000
 PORT: Final = 7447
 _POLL_S: Final = 0.01
+_PROBES: Final = 25
 _CHASE: Final[dict[str, Any]] = {
     "summary": "a ball on a circle at 0.4 m/s", "stand_off_m": 0.8, "look": "plain",
     "target": {"kind": "path", "speed_mps": 0.4, "path": [{"length_m": 12.566371, "turn_deg": 360.0}]},
@@ -69,6 +73,7 @@ class Rig:
         self.endpoint = ""
         self._peers: list[str] = []
         self._before_kib: dict[int, int] = {}
+        self._sockets = ""
 
     def __enter__(self) -> Self:
         with self._ending:
@@ -83,12 +88,12 @@ class Rig:
 
     def _start(self) -> None:
         self.folder.mkdir(parents=True)
-        sockets = self._ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
+        self._sockets = self._ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
         self._ending.enter_context(self.fleet)
         if self.setup.wired:
             self.wire = self._ending.enter_context(BenchWire(self.folder / "wire.log"))
         self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"tcp/127.0.0.1:{_free_port()}"
-        self._write_files(sockets)
+        self._write_files(self._sockets)
         self.fleet.run("sim", COMMAND_LINE, ["sim", "--config", str(self.folder / "sim.toml")])
         self.fleet.run("sampler", "operator_side.faults.sampler", [str(self.folder / "holes.csv")])
         self.fleet.wait_line("sim", "simulation ready", READY_S)
@@ -98,7 +103,7 @@ class Rig:
         self.start_robot()
         self.start_peer("peer", self.setup.driver, fault=self.setup.fault)
         self.wait_speed(self.setup.at_speed_mps)
-        self._before_kib = self.fleet.memory_kib()
+        self._before_kib = self.fleet.memory_kib(self._judged)
 
     def _write_files(self, sockets: str) -> None:
         device = {"kind": "sim", "options": {"socket_dir": sockets}}
@@ -116,7 +121,8 @@ class Rig:
         }
         for name, table in files.items():
             (self.folder / f"{name}.toml").write_text(toml_text(table), "utf-8")
-        (self.folder / "sitecustomize.py").write_text(_clock_text(self.setup.clock, self.folder), "utf-8")
+        if self.setup.clock:
+            write_wrong_clock(self.folder, self.setup.clock)
 
     # --- processes -----------------------------------------------------------------------------------------------
 
@@ -182,6 +188,16 @@ class Rig:
         late = [row for row in self.motors() if row.t_us > now_us() - STEADY_US]
         return len(late) > STEADY_US / 40_000 and all(wheel_mps(row) >= mps for row in late)
 
+    def probe_motors(self) -> float:
+        """With the robot gone: the last speed it told a wheel, m/s. Then tells zero itself, so that the log goes on."""
+        last_mps = wheel_mps(self.motors()[-1])
+        drive = SimDrive(SimSocketConfig(socket_dir=self._sockets))
+        for _ in range(_PROBES):
+            drive.set(0.0, 0.0)
+            time.sleep(TICK_US / 1e6)
+        drive.close()
+        return last_mps
+
     # --- evidence ------------------------------------------------------------------------------------------------
 
     def motors(self) -> list[Motors]:
@@ -202,27 +218,20 @@ class Rig:
         """How often the fault was done."""
         return len(self.noted(name, INJECTED))
 
+    @property
+    def _judged(self) -> tuple[str, ...]:
+        """Sightline's own processes; what a scripted driver needs to send 10 MB is its own affair."""
+        return ("sim", "robot", "peer") if self.setup.driver == "vision" else ("sim", "robot")
+
     def grown_mb(self) -> float:
-        """The most that any process has grown since the wheels were at speed."""
-        after_kib = self.fleet.memory_kib()
+        """The most that any judged process has grown since the wheels were at speed."""
+        after_kib = self.fleet.memory_kib(self._judged)
         grown_kib = (after_kib[pid] - before for pid, before in self._before_kib.items() if pid in after_kib)
         return max(grown_kib, default=0) / 1024
 
     def stalled_us(self, from_us: int, to_us: int) -> int:
         """The longest time in the window for which stamps cannot be trusted."""
         return stalled_us(self.folder / "holes.csv", from_us, to_us)
-
-
-def _clock_text(expression: str, folder: Path) -> str:
-    """A `sitecustomize` that puts Python's wall clock wrong in every process that starts with this folder on its path."""
-    return f"""import os, pathlib, sys, time
-if {bool(expression)} and "operator_side.faults.sampler" not in sys.argv:
-    right, right_ns = time.time, time.time_ns
-    time.time = lambda: right() + ({expression or 0})
-    time.time_ns = lambda: right_ns() + int(({expression or 0}) * 1e9)
-    with open({str(folder / "clock.ledger")!r}, "a") as ledger:
-        ledger.write(f"{INJECTED},{{time.monotonic_ns() // 1000}},0\\n")
-"""
 
 
 def _free_port() -> int:

@@ -1,21 +1,19 @@
 """A camera that plays a folder of JPEGs in name order, looped and paced. Shell (files and a clock)."""
 
-import math
-import time
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
 
-from protocol.config import Config
 from protocol.errors import HardwareError, WireError
 from protocol.jpeg import JpegSize, read_jpeg_size
-from protocol.messages import CameraModel
+from robot_side.hardware.lens import LensConfig, camera_model
+from robot_side.hardware.pace import Pace, now_us
 from robot_side.ports import Picture
 
 
-class FolderCameraConfig(Config):
-    """`hfov_deg` is the horizontal field of view that the pictures were taken with."""
+class FolderCameraConfig(LensConfig):
+    """`path` holds the pictures, all of one size."""
 
     path: Path
     fps: Annotated[float, Field(gt=0, le=240)] = 30.0
@@ -29,48 +27,37 @@ class FolderCamera:
     live = False
 
     def __init__(self, config: FolderCameraConfig) -> None:
-        paths = sorted(path for path in config.path.expanduser().glob("*") if path.suffix.lower() in (".jpg", ".jpeg"))
-        if not paths:
-            raise HardwareError(f"no .jpg pictures in {config.path}; point camera.options.path at a folder with some")
+        paths = jpegs_in(config.path)
         self._pictures = [path.read_bytes() for path in paths]
-        sizes = {_size(path, jpeg) for path, jpeg in zip(paths, self._pictures, strict=True)}
-        if len(sizes) > 1:
+        sizes = {jpeg_size(path, jpeg) for path, jpeg in zip(paths, self._pictures, strict=True)}
+        if len({(size.width_px, size.height_px) for size in sizes}) > 1:
             raise HardwareError(f"the pictures in {config.path} differ in size; one camera has one size")
-        self.model = _model(sizes.pop(), config.hfov_deg)
-        self._interval_s = 1 / config.fps
-        self._next_s = time.monotonic()
+        self.model = camera_model(config, sizes.pop())
+        self._pace = Pace(config.fps)
         self._count = 0
 
     def read(self, timeout_s: float) -> Picture | None:
         """The picture of the next tick."""
-        now_s = time.monotonic()
-        self._next_s = max(self._next_s + self._interval_s, now_s)
-        if self._next_s - now_s > timeout_s:
-            time.sleep(timeout_s)
-            self._next_s -= self._interval_s
+        if not self._pace.wait(timeout_s):
             return None
-        time.sleep(self._next_s - now_s)
         self._count += 1
-        return Picture(self._pictures[self._count % len(self._pictures)], time.monotonic_ns() // 1000)
+        return Picture(self._pictures[(self._count - 1) % len(self._pictures)], now_us())
 
     def close(self) -> None:
         """Nothing to give back."""
 
 
-def _size(path: Path, jpeg: bytes) -> JpegSize:
+def jpegs_in(folder: Path) -> list[Path]:
+    """The .jpg and .jpeg files of `folder` in name order. Raises HardwareError if there is none."""
+    paths = sorted(path for path in folder.expanduser().glob("*") if path.suffix.lower() in (".jpg", ".jpeg"))
+    if not paths:
+        raise HardwareError(f"no .jpg pictures in {folder}; name a folder that has some")
+    return paths
+
+
+def jpeg_size(path: Path, jpeg: bytes) -> JpegSize:
+    """The size of `jpeg`, read from `path`. Raises HardwareError if it is no plain JPEG."""
     try:
         return read_jpeg_size(jpeg)
     except WireError as error:
         raise HardwareError(f"{path}: {error.detail}; remove it or convert it to a plain JPEG") from None
-
-
-def _model(size: JpegSize, hfov_deg: float) -> CameraModel:
-    focal_px = size.width_px / 2 / math.tan(math.radians(hfov_deg) / 2)
-    return CameraModel(
-        width_px=size.width_px,
-        height_px=size.height_px,
-        fx_px=focal_px,
-        fy_px=focal_px,
-        cx_px=size.width_px / 2,
-        cy_px=size.height_px / 2,
-    )

@@ -1,0 +1,148 @@
+"""`sightline bench loop` and `bench watchers`: is the whole loop fresh, and does it stay so? Shell."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+
+import typer
+
+from operator_side.cli_judge import CHECK_FAILED, Json
+from operator_side.extras import needs
+from protocol.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from benchmarks.loop import Race
+
+Transport = Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")]
+
+
+class Judged(Protocol):
+    """A check, whichever bench made it."""
+
+    @property
+    def name(self) -> str:
+        """What is demanded."""
+        ...
+
+    @property
+    def value(self) -> float | None:
+        """What was measured."""
+        ...
+
+    @property
+    def unit(self) -> str:
+        """Of value and bound."""
+        ...
+
+    @property
+    def bound(self) -> float:
+        """The most that is allowed."""
+        ...
+
+    @property
+    def ok(self) -> bool:
+        """Whether it holds."""
+        ...
+
+
+def register_bench(group: typer.Typer) -> None:
+    """Add the commands to the `bench` group."""
+    group.command(epilog="Example: sightline bench loop --detector-delay-ms 80 --seconds 20 --out runs/loop")(loop)
+    group.command(epilog="Example: sightline bench watchers --viewers 10 --seconds 20")(watchers)
+
+
+def loop(
+    *,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Of the pictures, in pixels.")] = "640x480",
+    fps: Annotated[float, typer.Option(help="Pictures a second, 1 to 240.")] = 30.0,
+    transport: Transport = "zenoh",
+    detector_delay_ms: Annotated[float, typer.Option(help="Make every detector this much slower, 0 to 300.")] = 0.0,
+    seconds: Annotated[float, typer.Option(help="Of each contestant, 2 to 600.")] = 10.0,
+    peers: Annotated[str, typer.Option(help="all, none, or of older, lekiwi, openpi, callback.")] = "all",
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Leave loop.json and loop.png here.")] = None,
+    as_json: Json = False,
+) -> int:
+    """Capture to the driver's verdict, beside the in-process floor, bare TCP and what others build."""
+    with needs("bench"):
+        from benchmarks.loop import run_race
+        from benchmarks.loop_setting import LoopSetting, peers_of, size_of
+
+        if peers != "none":
+            import zmq  # noqa: F401  # a peer's need; said here, not by a process that dies
+    width_px, height_px = size_of(size)
+    setting = LoopSetting(Path(), width_px, height_px, fps, transport, detector_delay_ms, seconds, peers_of(peers))
+    race = run_race(setting, lambda line: typer.echo(line, err=True))
+    result = _result_of(race)
+    if out is not None:
+        _leave(out, race, result)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        typer.echo("\n".join([*_table(race), "", *_check_lines(race.checks)]))
+    return 0 if result["ok"] else CHECK_FAILED
+
+
+def watchers(
+    *,
+    viewers: Annotated[int, typer.Option(min=2, max=12, help="One never reads, one reads once a second.")] = 10,
+    seconds: Annotated[float, typer.Option(min=3, max=600, help="Without viewers, and again with them.")] = 20.0,
+    transport: Transport = "zenoh",
+    as_json: Json = False,
+) -> int:
+    """What viewers of the robot's pictures cost whoever drives: age of the commands, memory of the robot."""
+    with needs("all"):
+        from benchmarks.watchers import measure_watchers
+
+    checks, figures = measure_watchers(viewers, seconds, transport, lambda line: typer.echo(line, err=True))
+    ok = all(check.ok for check in checks)
+    if as_json:
+        typer.echo(json.dumps({"ok": ok, "checks": [asdict(check) for check in checks], "figures": figures}))
+    else:
+        typer.echo("\n".join(_check_lines(checks)))
+    return 0 if ok else CHECK_FAILED
+
+
+def _result_of(race: "Race") -> dict[str, Any]:
+    return {
+        "ok": all(check.ok for check in race.checks),
+        "checks": [asdict(check) for check in race.checks],
+        "setting": {**asdict(race.setting), "pictures": None, "jpeg_bytes": race.jpeg_bytes},
+        "contestants": [asdict(figures) for figures in race.figures.values()],
+    }
+
+
+def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
+    with needs("report"):
+        from benchmarks.loop_picture import draw_race
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "loop.json").write_text(json.dumps(result, indent=1), "utf-8")
+        draw_race(folder / "loop.png", race)
+    except OSError as error:
+        raise ConfigError(f"--out {folder}: {error.strerror}; choose a folder that can be written") from None
+
+
+def _table(race: "Race") -> list[str]:
+    head = f"{'':10} {'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'bytes':>8} {'others':>7}  CPU ms a picture; MB"
+    return [head, *(_row(name, race) for name in race.figures)]
+
+
+def _row(name: str, race: "Race") -> str:
+    one = race.figures[name]
+    ages = " ".join(f"{'never' if age is None else f'{age:.1f}':>8}" for age in (one.p50_ms, one.p95_ms, one.p99_ms))
+    cpu = " ".join(f"{process} {cpu_ms:.2f}" for process, cpu_ms in one.cpu_ms.items())
+    memory = " ".join(f"{megabytes:.0f}" for megabytes in one.memory_mb.values())
+    return (
+        f"{name:10} {one.answered_percent:7.1f} % {ages}    {one.bytes_per_picture:8.0f} {one.taken_percent:5.1f} %  "
+        f"{cpu}; {memory}"
+    )
+
+
+def _check_lines(checks: "Sequence[Judged]") -> list[str]:
+    from operator_side.check_text import check_line
+    from operator_side.score import Check
+
+    return [check_line(Check(one.name, one.value, one.unit, one.bound, one.ok)) for one in checks]

@@ -1,0 +1,106 @@
+"""Runs rows of the fault bench and judges them. Shell (processes, files)."""
+
+import shutil
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from operator_side.faults.judge import (
+    MEMORY_MB,
+    Blind,
+    Stop,
+    at_least,
+    at_most,
+    last_valid_us,
+    measure_stop,
+    moved_on_old_sight,
+    stop_checks,
+)
+from operator_side.faults.rig import Rig
+from operator_side.faults.row import Injected, Outcome, Row
+from operator_side.faults.sampler import STALL_US
+from operator_side.score import Check
+from protocol.errors import SightlineError
+from sim.wire_tun import why_impossible
+
+MOST_TRIES: Final = 3
+_WATCHED_US: Final = 1_000_000
+"""After the injection: the time in which a stop is measured, and a stalled sampler spoils it."""
+
+
+def run_row(row: Row, folder: Path) -> Outcome:
+    """Run one row, again while its sampler stalled; its files stay in `folder` unless all was well."""
+    if row.setup.wired and (why := why_impossible()):
+        return Outcome(row, skipped=why)
+    for number in range(1, MOST_TRIES + 1):
+        place = folder / f"{row.id}-{number}"
+        shutil.rmtree(place, ignore_errors=True)
+        try:
+            checks, stalled_us = _run_once(row, place)
+        except (SightlineError, OSError) as error:  # OSError: a process that was to be hurt is gone
+            return Outcome(row, trouble=" ".join(str(error).split()))
+        if stalled_us <= STALL_US:
+            break
+    else:
+        return Outcome(row, checks, trouble=f"inconclusive: sampler stalled {stalled_us / 1000:.0f} ms each time")
+    outcome = Outcome(row, checks)
+    if outcome.ok:
+        shutil.rmtree(place)
+    return outcome
+
+
+def _run_once(row: Row, place: Path) -> tuple[tuple[Check, ...], int]:
+    """The checks, and for how long the sampler stalled."""
+    with Rig(place, row.setup) as rig:
+        injected = row.inject(rig)
+        grown_mb = rig.grown_mb()
+        checks = (
+            at_least("injected", injected.count, "times", 1),
+            *_motion_checks(row, rig, injected),
+            at_most("memory", grown_mb, "MB", MEMORY_MB),
+            *injected.checks,
+        )
+        return checks, rig.stalled_us(injected.at_us, injected.at_us + _WATCHED_US)
+
+
+def _motion_checks(row: Row, rig: Rig, injected: Injected) -> Iterable[Check]:
+    rows, sent = rig.motors(), rig.sent()
+    blind = Blind(injected.at_us, injected.resumed_us) if row.blind else None
+    if row.stops:
+        until_us = injected.resumed_us or rows[-1].t_us
+        since_us = last_valid_us(sent, blind or Blind(until_us))
+        stop = measure_stop(rows, since_us, injected.resumed_us) if since_us else Stop(None, None, 0.0)
+        yield from stop_checks(stop, row.zero_ms, row.distance_m)
+    yield at_most("on old sight", moved_on_old_sight(rows, sent, blind), "lines", 0)
+    if row.again:
+        yield at_least("drives again", bool(injected.again), "", 1)
+
+
+def run_rows(rows: Iterable[Row], repeat: int, folder: Path, say: Callable[[Outcome], None]) -> list[list[Outcome]]:
+    """Every row `repeat` times; one that is skipped is not repeated."""
+    results: list[list[Outcome]] = []
+    with _terminated_like_interrupted():
+        for row in rows:
+            outcomes: list[Outcome] = []
+            while len(outcomes) < repeat and not any(outcome.skipped for outcome in outcomes):
+                outcomes.append(run_row(row, folder))
+                say(outcomes[-1])
+            results.append(outcomes)
+    return results
+
+
+@contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """SIGTERM ends the bench as Ctrl-C does: no process is left behind."""
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

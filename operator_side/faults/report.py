@@ -1,0 +1,113 @@
+"""The fault bench's report: a line per run, JSON for scripts, and the table that `docs/faults.md` holds. Pure."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+from operator_side.check_text import number
+from operator_side.faults.row import Outcome
+from operator_side.score import Check
+
+Results = Sequence[Sequence[Outcome]]
+_LOWEST_IS_WORST: Final = ("injected", "drives again", "sent", "speed kept", "commands after it", "reset refused",
+                           "next driver after")
+_TOLD_IF_WRONG: Final = ("on old sight", "drives again", "reset refused", "exit code", "last speed told")
+"""Yes or no: in the table they are in what was demanded."""
+_COUNTED_FROM: Final = 1000
+
+
+def passed(results: Results) -> bool:
+    """Whether something ran, and all that ran is within bounds; rows that could not run here do not count."""
+    ran = [outcome for outcomes in results for outcome in outcomes if not outcome.skipped]
+    return bool(ran) and all(outcome.ok for outcome in ran)
+
+
+def worst_checks(outcomes: Iterable[Outcome]) -> list[Check]:
+    """Of each figure the worst run; one that never happened is worst of all."""
+    by_name: dict[str, list[Check]] = {}
+    for outcome in outcomes:
+        for check in outcome.checks:
+            by_name.setdefault(check.name, []).append(check)
+    return [max(checks, key=_badness) for checks in by_name.values()]
+
+
+def _badness(check: Check) -> tuple[bool, float]:
+    if check.value is None:
+        return True, float("inf")
+    return not check.ok, -check.value if check.name in _LOWEST_IS_WORST else check.value
+
+
+def run_line(outcome: Outcome) -> str:
+    """One run, for a person who waits."""
+    if outcome.skipped:
+        return f"{outcome.row.id:<22} skip  {outcome.skipped}"
+    wrong = [_figure(check) + f" (bound {number(check.bound)})" for check in outcome.checks if not check.ok]
+    text = ", ".join([outcome.trouble] * bool(outcome.trouble) + (wrong or _figures(outcome.checks)))
+    return f"{outcome.row.id:<22} {'ok  ' if outcome.ok else 'FAIL'}  {text}"
+
+
+def _figures(checks: Iterable[Check]) -> list[str]:
+    return [_figure(check) for check in checks]
+
+
+def _figure(check: Check) -> str:
+    counted = check.value is not None and check.value >= _COUNTED_FROM
+    return f"{check.name} {f'{check.value:.0f}' if counted else number(check.value)} {check.unit}".rstrip()
+
+
+def to_dict(results: Results) -> dict[str, Any]:
+    """One object, as every judging command prints with `--json`."""
+    checks = [
+        asdict(check) | {"name": f"{outcomes[0].row.id}: {check.name}"}
+        for outcomes in results
+        for check in worst_checks(outcomes)
+    ]
+    rows = [
+        {
+            "id": outcomes[0].row.id, "what": outcomes[0].row.what, "demanded": outcomes[0].row.demanded,
+            "runs": len(outcomes), "ok": all(one.ok for one in outcomes), "skipped": outcomes[0].skipped,
+            "trouble": next((one.trouble for one in outcomes if one.trouble), ""),
+        }
+        for outcomes in results
+    ]
+    return {"ok": passed(results), "checks": checks, "rows": rows}
+
+
+def markdown(results: Results, machine: Sequence[str], command: str, repeat: int) -> str:
+    """The whole of `docs/faults.md`."""
+    ran = [outcomes for outcomes in results if not outcomes[0].skipped]
+    good = sum(all(one.ok for one in outcomes) for outcomes in ran)
+    return "\n".join([
+        "# What the robot did when things broke",
+        "",
+        f"Written by `{command}`; do not edit. {good} of {len(ran)} rows passed.",
+        "",
+        *_LEGEND,
+        "",
+        *(f"- {line}" for line in machine),
+        "",
+        f"| fault | demanded | worst of {repeat} | pass |",
+        "|---|---|---|---|",
+        *map(_table_row, results),
+        "",
+    ])
+
+
+_LEGEND: Final = (
+    "Real processes, one fault each, injected at 0.3 m/s or more (vision follows a ball) or at 0.5 m/s (a scripted",
+    "driver), and judged from the simulated motors' own log. Times count from the last valid command. *Falls*: the",
+    "wheels leave their highest speed for good. *Zero*: they are told zero and really roll slower than 0.01 m/s.",
+    "*Injected*: how often the fault was done; a row that injected nothing fails. In every row, besides that:",
+    "no motion that no frame younger than 400 ms allows, and no process of Sightline grows by 5 MB. A row during which",
+    "this machine stood still for over 20 ms is run again, three times at most.",
+)
+
+
+def _table_row(outcomes: Sequence[Outcome]) -> str:
+    row, first = outcomes[0].row, outcomes[0]
+    if first.skipped:
+        return f"| {row.what} | {row.demanded} | {first.skipped} | not run |"
+    trouble = [one.trouble for one in outcomes if one.trouble][:1]
+    told = [check for check in worst_checks(outcomes) if not check.ok or check.name not in _TOLD_IF_WRONG]
+    good = all(one.ok for one in outcomes)
+    return f"| {row.what} | {row.demanded} | {', '.join([*trouble, *_figures(told)])} | {'yes' if good else '**no**'} |"

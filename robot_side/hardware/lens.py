@@ -1,0 +1,91 @@
+"""The lens of a camera plug-in: a calibrated model from a file or from options, else a guess from its angle. Shell.
+
+The file is what `sightline calibrate camera` writes: the fields of `protocol.messages.CameraModel` as TOML.
+"""
+
+import json
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError
+
+from protocol.config import Config
+from protocol.errors import ConfigError
+from protocol.jpeg import JpegSize
+from protocol.messages import CameraModel
+
+
+class LensConfig(Config):
+    """`model_file` (TOML) or `model` (the same fields as a table); without them the lens is guessed from `hfov_deg`.
+
+    `hfov_deg` is the horizontal field of view; a model guessed from it says that it is not calibrated.
+    """
+
+    hfov_deg: Annotated[float, Field(gt=5, lt=175)] = 60.0
+    model_file: Path | None = None
+    model: dict[str, Any] | None = None
+
+
+def camera_model(config: LensConfig, size: JpegSize) -> CameraModel:
+    """The model of pictures of `size`.
+
+    Raises ConfigError for a file that cannot be read, a field that is wrong or unknown, both sources at once, and a
+    model that was made at another size: a camera may crop, so nothing is scaled.
+    """
+    if config.model_file is not None and config.model is not None:
+        raise ConfigError("camera options model and model_file are both set; keep one")
+    if config.model_file is not None:
+        return _fitting(read_model(config.model_file), size, str(config.model_file))
+    if config.model is not None:
+        return _fitting(_checked(config.model, "camera option model"), size, "camera option model")
+    return guessed_model(size, config.hfov_deg)
+
+
+def guessed_model(size: JpegSize, hfov_deg: float) -> CameraModel:
+    """A lens without distortion, its axis through the middle of the picture."""
+    focal_px = size.width_px / 2 / math.tan(math.radians(hfov_deg) / 2)
+    return CameraModel(
+        width_px=size.width_px,
+        height_px=size.height_px,
+        fx_px=focal_px,
+        fy_px=focal_px,
+        cx_px=size.width_px / 2,
+        cy_px=size.height_px / 2,
+    )
+
+
+def read_model(path: Path) -> CameraModel:
+    """The model in a TOML file. Raises ConfigError naming the file and what is wrong in it."""
+    try:
+        table = tomllib.loads(path.expanduser().read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be read: {error.strerror}; `sightline calibrate camera` writes one"
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: is no TOML: {error}") from None
+    return _checked(table, str(path))
+
+
+def _checked(table: dict[str, Any], where: str) -> CameraModel:
+    """On the wire unknown fields are a newer peer's; in a file they are a slip of the pen."""
+    unknown = sorted(set(table) - set(CameraModel.model_fields))
+    if unknown:
+        known = ", ".join(CameraModel.model_fields)
+        raise ConfigError(f"{where}: {unknown[0]!r} is no field of a camera model; known: {known}")
+    try:
+        return CameraModel.model_validate_json(json.dumps(table, default=str))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ConfigError(f"{where}: {'.'.join(str(part) for part in first['loc'])}: {first['msg']}") from None
+
+
+def _fitting(model: CameraModel, size: JpegSize, where: str) -> CameraModel:
+    if (model.width_px, model.height_px) != (size.width_px, size.height_px):
+        raise ConfigError(
+            f"{where} is of {model.width_px}x{model.height_px} pictures, the camera gives "
+            f"{size.width_px}x{size.height_px}; calibrate at this size, or choose that one"
+        )
+    return model

@@ -1,0 +1,296 @@
+"""The fault bench: its judge on made-up logs, its rows and report, and the rows themselves on real processes.
+
+The short set is marked `slow`, the rest `faults`.
+"""
+
+import json
+import math
+
+import pytest
+import typer
+from hypothesis import given
+from hypothesis import strategies as st
+
+from operator_side import cli_faults
+from operator_side.faults import camera
+from operator_side.faults.attacks import ATTACKS, MALFORMED, OVERSIZED
+from operator_side.faults.bench import run_row
+from operator_side.faults.judge import (
+    Blind,
+    Motors,
+    Sent,
+    last_valid_us,
+    measure_stop,
+    most_gain_mps2,
+    moved_on_old_sight,
+    read_motors,
+    stop_checks,
+)
+from operator_side.faults.ledger import GOOD, INJECTED, Ledger, read_ledger
+from operator_side.faults.machine import describe_machine
+from operator_side.faults.report import markdown, passed, run_line, to_dict, worst_checks
+from operator_side.faults.row import Outcome
+from operator_side.faults.rows import ROWS, chosen
+from operator_side.faults.sampler import stalled_us
+from operator_side.score import Check
+from protocol.channels import TWIST
+from protocol.errors import ConfigError, WireError
+from protocol.jpeg import read_jpeg_size
+from protocol.twist_text import parse_twist
+from robot_side.kinematics import DiffDriveConfig
+
+RADIUS_M = DiffDriveConfig().wheel_radius_m
+TICK_US = 20_000
+SENT_EVERY_US = 33_000
+
+
+def log(speeds_mps, lag_rows=0):
+    """A motors' log of one row a tick; the wheels follow `lag_rows` later."""
+    rows, angle_rad = [], 0.0
+    for index, speed_mps in enumerate(speeds_mps):
+        rows.append(Motors(index * TICK_US, speed_mps / RADIUS_M, speed_mps / RADIUS_M, angle_rad, angle_rad))
+        angle_rad += speeds_mps[max(0, index - lag_rows)] / RADIUS_M * TICK_US / 1e6
+    return rows
+
+
+def drive_and_stop(plateau=50, ramp=10, rest=50, top_mps=0.5):
+    return [top_mps] * plateau + [top_mps * (1 - (k + 1) / ramp) for k in range(ramp)] + [0.0] * rest
+
+
+def commands(until_us, age_us=5_000):
+    return [Sent(t_us, t_us - age_us) for t_us in range(0, until_us + 1, SENT_EVERY_US)]
+
+
+# --- the judge ---------------------------------------------------------------------------------------------------
+
+
+@given(st.integers(1, 60), st.integers(1, 30), st.integers(0, 4))
+def test_a_stop_is_measured_where_it_is(plateau, ramp, lag_rows):
+    rows = log(drive_and_stop(plateau, ramp), lag_rows)
+    stop = measure_stop(rows, since_us=0)
+    assert stop.falls_ms == plateau * 20
+    zero_ms = (plateau + ramp - 1) * 20
+    assert zero_ms <= stop.zero_ms <= zero_ms + (lag_rows + 1) * 20
+    assert stop.distance_m == pytest.approx(0.5 * 0.02 * (plateau + (ramp - 1) / 2 + lag_rows), rel=1e-6)
+
+
+def test_wheels_that_only_coast_are_not_at_zero():
+    rows = log([0.5] * 10 + [0.0] * 20, lag_rows=30)
+    assert measure_stop(rows, 0).zero_ms is None
+
+
+def test_speed_that_comes_back_is_no_stop():
+    rows = log([*drive_and_stop(), 0.1, 0.1])
+    assert measure_stop(rows, 0).zero_ms is None
+    assert not all(check.ok for check in stop_checks(measure_stop(rows, 0)))
+
+
+def test_wheels_that_never_slow_never_fall():
+    stop = measure_stop(log([0.5] * 100), since_us=1_000_000)
+    assert stop.falls_ms is None and stop.zero_ms is None
+    assert not any(check.ok for check in stop_checks(stop))
+
+
+def test_a_dip_does_not_count_as_falling():
+    speeds = [0.5] * 20 + [0.3] + [0.5] * 10 + drive_and_stop(0)
+    assert measure_stop(log(speeds), 0).falls_ms == 31 * 20
+
+
+def test_turning_on_the_spot_is_motion():
+    turning = [Motors(index * TICK_US, -5.0, 5.0, -0.1 * index, 0.1 * index) for index in range(50)]
+    assert measure_stop(turning, 0).zero_ms is None
+    assert moved_on_old_sight(turning, [Sent(0, -2_000_000)], None) > 0
+
+
+@pytest.mark.parametrize(("late_ms", "ok"), [(300, True), (340, True), (360, False), (700, False)])
+def test_the_bound_on_falling_is_a_bound(late_ms, ok):
+    rows = log(drive_and_stop(plateau=late_ms // 20, ramp=5))
+    assert stop_checks(measure_stop(rows, 0))[0].ok is ok
+
+
+def test_a_log_is_read_without_its_unfinished_line():
+    text = "t_us,left_rad_s,right_rad_s,left_rad,right_rad\n1,2.0,3.0,4.0,5.0\n2,2.0,3."
+    assert read_motors(text) == [Motors(1, 2.0, 3.0, 4.0, 5.0)]
+
+
+# --- old sight ---------------------------------------------------------------------------------------------------
+
+
+def test_driving_on_young_frames_is_allowed():
+    assert moved_on_old_sight(log(drive_and_stop()), commands(900_000), None) == 0
+
+
+def test_driving_on_for_ever_is_not():
+    rows = log([0.5] * 150)
+    assert moved_on_old_sight(rows, commands(1_000_000), None) > 70
+
+
+def test_gaining_speed_on_an_old_frame_is_not_even_within_the_ramp():
+    speeds = [0.3] * 50 + [0.3 - 0.01 * k for k in range(20)] + [0.15] + [0.0] * 30
+    last_us = (50 + 20 - 22) * TICK_US
+    assert moved_on_old_sight(log(speeds), commands(last_us, age_us=0), None) == 1
+
+
+def test_commands_while_blind_allow_nothing_until_sight_is_back():
+    rows, sent = log([0.5] * 150), commands(3_000_000)
+    assert moved_on_old_sight(rows, sent, None) == 0
+    assert moved_on_old_sight(rows, sent, Blind(1_000_000)) > 60
+    assert moved_on_old_sight(rows, sent, Blind(1_000_000, 1_200_000)) == 0
+
+
+def test_without_any_command_no_motion_is_allowed():
+    assert moved_on_old_sight(log([0.5] * 10), [], None) == 9
+
+
+@given(st.lists(st.integers(0, 10**6), max_size=20), st.integers(0, 10**6))
+def test_the_last_valid_command_is_from_before_the_blindness(times_us, from_us):
+    last_us = last_valid_us([Sent(t_us, t_us) for t_us in times_us], Blind(from_us))
+    assert last_us == max((t_us for t_us in times_us if t_us <= from_us), default=None)
+
+
+@pytest.mark.parametrize("gain_mps2", [0.5, 2.0, 8.0])
+def test_the_hardest_change_is_found(gain_mps2):
+    speeds = [0.0] * 10 + [min(0.5, gain_mps2 * 0.02 * k) for k in range(60)]
+    assert most_gain_mps2(log(speeds), 0) == pytest.approx(min(gain_mps2, 0.5 / 0.1), rel=0.01)
+
+
+# --- what the bench's own processes note -------------------------------------------------------------------------
+
+
+def test_a_ledger_is_read_as_it_was_written_and_a_torn_line_is_left_out(tmp_path):
+    path = tmp_path / "a.ledger"
+    ledger = Ledger(path)
+    ledger.note(GOOD, 7)
+    ledger.note(INJECTED)
+    with path.open("a") as torn:
+        torn.write("good,12")
+    assert [one.frame_us for one in read_ledger(path, GOOD)] == [7] and len(read_ledger(path, INJECTED)) == 1
+    assert read_ledger(tmp_path / "none", GOOD) == []
+
+
+def test_only_holes_in_the_window_spoil_a_row(tmp_path):
+    path = tmp_path / "holes.csv"
+    path.write_text("100,200\n5000,9000\n20000,20100\n")
+    assert stalled_us(path, 300, 4000) == 0
+    assert stalled_us(path, 150, 6000) == 4000
+
+
+@pytest.mark.parametrize("text", [*MALFORMED, *OVERSIZED], ids=lambda text: repr(text[:12]))
+def test_what_is_sent_as_malformed_is(text):
+    with pytest.raises(WireError):
+        parse_twist(text)
+
+
+def test_the_oversized_are_beyond_the_channel():
+    assert all(len(text) > TWIST.max_payload_bytes for text in OVERSIZED)
+
+
+def test_the_cameras_spare_pictures_are_what_they_are_called(tmp_path):
+    camera.write_spares(tmp_path)
+    for name in ("black", "resized"):
+        size = read_jpeg_size((tmp_path / f"{name}.jpg").read_bytes())
+        assert (size.width_px, size.height_px) == camera.SPARE[name]
+    bomb = (tmp_path / "bomb.jpg").read_bytes()
+    assert len(bomb) < 2000 and read_jpeg_size(bomb, max_pixels=2**33).width_px == 65_500
+    with pytest.raises(WireError):
+        read_jpeg_size(bomb)
+
+
+# --- rows and report ---------------------------------------------------------------------------------------------
+
+
+def outcome(row=ROWS[0], value=1.0, bound=2.0, **changes):
+    check = Check("zero", value, "ms", bound, value is not None and value <= bound)
+    return Outcome(row, **{"checks": (check,), **changes})
+
+
+def test_rows_are_told_apart_and_say_what_they_demand():
+    assert len({row.id for row in ROWS}) == len(ROWS) == len({row.what for row in ROWS})
+    assert all(row.demanded and row.id.count(".") == 1 and "|" not in row.what + row.demanded for row in ROWS)
+    assert all(row.setup.fault in ATTACKS for row in ROWS if row.setup.driver == "driver" and row.setup.fault)
+    assert 6 <= sum(row.short for row in ROWS) < len(ROWS)
+
+
+def test_rows_are_chosen_by_id_group_and_length():
+    assert [row.id for row in chosen(["vision.kill"], short=False)] == ["vision.kill"]
+    assert {row.id.partition(".")[0] for row in chosen(["wire", "stop"], short=False)} == {"wire", "stop"}
+    assert all(row.short for row in chosen([], short=True))
+    with pytest.raises(ConfigError, match=r"did you mean 'vision\.kill'"):
+        chosen(["vison.kill"], short=False)
+
+
+@pytest.mark.parametrize(
+    "bad", [outcome(value=3.0), outcome(value=None), outcome(trouble="inconclusive"), outcome(checks=())]
+)
+def test_one_bad_run_fails_everything(bad):
+    assert passed([[outcome()], [outcome(), outcome()]])
+    assert not passed([[outcome()], [outcome(), bad]])
+    assert "FAIL" in run_line(bad) and to_dict([[bad]])["ok"] is False
+
+
+def test_rows_that_cannot_run_are_told_and_are_not_a_pass():
+    skipped = outcome(skipped="needs root", checks=())
+    assert passed([[skipped], [outcome()]]) and not passed([[skipped]])
+    assert "needs root" in run_line(skipped) and "needs root" in markdown([[skipped]], [], "x", 1)
+
+
+@given(st.lists(st.one_of(st.none(), st.floats(0, 10)), min_size=1, max_size=6))
+def test_the_worst_run_is_reported(values):
+    (worst,) = worst_checks(outcome(value=value) for value in values)
+    expected = None if None in values else max(values)
+    assert worst.value == expected
+
+
+def test_a_failure_outweighs_a_larger_figure_and_less_injected_is_worse():
+    few, many = (Outcome(ROWS[0], (Check("injected", value, "times", 1, value >= 1),)) for value in (1.0, 50.0))
+    assert worst_checks([many, few])[0].value == 1.0
+
+
+def test_the_report_is_one_object_and_one_table():
+    results = [[outcome(), outcome(value=1.5)], [outcome(ROWS[1], value=3.0)]]
+    report = json.loads(json.dumps(to_dict(results)))
+    assert [check["value"] for check in report["checks"]] == [1.5, 3.0]
+    assert [row["ok"] for row in report["rows"]] == [True, False]
+    text = markdown(results, ["CPU: one"], "sightline faults", 2)
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    assert len(rows) == 1 + len(results) and {line.count("|") for line in rows} == {5}
+    assert "| yes |" in rows[1] and "**no**" in rows[2] and "1 of 2 rows passed" in text
+
+
+def test_the_machine_is_described_without_naming_it():
+    text = " ".join(describe_machine())
+    assert "Python 3" in text and "cores" in text and "/" not in text.replace("x86_64", "")
+
+
+def test_the_command_lists_and_refuses(capsys, tmp_path):
+    app = typer.Typer()
+    cli_faults.register(app)
+    app.callback()(lambda: None)
+    assert app(["faults", "--list", "--only", "stop"], standalone_mode=False) == 0
+    assert len(capsys.readouterr().out.splitlines()) == sum(row.id.startswith("stop.") for row in ROWS)
+    with pytest.raises(ConfigError, match="no folder"):
+        app(["faults", "--only", "stop", "--out", str(tmp_path / "none" / "f.md")], standalone_mode=False)
+
+
+# --- the rows themselves -----------------------------------------------------------------------------------------
+
+
+def run_once(row, tmp_path):
+    done = run_row(row, tmp_path)
+    if done.skipped:
+        pytest.skip(done.skipped)
+    assert done.ok, run_line(done)
+    assert all(check.value is not None and math.isfinite(check.value) for check in done.checks)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", chosen([], short=True), ids=lambda row: row.id)
+def test_the_short_set(row, tmp_path):
+    run_once(row, tmp_path)
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("row", [row for row in ROWS if not row.short], ids=lambda row: row.id)
+def test_the_long_set(row, tmp_path):
+    run_once(row, tmp_path)
+
