@@ -27,6 +27,7 @@ from robot_side.supervision import ServiceManager, become_punctual
 
 _SHUTDOWN_US = 2_000_000
 _WATCHDOG_PERIOD_US = 100_000
+_MIN_TICK_US = 2_000  # a flood of commands must not become a flood of motor writes
 _WARNING = (
     "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
     "(docs/safety.md)"
@@ -69,7 +70,7 @@ class Driver:
         self._shown = self._driving.gate.state
         self._ending_since_us: int | None = None
         self._manager = ServiceManager()
-        self._watchdog_due_us = 0
+        self._watchdog_due_us = self._ticked_us = 0
         self.child = NetworkChild(config, self._driving.session)
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, self._on_signal)
@@ -89,7 +90,7 @@ class Driver:
                 self._driving.tick_late_max_us = max(self._driving.tick_late_max_us, now_us - deadline_us)
                 deadline_us = max(deadline_us + TICK_US, now_us)
                 self._tick(now_us, punctual=True)
-            elif arrived:
+            elif arrived and now_us - self._ticked_us >= _MIN_TICK_US:
                 self._tick(now_us, punctual=False)
         self._manager.tell("STOPPING=1")
         return self.child.exit_code
@@ -114,6 +115,7 @@ class Driver:
         select.select(readable, [], [], timeout_s)
 
     def _tick(self, now_us: int, *, punctual: bool) -> None:
+        self._ticked_us = now_us
         self._move(now_us)
         self.child.send(ipc.pack_motion(self._driving.motion()))
         if punctual:

@@ -134,7 +134,7 @@ class Driving:
             refused=dict(gate.counters),
             last_refusal=gate.last_refusal,
             stream=self.stream,
-            auto_arm=limits.auto_arm,
+            auto_arm=gate.arms_itself,
             tick_late_max_us=self.tick_late_max_us,
             network_restarts=self.network_restarts,
             max_linear_mps=limits.max_linear_mps,

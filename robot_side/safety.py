@@ -53,7 +53,7 @@ class SafetyGate:
         self._guard = guard
         self._command: Accepted | None = None
         self._live_commands = 0
-        self._auto_arm = config.auto_arm and not stopped
+        self.arms_itself = config.auto_arm and not stopped
         self._last_step_us: int | None = None
         self._hold_since_us = 0
 
@@ -204,7 +204,7 @@ class SafetyGate:
     def disarm(self, reason: str = "disarmed") -> str:
         """Wheels to zero; commands are judged but not obeyed. Always granted."""
         self._leave(Event.DISARM, reason)
-        self._auto_arm = False
+        self.arms_itself = False
         return "disarmed"
 
     def reset(self, who: Holder, now_us: int) -> str:
@@ -227,7 +227,7 @@ class SafetyGate:
         missing = self._missing_to_arm(now_us)
         if missing:
             raise WireError(Refusal.NOT_ALLOWED, missing)
-        self._auto_arm = self.config.auto_arm
+        self.arms_itself = self.config.auto_arm
         self._begin(f"armed by {who.source}", now_us)
         return "armed"
 
@@ -280,7 +280,7 @@ class SafetyGate:
             self._leave(Event.HUMAN_LOST, "the person driving was lost; arm again")
 
     def _arm_by_itself(self, now_us: int) -> None:
-        if self._auto_arm and self.state is State.DISARMED and not self._missing_to_arm(now_us):
+        if self.arms_itself and self.state is State.DISARMED and not self._missing_to_arm(now_us):
             self._begin("armed by itself (auto_arm)", now_us)
 
     def _begin(self, reason: str, now_us: int) -> None:
@@ -291,7 +291,7 @@ class SafetyGate:
         """Go where the wheels are off. `auto`: auto_arm may take it up again without a person."""
         if after(self.state, event) is not self.state:
             self._command, self._live_commands = None, 0
-            self._auto_arm = self._auto_arm and auto
+            self.arms_itself = self.arms_itself and auto
             self._go(event, reason)
 
     def _go(self, event: Event, reason: str) -> None:

@@ -1,0 +1,64 @@
+# One image per service from one file: targets robot, vision, sim. compose.yaml runs them together.
+# Plain multi-stage: works with BuildKit and without.
+
+# --- what every image runs on: a user without rights, and the folders it may write to when they are mounted ----------
+FROM python:3.11-slim-bookworm AS service
+RUN useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin sightline \
+ && install -d -m 0700 -o sightline -g sightline /run/sightline /var/lib/sightline
+ENV PATH=/opt/sightline/bin:$PATH PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \
+    SIGHTLINE_ROBOT__STATE_DIR=/var/lib/sightline
+USER sightline
+WORKDIR /tmp
+ENTRYPOINT ["sightline"]
+
+# --- the project as a wheel --------------------------------------------------------------------------------------------
+FROM python:3.11-slim-bookworm AS build
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_CONSTRAINT=/src/constraints.txt
+WORKDIR /src
+COPY requirements.lock pyproject.toml README.md LICENSE ./
+# The lock's versions as constraints: an extra of a local package cannot be installed by hash.
+RUN sed -n 's/^\([[:alnum:]].*[^ \\]\) *\\*$/\1/p' requirements.lock > constraints.txt
+# A wheel of the same name and extras without any code: what depends on it is built anew only when the lock changes.
+RUN mkdir protocol robot_side vision_side sim operator_side benchmarks \
+ && pip wheel --no-deps --wheel-dir /empty .
+
+FROM build AS wheel
+COPY protocol protocol
+COPY robot_side robot_side
+COPY vision_side vision_side
+COPY sim sim
+COPY operator_side operator_side
+COPY benchmarks benchmarks
+RUN pip wheel --no-deps --wheel-dir /dist .
+
+# --- robot: no OpenCV, no NumPy, no PyBullet ---------------------------------------------------------------------------
+FROM build AS robot-packages
+RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[zenoh]"
+COPY --from=wheel /dist /dist
+RUN /opt/sightline/bin/pip install --no-deps --force-reinstall /dist/*.whl
+
+FROM service AS robot
+COPY --from=robot-packages /opt/sightline /opt/sightline
+CMD ["robot"]
+
+# --- vision ------------------------------------------------------------------------------------------------------------
+FROM build AS vision-packages
+RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[vision]"
+COPY --from=wheel /dist /dist
+RUN /opt/sightline/bin/pip install --no-deps --force-reinstall /dist/*.whl
+
+FROM service AS vision
+COPY --from=vision-packages /opt/sightline /opt/sightline
+CMD ["vision"]
+
+# --- sim ---------------------------------------------------------------------------------------------------------------
+FROM build AS sim-packages
+# PyBullet has a ready-made wheel for x86_64 only; elsewhere pip compiles it.
+RUN [ "$(uname -m)" = x86_64 ] || { apt-get update && apt-get install -y --no-install-recommends g++; }
+RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[sim]"
+COPY --from=wheel /dist /dist
+RUN /opt/sightline/bin/pip install --no-deps --force-reinstall /dist/*.whl
+
+FROM service AS sim
+COPY --from=sim-packages /opt/sightline /opt/sightline
+CMD ["sim"]
