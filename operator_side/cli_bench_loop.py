@@ -94,12 +94,14 @@ def watchers(
 ) -> int:
     """What viewers of the robot's pictures cost whoever drives: age of the commands, memory of the robot."""
     with needs("all"):
+        from benchmarks.loop_setting import LoopSetting
         from benchmarks.watchers import measure_watchers
 
-    checks, figures = measure_watchers(viewers, seconds, transport, lambda line: typer.echo(line, err=True))
+    setting = LoopSetting(Path(), transport=transport, seconds=seconds)
+    checks = measure_watchers(setting, viewers, lambda line: typer.echo(line, err=True))
     ok = all(check.ok for check in checks)
     if as_json:
-        typer.echo(json.dumps({"ok": ok, "checks": [asdict(check) for check in checks], "figures": figures}))
+        typer.echo(json.dumps({"ok": ok, "checks": [asdict(check) for check in checks]}))
     else:
         typer.echo("\n".join(_check_lines(checks)))
     return 0 if ok else CHECK_FAILED
@@ -126,7 +128,8 @@ def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
 
 
 def _table(race: "Race") -> list[str]:
-    head = f"{'':10} {'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'bytes':>8} {'others':>7}  CPU ms a picture; MB"
+    names = f"{'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'bytes':>8} {'others':>7}"
+    head = f"{'':10} {names}  CPU ms a picture; MB"
     return [head, *(_row(name, race) for name in race.figures)]
 
 
@@ -135,10 +138,8 @@ def _row(name: str, race: "Race") -> str:
     ages = " ".join(f"{'never' if age is None else f'{age:.1f}':>8}" for age in (one.p50_ms, one.p95_ms, one.p99_ms))
     cpu = " ".join(f"{process} {cpu_ms:.2f}" for process, cpu_ms in one.cpu_ms.items())
     memory = " ".join(f"{megabytes:.0f}" for megabytes in one.memory_mb.values())
-    return (
-        f"{name:10} {one.answered_percent:7.1f} % {ages}    {one.bytes_per_picture:8.0f} {one.taken_percent:5.1f} %  "
-        f"{cpu}; {memory}"
-    )
+    carried = f"{one.bytes_per_picture or 0:8.0f} {one.taken_percent:5.1f} %"
+    return f"{name:10} {one.answered_percent:7.1f} % {ages}    {carried}  {cpu}; {memory}"
 
 
 def _check_lines(checks: "Sequence[Judged]") -> list[str]:

@@ -95,10 +95,10 @@ def vision(
     sets: Sets = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what is seen and steer nothing.")] = False,
     camera: Annotated[
-        str | None, typer.Option("--camera", metavar="KIND", help="With --dry-run: look through this machine's own camera.")
+        str | None, typer.Option("--camera", metavar="KIND", help="With --dry-run: a camera of this machine.")
     ] = None,
     camera_sets: Annotated[
-        list[str] | None, typer.Option("--camera-set", metavar="KEY=VALUE", help="An option of that camera, e.g. fps=15.")
+        list[str] | None, typer.Option("--camera-set", metavar="KEY=VALUE", help="An option of it, e.g. fps=15.")
     ] = None,
     shape: Annotated[str | None, typer.Option("--shape", hidden=True)] = None,
 ) -> int:

@@ -33,9 +33,26 @@ def run(capsys, *arguments):
 
 
 def test_the_commands_of_this_version_exist():
-    expected = {"sim", "robot", "vision", "demo", "robots", "status", "arm", "disarm", "stop", "reset", "score", "faults"}
+    expected = {
+        "sim",
+        "robot",
+        "vision",
+        "demo",
+        "robots",
+        "status",
+        "arm",
+        "disarm",
+        "stop",
+        "reset",
+        "score",
+        "faults",
+    }
     assert expected <= {path[0] for path in COMMANDS if len(path) == 1}
-    groups = {"calibrate": ("camera",), "config": ("check", "show", "schema"), "bench": ("codec", "pipeline", "odometry", "robot", "demo", "report")}
+    groups = {
+        "calibrate": ("camera",),
+        "config": ("check", "show", "schema"),
+        "bench": ("codec", "pipeline", "odometry", "robot", "demo", "report"),
+    }
     assert {(group, name) for group, names in groups.items() for name in names} <= set(COMMANDS)
 
 

@@ -20,8 +20,8 @@ def test_peers_of_both_kinds_hear_and_are_heard():
             with open_link("r1", connect=[endpoint], role="vision") as peer:
                 frames = peer.latest(FRAME)
                 assert until(lambda: robot.has_listener(FRAME))
-                assert until(lambda: robot.publish(FRAME, b"{}", b"jpeg") and frames.take(0.05))
-                assert until(lambda: peer.publish(TWIST, b"{}", b"0|0") and twists.take(0.05))
+                assert until(lambda taken=frames.take: robot.publish(FRAME, b"{}", b"jpeg") and taken(0.05))
+                assert until(lambda say=peer.publish: say(TWIST, b"{}", b"0|0") and twists.take(0.05))
             assert until(lambda: not robot.has_listener(FRAME))
         assert not robot.publish(STATUS, b"{}", b"{}")
 
