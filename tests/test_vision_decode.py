@@ -37,6 +37,23 @@ def test_buffer_is_allocated_once() -> None:
     assert one.decode(GOOD).bgr is one.decode(GOOD).bgr
 
 
+@pytest.mark.parametrize("size", [(320, 240), (640, 480), (801, 601)])
+def test_pixels_stay_in_the_cache(size: tuple[int, int]) -> None:
+    """On a 32-byte boundary libjpeg-turbo writes past it."""
+    assert {decoder(*size)._picture.bgr.ctypes.data % 32 for _ in range(8)} == {16}
+
+
+def test_what_a_known_head_spares_is_only_the_check_of_that_head() -> None:
+    one, fresh = decoder(), decoder()
+    first = one.decode(GOOD).bgr.copy()
+    for other in (jpeg_of(np.zeros((241, 320, 3), np.uint8)), GOOD[:-200], GOOD[:100], b""):
+        with pytest.raises(WireError):
+            one.decode(other)
+    finer = jpeg_of(scene(camera(), 1, 0), 95)
+    assert np.array_equal(one.decode(finer).bgr, fresh.decode(finer).bgr)
+    assert np.array_equal(one.decode(GOOD).bgr, first)
+
+
 def test_grey_pictures_decode() -> None:
     grey = cv2.imencode(".jpg", np.full((240, 320), 77, np.uint8))[1].tobytes()
     assert np.ptp(decoder().decode(grey).bgr) <= 2
@@ -60,6 +77,27 @@ def test_progressive_bomb_is_refused_before_it_costs() -> None:
     with pytest.raises(WireError, match=f"more than {MAX_SCANS} scans"):
         decoder().decode(bomb)
     assert time.process_time() - started < 0.05
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["new-head", "known-head"])
+def test_scans_after_a_whole_one_cost_nothing(known: bool) -> None:
+    one, scan = decoder(), GOOD[GOOD.rfind(b"\xff\xda") : -2]
+    if known:
+        one.decode(GOOD)
+    started = time.process_time()
+    with pytest.raises(WireError, match="does not decode"):
+        one.decode(GOOD[:-2] + scan * 60 + b"\xff\xd9")
+    assert time.process_time() - started < 0.05
+
+
+def test_baseline_scans_one_component_each_are_counted() -> None:
+    """A first scan that lacks components lets more follow: the head alone proves nothing."""
+    one = decoder()
+    one.decode(GOOD)
+    at = GOOD.rfind(b"\xff\xda")
+    luma = bytes.fromhex("ffda0008010100003f00") + GOOD[at + 14 : -2]
+    with pytest.raises(WireError, match=f"more than {MAX_SCANS} scans"):
+        one.decode(GOOD[:at] + luma * (MAX_SCANS + 1) + b"\xff\xd9")
 
 
 @settings(max_examples=150, deadline=None)

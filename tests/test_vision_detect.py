@@ -13,7 +13,7 @@ from tests.vision_rig import ball_about_lens, camera, draw_ball, jpeg_of, scene
 from vision_side.config import HsvConfig, HsvRange
 from vision_side.decode import Decoder, Picture
 from vision_side.detect.colour import colour_table
-from vision_side.detect.disc import fit_circle
+from vision_side.detect.disc import fit_circle, round_part
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.port import Detection
 from vision_side.sphere import locate
@@ -158,6 +158,33 @@ def test_circle_fit_is_exact_on_arcs(cx: float, cy: float, radius: float, start:
     assert fit == pytest.approx((cx, cy, radius), abs=1e-6)
 
 
+@given(cx=st.floats(0, 640), cy=st.floats(0, 480), radius=st.floats(12, 80), start=st.floats(0, 6.28))
+def test_what_cuts_a_disc_off_is_left_out_of_its_circle(cx: float, cy: float, radius: float, start: float) -> None:
+    turn = np.linspace(start, start + 2 * math.pi, 120, endpoint=False)
+    across = np.minimum(np.cos(turn - start), 0.7)  # a straight cut, at 0.7 radii from the centre
+    along = np.sin(turn - start)
+    x, y = across * math.cos(start) - along * math.sin(start), across * math.sin(start) + along * math.cos(start)
+    part = round_part(np.column_stack([cx + radius * x, cy + radius * y]), 3.0, 0.07)
+    assert part is not None
+    assert part[0] == pytest.approx((cx, cy, radius), abs=0.035 * radius)
+    assert 60 <= len(part[1]) <= 120
+
+
+@pytest.mark.parametrize("size", [(320, 240), (640, 480)])
+@pytest.mark.parametrize("at", range(8))
+def test_the_smallest_disc_is_found_wherever_it_lies(size: tuple[int, int], at: int) -> None:
+    """Where to look is decided on few pixels: none may slip between them."""
+    scale, config = size[0] // 320, HsvConfig()
+    for row in range(4):
+        picture = np.full((size[1], size[0], 3), 140, np.uint8)
+        middle = ((100 + at) * scale, (60 + row) * scale)
+        cv2.circle(picture, middle, round(4 * scale), (13, 199, 242), -1)
+        found = HsvDetector(config).detect(Picture(np.ascontiguousarray(picture[::scale, ::scale]), scale))
+        assert len(found) == 1
+        assert (found[0].x1_px + found[0].x2_px) / 2 == pytest.approx(middle[0], abs=1.5 * scale)
+        assert (found[0].y1_px + found[0].y2_px) / 2 == pytest.approx(middle[1], abs=1.5 * scale)
+
+
 def test_circle_fit_of_a_line_has_no_radius() -> None:
     assert fit_circle(np.column_stack([np.arange(20.0), 2 * np.arange(20.0)]))[2] == 0.0
 
@@ -190,3 +217,11 @@ def test_distortion_is_undone() -> None:
     first, second = locate(found, straight, 0.1), locate(moved, bent, 0.1)
     assert first is not None and second is not None
     assert (second.x_m, second.y_m) == pytest.approx((first.x_m, first.y_m), abs=0.002)
+
+
+def test_detections_reach_a_distorted_camera_as_they_are() -> None:
+    bent = camera().model_copy(update={"distortion": (1e-9,)})
+    found = detect(bent, scene(bent, 0.7, 0.3))[0]
+    first, second = locate(found, camera(), 0.1), locate(found, bent, 0.1)
+    assert first is not None and second is not None
+    assert (second.x_m, second.y_m) == pytest.approx((first.x_m, first.y_m), abs=1e-6)

@@ -117,7 +117,7 @@ def test_the_answer_names_the_frame_field_for_field() -> None:
         "frame", frame.session, frame.seq, frame.t_us)
 
 
-def test_only_the_service_knows_of_clocks_and_links() -> None:
+def test_only_the_shells_know_of_clocks_and_links() -> None:
     forbidden = {"time", "threading", "socket", "asyncio", "logging", "zenoh", "random"}
     for path in Path(vision_side.__file__).parent.rglob("*.py"):
         tree = ast.parse(path.read_text())

@@ -1,5 +1,6 @@
 """A frame in, a command out: bound, decode, detect, track, steer. Pure: the clock is the frame's capture time."""
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 
@@ -115,15 +116,17 @@ class Pipeline:
         target = self._track.target
         if target is None:
             return self._look_around(dt_s, header, detections)
-        here = aim_at(target, Motion(header.pose, 0.0, 0.0), self._camera, 0.0)
-        self._search.reset(here.bearing_rad)
+        x, y = from_odometry(header.pose, target.x_m, target.y_m)
+        x, y = x - self._camera.x_m, y - self._camera.y_m
+        bearing_rad = math.atan2(y, x)
+        self._search.reset(bearing_rad)
         latency_s = self._foretelling.latency_s
         then = self._foretelling.motion(header.t_us, header.pose, header.moving, header.applied)
         aim = aim_at(target, then, self._camera, latency_s)
         twist = self._steer.step(dt_s, aim, latency_s, self._may_drive(target))
         phase = "tracking" if seen else "coasting"
         box = seen.detection if seen else None
-        return Answer(twist, Seen(phase, detections, box, here.bearing_rad, here.distance_m))
+        return Answer(twist, Seen(phase, detections, box, bearing_rad, math.hypot(x, y)))
 
     def _may_drive(self, target: Target) -> bool:
         config = self._config.track

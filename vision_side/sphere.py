@@ -1,12 +1,14 @@
 """A sphere's outline in pixels -> where its centre is, in metres about the robot. Pure.
 
 A sphere projects to an ellipse, not to a circle about its centre. Its outline rays do form a circular cone: for every
-unit ray u, u . c = cos(alpha) with c towards the centre, and the centre is at radius / sin(alpha). So u . w = 1 is
-linear in w = c / cos(alpha), exact at any angle off the axis, and holds for whatever part of the outline is in view.
+unit ray u, u . c = cos(alpha) with c towards the centre, and the centre is at radius / sin(alpha). So u . w = 1, or
+p . w = |p| for any point p of the ray, is linear in w = c / cos(alpha), exact at any angle off the axis, and holds for
+whatever part of the outline is in view.
 """
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -14,6 +16,8 @@ from numpy.typing import NDArray
 
 from protocol.messages import CameraModel
 from vision_side.detect.port import Detection
+
+Column = NDArray[np.float64]
 
 _MIN_POINTS = 6
 _TRIMS = 3
@@ -35,7 +39,7 @@ def locate(detection: Detection, camera: CameraModel, radius_m: float) -> Sighti
     outline = detection.outline_px if detection.outline_px is not None else _box_outline(detection, camera)
     if len(outline) < _MIN_POINTS:
         return None
-    centre = _cone_centre(_rays(outline, camera), radius_m)
+    centre = _cone_centre(_points_ahead(outline, camera), radius_m)
     if centre is None:
         return None
     right, down, ahead = centre
@@ -44,16 +48,23 @@ def locate(detection: Detection, camera: CameraModel, radius_m: float) -> Sighti
     return Sighting(x_m, camera.y_m - right, detection)
 
 
-def _rays(outline_px: NDArray[np.float64], camera: CameraModel) -> NDArray[np.float64]:
-    """Unit rays (3, N), right, down and ahead, through the pixels."""
+def _points_ahead(outline_px: NDArray[np.float64], camera: CameraModel) -> NDArray[np.float64]:
+    """Where the pixels' rays are one metre ahead: right, down, 1, and how far that is (4, N)."""
+    points = np.ones((4, len(outline_px)))
     if camera.distortion:
         matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1.0]])
-        flat = cv2.undistortPoints(outline_px[:, None], matrix, _opencv_distortion(camera))[:, 0]
+        points[:2] = cv2.undistortPoints(outline_px[:, None], matrix, _opencv_distortion(camera))[:, 0].T
     else:
-        flat = (outline_px - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px)
-    x, y = flat.T
-    ahead = 1.0 / np.sqrt(x * x + y * y + 1.0)
-    return np.array([x * ahead, y * ahead, ahead])
+        principal, focal = _pinhole(camera.cx_px, camera.cy_px, camera.fx_px, camera.fy_px)
+        np.divide(outline_px.T - principal, focal, out=points[:2])
+    np.sqrt(np.add.reduce(points[:3] * points[:3]), out=points[3])
+    return points
+
+
+@lru_cache(maxsize=64)
+def _pinhole(cx_px: float, cy_px: float, fx_px: float, fy_px: float) -> tuple[Column, Column]:
+    """As columns; kept, since building them costs as much as using them."""
+    return np.array([[cx_px], [cy_px]]), np.array([[fx_px], [fy_px]])
 
 
 def _opencv_distortion(camera: CameraModel) -> NDArray[np.float64]:
@@ -62,18 +73,18 @@ def _opencv_distortion(camera: CameraModel) -> NDArray[np.float64]:
     return np.array(camera.distortion + (0.0,) * (count - len(camera.distortion)))
 
 
-def _cone_centre(rays: NDArray[np.float64], radius_m: float) -> tuple[float, float, float] | None:
-    """Least squares of u . w = 1, then the centre at radius / sin(alpha) along w."""
-    w = _solved(rays @ rays.T, rays.sum(axis=1))
+def _cone_centre(points: NDArray[np.float64], radius_m: float) -> tuple[float, float, float] | None:
+    """Least squares of p . w = |p|, then the centre at radius / sin(alpha) along w. `points` are columns p, |p|."""
+    w = _solved(points)
     for _ in range(_TRIMS):
         if w is None:
             return None
-        off = np.abs(np.array(w) @ rays - 1.0)
+        off = np.abs(np.array((*w, -1.0)) @ points)
         limit = _OUTLIER * np.sort(off)[len(off) // 2]
-        if off.max() <= limit:
+        if np.maximum.reduce(off) <= limit:
             break
-        rays = rays[:, off <= limit]
-        w = _solved(rays @ rays.T, rays.sum(axis=1))
+        points = points[:, off <= limit]
+        w = _solved(points)
     if w is None:
         return None
     right, down, ahead = w
@@ -84,10 +95,9 @@ def _cone_centre(rays: NDArray[np.float64], radius_m: float) -> tuple[float, flo
     return right * per_w, down * per_w, ahead * per_w
 
 
-def _solved(matrix: NDArray[np.float64], right_side: NDArray[np.float64]) -> tuple[float, float, float] | None:
-    """Solve a symmetric 3x3 system by cofactors, several times faster than a call of LAPACK; None if singular."""
-    (a, b, c), (_, d, e), (_, _, f) = matrix.tolist()
-    x, y, z = right_side.tolist()
+def _solved(points: NDArray[np.float64]) -> tuple[float, float, float] | None:
+    """w of the normal equations, by cofactors, several times faster than a call of LAPACK; None if singular."""
+    (a, b, c, x), (_, d, e, y), (_, _, f, z), _ = (points @ points.T).tolist()
     aa, ab, ac = d * f - e * e, c * e - b * f, b * e - c * d
     bb, bc, cc = a * f - c * c, b * c - a * e, a * d - b * b
     determinant = a * aa + b * ab + c * ac

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from vision_side.config import HsvRange
 
-MARGIN_PX = 6
-COARSE = 2
-"""Where to look is decided on every second pixel of every second row; the mask itself is of full resolution."""
+COARSE = 4
+"""Where to look is decided on every fourth pixel of every fourth row, which no disc worth measuring slips between."""
+MARGIN_PX = 10
+"""Around that: the smallest disc reaches 6 pixels from its only one that was looked at; the rest is background."""
 _KERNEL = np.ones((3, 3), np.uint8)
 
 
@@ -32,23 +33,23 @@ class ColourMask:
 
     def __init__(self, ranges: tuple[HsvRange, ...]) -> None:
         self._table = colour_table(ranges)
-        self._codes = np.zeros((0, 0, 2), np.uint8)
 
     def region(self, bgr: NDArray[np.uint8]) -> Region | None:
         """Where the colour is, speckle removed; None if nowhere."""
-        if self._codes.shape[:2] != bgr.shape[:2]:
-            self._codes = np.zeros((*bgr.shape[:2], 2), np.uint8)
-        cv2.cvtColor(bgr, cv2.COLOR_BGR2BGR565, dst=self._codes)
-        codes = self._codes.view(np.uint16)[..., 0]
-        coarse = cv2.LUT(codes[::COARSE, ::COARSE].copy(), self._table)
-        x, y, width, height = (one * COARSE for one in cv2.boundingRect(coarse))
+        coarse = _codes(bgr[COARSE // 2 :: COARSE])[:, COARSE // 2 :: COARSE].copy()
+        x, y, width, height = cv2.boundingRect(cv2.LUT(coarse, self._table))
         if not width:
             return None
-        x1, y1 = max(0, x - MARGIN_PX), max(0, y - MARGIN_PX)
-        part = slice(y1, y + height + MARGIN_PX), slice(x1, x + width + MARGIN_PX)
+        x1, y1 = max(0, x * COARSE - MARGIN_PX), max(0, y * COARSE - MARGIN_PX)
+        part = bgr[y1 : (y + height) * COARSE + MARGIN_PX, x1 : (x + width) * COARSE + MARGIN_PX]
         # Speckle would cost findContours a hundredfold; a 3x3 opening removes it and keeps discs.
-        mask = cv2.morphologyEx(cv2.LUT(codes[part], self._table), cv2.MORPH_OPEN, _KERNEL)
-        return Region(bgr[part], mask, (x1, y1))
+        mask = cv2.morphologyEx(cv2.LUT(_codes(part), self._table), cv2.MORPH_OPEN, _KERNEL)
+        return Region(part, mask, (x1, y1))
+
+
+def _codes(bgr: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """BGR565 of each pixel."""
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
 
 
 def colour_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:

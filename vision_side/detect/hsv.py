@@ -1,17 +1,15 @@
 """Detector of round things of one colour: colour mask, outlines, sharp edge, circle fit. Pure."""
 
-from heapq import nlargest
 from typing import Any
 
 import cv2
-import numpy as np
 from numpy.typing import NDArray
 
 from vision_side.config import HsvConfig
 from vision_side.decode import Picture
 from vision_side.detect.colour import ColourMask, Region
-from vision_side.detect.disc import MIN_POINTS, Outline, grown, round_part
-from vision_side.detect.edge import sharp_outline
+from vision_side.detect.disc import Fit, Outline, round_part
+from vision_side.detect.edge import Box, sharp_outline
 from vision_side.detect.port import Circle, Detection
 
 Pixels = NDArray[Any]
@@ -34,42 +32,49 @@ class HsvDetector:
         if region is None:
             return ()
         outlines, _ = cv2.findContours(region.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        longest = nlargest(self._config.max_contours, outlines, key=len)
+        longest = sorted(outlines, key=len, reverse=True)[: self._config.max_contours]
         found = [self._disc(picture, region, outline) for outline in longest]
         return tuple(sorted((disc for disc in found if disc), key=_radius, reverse=True))
 
     def _disc(self, picture: Picture, region: Region, outline: Pixels) -> Detection | None:
         """The disc that `outline` encloses, or None if it is too small or not round."""
-        x, y, width, height = cv2.boundingRect(outline)
-        if max(width, height) < 2 * self._config.min_radius_px:
+        box = cv2.boundingRect(outline)
+        if max(box[2], box[3]) < 2 * self._config.min_radius_px:
             return None
-        sharp = sharp_outline(region.bgr, region.mask, (x, y, width, height))
-        pixels = (outline if sharp is None else sharp) + region.origin_px
-        edge = _own_edge(pixels, picture.bgr.shape)
-        if len(edge) < MIN_POINTS:
-            return None
+        sharp = sharp_outline(region.bgr, region.mask, box)
+        if sharp is not None:
+            outline, box = sharp, cv2.boundingRect(sharp)
+        edge = _own_edge(outline, box, region.origin_px, picture.bgr.shape)
         fit = round_part(edge, self._config.min_radius_px, self._config.max_roughness)
         if fit is None or len(fit[1]) < self._config.min_outline_kept * len(edge):
             return None
-        return self._detection(pixels, *fit, picture.scale)
+        return self._detection((box, *fit), len(fit[1]) / len(outline), region.origin_px, picture.scale)
 
-    def _detection(self, pixels: Pixels, circle: tuple[float, float, float], edge: Outline, scale: int) -> Detection:
-        """In pixels of the encoded picture."""
-        x, y, width, height = cv2.boundingRect(pixels)
-        disc = Circle(circle[0] * scale, circle[1] * scale, (circle[2] + _EDGE_PX) * scale)
-        return Detection(x * scale, y * scale, (x + width) * scale, (y + height) * scale, len(edge) / len(pixels),
-                         self._label, disc, grown(edge, circle, _EDGE_PX) * scale)
+    def _detection(self, shape: tuple[Box, Fit, Outline], score: float, origin_px: tuple[int, int],
+                   scale: int) -> Detection:
+        """In pixels of the encoded picture. The shape's circle and edge go by the centres of the region's pixels."""
+        box, circle, edge = shape
+        x, y = origin_px[0] + box[0], origin_px[1] + box[1]
+        cx, cy = origin_px[0] + 0.5 + circle[0], origin_px[1] + 0.5 + circle[1]
+        radius = circle[2] + _EDGE_PX
+        outwards = radius / circle[2]
+        ring = edge.T * (outwards * scale)
+        ring[0] += (cx - outwards * circle[0]) * scale
+        ring[1] += (cy - outwards * circle[1]) * scale
+        return Detection(x * scale, y * scale, (x + box[2]) * scale, (y + box[3]) * scale, score, self._label,
+                         Circle(cx * scale, cy * scale, radius * scale), ring.T)
 
 
-def _own_edge(pixels: Pixels, shape: tuple[int, ...]) -> Outline:
-    """Centres of the outline's pixels, less those that the picture's border made."""
-    flat, (rows, columns) = pixels[:, 0], shape[:2]
-    x, y, width, height = cv2.boundingRect(pixels)
-    if x <= 0 or y <= 0 or x + width >= columns or y + height >= rows:
+def _own_edge(pixels: Pixels, box: Box, origin_px: tuple[int, int], shape: tuple[int, ...]) -> Pixels:
+    """The outline's pixels (N, 2), less those that the picture's border made."""
+    flat = pixels[:, 0]
+    left, top = -origin_px[0], -origin_px[1]  # where the picture begins, in the region's pixels
+    right, bottom = left + shape[1] - 1, top + shape[0] - 1
+    x, y, width, height = box
+    if x <= left or y <= top or x + width > right or y + height > bottom:
         xs, ys = flat.T
-        flat = flat[(xs > 0) & (ys > 0) & (xs < columns - 1) & (ys < rows - 1)]
-    centres: NDArray[np.float64] = flat + 0.5
-    return centres
+        flat = flat[(xs > left) & (ys > top) & (xs < right) & (ys < bottom)]
+    return flat
 
 
 def _radius(detection: Detection) -> float:

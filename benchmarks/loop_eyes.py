@@ -1,0 +1,45 @@
+"""The same eyes for every contestant of `bench loop`: one `Pipeline`, with a detector as slow as was asked. Shell."""
+
+import time
+
+from benchmarks.loop_pictures import camera_of
+from protocol.messages import CameraModel, FrameHeader
+from protocol.twist_text import format_twist
+from vision_side.config import VisionConfig
+from vision_side.decode import Picture
+from vision_side.detect.hsv import HsvDetector
+from vision_side.detect.port import Detection, Detector
+from vision_side.pipeline import Frame, Pipeline
+
+
+class SlowDetector:
+    """A detector that takes `delay_s` longer; it waits as for an accelerator, without using the processor."""
+
+    def __init__(self, detector: Detector, delay_s: float) -> None:
+        self._detector, self._delay_s = detector, delay_s
+
+    def detect(self, picture: Picture) -> tuple[Detection, ...]:
+        """As the detector inside, later."""
+        time.sleep(self._delay_s)
+        return self._detector.detect(picture)
+
+
+def build_pipeline(config: VisionConfig, camera: CameraModel, delay_ms: float) -> Pipeline:
+    """The services' own pipeline; with a delay of 0 its detector is the services' own too."""
+    return Pipeline(config, camera, SlowDetector(HsvDetector(config.hsv), delay_ms / 1000) if delay_ms else None)
+
+
+class Eyes:
+    """Pictures in, `linear|angular` out."""
+
+    def __init__(self, width_px: int, height_px: int, delay_ms: float) -> None:
+        self._pipeline = build_pipeline(VisionConfig(), camera_of(width_px, height_px), delay_ms)
+        self._seq = 0
+
+    def answer(self, t_us: int, jpeg: bytes) -> str:
+        """The command for a picture captured at `t_us`. Raises ValueError for one that cannot be answered."""
+        self._seq += 1
+        twist = self._pipeline.step(Frame(FrameHeader(session="00000001", seq=self._seq, t_us=t_us), jpeg)).twist
+        if twist is None:
+            raise ValueError(f"no command for the picture of {t_us} us: {dict(self._pipeline.skipped)}")
+        return format_twist(twist).decode()

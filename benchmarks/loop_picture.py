@@ -1,0 +1,55 @@
+"""The distributions of `bench loop` as a picture: share of answers by age, and age over time. Shell (a file)."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from benchmarks.loop import Race
+from benchmarks.loop_setting import FLOOR, OURS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LABELS: Final = {
+    FLOOR: "floor (one process)", OURS: "sightline", "tcp": "bare TCP", "older": "older write-up",
+    "lekiwi": "ZeroMQ as LeKiwi", "openpi": "WebSocket as openpi", "callback": "zenoh, plain callback",
+}
+
+
+def draw_race(path: Path, race: Race) -> None:
+    """Write a PNG: left the share of verdicts by age, right the age over time."""
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    shares, times = figure.subplots(1, 2)
+    for name, sample in race.samples.items():
+        if sample.course.ages_us:
+            _draw_one(shares, times, name, sample.course.ages_us)
+    _finish(shares, "age at the verdict, ms", "share of verdicts, %")
+    _finish(times, "seconds", "age at the verdict, ms")
+    shares.set_xscale("log")
+    times.set_yscale("log")
+    shares.legend(loc="lower right")
+    setting = race.setting
+    figure.suptitle(
+        f"{setting.width_px}x{setting.height_px} at {setting.fps:g} fps, {setting.transport}, detector "
+        f"{'as it is' if not setting.detector_delay_ms else f'+{setting.detector_delay_ms:g} ms'}, loopback"
+    )
+    canvas.print_png(path)  # type: ignore[no-untyped-call]
+
+
+def _draw_one(shares: "Axes", times: "Axes", name: str, ages_us: tuple[tuple[int, int], ...]) -> None:
+    ages_ms = sorted(age_us / 1000 for _, age_us in ages_us)
+    width = 2.5 if name == OURS else 1.2
+    percents = [100 * (at + 1) / len(ages_ms) for at in range(len(ages_ms))]
+    shares.plot(ages_ms, percents, label=LABELS[name], linewidth=width)
+    begin_us = ages_us[0][0]
+    times.plot([(at_us - begin_us) / 1e6 for at_us, _ in ages_us], [age_us / 1000 for _, age_us in ages_us],
+               linewidth=width)
+
+
+def _finish(axes: "Axes", across: str, up: str) -> None:
+    axes.set_xlabel(across)
+    axes.set_ylabel(up)
+    axes.grid(visible=True, which="both", alpha=0.3)

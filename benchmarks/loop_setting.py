@@ -1,0 +1,61 @@
+"""What `bench loop` is asked to do. Pure."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from protocol.errors import ConfigError
+
+OURS: Final = "sightline"
+FLOOR: Final = "floor"
+TCP: Final = "tcp"
+"""The least that two processes can do; a reference, and a rival only when the detector is slow."""
+TRIES: Final = 3
+PEERS: Final = ("older", "lekiwi", "openpi", "callback")
+TAKEN_BOUND_PERCENT: Final = 3.0
+"""More of the machine's time than this in other hands makes a sample inconclusive."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoopSetting:
+    """One race: the same for every contestant. `pictures` is a folder of JPEGs of the given size."""
+
+    pictures: Path
+    width_px: int = 640
+    height_px: int = 480
+    fps: float = 30.0
+    transport: str = "zenoh"
+    detector_delay_ms: float = 0.0
+    seconds: float = 10.0
+    peers: tuple[str, ...] = PEERS
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for what cannot be run."""
+        if not 1 <= self.fps <= 240 or not 2 <= self.seconds <= 600 or not 0 <= self.detector_delay_ms <= 300:
+            raise ConfigError("--fps 1 to 240, --seconds 2 to 600 and --detector-delay-ms 0 to 300, e.g. --fps 30")
+        if not 64 <= self.width_px <= 1920 or not 64 <= self.height_px <= 1080:
+            raise ConfigError(f"--size {self.width_px}x{self.height_px}: 64x64 to 1920x1080")
+
+    @property
+    def is_loaded(self) -> bool:
+        """Whether the detector alone takes longer than the camera needs for a picture."""
+        return self.detector_delay_ms > 1000 / self.fps
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """`640x480` as (width, height). Raises ConfigError for what is none."""
+    width, cross, height = text.partition("x")
+    if not cross or not (width + height).isascii() or not width.isdigit() or not height.isdigit():
+        raise ConfigError(f"--size {text!r}: write WIDTHxHEIGHT, e.g. 640x480")
+    return int(width), int(height)
+
+
+def peers_of(text: str) -> tuple[str, ...]:
+    """`all`, `none`, or names separated by commas. Raises ConfigError for a name that is none of `PEERS`."""
+    if text in ("all", "none"):
+        return PEERS if text == "all" else ()
+    names = tuple(text.split(","))
+    unknown = [name for name in names if name not in PEERS]
+    if unknown:
+        raise ConfigError(f"--peers {unknown[0]!r}: all, none, or of {', '.join(PEERS)}")
+    return names

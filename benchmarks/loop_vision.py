@@ -1,0 +1,63 @@
+"""The vision service with a tap: keeps what the frames' headers say, and may be made slow. Shell.
+
+`python -m benchmarks.loop_vision SETTINGS`. The service is `vision_side.service.Service` as it is; the tap costs an
+append per frame, and only a detector with a delay is put into its pipeline.
+"""
+
+import json
+import signal
+import sys
+import threading
+from pathlib import Path
+
+from benchmarks.loop_eyes import build_pipeline
+from protocol.channels import MAX_HEADER_BYTES
+from protocol.codec import decode
+from protocol.messages import CameraModel, FrameHeader
+from protocol.transports.link import Link, Message
+from protocol.transports.opening import open_link
+from vision_side.config import VisionConfig
+from vision_side.pipeline import SOURCE
+from vision_side.service import Service
+
+_WAIT_S = 0.2
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+class TappedService(Service):
+    """Remembers the header of every frame it was given."""
+
+    def __init__(self, config: VisionConfig, link: Link, delay_ms: float) -> None:
+        self._delay_ms = delay_ms
+        super().__init__(config, link, _say)
+        self.headers: list[bytes] = []
+
+    def _use(self, camera: CameraModel) -> None:
+        super()._use(camera)
+        if self._delay_ms:
+            self._pipeline = build_pipeline(self._config, camera, self._delay_ms)
+
+    def _frame(self, message: Message, started_ns: int) -> None:
+        self.headers.append(message.header)
+        super()._frame(message, started_ns)
+
+
+def main(settings: dict[str, object]) -> None:
+    """Serve until SIGTERM, then write the headers as (seq, t_us, latency_us)."""
+    config = VisionConfig.model_validate(settings["config"])
+    ending = threading.Event()
+    with open_link(config.robot, connect=config.connect, role=SOURCE) as link:
+        signal.signal(signal.SIGTERM, lambda *_: ending.set())
+        service = TappedService(config, link, float(str(settings["delay_ms"])))
+        while not ending.is_set():
+            service.turn(_WAIT_S)
+    headers = [decode(FrameHeader, header, MAX_HEADER_BYTES) for header in service.headers]
+    rows = [(header.seq, header.t_us, header.latency_us) for header in headers]
+    Path(str(settings["tally"])).write_text(json.dumps(rows))
+
+
+if __name__ == "__main__":
+    main(json.loads(sys.argv[1]))

@@ -1,0 +1,58 @@
+"""One process of one peer: `python -m benchmarks.peers NAME ROLE SETTINGS`. Shell.
+
+ROLE is robot, vision or (the floor) alone; SETTINGS is JSON. It runs until SIGTERM and then writes its tally.
+"""
+
+import importlib
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+from benchmarks.loop_tally import Tally
+from benchmarks.peers.film import Film
+
+_RETRY_S: Final = 0.1
+
+
+def main(name: str, role: str, settings: dict[str, Any]) -> None:
+    """Play `role` of peer `name`."""
+    play = _part(importlib.import_module(f"benchmarks.peers.{name}"), role, settings)
+    while True:
+        try:
+            play()
+        except ConnectionRefusedError:  # whoever listens may start later
+            time.sleep(_RETRY_S)
+
+
+def _part(peer: ModuleType, role: str, settings: dict[str, Any]) -> Callable[[], None]:
+    if role == "vision":
+        signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
+        return partial(peer.vision, _eyes(settings), settings["port"])
+    tally, film = Tally(Path(settings["tally"])), Film(Path(settings["pictures"]), settings["fps"])
+    signal.signal(signal.SIGTERM, lambda *_: _end(tally))
+    if role == "alone":
+        return partial(peer.alone, film, _eyes(settings), tally, hot=not settings["delay_ms"])
+    return partial(peer.robot, film, tally, settings["port"])
+
+
+def _eyes(settings: dict[str, Any]) -> Any:
+    from benchmarks.loop_eyes import Eyes  # a robot has no use for it, and it is large
+
+    return Eyes(settings["width_px"], settings["height_px"], settings["delay_ms"])
+
+
+def _end(tally: Tally) -> None:
+    """At once, whatever the transport's threads are doing."""
+    tally.save()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], json.loads(sys.argv[3]))

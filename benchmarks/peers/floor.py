@@ -1,0 +1,35 @@
+"""The floor: no transport at all. Sleep until the picture's time, then decode and step, in one process. Shell."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import TYPE_CHECKING, Final
+
+from protocol.twist_text import parse_twist
+
+if TYPE_CHECKING:
+    from benchmarks.loop_eyes import Eyes
+    from benchmarks.loop_tally import Tally
+    from benchmarks.peers.film import Film
+
+_HOT_STEPS: Final = 150
+
+
+def alone(film: Film, eyes: Eyes, tally: Tally, *, hot: bool) -> None:
+    """Answer pictures at their pace for ever; before that, `hot` measures steps without any pause."""
+    if hot:
+        tally.hot_us = statistics.median(_step_us(film, eyes) for _ in range(_HOT_STEPS))
+    while True:
+        time.sleep(film.next_in_s())
+        t_us, jpeg = film.shoot()
+        tally.capture(t_us)
+        parse_twist(eyes.answer(t_us, jpeg).encode())
+        tally.judge(t_us)
+
+
+def _step_us(film: Film, eyes: Eyes) -> float:
+    t_us, jpeg = film.shoot()
+    began_ns = time.perf_counter_ns()
+    eyes.answer(t_us, jpeg)
+    return (time.perf_counter_ns() - began_ns) / 1000

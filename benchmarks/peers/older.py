@@ -1,0 +1,95 @@
+"""The older write-up's pattern: base64 text over WebSocket, every second picture, a command loop of 55.1 ms. Shell.
+
+The robot's server is an asyncio one here; the write-up's own looked for work every 100 ms and was slower still. The
+vision keeps the newest text in a variable, which its main loop watches without a pause, as the write-up does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import threading
+import time
+from typing import TYPE_CHECKING, Final
+
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.sync.client import ClientConnection, connect
+
+if TYPE_CHECKING:
+    from benchmarks.loop_eyes import Eyes
+    from benchmarks.loop_tally import Tally
+    from benchmarks.peers.film import Film
+
+COMMAND_PERIOD_S: Final = 0.0551
+
+
+class Wheels:
+    """The newest command, given to the motors again and again by a thread."""
+
+    def __init__(self, tally: Tally) -> None:
+        self.command = ""
+        self._tally = tally
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        done = ""
+        while True:
+            time.sleep(COMMAND_PERIOD_S)
+            command = self.command
+            if command != done:
+                done = command
+                linear, angular, t_us = command.split("|")
+                float(linear), float(angular)
+                self._tally.judge(int(t_us))
+
+
+def robot(film: Film, tally: Tally, port: int) -> None:
+    """Serve pictures to whoever connects."""
+    asyncio.run(_serve(film, tally, port))
+
+
+async def _serve(film: Film, tally: Tally, port: int) -> None:
+    clients: set[ServerConnection] = set()
+    wheels = Wheels(tally)
+
+    async def hear(client: ServerConnection) -> None:
+        clients.add(client)
+        async for text in client:
+            wheels.command = str(text)
+
+    async with serve(hear, "127.0.0.1", port):
+        odd = False
+        while True:
+            await asyncio.sleep(film.next_in_s())
+            t_us, jpeg = film.shoot()
+            tally.capture(t_us)
+            odd = not odd
+            for client in clients if odd else ():
+                await client.send(f"{t_us} {base64.encodebytes(jpeg).decode()}")
+
+
+class Newest:
+    """The newest text, and whether it was looked at."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self.text = ""
+        self.processed = True
+        self._connection = connection
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        for message in self._connection:
+            self.text, self.processed = str(message), False
+
+
+def vision(eyes: Eyes, port: int) -> None:
+    """Answer the robot at `port`."""
+    connection = connect(f"ws://127.0.0.1:{port}", compression=None)
+    newest = Newest(connection)
+    while True:
+        if newest.processed:
+            continue
+        stamp, _, picture = newest.text.partition(" ")
+        newest.processed = True
+        answer = eyes.answer(int(stamp), base64.decodebytes(picture.encode()))
+        connection.send(f"{answer}|{stamp}")

@@ -1,0 +1,52 @@
+"""One WebSocket request per picture, as openpi does it: the robot asks, waits, and acts on the answer. Shell.
+
+The vision is an asyncio server that computes inside its handler; compression is off and messages are binary, as there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+import time
+from typing import TYPE_CHECKING, Final
+
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.sync.client import connect
+
+if TYPE_CHECKING:
+    from benchmarks.loop_eyes import Eyes
+    from benchmarks.loop_tally import Tally
+    from benchmarks.peers.film import Film
+
+STAMP: Final = struct.Struct("<Q")
+ANSWER: Final = struct.Struct("<Qdd")
+
+
+def robot(film: Film, tally: Tally, port: int) -> None:
+    """Ask the vision at `port` about one picture after the other."""
+    connection = connect(f"ws://127.0.0.1:{port}", compression=None, max_size=None)
+    while True:
+        time.sleep(film.next_in_s())
+        t_us, jpeg = film.shoot()
+        tally.capture(t_us)
+        connection.send(STAMP.pack(t_us) + jpeg)
+        answer = connection.recv()
+        ANSWER.unpack(answer if isinstance(answer, bytes) else answer.encode())
+        tally.judge(t_us)
+
+
+def vision(eyes: Eyes, port: int) -> None:
+    """Serve answers at `port`."""
+    asyncio.run(_serve(eyes, port))
+
+
+async def _serve(eyes: Eyes, port: int) -> None:
+    async def handle(connection: ServerConnection) -> None:
+        async for message in connection:
+            data = message if isinstance(message, bytes) else message.encode()
+            (t_us,) = STAMP.unpack_from(data)
+            linear, angular = eyes.answer(t_us, data[STAMP.size :]).split("|")
+            await connection.send(ANSWER.pack(t_us, float(linear), float(angular)))
+
+    async with serve(handle, "127.0.0.1", port, compression=None, max_size=None) as server:
+        await server.serve_forever()

@@ -1,0 +1,51 @@
+"""A bare TCP exchange: length and stamp, JPEG out; a line of text back. Shell.
+
+The robot sends from one thread and listens in another; the vision answers one picture after the other.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+import time
+from typing import IO, TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from benchmarks.loop_eyes import Eyes
+    from benchmarks.loop_tally import Tally
+    from benchmarks.peers.film import Film
+
+HEAD: Final = struct.Struct("<IQ")
+"""Bytes of JPEG, and the capture time in microseconds, by which the answer is told apart in measuring."""
+
+
+def robot(film: Film, tally: Tally, port: int) -> None:
+    """Serve one vision."""
+    with socket.create_server(("127.0.0.1", port)) as server:
+        connection, _ = server.accept()
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    threading.Thread(target=_listen, args=(connection.makefile("rb"), tally), daemon=True).start()
+    while True:
+        time.sleep(film.next_in_s())
+        t_us, jpeg = film.shoot()
+        tally.capture(t_us)
+        connection.sendall(HEAD.pack(len(jpeg), t_us) + jpeg)
+
+
+def _listen(lines: IO[bytes], tally: Tally) -> None:
+    for line in lines:
+        linear, angular, t_us = line.split(b"|")
+        float(linear), float(angular)
+        tally.judge(int(t_us))
+
+
+def vision(eyes: Eyes, port: int) -> None:
+    """Answer the robot at `port`."""
+    connection = socket.create_connection(("127.0.0.1", port))
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    frames = connection.makefile("rb")
+    while True:
+        size, t_us = HEAD.unpack(frames.read(HEAD.size))
+        answer = eyes.answer(t_us, frames.read(size))
+        connection.sendall(f"{answer}|{t_us}\n".encode())
