@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from operator_side.cli_bench_loop import register_bench
 from operator_side.cli_judge import CHECK_FAILED, Json, numbers
 from operator_side.extras import needs
 
@@ -23,6 +24,7 @@ def register(app: typer.Typer) -> None:
     group.command(epilog="Example: sightline bench robot --seconds 60")(robot)
     group.command(epilog="Example: sightline bench demo --scenario circle --seeds 201,202,203")(demo)
     group.command(epilog="Example: sightline bench report --out docs/performance.md")(report)
+    register_bench(group)
     app.add_typer(group, name="bench")
 
 
