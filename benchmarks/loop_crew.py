@@ -55,8 +55,8 @@ class Crew:
             process.send_signal(signal.SIGCONT)
 
     def end(self) -> None:
-        """End one after the other, the newest first; idempotent."""
-        for process in reversed(self._running.values()):
+        """End one after the other, the oldest first: a robot keeps its notes before its peer vanishes. Idempotent."""
+        for process in self._running.values():
             process.terminate()
             try:
                 process.wait(_END_S)

@@ -72,7 +72,7 @@ def figures_of(sample: Sample) -> Figures:
     return Figures(
         name=sample.name,
         captured=course.captured,
-        fps=len(ages_ms) / sample.seconds,
+        fps=course.captured * course.answered_percent / 100 / sample.seconds,
         answered_percent=course.answered_percent,
         p50_ms=percentile(ages_ms, 50),
         p95_ms=percentile(ages_ms, 95),
