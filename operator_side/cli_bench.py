@@ -44,7 +44,7 @@ def pipeline(*, as_json: Json = False) -> int:
     from operator_side.score import Check
 
     checks = [
-        Check(f"step at {one.width_px}x{one.height_px}, hot (paced {one.paced_us:.0f}, decoding alone {one.decode_us:.0f})",
+        Check(f"step at {one.width_px}x{one.height_px}, hot (paced {one.paced_us:.0f}, decode {one.decode_us:.0f})",
               one.median_us, "us", one.bound_us, one.median_us <= one.bound_us and one.phase == "tracking")
         for one in time_steps()
     ]
