@@ -46,7 +46,13 @@ SECTIONS: Final = (
         "The same in real time",
         "`sightline demo`: real processes over Zenoh. The median of six seeds is held against the bounds above x 1.5; "
         "every run's recorded frames, replayed through a fresh pipeline, must give the twists that were on the wire.",
-        ("bench", "demo", "--seeds", _SEEDS, "--seconds", "20"),
+        ("bench", "demo", "--seeds", _SEEDS, "--seconds", "12"),
+    ),
+    Section(
+        "Killed at speed",
+        "Vision and the network process, killed with -9 while driving at 0.3 m/s or more, ten times each; judged "
+        "from the simulated motors' own log. [faults.md](faults.md) has every fault.",
+        ("faults", "--only", "vision.kill", "--only", "network.kill", "--only", "vision.restart", "--repeat", "10"),
     ),
     Section("Odometry", "Against the simulated world's truth.", ("bench", "odometry")),
     Section("Messages", "Encode and decode, hot.", ("bench", "codec")),
