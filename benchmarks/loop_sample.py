@@ -1,6 +1,6 @@
 """One sample of one contestant: start it, let it settle, read the kernel's counters around its time, end it. Shell.
 
-A sample during which others had the machine's time is marked and taken again, three times at most.
+A sample during which others had the machine's time is marked and taken again, as often as the setting allows.
 """
 
 import json
@@ -16,7 +16,7 @@ from benchmarks.loop_course import Course, Sample, course_of_tally
 from benchmarks.loop_crew import Crew, free_port
 from benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
 from benchmarks.loop_ours import running_services
-from benchmarks.loop_setting import FLOOR, OURS, TAKEN_BOUND_PERCENT, TRIES, LoopSetting
+from benchmarks.loop_setting import FLOOR, OURS, TAKEN_BOUND_PERCENT, LoopSetting
 from benchmarks.loop_sockets import carried_between, carried_bytes
 
 _SETTLE_S: Final = 1.5
@@ -57,18 +57,16 @@ class Peer:
 
 
 def take_sample(name: str, setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> Sample:
-    """The least disturbed of up to three samples. Raises HardwareError if the contestant does not start."""
-    best: Sample | None = None
-    for number in range(1, TRIES + 1):
-        taken = _take_one(name, setting, folder / f"{name}-{number}", number)
-        answers = len(taken.course.ages_us)
-        say(f"{name}: {answers} answers; others had {taken.taken_percent:.1f} % of the machine's time")
-        if best is None or taken.taken_percent < best.taken_percent:
-            best = taken
-        if taken.taken_percent <= TAKEN_BOUND_PERCENT:
+    """The least disturbed of up to `setting.tries` samples. Raises HardwareError if the contestant does not start."""
+    taken: list[Sample] = []
+    while len(taken) < setting.tries:
+        number = len(taken) + 1
+        taken.append(_take_one(name, setting, folder / f"{name}-{number}", number))
+        others = taken[-1].taken_percent
+        say(f"{name}: {len(taken[-1].course.ages_us)} answers; others had {others:.1f} % of the machine's time")
+        if others <= TAKEN_BOUND_PERCENT:
             break
-    assert best is not None
-    return best
+    return min(taken, key=lambda sample: sample.taken_percent)
 
 
 def _take_one(name: str, setting: LoopSetting, folder: Path, number: int) -> Sample:

@@ -10,7 +10,6 @@ OURS: Final = "sightline"
 FLOOR: Final = "floor"
 TCP: Final = "tcp"
 """The least that two processes can do; a reference, and a rival only when the detector is slow."""
-TRIES: Final = 3
 PEERS: Final = ("older", "lekiwi", "openpi", "callback")
 TAKEN_BOUND_PERCENT: Final = 3.0
 """More of the machine's time than this in other hands makes a sample inconclusive."""
@@ -18,7 +17,7 @@ TAKEN_BOUND_PERCENT: Final = 3.0
 
 @dataclass(frozen=True, slots=True)
 class LoopSetting:
-    """One race: the same for every contestant. `pictures` is a folder of JPEGs of the given size."""
+    """The same for every contestant. `pictures` is a folder of JPEGs of the given size."""
 
     pictures: Path
     width_px: int = 640
@@ -28,6 +27,8 @@ class LoopSetting:
     detector_delay_ms: float = 0.0
     seconds: float = 10.0
     peers: tuple[str, ...] = PEERS
+    tries: int = 3
+    """A sample that others disturbed is taken again, so often at most."""
 
     def __post_init__(self) -> None:
         """Raise ConfigError for what cannot be run."""

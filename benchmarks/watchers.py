@@ -18,7 +18,7 @@ from benchmarks.loop_figures import ANSWERED_PERCENT, LoopCheck, at_most, percen
 from benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
 from benchmarks.loop_ours import Ours, running_services
 from benchmarks.loop_pictures import write_pictures
-from benchmarks.loop_setting import TAKEN_BOUND_PERCENT, TRIES, LoopSetting
+from benchmarks.loop_setting import TAKEN_BOUND_PERCENT, LoopSetting
 
 P95_GROWTH_MS: Final = 3.0
 MEMORY_GROWTH_MB: Final = 5.0
@@ -48,15 +48,15 @@ class Watch:
 def measure_watchers(setting: LoopSetting, viewers: int, say: Callable[[str], None]) -> list[LoopCheck]:
     """Run `setting.seconds` without, and again with `viewers` (2 to 12); `setting.pictures` is filled in.
 
-    Taken again, three times at most, while others have the machine. Raises ConfigError for an unknown transport,
-    HardwareError for a process that does not run.
+    Taken again, `setting.tries` times at most, while others have the machine. Raises ConfigError for an unknown
+    transport, HardwareError for a process that does not run.
     """
     with tempfile.TemporaryDirectory(prefix="sightline-watchers-") as name:
         ready = replace(setting, pictures=Path(name) / "pictures")
         ready.pictures.mkdir()
         write_pictures(ready.pictures, ready.width_px, ready.height_px)
         pairs = []
-        for number in range(TRIES):
+        for number in range(setting.tries):
             folder = Path(name) / str(number)
             folder.mkdir()
             pairs.append(_measure(ready, viewers, folder, say))

@@ -36,7 +36,8 @@ def test_odometry_is_exact_on_an_arc(linear, angular, steps):
         t = seconds * step / steps
         odometer.update(WheelAngles(left * t, right * t, round(t * 1e6)))
     turned = angular * seconds
-    way = linear * seconds * (2 * math.sin(turned / 2) / turned if turned else 1.0)
+    half = turned / 2  # divided by itself, not by `turned`: halving a denormal rounds
+    way = linear * seconds * (math.sin(half) / half if half else 1.0)
     x, y, yaw = odometer.pose
     assert x == pytest.approx(way * math.cos(turned / 2), abs=1e-9)
     assert y == pytest.approx(way * math.sin(turned / 2), abs=1e-9)
