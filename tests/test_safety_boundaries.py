@@ -328,7 +328,11 @@ def test_a_frozen_picture_holds(unchanged_us, state):
     rig = Rig().armed()
     rig.gate.pictures.add(rig.now_us - unchanged_us, 7)
     rig.gate.pictures.add(rig.now_us, 7)
-    assert rig.offer().accepted == (unchanged_us <= 400_000)
+    verdict = rig.offer()
+    assert verdict.accepted == (unchanged_us <= 400_000)
+    if not verdict.accepted:
+        assert verdict.reason is Refusal.STALE
+        assert verdict.detail == "the camera's picture has not changed for 400 ms"
     decision = rig.step(0)
     assert decision.state is state
     assert (decision.reason == "the camera's picture does not change") == (unchanged_us > 400_000)
