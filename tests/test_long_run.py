@@ -1,0 +1,95 @@
+"""Ten simulated minutes of the closed loop over a bad link, in virtual time: the robot's own logic, an ideal vision."""
+
+import math
+
+from protocol.channels import FRAME, TWIST
+from protocol.codec import decode, encode
+from protocol.messages import AnswerHeader, Echo, FrameHeader, State, Twist
+from protocol.transports.link import Message
+from protocol.transports.memory import MemoryNetwork
+from protocol.twist_text import format_twist
+from robot_side.config import PluginChoice, RobotConfig
+from robot_side.driving import Driving
+from robot_side.limits import STOP_TIME_BOUND_US, SafetyConfig
+from robot_side.ports import Picture, WheelAngles
+from robot_side.sending import Sending
+
+TICK_US, FRAME_US = 20_000, 33_333
+OUTAGE_US = (300_000_000, 302_000_000)
+
+
+class LongRun:
+    """Wheels follow at once; vision turns towards the origin from the pose in the frame's header."""
+
+    def __init__(self, seed: int):
+        config = RobotConfig(safety=SafetyConfig(auto_arm=True), range_sensor=PluginChoice(kind="none"))
+        self.network = MemoryNetwork(seed, delay_us=40_000, jitter_us=60_000, loss=0.1)
+        self.driving = Driving(config, "0000aaaa")
+        self.sending = Sending(config.stream, "0000aaaa", 0, config.max_frame_bytes)
+        self.robot, self.vision = self.network.link("r1"), self.network.link("r1", "vision")
+        self.robot.subscribe(TWIST, self._on_twist)
+        self.vision.subscribe(FRAME, self._on_frame)
+        self.now_us = self.answers = 0
+        self.angles = [0.0, 0.0]
+        self.speeds = (0.0, 0.0)
+        self.trace = []
+        self.accepted_us = 0
+        self.oldest_motion_us = 0
+
+    def _cut(self) -> bool:
+        return OUTAGE_US[0] <= self.now_us < OUTAGE_US[1]
+
+    def _on_twist(self, message: Message) -> None:
+        before = self.driving.gate.accepted
+        judged = None if self._cut() else self.driving.on_twist(message, self.network.now_us)
+        if judged is not None:
+            self.sending.on_judged(judged, self.network.now_us)
+        if self.driving.gate.accepted > before:
+            self.accepted_us = self.network.now_us
+
+    def _on_frame(self, message: Message) -> None:
+        if self._cut():
+            return
+        header = decode(FrameHeader, message.header)
+        x, y, yaw = header.pose
+        bearing = math.remainder(math.atan2(2.0 - y, -x) - yaw, math.tau)
+        twist = Twist(linear_mps=0.4, angular_rad_s=max(-2.0, min(2.0, 1.5 * bearing)))
+        echo = Echo(channel="frame", session=header.session, seq=header.seq, t_us=header.t_us)
+        answer = AnswerHeader(source="vision", session="0000bbbb", seq=self.answers, echo=echo)
+        self.answers += 1
+        self.vision.publish(TWIST, encode(answer), format_twist(twist))
+
+    def run(self, seconds: float) -> "LongRun":
+        """Advance tick by tick; frames are captured on the tick after they are due."""
+        frame_due_us = 0
+        while self.now_us < seconds * 1e6:
+            self.now_us += TICK_US
+            self.network.advance(self.now_us)
+            if self.now_us >= frame_due_us and self.sending.may_capture(self.now_us, listening=True):
+                frame_due_us += FRAME_US
+                header, message = self.sending.on_camera(Picture(b"jpeg", self.now_us), self.now_us)
+                self.driving.on_issued(header.seq, header.t_us, 0)
+                self.robot.publish(message.channel, message.header, message.payload)
+            self._tick()
+        return self
+
+    def _tick(self) -> None:
+        self.angles = [angle + speed * TICK_US / 1e6 for angle, speed in zip(self.angles, self.speeds, strict=True)]
+        self.speeds = self.driving.tick(self.now_us, WheelAngles(*self.angles, self.now_us), None)
+        self.sending.motion = self.driving.motion()
+        if self.now_us - self.accepted_us > STOP_TIME_BOUND_US:
+            assert self.speeds == (0.0, 0.0), f"still moving at {self.now_us} us"
+        self.trace.append((self.speeds, self.driving.gate.state))
+
+
+def test_ten_minutes_over_a_bad_link_drive_stop_in_the_outage_and_repeat_identically():
+    run = LongRun(seed=11).run(600)
+    moving = [speeds != (0.0, 0.0) for speeds, _ in run.trace]
+    assert sum(moving) / len(moving) > 0.9, "the link is bad, not gone"
+    outage = [state for _, state in run.trace[OUTAGE_US[0] // TICK_US + 40 : OUTAGE_US[1] // TICK_US]]
+    assert set(outage) == {State.HOLD}
+    assert run.trace[-1][1] in (State.ACTIVE, State.DEGRADED)
+    assert run.network.dropped["FROM_ROBOT"] > 500 and run.network.dropped["TO_ROBOT"] > 500
+    again = LongRun(seed=11).run(600)
+    assert again.trace == run.trace
+    assert LongRun(seed=12).run(60).trace != run.trace[: 60 * 50]
