@@ -55,6 +55,7 @@ SECTIONS: Final = (
         ("faults", "--only", "vision.kill", "--only", "network.kill", "--only", "vision.restart", "--repeat", "10"),
     ),
     Section("Odometry", "Against the simulated world's truth.", ("bench", "odometry")),
+    Section("Gate", "One command judged and one step decided.", ("bench", "gate")),
     Section("Messages", "Encode and decode, hot.", ("bench", "codec")),
     Section("Vision", "`Pipeline.step`, decoding included, hot, one thread.", ("bench", "pipeline")),
     Section(

@@ -19,6 +19,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(help="Measure what things cost on this machine.", rich_markup_mode=None)
     group.command(epilog="Example: sightline bench codec --json")(codec)
+    group.command(epilog="Example: sightline bench gate")(gate)
     group.command(epilog="Example: sightline bench pipeline")(pipeline)
     group.command(epilog="Example: sightline bench odometry")(odometry)
     group.command(epilog="Example: sightline bench robot --seconds 60")(robot)
@@ -35,6 +36,15 @@ def codec(*, as_json: Json = False) -> int:
 
     costs = measure_codec()
     return _print_checks([Check(cost.name, cost.median_us, "us", cost.bound_us, cost.ok) for cost in costs], as_json)
+
+
+def gate(*, as_json: Json = False) -> int:
+    """Judge one command and decide one step, as the driver does."""
+    from benchmarks.gate import BOUND_US, measure_gate
+    from operator_side.score import Check
+
+    took_us = measure_gate()
+    return _print_checks([Check("offer and step", took_us, "us", BOUND_US, took_us <= BOUND_US)], as_json)
 
 
 def pipeline(*, as_json: Json = False) -> int:
