@@ -5,17 +5,21 @@ import os
 from typing import Annotated
 
 import typer
+from pydantic import BaseModel
 
 from operator_side.cli_services import Sets
 from operator_side.service_settings import load_service
 from operator_side.settings import model_of
 from operator_side.toml_text import toml_text
+from robot_side.config import RobotConfig
+from robot_side.plugins import configured
+from sim.robot_model import load_robot
+from sim.scenario import load_scenario
+from sim.service import SimConfig
 
 ServiceName = Annotated[str, typer.Argument(metavar="SERVICE", help="robot, vision or sim.")]
 File = Annotated[str | None, typer.Argument(metavar="[FILE]", help="The service's TOML file.")]
 Profile = Annotated[str | None, typer.Option(help="Lay this profile under it, e.g. sim.")]
-
-
 
 
 def register(app: typer.Typer) -> None:
@@ -33,7 +37,20 @@ def register(app: typer.Typer) -> None:
 def check(service: ServiceName, file: File = None, profile: Profile = None, sets: Sets = None) -> None:
     """Say whether a configuration is good; exit 2 and name what is wrong if not."""
     loaded = load_service(service, profile=profile, file=file, sets=sets or (), environ=os.environ)
+    _check_names(loaded.config)
     typer.echo(f"{file or service}: ok, {len(loaded.given)} values set, the rest by default")
+
+
+def _check_names(config: BaseModel) -> None:
+    """What the configuration names: devices with their options, scenario and robot. Opens nothing."""
+    if isinstance(config, RobotConfig):
+        named = {"cameras": config.camera, "drives": config.drive, "range_sensors": config.ranging}
+        for group, choice in named.items():
+            if choice is not None:
+                configured(group, choice)
+    if isinstance(config, SimConfig):
+        load_scenario(config.scenario)
+        load_robot(config.robot)
 
 
 def show(

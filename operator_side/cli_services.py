@@ -11,10 +11,11 @@ from protocol.errors import ConfigError
 
 ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help="TOML file; see `sightline config`.")]
 Sets = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set one value, e.g. safety.auto_arm=true.")
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Set one value; `sightline config show SERVICE` lists the keys."),
 ]
 Listen = Annotated[
-    list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Listen here, e.g. tcp/0.0.0.0:7447.")
+    list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Listen here, e.g. tcp/0.0.0.0:7447 or ws://0.0.0.0:9090.")
 ]
 Connect = Annotated[
     list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Connect here, e.g. tcp/192.168.1.20:7447.")
@@ -105,6 +106,8 @@ def vision(
     """Look at a robot's pictures and steer it, until Ctrl-C."""
     if camera is not None and not dry_run:
         raise ConfigError("--camera looks without a robot, so there is nothing to steer: add --dry-run")
+    if camera_sets and camera is None:
+        raise ConfigError("--camera-set is for the camera of --camera; name one, e.g. --camera v4l2")
     options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect)}
     loaded = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
     with needs("vision"):

@@ -55,7 +55,7 @@ def _nearest_key(model: type[BaseModel], key: Key) -> str:
     in_list = any(part.isdigit() for part in key)
     names = _list_keys(model) if in_list else [".".join(known) for known in known_keys(model)]
     nearest = difflib.get_close_matches(key[-1] if in_list else ".".join(key), names, n=1, cutoff=0.6)
-    return f"; did you mean {nearest[0]!r}?" if nearest else "; `sightline config schema` lists them"
+    return f"; did you mean {nearest[0]!r}?" if nearest else "; `sightline config show SERVICE` lists them"
 
 
 def _list_keys(model: type[BaseModel]) -> list[str]:

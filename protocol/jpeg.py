@@ -1,6 +1,6 @@
 """Bounds-check a JPEG from its header, before any decoder sees it. Pure.
 
-A 631-byte JPEG can cost a decoder 38 s and gigabytes (docs/performance.md); this walk costs microseconds.
+A JPEG of some hundred bytes can cost a decoder half a minute and gigabytes; this walk costs microseconds.
 Marker layout: ITU-T T.81, annex B.
 """
 

@@ -2,13 +2,17 @@
 
 import difflib
 import importlib
+import sys
 from importlib.metadata import entry_points
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from protocol.errors import ConfigError
 from robot_side.config import PluginChoice
+
+_WORDS: Final = {"cameras": "camera", "drives": "drive", "range_sensors": "range sensor"}
 
 
 def build(group: str, choice: PluginChoice) -> Any:
@@ -17,14 +21,26 @@ def build(group: str, choice: PluginChoice) -> Any:
     Raises ConfigError for an unknown kind (nearest named), a missing package or a wrong option; HardwareError as the
     device itself does.
     """
+    plugin, config = configured(group, choice)
+    return plugin(config)
+
+
+def configured(group: str, choice: PluginChoice) -> tuple[Any, Any]:
+    """The class and its checked `Config`, without touching the device. Raises ConfigError."""
     plugin = _load(group, choice.kind)
     try:
-        config = plugin.Config.model_validate(choice.options)
+        return plugin, plugin.Config.model_validate(choice.options)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"option {where!r} of {group} {choice.kind!r}: {first['msg']}") from None
-    return plugin(config)
+        raise ConfigError(f"{_WORDS[group]} {choice.kind!r}: {_problem(plugin.Config, error)}") from None
+
+
+def _problem(config: type[BaseModel], error: ValidationError) -> str:
+    """A misspelt option before a missing one: it is usually both."""
+    problems = sorted(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden")
+    where = ".".join(str(part) for part in problems[0]["loc"])
+    if problems[0]["type"] == "extra_forbidden":
+        return f"unknown option {where!r}; it takes {', '.join(config.model_fields)}"
+    return f"option {where!r}: {'is missing' if problems[0]['type'] == 'missing' else problems[0]['msg']}"
 
 
 def _load(group: str, kind: str) -> Any:
@@ -33,10 +49,13 @@ def _load(group: str, kind: str) -> Any:
         if kind in known:
             return known[kind].load()
         if ":" in kind:
+            if str(Path.cwd()) not in sys.path:  # a class of one's own lies where the robot is started
+                sys.path.insert(0, str(Path.cwd()))
             module, _, name = kind.partition(":")
             return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{group} {kind!r} cannot be loaded: {error}") from None
+        raise ConfigError(f"{_WORDS[group]} {kind!r} cannot be loaded: {error}") from None
     nearest = difflib.get_close_matches(kind, known, n=1)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-    raise ConfigError(f"no {group} called {kind!r}{hint} Known: {', '.join(sorted(known))}, or package.module:Name")
+    there_are = ", ".join(sorted(known))
+    raise ConfigError(f"no {_WORDS[group]} called {kind!r}{hint}; there are {there_are}, or package.module:Name")

@@ -107,7 +107,7 @@ class RobotModel(Config):
     """One robot."""
 
     name: str
-    summary: str
+    summary: str = ""
     wheels: Wheels
     chassis: Chassis
     caster: Caster

@@ -115,7 +115,7 @@ class Scenario(Config):
     """One scenario. `stand_off_m` is what both the steering and the score go by: lens to the ball's centre."""
 
     name: str
-    summary: str
+    summary: str = ""
     seconds: Annotated[float, Field(gt=0, le=3600)] = 20.0
     stand_off_m: Annotated[float, Field(gt=0, le=20)] = 0.8
     look: Look

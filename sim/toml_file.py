@@ -20,6 +20,8 @@ def find(kind: str, name: str, folder: Path) -> Path:
     path = Path(name) if name.endswith(".toml") else folder / f"{name}.toml"
     if path.is_file() and (name.endswith(".toml") or name in names_in(folder)):
         return path
+    if name.endswith(".toml"):
+        raise ConfigError(f"no {kind} file {name}; by name there are {', '.join(names_in(folder))}")
     raise ConfigError(f"no {kind} called {name!r}{_nearest(name, folder)}; there are {', '.join(names_in(folder))}")
 
 
@@ -52,6 +54,8 @@ def check(model: type[Model], table: dict[str, Any], path: Path) -> Model:
 def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
     first = error.errors(include_url=False, include_context=False)[0]
     where = ".".join(str(part) for part in first["loc"]) or "file"
+    if first["type"] == "missing":
+        return f"{where}: is missing"
     if first["type"] != "extra_forbidden":
         return f"{where}: {first['msg']} (got {str(first['input'])[:60]})"
     near = difflib.get_close_matches(str(first["loc"][-1]), _fields(model), n=1)

@@ -92,7 +92,7 @@ def test_a_port_in_use_names_its_owner(tmp_path):
     ("change", "code", "says"),
     [
         ({"camera": {"kind": "folder", "options": {"path": "/nowhere"}}}, 3, "no .jpg pictures in /nowhere"),
-        ({"camera": {"kind": "webcam"}}, 2, "no cameras called 'webcam'"),
+        ({"camera": {"kind": "webcam"}}, 2, "no camera called 'webcam'"),
         ({"camera": {"kind": "folders"}}, 2, "did you mean 'folder'?"),
         ({"drive": {"kind": "log", "options": {"pth": "x"}}}, 2, "pth"),
         ({"drive": {"kind": "sim", "options": {"socket_dir": "/nowhere"}}}, 3, "sightline sim"),

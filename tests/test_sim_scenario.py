@@ -29,7 +29,7 @@ def test_everything_shipped_loads():
     [
         (load_scenario, "cirlce", "did you mean 'circle'"),
         (load_scenario, "../robots/raspberry", "no scenario called"),
-        (load_scenario, "/nowhere/x.toml", "no scenario called"),
+        (load_scenario, "/nowhere/x.toml", "no scenario file /nowhere/x.toml"),
         (load_robot, "rasberry", "did you mean 'raspberry'"),
         (look_named, "dimm", "did you mean 'dim'"),
     ],
