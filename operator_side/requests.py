@@ -77,12 +77,13 @@ class Operator:
 
     def ask(self, verb: Verb, timeout_s: float = 2.0) -> Reply:
         """Ask once, repeating it until the reply comes. Raises LinkError when none comes in time."""
-        if self._report is None and verb in _CITES_STATUS:
-            self.wait_report(timeout_s)
+        if verb in _CITES_STATUS:
+            self.wait_report(timeout_s)  # one of now: not from before an earlier STOP or disarm
         self._id += 1
+        cited = self._report  # of when it was asked: a STOP that somebody says meanwhile stands above it
         deadline_s = time.monotonic() + timeout_s
         while time.monotonic() < deadline_s:
-            self._send(verb)
+            self._send(verb, cited)
             with self._news:
                 if self._news.wait_for(lambda: self._id in self._replies, REPEAT_S):
                     return self._replies[self._id]
@@ -106,7 +107,7 @@ class Operator:
         started_s = time.monotonic()
         told = False
         while time.monotonic() - started_s < timeout_s:
-            self._send(Verb.STOP)
+            self._send(Verb.STOP, None)
             with self._news:
                 if self._news.wait_for(self._is_stopped, STOP_PERIOD_S):
                     assert self._report is not None
@@ -121,9 +122,8 @@ class Operator:
     def _is_stopped(self) -> bool:
         return self._report is not None and self._report.status.state is State.STOPPED
 
-    def _send(self, verb: Verb) -> None:
+    def _send(self, verb: Verb, report: Report | None) -> None:
         self._seq += 1
-        report = self._report
         echo = None
         if report is not None:
             stamp = report.stamp

@@ -4,7 +4,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 from protocol.config import Config
 from protocol.messages import SessionId
@@ -14,6 +15,8 @@ from robot_side.config import RobotConfig
 _PACKETS_PER_WAKE = 64  # a flood is drained in portions, so that no tick waits for its end
 _FIRST_BACKOFF_US = 200_000
 _LONGEST_BACKOFF_US = 2_000_000
+_WEDGED_US = 2_000_000
+_STARTS_WITHIN_US = 30_000_000  # a first start reads its packages from a slow card
 _END_S = 1.0
 
 
@@ -28,7 +31,10 @@ class Setup(Config):
 class NetworkChild:
     """The network process as the driver sees it. No method waits for it, except `close`."""
 
-    def __init__(self, config: RobotConfig, session: str) -> None:
+    def __init__(self, config: RobotConfig, session: str, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._heard = False
+        self._heard_us = 0
         self._config = config
         self._session = session
         self._process: subprocess.Popen[bytes] | None = None
@@ -44,17 +50,28 @@ class NetworkChild:
         """Start it if it is not there and its time has come."""
         if self._process is not None and self._process.poll() is not None:
             self._on_exit(self._process.returncode, now_us)
+        if self._heard:
+            self._heard, self._heard_us = False, now_us
+        if self._process is not None and self._was_ready and now_us - self._heard_us > _WEDGED_US:
+            self._process.kill()  # stopped or wedged: it reports five times a second while it is well
         if self._process is None and now_us >= self._start_at_us and not self.failed_at_start:
-            self._start(first_seq)
+            self._heard_us = now_us + _STARTS_WITHIN_US
+            try:
+                self._start(first_seq)
+            except OSError as error:
+                self._say(f"network process does not start: {error.strerror}; trying again")
+                self._start_at_us = now_us + _LONGEST_BACKOFF_US
 
     def _start(self, first_seq: int) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        ours.setblocking(False)
-        setup = Setup(config=self._config, session=self._session, first_seq=first_seq)
-        ours.send(setup.model_dump_json().encode())
-        with theirs:
+        with ExitStack() as undo, theirs:
+            undo.callback(ours.close)
+            ours.setblocking(False)
+            setup = Setup(config=self._config, session=self._session, first_seq=first_seq)
+            ours.send(setup.model_dump_json().encode())
             command = [sys.executable, "-m", "robot_side.network", str(theirs.fileno())]
             self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
+            undo.pop_all()
         self.socket = ours
         self.restarts += 1
 
@@ -66,7 +83,7 @@ class NetworkChild:
         if not self._was_ready:  # it said why itself
             self.failed_at_start, self.exit_code = True, code if code > 0 else 1
             return
-        print(f"network process ended ({code}); starting it again", flush=True)
+        self._say(f"network process ended ({code}); starting it again")
         self._start_at_us = now_us + self._backoff_us
         self._backoff_us = min(2 * self._backoff_us, _LONGEST_BACKOFF_US)
 
@@ -89,6 +106,7 @@ class NetworkChild:
             packet = self._receive()
             if not packet:
                 return
+            self._heard = True
             yield packet
 
     def _receive(self) -> bytes:

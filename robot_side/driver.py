@@ -7,13 +7,14 @@ interpreter lock for ever; this loop still reads its own clock 50 times a second
 import secrets
 import select
 import signal
+import struct
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from types import FrameType
 
 from protocol.channels import REQUEST, TWIST, check_robot_id
 from protocol.codec import decode
-from protocol.errors import HardwareError
+from protocol.errors import WireError
 from protocol.messages import State, StreamStatus
 from robot_side import ipc
 from robot_side.child import NetworkChild
@@ -22,7 +23,8 @@ from robot_side.driving import Driving
 from robot_side.latch import StopLatch
 from robot_side.limits import TICK_US
 from robot_side.plugins import build
-from robot_side.ports import Drive, RangeSensor
+from robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
+from robot_side.scribe import Scribe
 from robot_side.supervision import ServiceManager, become_punctual
 
 _SHUTDOWN_US = 2_000_000
@@ -47,8 +49,15 @@ def run(config: RobotConfig) -> int:
         if ranges is not None:
             ending.callback(ranges.close)
         driver = Driver(config, drive, ranges)
+        ending.callback(driver.scribe.close)
         ending.callback(driver.child.close)
+        ending.callback(_zero, drive)  # last in, first to run: however the loop ends, the motors are told zero
         return driver.loop()
+
+
+def _zero(drive: Drive) -> None:
+    with suppress(Exception):  # nothing may keep what ends after it from ending
+        drive.set(0.0, 0.0)
 
 
 def zero_motors(config: RobotConfig) -> int:
@@ -63,15 +72,17 @@ class Driver:
     """The loop and what it holds."""
 
     def __init__(self, config: RobotConfig, drive: Drive, ranges: RangeSensor | None) -> None:
-        self._latch = StopLatch(config.state_dir, config.robot)
+        latch = StopLatch(config.state_dir, config.robot)
+        self.scribe = Scribe(latch)
         self._drive = drive
         self._ranges = ranges
-        self._driving = Driving(config, secrets.token_hex(4), stopped=self._latch.is_set())
+        self._driving = Driving(config, secrets.token_hex(4), stopped=latch.is_set())
         self._shown = self._driving.gate.state
         self._ending_since_us: int | None = None
         self._manager = ServiceManager()
         self._watchdog_due_us = self._ticked_us = 0
-        self.child = NetworkChild(config, self._driving.session)
+        self._obeyed = False
+        self.child = NetworkChild(config, self._driving.session, self.scribe.say)
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, self._on_signal)
 
@@ -99,15 +110,15 @@ class Driver:
         """What this robot lacks is said before it moves."""
         missing = list(become_punctual())
         for line in [*missing, *([] if self._manager.is_there else [_WARNING])]:
-            print(f"robot {self._driving.config.robot}: {line}", flush=True)
+            self.scribe.say(f"robot {self._driving.config.robot}: {line}")
 
     def _ended(self) -> bool:
         if self.child.failed_at_start:
-            return True
+            self._ending_since_us = self._ending_since_us or _now_us()
         if self._ending_since_us is None:
             return False
         self._driving.gate.disarm("shutting down")
-        return self._driving.at_rest or _now_us() - self._ending_since_us > _SHUTDOWN_US
+        return (self._driving.at_rest and self._obeyed) or _now_us() - self._ending_since_us > _SHUTDOWN_US
 
     def _wait(self, deadline_us: int) -> None:
         timeout_s = max(0, deadline_us - _now_us()) / 1e6
@@ -122,7 +133,7 @@ class Driver:
             for message in self._driving.messages(now_us):
                 self.child.send(ipc.pack_message(ipc.Kind.PUBLISH, message))
             self.child.keep_alive(now_us, self._driving.gate.issued.last_seq("frame") + 1)
-            self._driving.network_restarts = self.child.restarts
+            self._driving.network_restarts = max(0, self.child.restarts)
             self._show(self._driving.gate.state, self._driving.gate.reason)
             self._feed_watchdog(now_us)
 
@@ -132,26 +143,30 @@ class Driver:
             self._watchdog_due_us = now_us + _WATCHDOG_PERIOD_US
 
     def _move(self, now_us: int) -> None:
-        """Sensors, gate, motors. A device that fails stops the robot; the other devices are still served."""
-        wheels = scan = None
+        """Sensors, gate, motors. Whatever a device raises stops the robot, never the loop that stops it."""
+        wheels: WheelAngles | None = None
+        scan: Ranges | None = None
+        self._obeyed = False
         try:
             wheels = self._drive.wheels()
             scan = self._ranges.read() if self._ranges else None
-        except HardwareError as error:
-            self._driving.gate.fault(str(error))
-        speeds = self._driving.tick(now_us, wheels, scan)
+            speeds = self._driving.tick(now_us, wheels, scan)
+        except Exception as error:  # a plug-in is foreign code; a reading may be no number
+            self._driving.gate.fault(f"{error or type(error).__name__}")
+            speeds = self._driving.tick(now_us, None, None)
         try:
             self._drive.set(*speeds)
-        except HardwareError as error:
-            self._driving.gate.fault(str(error))
+            self._obeyed = True
+        except Exception as error:
+            self._driving.gate.fault(f"{error or type(error).__name__}")
 
     def _show(self, state: State, reason: str) -> None:
-        """One line per change of state; the latch is kept before it is said."""
+        """One line per change of state; the latch is a level that the scribe keeps."""
         shown, self._shown = self._shown, state
         if state is shown or {state, shown} == {State.ACTIVE, State.DEGRADED}:
             return  # on a lossy link these two alternate many times a second
-        self._latch.keep(state is State.STOPPED)
-        print(f"robot {self._driving.config.robot}: {state} ({reason})", flush=True)
+        self.scribe.keep(state is State.STOPPED)
+        self.scribe.say(f"robot {self._driving.config.robot}: {state} ({reason})")
 
     # --- packets of the network process --------------------------------------------------------------------------
 
@@ -159,16 +174,21 @@ class Driver:
         """Handle what the child sent; True if a command was among it."""
         commanded = False
         for packet in self.child.packets():
-            kind = ipc.kind_of(packet)
-            if kind is ipc.Kind.ISSUED:
-                self._driving.on_issued(*ipc.unpack_issued(packet))
-            elif kind is ipc.Kind.RAW:
-                commanded |= self._on_raw(packet)
-            elif kind is ipc.Kind.STREAM:
-                self._driving.stream = decode(StreamStatus, packet[1:])
-            elif kind is ipc.Kind.READY:
-                self.child.on_ready()
+            with suppress(ValueError, KeyError, struct.error, WireError):  # a broken child is restarted, not obeyed
+                commanded |= self._on_packet(packet)
         return commanded
+
+    def _on_packet(self, packet: bytes) -> bool:
+        kind = ipc.kind_of(packet)
+        if kind is ipc.Kind.RAW:
+            return self._on_raw(packet)
+        if kind is ipc.Kind.ISSUED:
+            self._driving.on_issued(*ipc.unpack_issued(packet))
+        elif kind is ipc.Kind.STREAM:
+            self._driving.stream = decode(StreamStatus, packet[1:])
+        elif kind is ipc.Kind.READY:
+            self.child.on_ready()
+        return False
 
     def _on_raw(self, packet: bytes) -> bool:
         message = ipc.unpack_message(packet)

@@ -10,6 +10,8 @@ from protocol.messages import (
     AnswerHeader,
     Holder,
     Odometry,
+    Planar,
+    Pose,
     Reply,
     Request,
     RequestHeader,
@@ -31,6 +33,21 @@ from robot_side.safety import SafetyGate
 
 _PERIODS_US = {STATUS.name: 100_000, ODOMETRY.name: 50_000}
 _CITES_NOTHING_OF_OURS = (Refusal.OTHER_SESSION, Refusal.UNKNOWN_FRAME, Refusal.FROM_FUTURE)
+
+
+_WIRE_LIMIT = 1e6  # of every number on the wire: an encoder that wraps around must not end anything
+
+
+def _bounded(pair: Planar) -> Planar:
+    return _within(pair[0]), _within(pair[1])
+
+
+def _bounded_pose(pose: Pose) -> Pose:
+    return _within(pose[0]), _within(pose[1]), pose[2]
+
+
+def _within(value: float) -> float:
+    return max(-_WIRE_LIMIT, min(_WIRE_LIMIT, value))
 
 
 class Driving:
@@ -105,8 +122,8 @@ class Driving:
         """The robot at this moment, for frame headers."""
         applied = self.gate.applied
         return Motion(
-            self.odometer.pose,
-            self.odometer.moving,
+            _bounded_pose(self.odometer.pose),
+            _bounded(self.odometer.moving),
             (applied.linear_mps, applied.angular_rad_s),
             self.gate.latency_us,
         )
@@ -114,7 +131,7 @@ class Driving:
     def messages(self, now_us: int) -> Iterator[Message]:
         """What is to be published now: replies and scans at once, status and odometry at their rates."""
         if self._is_due(ODOMETRY, now_us):
-            self._post(ODOMETRY, Odometry(pose=self.odometer.pose, moving=self.odometer.moving), now_us)
+            self._post(ODOMETRY, Odometry(pose=self.motion().pose, moving=self.motion().moving), now_us)
         if self._is_due(STATUS, now_us):
             self._post(STATUS, self.status(now_us), now_us)
         outbox, self._outbox = self._outbox, []
@@ -159,9 +176,11 @@ class Driving:
             angle_min_rad=scan.angle_min_rad,
             angle_increment_rad=scan.angle_increment_rad,
             range_min_m=scan.range_min_m,
-            range_max_m=scan.range_max_m,
+            range_max_m=min(scan.range_max_m, _WIRE_LIMIT),
         )
-        self._outbox.append(Message(SCAN, "", encode(header), encode_ranges(scan.ranges_m)))
+        payload = encode_ranges(scan.ranges_m)
+        if len(payload) <= SCAN.max_payload_bytes:
+            self._outbox.append(Message(SCAN, "", encode(header), payload))
 
     def _is_due(self, channel: Channel, now_us: int) -> bool:
         due_us = self._due_us.get(channel.name, now_us)

@@ -44,6 +44,7 @@ class IssuedRecord:
     def __init__(self, session: str) -> None:
         self.session = session
         self._times: dict[str, OrderedDict[int, int]] = {}
+        self._denied_seq = -1
 
     def add(self, channel: str, seq: int, t_us: int) -> None:
         """Remember it; the caller tells this before it publishes."""
@@ -55,6 +56,18 @@ class IssuedRecord:
     def last_seq(self, channel: str) -> int:
         """The newest seq issued on `channel`, -1 before the first."""
         return next(reversed(self._times.get(channel, OrderedDict({-1: 0}))))
+
+    def deny_earlier(self) -> None:
+        """From now on no request may cite a status issued before: somebody has just said STOP or disarm."""
+        self._denied_seq = self.last_seq("status")
+
+    def check_request(self, echo: Echo | None, now_us: int, max_age_us: int) -> None:
+        """Raise WireError unless `echo` names a status issued since the last STOP or disarm and young enough."""
+        if echo is None or echo.channel != "status":
+            raise WireError(Refusal.MALFORMED, "what lets a robot move again must cite a status")
+        self.age_us(echo, now_us, max_age_us)
+        if echo.seq <= self._denied_seq:
+            raise WireError(Refusal.STALE, "cites a status from before the last STOP or disarm; ask again")
 
     def age_us(self, echo: Echo, now_us: int, max_age_us: int) -> int:
         """Age of what `echo` names. Raises WireError OTHER_SESSION, UNKNOWN_FRAME, FROM_FUTURE or STALE."""

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import zlib
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 from protocol.channels import ACK, FRAME, REQUEST, TWIST
 from protocol.codec import encode
@@ -27,6 +27,7 @@ _STREAM_STATUS_US = 200_000
 _CAMERA_TIMEOUT_S = 0.2
 _CAMERA_RETRY_S = 0.5
 _LONGEST_NAP_S = 0.1
+_LEAVES_WITHIN_S = 3.0
 
 
 class Network:
@@ -46,11 +47,11 @@ class Network:
 
     def run(self) -> None:
         """Until the driver closes its end."""
+        self._to_driver(bytes([ipc.Kind.READY]))
         self._link.subscribe(TWIST, self._forward)
         self._link.subscribe(REQUEST, self._forward)
         self._link.subscribe(ACK, self._on_ack)
         threading.Thread(target=self._read_driver, daemon=True).start()
-        self._to_driver(bytes([ipc.Kind.READY]))
         while self.running:
             self._stream_one()
 
@@ -110,15 +111,21 @@ class Network:
             self._dropped_commands += 1
 
     def _read_driver(self) -> None:
+        """Until the driver closes its end; then the camera loop ends, or the whole process if it hangs."""
         status_due_us = 0
-        while packet := self._receive():
-            self._on_packet(packet)
-            now_us = _now_us()
-            if now_us >= status_due_us:
-                status_due_us = now_us + _STREAM_STATUS_US
-                self._report(now_us)
-        self.running = False
-        self._credit.set()
+        try:
+            while packet := self._receive():
+                with suppress(ValueError):  # a message over its bounds: one lost message
+                    self._on_packet(packet)
+                now_us = _now_us()
+                if now_us >= status_due_us:
+                    status_due_us = now_us + _STREAM_STATUS_US
+                    self._report(now_us)
+        finally:
+            self.running = False
+            self._credit.set()
+            time.sleep(_LEAVES_WITHIN_S)
+            os._exit(1)
 
     def _receive(self) -> bytes:
         try:
@@ -178,13 +185,17 @@ def main() -> None:
     """Entry of the child process: argv[1] is the socket's descriptor."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the driver ends us, after zero
     driver = socket.socket(fileno=int(sys.argv[1]))
-    code = 0
+    code = 1
     try:
         _run(driver)
+        code = 0
     except SightlineError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         code = error.exit_code
-    os._exit(code)  # daemon threads of a transport must not keep a finished process
+    except Exception as error:
+        print(f"error: network process: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+    finally:
+        os._exit(code)  # daemon threads of a transport must not keep a finished process
 
 
 if __name__ == "__main__":

@@ -180,9 +180,7 @@ class SafetyGate:
     def request(self, header: RequestHeader, request: Request, now_us: int) -> str:
         """Carry out a request and return what happened, in words. Raises WireError with the reason if it may not be."""
         if request.verb not in _NEEDS_NO_ECHO:
-            if header.echo is None:
-                raise WireError(Refusal.MALFORMED, f"{request.verb} must cite a status")
-            self.issued.age_us(header.echo, now_us, _MAX_REQUEST_AGE_US)
+            self.issued.check_request(header.echo, now_us, _MAX_REQUEST_AGE_US)
         self._notice_lost_human(now_us)
         who = Holder(source=header.source, session=header.session)
         if request.verb is Verb.STOP:
@@ -195,6 +193,7 @@ class SafetyGate:
     def stop(self, reason: str = "STOP") -> str:
         """Latch STOPPED: wheels to zero and held until `reset`. Always granted."""
         self._leave(Event.STOP, reason)
+        self.issued.deny_earlier()
         return "STOPPED"
 
     def fault(self, reason: str) -> None:
@@ -204,6 +203,7 @@ class SafetyGate:
     def disarm(self, reason: str = "disarmed") -> str:
         """Wheels to zero; commands are judged but not obeyed. Always granted."""
         self._leave(Event.DISARM, reason)
+        self.issued.deny_earlier()
         self.arms_itself = False
         return "disarmed"
 
@@ -232,12 +232,13 @@ class SafetyGate:
         return "armed"
 
     def acquire(self, who: Holder, now_us: int) -> str:
-        """Take the lease ahead of the first command."""
+        """Take the lease ahead of the first command. It is not renewed so: only commands do that."""
         if who.source not in RANKS or not self._lease.may_take(who, now_us):
             holder = self._lease.live_holder(now_us)
             raise WireError(Refusal.NOT_HOLDER, f"{holder.source if holder else 'nobody'} drives")
-        if self._lease.live_holder(now_us) != who:
-            self._live_commands = 0  # those of the driver before do not arm for this one
+        if self._lease.live_holder(now_us) == who:
+            return "already held"
+        self._live_commands, self._command = 0, None  # the driver before neither arms nor drives for this one
         self._lease.take(who, now_us)
         return "acquired"
 

@@ -464,7 +464,7 @@ def test_stop_disarm_and_release_need_no_echo(verb):
         assert rig.request(verb, echo=False)
     else:
         error = refused(rig, verb, echo=False)
-        assert error.reason is Refusal.MALFORMED and error.detail == f"{verb} must cite a status"
+        assert error.reason is Refusal.MALFORMED and error.detail == "what lets a robot move again must cite a status"
 
 
 @pytest.mark.parametrize("verb", [Verb.ARM, Verb.RESET, Verb.ACQUIRE])
@@ -692,6 +692,49 @@ def test_acquire_takes_the_lease_ahead_of_the_first_command():
         assert (error.reason, error.detail) == (Refusal.NOT_HOLDER, "teleop drives")
     error = refused(Rig(), Verb.ACQUIRE, source="operator")
     assert (error.reason, error.detail) == (Refusal.NOT_HOLDER, "nobody drives")
+
+
+def test_acquiring_again_renews_nothing():
+    rig = Rig()
+    rig.request(Verb.ACQUIRE, source="teleop", session=HUMAN)
+    rig.silence(500)
+    assert rig.request(Verb.ACQUIRE, source="teleop", session=HUMAN) == "already held"
+    rig.silence(480)
+    assert rig.gate.holder(rig.now_us) == HUMAN_HOLDER
+    assert rig.gate.holder(rig.now_us + 20_000) is None
+
+
+def test_who_acquires_is_not_driven_by_the_one_before():
+    rig = Rig().armed().drive(400)
+    rig.request(Verb.ACQUIRE, source="teleop", session=HUMAN)
+    assert rig.step().state is H
+
+
+@pytest.mark.parametrize("verb", [Verb.ARM, Verb.RESET, Verb.ACQUIRE])
+@pytest.mark.parametrize("denial", ["stop", "disarm"])
+def test_what_was_asked_before_a_stop_or_disarm_does_not_undo_it(verb, denial):
+    rig = Rig().armed()
+    rig.gate.issued.add("status", 70, rig.now_us)
+    getattr(rig.gate, denial)()
+    for seq, reason in ((70, Refusal.STALE), (71, None)):
+        rig.gate.issued.add("status", seq, rig.now_us)
+        cited = Echo(channel="status", session=ROBOT, seq=seq, t_us=rig.now_us)
+        header = RequestHeader(source="teleop", session=HUMAN, seq=seq, echo=cited)
+        try:
+            rig.gate.request(header, Request(id=1, verb=verb), rig.now_us)
+        except WireError as error:
+            assert reason is None or error.detail == "cites a status from before the last STOP or disarm; ask again"
+            assert reason is None or error.reason is reason
+        else:
+            assert reason is None
+
+
+def test_a_request_cites_a_status_and_no_frame():
+    rig = Rig()
+    header = RequestHeader(source="operator", session=HUMAN, seq=0, echo=rig.frame())
+    with pytest.raises(WireError) as caught:
+        rig.gate.request(header, Request(id=1, verb=Verb.RESET), rig.now_us)
+    assert caught.value.reason is Refusal.MALFORMED
 
 
 def test_a_human_who_acquires_and_then_is_silent_was_lost():

@@ -1,0 +1,66 @@
+"""Disk and terminal for the driver's loop, on a thread of its own: neither may hold the wheels up. Shell.
+
+A full disk, a terminal that hung up or a reader that does not read costs a line or a mark, never a tick.
+"""
+
+import queue
+import sys
+import threading
+from contextlib import suppress
+from typing import Final
+
+from robot_side.latch import StopLatch
+
+_LINES_WAITING: Final = 32
+_RETRY_S: Final = 0.5
+_CLOSE_S: Final = 1.0
+
+
+class Scribe:
+    """Prints lines, and keeps the STOP latch as it was last wanted: a level, tried again until it is kept."""
+
+    def __init__(self, latch: StopLatch) -> None:
+        self._latch = latch
+        self._wanted = self._kept = latch.is_set()
+        self._lines: queue.Queue[str] = queue.Queue(_LINES_WAITING)
+        self._closing = False
+        self._thread = threading.Thread(target=self._write_all, name="scribe", daemon=True)
+        self._thread.start()
+
+    def keep(self, stopped: bool) -> None:
+        """Want the latch so; never waits."""
+        self._wanted = stopped
+        self.say("")
+
+    def say(self, line: str) -> None:
+        """Print `line` soon; dropped when nobody has read for long. An empty line only wakes the thread."""
+        with suppress(queue.Full):
+            self._lines.put_nowait(line)
+
+    def close(self) -> None:
+        """Write what waits, for a second at most."""
+        self._closing = True
+        self.say("")
+        self._thread.join(_CLOSE_S)
+
+    def _write_all(self) -> None:
+        while not (self._closing and self._lines.empty() and self._kept == self._wanted):
+            self._keep()
+            with suppress(queue.Empty):
+                self._print(self._lines.get(timeout=_RETRY_S))
+
+    def _keep(self) -> None:
+        wanted = self._wanted
+        if wanted == self._kept:
+            return
+        try:
+            self._latch.keep(wanted)
+            self._kept = wanted
+        except OSError as error:
+            self._print(f"the STOP mark is not kept over a restart: {error.strerror}; is the disk full or read-only?")
+
+    @staticmethod
+    def _print(line: str) -> None:
+        with suppress(OSError, ValueError):
+            if line:
+                print(line, file=sys.stdout, flush=True)
