@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks.loop_course import Sample
+from benchmarks.loop_crew import terminated_like_interrupted
 from benchmarks.loop_figures import Figures, LoopCheck, figures_of, judge
 from benchmarks.loop_ours import endpoint_of
 from benchmarks.loop_pictures import write_pictures
@@ -30,7 +31,7 @@ def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
     Raises ConfigError for an unknown transport, HardwareError with its last words for a process that does not run.
     """
     endpoint_of(setting.transport, 1)
-    with tempfile.TemporaryDirectory(prefix="sightline-loop-") as name:
+    with terminated_like_interrupted(), tempfile.TemporaryDirectory(prefix="sightline-loop-") as name:
         pictures = Path(name) / "pictures"
         pictures.mkdir()
         jpeg_bytes = write_pictures(pictures, setting.width_px, setting.height_px)

@@ -7,13 +7,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from benchmarks.loop import Race
-from benchmarks.loop_setting import FLOOR, OURS
+from benchmarks.loop_setting import FLOOR, OURS, TCP
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LABELS: Final = {
-    FLOOR: "floor (one process)", OURS: "sightline", "tcp": "bare TCP", "older": "older write-up",
+    FLOOR: "floor (one process)", OURS: "sightline", TCP: "bare TCP", "older": "older write-up",
     "lekiwi": "ZeroMQ as LeKiwi", "openpi": "WebSocket as openpi", "callback": "zenoh, plain callback",
 }
 
@@ -41,12 +41,12 @@ def draw_race(path: Path, race: Race) -> None:
 
 def _draw_one(shares: "Axes", times: "Axes", name: str, ages_us: tuple[tuple[int, int], ...]) -> None:
     ages_ms = sorted(age_us / 1000 for _, age_us in ages_us)
-    width = 2.5 if name == OURS else 1.2
+    width, style = (2.5 if name == OURS else 1.2), ("--" if name in (FLOOR, TCP) else "-")
     percents = [100 * (at + 1) / len(ages_ms) for at in range(len(ages_ms))]
-    shares.plot(ages_ms, percents, label=LABELS[name], linewidth=width)
+    shares.plot(ages_ms, percents, label=LABELS[name], linewidth=width, linestyle=style)
     begin_us = ages_us[0][0]
     times.plot([(at_us - begin_us) / 1e6 for at_us, _ in ages_us], [age_us / 1000 for _, age_us in ages_us],
-               linewidth=width)
+               linewidth=width, linestyle=style)
 
 
 def _finish(axes: "Axes", across: str, up: str) -> None:

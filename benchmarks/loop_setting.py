@@ -11,7 +11,7 @@ FLOOR: Final = "floor"
 TCP: Final = "tcp"
 """The least that two processes can do; a reference, and a rival only when the detector is slow."""
 PEERS: Final = ("older", "lekiwi", "openpi", "callback")
-TAKEN_BOUND_PERCENT: Final = 3.0
+TAKEN_BOUND_PERCENT: Final = 5.0
 """More of the machine's time than this in other hands makes a sample inconclusive."""
 
 

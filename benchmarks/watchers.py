@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.loop_course import Course
-from benchmarks.loop_crew import Crew
+from benchmarks.loop_crew import Crew, terminated_like_interrupted
 from benchmarks.loop_figures import ANSWERED_PERCENT, LoopCheck, at_most, percentile
 from benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
 from benchmarks.loop_ours import Ours, running_services
@@ -51,7 +51,7 @@ def measure_watchers(setting: LoopSetting, viewers: int, say: Callable[[str], No
     Taken again, `setting.tries` times at most, while others have the machine. Raises ConfigError for an unknown
     transport, HardwareError for a process that does not run.
     """
-    with tempfile.TemporaryDirectory(prefix="sightline-watchers-") as name:
+    with terminated_like_interrupted(), tempfile.TemporaryDirectory(prefix="sightline-watchers-") as name:
         ready = replace(setting, pictures=Path(name) / "pictures")
         ready.pictures.mkdir()
         write_pictures(ready.pictures, ready.width_px, ready.height_px)

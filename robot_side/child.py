@@ -13,7 +13,7 @@ from robot_side import ipc
 from robot_side.config import RobotConfig
 
 _PACKETS_PER_WAKE = 64  # a flood is drained in portions, so that no tick waits for its end
-_FIRST_BACKOFF_US = 200_000
+_FIRST_BACKOFF_US = 700_000  # the wheels are at zero before anybody can drive them again
 _LONGEST_BACKOFF_US = 2_000_000
 _WEDGED_US = 2_000_000
 _STARTS_WITHIN_US = 30_000_000  # a first start reads its packages from a slow card

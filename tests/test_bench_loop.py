@@ -1,7 +1,10 @@
 """`sightline bench loop` and `bench watchers`: their figures, and short runs of real processes; nothing is timed."""
 
 import json
+import os
 import socket
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +18,7 @@ from benchmarks.loop_course import Course, Sample, course_of_headers, course_of_
 from benchmarks.loop_crew import free_port
 from benchmarks.loop_eyes import Eyes
 from benchmarks.loop_figures import figures_of, judge, percentile
-from benchmarks.loop_machine import Reading, taken_percent
+from benchmarks.loop_machine import Reading, children_of, taken_percent
 from benchmarks.loop_pictures import camera_of, write_pictures
 from benchmarks.loop_setting import FLOOR, OURS, PEERS, TCP, LoopSetting, peers_of, size_of
 from benchmarks.loop_sockets import carried_between, carried_bytes
@@ -23,6 +26,7 @@ from benchmarks.watchers import measure_watchers
 from operator_side.cli_bench_loop import register_bench
 from protocol.errors import ConfigError, HardwareError
 from robot_side.hardware.folder_camera import FolderCamera, FolderCameraConfig
+from tests.link_rigs import until
 
 SMALL = LoopSetting(Path(), 160, 120, fps=30.0, seconds=2.0, tries=1)
 MS = 1000
@@ -246,6 +250,28 @@ def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkey
     assert [one["name"] for one in printed["contestants"]] == [FLOOR, OURS]
     assert json.loads((tmp_path / "new" / "loop.json").read_text()) == printed
     assert (tmp_path / "new" / "loop.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.slow
+def test_terminated_it_leaves_no_process_and_no_folder(tmp_path):
+    code = """
+from pathlib import Path
+from benchmarks.loop import run_race
+from benchmarks.loop_setting import LoopSetting
+run_race(LoopSetting(Path(), 160, 120, seconds=60.0, peers=(), tries=1), print)
+"""
+    bench = subprocess.Popen(
+        [sys.executable, "-c", code], env={**os.environ, "TMPDIR": str(tmp_path)}, stderr=subprocess.DEVNULL
+    )
+    try:
+        assert until(lambda: "first answer" in "".join(path.read_text() for path in tmp_path.rglob("floor.log")), 20)
+        (floor,) = children_of(bench.pid)
+        bench.terminate()
+        assert bench.wait(10) != 0
+    finally:
+        bench.kill()
+    assert not Path(f"/proc/{floor}").exists()
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_process_that_cannot_start_is_said_in_its_own_words(monkeypatch):

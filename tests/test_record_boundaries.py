@@ -90,6 +90,64 @@ def test_the_newest_seq_is_per_channel_and_minus_one_before_the_first():
     assert (record.last_seq("frame"), record.last_seq("status")) == (9, -1)
 
 
+# --- what a request cites ------------------------------------------------------------------------------------------
+
+
+def status(seq, t_us=0, channel="status", session=ROBOT):
+    return Echo(channel=channel, session=session, seq=seq, t_us=t_us)
+
+
+@pytest.mark.parametrize("cited", [None, status(0, channel="frame"), status(0, channel="beat")])
+def test_a_request_cites_a_status(cited):
+    record = IssuedRecord(ROBOT)
+    record.add("frame", 0, 0)
+    with pytest.raises(WireError) as caught:
+        record.check_request(cited, 0, 100)
+    assert caught.value.reason is Refusal.MALFORMED
+    assert caught.value.detail == "what lets a robot move again must cite a status"
+
+
+@pytest.mark.parametrize(
+    ("now_us", "reason"), [(0, None), (100, None), (101, Refusal.STALE), (-1, Refusal.FROM_FUTURE)]
+)
+def test_a_requests_status_is_judged_as_a_frame_is(now_us, reason):
+    record = IssuedRecord(ROBOT)
+    record.add("status", 0, 0)
+    try:
+        record.check_request(status(0), now_us, 100)
+    except WireError as error:
+        assert error.reason is reason
+    else:
+        assert reason is None
+
+
+@pytest.mark.parametrize(("seq", "denied"), [(4, True), (5, True), (6, False)])
+def test_a_request_from_before_a_denial_is_stale(seq, denied):
+    record = IssuedRecord(ROBOT)
+    for number in range(6):
+        record.add("status", number, 0)
+    record.add("frame", 9, 0)
+    record.deny_earlier()
+    record.add("status", 6, 0)
+    try:
+        record.check_request(status(seq), 0, 100)
+    except WireError as error:
+        assert denied and error.reason is Refusal.STALE
+        assert error.detail == "cites a status from before the last STOP or disarm; ask again"
+    else:
+        assert not denied
+
+
+def test_the_first_status_may_be_cited():
+    record = IssuedRecord(ROBOT)
+    record.add("status", 0, 0)
+    record.check_request(status(0), 0, 100)
+    record = IssuedRecord(ROBOT)
+    record.deny_earlier()
+    record.add("status", 0, 0)
+    record.check_request(status(0), 0, 100)
+
+
 # --- pictures ----------------------------------------------------------------------------------------------------
 
 
