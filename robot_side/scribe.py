@@ -14,6 +14,7 @@ from robot_side.latch import StopLatch
 _LINES_WAITING: Final = 32
 _RETRY_S: Final = 0.5
 _CLOSE_S: Final = 1.0
+_STACK_BYTES: Final = 256 * 1024
 
 
 class Scribe:
@@ -24,6 +25,7 @@ class Scribe:
         self._wanted = self._kept = latch.is_set()
         self._lines: queue.Queue[str] = queue.Queue(_LINES_WAITING)
         self._closing = False
+        threading.stack_size(_STACK_BYTES)  # the driver locks its memory, a stack of the usual 8 MB with it
         self._thread = threading.Thread(target=self._write_all, name="scribe", daemon=True)
         self._thread.start()
 
