@@ -3,6 +3,7 @@
 A full disk, a terminal that hung up or a reader that does not read costs a line or a mark, never a tick.
 """
 
+import os
 import queue
 import sys
 import threading
@@ -63,6 +64,8 @@ class Scribe:
 
     @staticmethod
     def _print(line: str) -> None:
-        with suppress(OSError, ValueError):
+        try:
             if line:
-                print(line, file=sys.stdout, flush=True)
+                print(line, flush=True)
+        except OSError:  # whoever read has gone: what is still buffered must not spoil the exit either
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
