@@ -51,7 +51,7 @@ SECTIONS: Final = (
     Section(
         "Killed at speed",
         "Vision and the network process, killed with -9 while driving at 0.3 m/s or more, ten times each; judged "
-        "from the simulated motors' own log. [faults.md](faults.md) has every fault.",
+        "from the simulated motors' own log. [faults.md](faults.md) has more faults.",
         ("faults", "--only", "vision.kill", "--only", "network.kill", "--only", "vision.restart", "--repeat", "10"),
     ),
     Section("Odometry", "Against the simulated world's truth.", ("bench", "odometry")),
