@@ -12,7 +12,16 @@ from typing import Final
 
 import typer
 
-from operator_side import cli_bench, cli_calibrate, cli_config, cli_faults, cli_judge, cli_people, cli_services
+from operator_side import (
+    cli_bench,
+    cli_calibrate,
+    cli_config,
+    cli_faults,
+    cli_judge,
+    cli_keys,
+    cli_people,
+    cli_services,
+)
 from operator_side.settings_errors import no_such_name
 from protocol.errors import SightlineError
 
@@ -29,7 +38,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for module in (cli_services, cli_judge, cli_people, cli_bench, cli_faults, cli_calibrate, cli_config):
+for module in (cli_services, cli_judge, cli_people, cli_bench, cli_faults, cli_calibrate, cli_keys, cli_config):
     module.register(app)
 
 

@@ -20,6 +20,7 @@ from protocol.channels import FRAME, KEY_PREFIX, STATUS, Channel, parse_key, pat
 from protocol.transports.endpoints import check_endpoints
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.link_rules import NOT_A_PUT, LinkRules
+from protocol.transports.secured import secured_for
 from protocol.transports.zenoh_session import open_session
 
 if TYPE_CHECKING:
@@ -41,20 +42,22 @@ def open_zenoh(
     role: str = "",
     timeout_s: float = 5.0,
     max_frame_bytes: int = FRAME.max_payload_bytes,
+    secure: str = "",
 ) -> ZenohLink:
     """Open a link to `robot`; use it in a `with`.
 
     Who listens is the router, inside this process, and reaches `connect` in the background; who only connects is a
-    client and reconnects by itself. `role` is the default source of what is published towards the robot. Raises
+    client and reconnects by itself. `role` is the default source of what is published towards the robot. `secure` is a
+    folder of `sightline keys`: mutual TLS, and only what the certificate's role may say or hear passes. Raises
     ConfigError for a robot id, endpoint or limit that is none or for a missing Zenoh; LinkError for a port in use or if
     nobody answers within `timeout_s`.
     """
     rules = LinkRules(robot, role, max_frame_bytes)
     check_endpoints(listen, connect)
-    return ZenohLink(open_session(listen, connect, timeout_s), rules)
+    return ZenohLink(open_session(listen, connect, timeout_s, secured_for(secure, role)), rules)
 
 
-def list_robots(connect: Sequence[str], seconds: float) -> dict[str, Message]:
+def list_robots(connect: Sequence[str], seconds: float, secure: str = "") -> dict[str, Message]:
     """The newest `status` of every robot heard within `seconds` at `connect`. Raises as `open_zenoh` does."""
     import zenoh
 
@@ -69,7 +72,7 @@ def list_robots(connect: Sequence[str], seconds: float) -> dict[str, Message]:
             LinkRules(robot).deliver(STATUS, key, *_parts(sample), lambda message: found.update({robot: message}))
 
     with ExitStack() as ending:
-        session = open_session((), connect, seconds)
+        session = open_session((), connect, seconds, secured_for(secure, "operator"))
         ending.callback(session.close)
         handler = zenoh.handlers.Callback(note, indirect=False)
         subscriber = session.declare_subscriber(f"{KEY_PREFIX}/*/{STATUS.name}", handler)

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 from protocol.errors import ConfigError, LinkError, SightlineError
 from protocol.transports.endpoints import check_endpoint, with_send_buffer
 from protocol.transports.port_owner import port_owner
+from protocol.transports.secured import Secured
+from protocol.transports.tls_trouble import tls_trouble
 
 if TYPE_CHECKING:
     import zenoh
@@ -27,26 +29,40 @@ MAX_SESSIONS: Final = 16
 RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
 
-def open_session(listen: Sequence[str], connect: Sequence[str], timeout_s: float) -> zenoh.Session:
-    """Open a session on checked endpoints.
+def open_session(
+    listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: Secured | None = None
+) -> zenoh.Session:
+    """Open a session on checked endpoints; with `secured`, by mutual TLS, and whoever listens checks who may what.
 
-    Raises ConfigError if Zenoh is not installed, LinkError if an endpoint cannot be listened on, or if there is only
-    `connect` and nobody answers there within `timeout_s`.
+    Raises ConfigError if Zenoh is not installed or an endpoint does not fit `secured`, LinkError if an endpoint cannot
+    be listened on, or if there is only `connect` and nobody answers there within `timeout_s`.
     """
+    if secured is not None:
+        secured.check((*listen, *connect))
     try:
         import zenoh
     except ImportError:
         raise ConfigError("Zenoh is not installed: pip install 'sightline[zenoh]'") from None
     logging.getLogger("zenoh").addHandler(logging.NullHandler())  # else Python prints its warnings to the terminal
-    config = zenoh.Config.from_json5(json.dumps(session_config(listen, connect, timeout_s)))
+    config = zenoh.Config.from_json5(json.dumps(session_config(listen, connect, timeout_s, secured)))
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise _explain(str(error), listen, connect, timeout_s) from None
+        raise _explain(str(error), listen, connect, timeout_s, secured) from None
 
 
-def session_config(listen: Sequence[str], connect: Sequence[str], timeout_s: float) -> dict[str, Any]:
+def session_config(
+    listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: Secured | None = None
+) -> dict[str, Any]:
     """The Zenoh configuration. Who listens is a router and reaches `connect` in the background, else a client."""
+    config = _session_config(listen, connect, timeout_s)
+    if secured is not None:
+        config["transport"]["link"]["tls"] = secured.tls_section()
+        config["access_control"] = secured.access_section()
+    return config
+
+
+def _session_config(listen: Sequence[str], connect: Sequence[str], timeout_s: float) -> dict[str, Any]:
     return {
         "mode": "router" if listen else "client",
         "listen": {"endpoints": [with_send_buffer(endpoint) for endpoint in listen], "exit_on_failure": True},
@@ -79,10 +95,15 @@ def _transport_config() -> dict[str, Any]:
     }
 
 
-def _explain(text: str, listen: Sequence[str], connect: Sequence[str], timeout_s: float) -> SightlineError:
+def _explain(
+    text: str, listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: Secured | None
+) -> SightlineError:
     """Zenoh's error as one line that names the endpoint and the fix; its source paths are left out."""
     if not listen:
         where = " or ".join(connect)
+        trouble = next((found for endpoint in connect if (found := tls_trouble(endpoint, secured))), "")
+        if trouble:
+            return LinkError(f"refused at {where}: {trouble}")
         return LinkError(f"nobody answers at {where}; is the robot running? tried for {timeout_s:g} s")
     where = next((endpoint for endpoint in listen if endpoint.partition("#")[0] in text), " or ".join(listen))
     if "in use" in text:

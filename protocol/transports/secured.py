@@ -1,0 +1,123 @@
+"""Who may say and hear what on a secured link: mutual TLS, access rules from the channel table. Shell (seeks files).
+
+A role is the common name of a certificate. Zenoh judges by inclusion and at every hop, and says nothing to who is
+denied: whoever listens denies all that is not listed here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from protocol.channels import CHANNELS, KEY_PREFIX, REQUEST, Channel, Direction
+from protocol.errors import ConfigError
+from protocol.transports.endpoints import check_endpoint
+
+ROBOT: Final = "robot"
+SOURCES: Final[dict[str, tuple[str, ...]]] = {
+    "vision": ("vision",),
+    "operator": ("operator", "teleop"),
+    "viewer": (),
+}
+"""Role of a certificate -> the sources it may speak as towards a robot. A viewer says nothing, not even `ack`."""
+ROLES: Final = (ROBOT, *SOURCES)
+_TLS: Final = ("tls", "quic")
+
+
+def certificate_role(source: str) -> str:
+    """The certificate that a link of role `source` shows; who is none of these is a viewer."""
+    if source == ROBOT:
+        return ROBOT
+    return next((role for role, sources in SOURCES.items() if source in sources), "viewer")
+
+
+@dataclass(frozen=True)
+class Secured:
+    """Keys of one role in a folder that `sightline keys` made."""
+
+    folder: str
+    role: str
+
+    def check(self, endpoints: Sequence[str]) -> None:
+        """Raise ConfigError if an endpoint is not of TLS: there is no silent way back to a plain link."""
+        for endpoint in endpoints:
+            if check_endpoint(endpoint)[0] not in _TLS:
+                raise ConfigError(f"{endpoint} is not secured: with --secure write tls/<host>:<port> or quic/...")
+
+    def tls_section(self) -> dict[str, Any]:
+        """Zenoh's `transport/link/tls`: both ends show a certificate of one private authority, names are verified."""
+        key, certificate = f"{self.folder}/{self.role}.key", f"{self.folder}/{self.role}.pem"
+        return {
+            "root_ca_certificate": f"{self.folder}/ca.pem",
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "listen_private_key": key,
+            "listen_certificate": certificate,
+            "connect_private_key": key,
+            "connect_certificate": certificate,
+        }
+
+    def access_section(self) -> dict[str, Any]:
+        """Zenoh's `access_control`: what passes is only what a listed role may say or hear, at every hop."""
+        rules = {role: list(_rules(role)) for role in ROLES}
+        return {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": [rule for of_role in rules.values() for rule in of_role],
+            "subjects": [{"id": role, "cert_common_names": [role]} for role in ROLES],
+            "policies": [{"subjects": [role], "rules": [rule["id"] for rule in rules[role]]} for role in ROLES],
+        }
+
+
+def secured_for(folder: str, source: str) -> Secured | None:
+    """What a link of role `source` shows and checks; None for no folder. Raises ConfigError for a missing file."""
+    if not folder:
+        return None
+    role = certificate_role(source)
+    missing = [name for name in ("ca.pem", f"{role}.pem", f"{role}.key") if not (Path(folder) / name).is_file()]
+    if missing:
+        raise ConfigError(f"{missing[0]} is missing in {folder}: make keys with `sightline keys init`, and copy "
+                          f"ca.pem, {role}.pem and {role}.key to this machine")
+    return Secured(folder, role)
+
+
+def may_publish(role: str) -> list[str]:
+    """Key expressions, for any robot, that a certificate of `role` may publish on."""
+    return [key for channel in CHANNELS.values() for key in _published(role, channel)]
+
+
+def may_hear(role: str) -> list[str]:
+    """Key expressions, for any robot, that a certificate of `role` may subscribe to."""
+    heard = Direction.TO_ROBOT if role == ROBOT else Direction.FROM_ROBOT
+    return [_pattern(channel) for channel in CHANNELS.values() if channel.direction is heard]
+
+
+def _published(role: str, channel: Channel) -> list[str]:
+    if role == ROBOT:
+        return [_pattern(channel)] if channel.direction is Direction.FROM_ROBOT else []
+    if channel.direction is Direction.FROM_ROBOT or (channel is REQUEST and role != "operator"):
+        return []
+    return [f"{KEY_PREFIX}/*/{channel.name}/{source}" for source in SOURCES[role]]
+
+
+def _pattern(channel: Channel) -> str:
+    return f"{KEY_PREFIX}/*/{channel.name}" + ("/*" if channel.has_source else "")
+
+
+def _rules(role: str) -> list[dict[str, Any]]:
+    """What comes in from a peer of `role` and goes out to it; subscriptions go out so that it knows who listens."""
+    said, heard = may_publish(role), may_hear(role)
+    listeners = sorted({_pattern(CHANNELS[key.split("/")[2]]) for key in said})
+    rows = [
+        ("says", "ingress", "put", said),
+        ("subscribes", "ingress", "declare_subscriber", heard),
+        ("hears", "egress", "put", heard),
+        ("is heard", "egress", "declare_subscriber", listeners),
+    ]
+    return [
+        {"id": f"{role} {what}", "permission": "allow", "flows": [flow], "messages": [message], "key_exprs": keys}
+        for what, flow, message, keys in rows
+        if keys
+    ]

@@ -1,0 +1,175 @@
+"""Secured Zenoh links: who may say and hear what, by certificate; what is wrong between two ends, in words."""
+
+import threading
+import time
+from itertools import product
+
+import pytest
+
+from operator_side import keys
+from protocol.channels import ACK, CHANNELS, FRAME, REQUEST, STATUS, TWIST, Direction
+from protocol.errors import ConfigError, LinkError
+from protocol.transports.secured import ROLES, SOURCES, certificate_role, may_hear, may_publish
+from protocol.transports.zenoh import list_robots, open_zenoh
+from tests.link_rigs import free_endpoint, until
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("keys") / "k"
+    keys.make(made, ["robot.local"])
+    return made
+
+
+@pytest.fixture
+def endpoint():
+    return free_endpoint().replace("tcp/", "tls/")
+
+
+def test_only_the_listed_may_publish():
+    assert may_publish("viewer") == []
+    assert "sightline/*/twist/vision" in may_publish("vision")
+    assert not any("request" in key for key in may_publish("vision"))
+    assert {"sightline/*/request/operator", "sightline/*/twist/teleop"} <= set(may_publish("operator"))
+    assert not any(key.endswith("/vision") for key in may_publish("operator"))
+    assert not any(key.endswith("/guest") for role in ROLES for key in may_publish(role))
+    assert {key.split("/")[2] for key in may_publish("robot")} == {
+        name for name, channel in CHANNELS.items() if channel.direction is Direction.FROM_ROBOT
+    }
+
+
+def test_what_is_said_towards_the_robot_is_heard_by_the_robot_alone():
+    assert all(key.endswith("/*") for key in may_hear("robot"))
+    assert not any("twist" in key for role in SOURCES for key in may_hear(role))
+
+
+def test_a_role_that_is_none_is_a_viewer():
+    assert [certificate_role(name) for name in ("vision", "teleop", "operator", "robot", "guest", "viewer3", "")] == [
+        "vision", "operator", "operator", "robot", "viewer", "viewer", "viewer",
+    ]  # fmt: skip
+
+
+def test_each_role_says_what_it_may_and_nothing_else(folder, endpoint):
+    heard = []
+    with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)) as robot:
+        for channel in (TWIST, ACK, REQUEST):
+            robot.subscribe(channel, lambda message: heard.append((message.channel.name, message.source)))
+        for role in SOURCES:
+            with open_zenoh("r1", connect=[endpoint], role=role, secure=str(folder)) as peer:
+                frames = peer.latest(FRAME)
+                until(lambda: robot.has_listener(FRAME))
+                for channel, source in product((TWIST, ACK, REQUEST), ("vision", "operator", "teleop", "guest")):
+                    peer.publish(channel, b"{}", b"", source)
+                robot.publish(FRAME, b"{}", b"jpeg")
+                assert frames.take(2.0) is not None, f"{role} may watch"
+                allowed = [key for key in may_publish(role) if key.split("/")[2] in ("twist", "ack", "request")]
+                until(lambda allowed=allowed: len(heard) >= len(allowed), 2.0)
+            time.sleep(0.1)  # what is denied must have had its chance
+            said = {f"sightline/*/{channel}/{source}" for channel, source in heard}
+            assert said == set(allowed)
+            heard.clear()
+
+
+@pytest.fixture
+def broken(tmp_path, folder):
+    """The folder's keys, to be spoiled."""
+    for file in folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    return tmp_path
+
+
+def _refusal(endpoint, robot_keys, peer_keys, plain_robot=False):
+    listen = endpoint.replace("tls/", "tcp/") if plain_robot else endpoint
+    with (
+        open_zenoh("r1", listen=[listen], role="robot", secure="" if plain_robot else str(robot_keys)) as robot,
+        pytest.raises(LinkError) as refusal,
+    ):
+        robot.subscribe(TWIST, lambda message: None)
+        target = endpoint if peer_keys else endpoint.replace("tls/", "tcp/")
+        open_zenoh("r1", connect=[target], role="vision", secure=str(peer_keys or ""), timeout_s=0.5)
+    assert "\n" not in str(refusal.value)
+    return str(refusal.value)
+
+
+def test_keys_of_another_authority_are_refused_with_the_cause(folder, endpoint, tmp_path):
+    keys.make(tmp_path / "other", [])
+    assert "of another authority" in _refusal(endpoint, folder, tmp_path / "other")
+
+
+def test_an_expired_certificate_is_named(folder, endpoint, broken):
+    keys.add(broken, "robot", [], days=-0.5)
+    assert "its certificate has expired" in _refusal(endpoint, broken, folder)
+
+
+def test_our_own_expired_certificate_is_named(folder, endpoint, broken):
+    keys.add(broken, "vision", [], days=-0.5)
+    assert "our certificate expired" in _refusal(endpoint, folder, broken)
+
+
+def test_a_certificate_of_another_host_is_named(folder, endpoint, broken, monkeypatch):
+    monkeypatch.setattr(keys, "LOOPBACK", ())
+    keys.add(broken, "robot", ["elsewhere.local"])
+    assert "names other addresses" in _refusal(endpoint, broken, folder)
+
+
+def test_plain_to_secured_and_secured_to_plain_are_refused_with_the_cause(folder, endpoint):
+    assert "speaks TLS only" in _refusal(endpoint, folder, None)
+    assert "plain link, not TLS" in _refusal(endpoint, folder, folder, plain_robot=True)
+
+
+def test_there_is_no_silent_way_back_to_a_plain_link(folder):
+    with pytest.raises(ConfigError, match="is not secured"):
+        open_zenoh("r1", connect=["tcp/127.0.0.1:7447"], role="vision", secure=str(folder))
+
+
+def test_a_machine_without_its_keys_is_told_which(broken):
+    (broken / "vision.key").unlink()
+    with pytest.raises(ConfigError, match=r"vision\.key is missing in .*copy ca\.pem, vision\.pem and vision\.key"):
+        open_zenoh("r1", connect=["tls/127.0.0.1:7447"], role="vision", secure=str(broken))
+
+
+def test_robots_are_listed_over_a_secured_link(folder, endpoint):
+    with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)) as robot:
+        found = {}
+        deadline_s = time.monotonic() + 5
+        listing = threading.Thread(target=lambda: found.update(list_robots([endpoint], 0.6, str(folder))))
+        listing.start()
+        while listing.is_alive() and time.monotonic() < deadline_s:
+            robot.publish(STATUS, b"{}", b"{}")
+            time.sleep(0.02)
+        listing.join()
+    assert set(found) == {"r1"}
+
+
+def test_keys_are_for_their_owner_only_and_never_overwritten(folder):
+    assert all(file.stat().st_mode & 0o077 == 0 for file in folder.glob("*.key"))
+    with pytest.raises(ConfigError, match="holds keys already"):
+        keys.make(folder, [])
+
+
+def test_certificates_are_told_with_their_hosts_and_end(folder):
+    shown = {certificate.role: certificate for certificate in keys.look(folder)}
+    assert set(shown) == {"sightline authority", *ROLES}
+    assert shown["robot"].hosts == ("localhost", "127.0.0.1", "robot.local")
+
+
+@pytest.mark.parametrize("host", ["a b", "röbot", "http://x", ""])
+def test_a_host_that_is_none_is_refused(folder, host):
+    with pytest.raises(ConfigError, match="no name or address"):
+        keys.add(folder, "viewer", [host])
+
+
+def test_a_host_that_is_none_leaves_nothing_behind(tmp_path):
+    with pytest.raises(ConfigError):
+        keys.make(tmp_path / "new", ["a b"])
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_without_an_authority_cannot_sign(tmp_path):
+    with pytest.raises(ConfigError, match="no authority"):
+        keys.add(tmp_path, "robot", [])
+    with pytest.raises(ConfigError, match="no certificates"):
+        keys.look(tmp_path)
+    (tmp_path / "x.pem").write_text("rubbish")
+    with pytest.raises(ConfigError, match="is no certificate"):
+        keys.look(tmp_path)
