@@ -8,6 +8,7 @@ import typer
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
+from robot_side.config import DEFAULT_ENDPOINT
 
 ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help="TOML file; see `sightline config`.")]
 Sets = Annotated[
@@ -20,6 +21,7 @@ Listen = Annotated[
 Connect = Annotated[
     list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Connect here, e.g. tcp/192.168.1.20:7447.")
 ]
+Secure = Annotated[str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; needs tls/ ends.")]
 RobotName = Annotated[str | None, typer.Option("--robot", metavar="ID", help="The robot's id [default: r1].")]
 SocketDir = Annotated[
     str | None, typer.Option("--socket-dir", metavar="DIR", help="Where the simulation's sockets are.")
@@ -31,6 +33,7 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example: sightline sim --scenario eight --seed 3")(sim)
     app.command(epilog="Example: sightline robot --listen tcp/0.0.0.0:7447 --set safety.max_linear_mps=0.3")(robot)
     app.command(epilog="Example: sightline vision --connect tcp/192.168.1.20:7447")(vision)
+    app.command(epilog="Example: sightline router --listen tcp/0.0.0.0:7447")(router)
 
 
 def sim(
@@ -94,6 +97,9 @@ def vision(
     connect: Connect = None,
     config: ConfigFile = None,
     sets: Sets = None,
+    detector: Annotated[
+        str | None, typer.Option("--detector", metavar="KIND", help="hsv, or boxes that a guest sends [default: hsv].")
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what is seen and steer nothing.")] = False,
     camera: Annotated[
         str | None, typer.Option("--camera", metavar="KIND", help="With --dry-run: a camera of this machine.")
@@ -108,7 +114,7 @@ def vision(
         raise ConfigError("--camera looks without a robot, so there is nothing to steer: add --dry-run")
     if camera_sets and camera is None:
         raise ConfigError("--camera-set is for the camera of --camera; name one, e.g. --camera v4l2")
-    options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect)}
+    options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "detector.kind": detector}
     loaded = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
     with needs("vision"):
         if dry_run:
@@ -122,10 +128,20 @@ def vision(
         return run(loaded.config)  # type: ignore[arg-type]
 
 
+def router(listen: Listen = None, connect: Connect = None, secure: Secure = "") -> int:
+    """Run the place where robots, visions and people of one site meet, until Ctrl-C. All of them connect to it."""
+    with needs("zenoh"):
+        from operator_side.router import run
+
+        return run(listen or [DEFAULT_ENDPOINT], connect or [], secure)
+
+
 def _only_look(config: Any, camera: str | None, camera_sets: list[str]) -> int:
     from operator_side.local_camera import local_camera
     from vision_side.dry_run import watch_camera, watch_robot
 
+    if config.detector.kind != "hsv":
+        raise ConfigError("--dry-run looks with vision's own eyes; leave the detector at hsv")
     if camera is None:
         return watch_robot(config, typer.echo, None)
     with local_camera(camera, camera_sets) as opened:

@@ -58,7 +58,8 @@ def session_config(
     config = _session_config(listen, connect, timeout_s)
     if secured is not None:
         config["transport"]["link"]["tls"] = secured.tls_section()
-        config["access_control"] = secured.access_section()
+        if listen:  # a client has one peer, whoever listens, and that one judges
+            config["access_control"] = secured.access_section()
     return config
 
 

@@ -1,0 +1,30 @@
+"""`sightline router`: where robots, visions and people meet; each frame crosses a robot's radio once. Shell.
+
+It is a Zenoh router and nothing else: a stock `zenohd` does as well, without the access rules of `--secure`.
+"""
+
+import signal
+import threading
+from collections.abc import Sequence
+from contextlib import closing
+
+from protocol.transports.endpoints import check_endpoints
+from protocol.transports.secured import ROBOT, secured_for
+from protocol.transports.zenoh_session import open_session
+
+_REACH_S = 5.0
+
+
+def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
+    """Serve until SIGTERM or SIGINT. Raises ConfigError, LinkError as `open_session` does."""
+    check_endpoints(listen, connect)
+    secured = secured_for(secure, ROBOT)
+    ending = threading.Event()
+    with closing(open_session(listen, connect, _REACH_S, secured)):
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda _number, _frame: ending.set())
+        rules = f"keys of {secure}, access rules on" if secure else "plain, open to whoever reaches it"
+        print(f"router: on {', '.join(listen)}; {rules}", flush=True)
+        ending.wait()
+    print("router: ended", flush=True)
+    return 0
