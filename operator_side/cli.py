@@ -17,6 +17,7 @@ from operator_side import (
     cli_calibrate,
     cli_config,
     cli_faults,
+    cli_install,
     cli_judge,
     cli_keys,
     cli_people,
@@ -38,7 +39,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for module in (cli_services, cli_judge, cli_people, cli_bench, cli_faults, cli_calibrate, cli_keys, cli_config):
+for module in (
+    cli_services, cli_judge, cli_people, cli_bench, cli_faults,
+    cli_calibrate, cli_keys, cli_install, cli_config,
+):
     module.register(app)
 
 
