@@ -1,19 +1,19 @@
 """Where pictures for a calibration come from: a folder, a camera of this machine, a robot. Shell (waits, files)."""
 
 import itertools
-import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from protocol.channels import ACK, CAMERA, FRAME
-from protocol.codec import decode, encode
+from operator_side.acknowledge import Viewer
+from protocol.channels import CAMERA, FRAME
+from protocol.codec import decode
 from protocol.errors import ConfigError, LinkError, WireError
 from protocol.jpeg import JpegSize, read_jpeg_size
-from protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader
-from protocol.transports.link import Link, Message
+from protocol.messages import CameraModel
+from protocol.transports.link import Link
 from robot_side.hardware.folder_camera import jpegs_in
 from robot_side.ports import Camera
 
@@ -53,28 +53,17 @@ def robot_pictures(link: Link, seconds: float) -> Iterator[bytes]:
 
     Raises LinkError when no frame comes for five seconds.
     """
-    frames, session = link.latest(FRAME), secrets.token_hex(4)
+    frames, viewer = link.latest(FRAME), Viewer(link, ROLE)
     heard_s = time.monotonic()
     ends_s = heard_s + seconds
-    seq = 0
     while time.monotonic() < ends_s:
         message = frames.take(_WAIT_S)
-        if message is not None and _acknowledge(link, message, session, seq := seq + 1):
+        if message is not None and viewer.acknowledge(message):
             heard_s = time.monotonic()
             yield message.payload
         if time.monotonic() - heard_s > _SILENCE_S:
             raise LinkError(f"no frames from robot {link.robot!r} within {_SILENCE_S:g} s; is `sightline robot` "
                             "running there, with this id, and its camera working?")
-
-
-def _acknowledge(link: Link, message: Message, session: str, seq: int) -> bool:
-    try:
-        frame = decode(FrameHeader, message.header)
-    except WireError:
-        return False
-    echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
-    link.publish(ACK, encode(AnswerHeader(source=ROLE, session=session, seq=seq, echo=echo)), b"")
-    return True
 
 
 def robot_model(link: Link, timeout_s: float = 3.0) -> CameraModel:

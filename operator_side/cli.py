@@ -16,6 +16,7 @@ from operator_side import (
     cli_bench,
     cli_calibrate,
     cli_config,
+    cli_doctor,
     cli_faults,
     cli_install,
     cli_judge,
@@ -41,7 +42,7 @@ app = typer.Typer(
 )
 for module in (
     cli_services, cli_judge, cli_people, cli_bench, cli_faults,
-    cli_calibrate, cli_keys, cli_install, cli_config,
+    cli_calibrate, cli_keys, cli_install, cli_doctor, cli_config,
 ):
     module.register(app)
 

@@ -32,8 +32,9 @@ def open_link(
     role: str = "",
     timeout_s: float = 5.0,
     max_frame_bytes: int = FRAME.max_payload_bytes,
+    secure: str = "",
 ) -> Link:
-    """Open `robot`'s link on every endpoint given; use it in a `with`.
+    """Open `robot`'s link on every endpoint given; use it in a `with`. `secure` is a folder of `sightline keys`.
 
     Raises ConfigError and LinkError as `open_zenoh` and `open_websocket` do; nothing stays open then.
     """
@@ -44,7 +45,8 @@ def open_link(
         if any(zenoh) or not any(web):
             from protocol.transports.zenoh import open_zenoh
 
-            links.append(undo.enter_context(open_zenoh(robot, listen=zenoh[0], connect=zenoh[1], **options)))
+            of_zenoh = open_zenoh(robot, listen=zenoh[0], connect=zenoh[1], secure=secure, **options)
+            links.append(undo.enter_context(of_zenoh))
         if any(web):
             from protocol.transports.websocket import open_websocket
 

@@ -1,0 +1,30 @@
+"""What a viewer says to a frame: seen. It returns credit and drives nothing. Shell (publishes)."""
+
+import secrets
+
+from protocol.channels import ACK
+from protocol.codec import decode, encode
+from protocol.errors import WireError
+from protocol.messages import AnswerHeader, Echo, FrameHeader
+from protocol.transports.link import Link, Message
+
+
+class Viewer:
+    """One viewer's session; `role` names it on the wire."""
+
+    def __init__(self, link: Link, role: str) -> None:
+        self._link, self._role = link, role
+        self._session = secrets.token_hex(4)
+        self._seq = 0
+
+    def acknowledge(self, message: Message) -> bool:
+        """Answer one frame; False for what is none."""
+        try:
+            frame = decode(FrameHeader, message.header)
+        except WireError:
+            return False
+        echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
+        header = AnswerHeader(source=self._role, session=self._session, seq=self._seq, echo=echo)
+        self._seq += 1
+        self._link.publish(ACK, encode(header), b"")
+        return True

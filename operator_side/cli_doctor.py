@@ -1,0 +1,79 @@
+"""`sightline doctor`: what is wrong here, or on the way to a robot, and the line that mends it. Shell."""
+
+import json
+import time
+from collections.abc import Iterator
+from typing import Annotated
+
+import typer
+
+from operator_side.doctor.finding import Finding, as_object
+from protocol.errors import SightlineError
+
+_LOOK_S = 3.0
+_ENOUGH = 0.9
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command(epilog="Example: sightline doctor --peer tcp/192.168.1.20:7447")(doctor)
+
+
+def doctor(
+    *,
+    robot: Annotated[str, typer.Argument(metavar="[ROBOT]", help="The robot's id.")] = "r1",
+    peer: Annotated[
+        str | None, typer.Option("--peer", metavar="ENDPOINT", help="Also look at the way to this robot or router.")
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option("--camera", metavar="KIND", help="Also look at a camera of this machine, e.g. v4l2.")
+    ] = None,
+    camera_sets: Annotated[
+        list[str] | None, typer.Option("--camera-set", metavar="KEY=VALUE", help="An option of it, e.g. fps=15.")
+    ] = None,
+    secure: Annotated[str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`.")] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> int:
+    """Look for what commonly goes wrong, and say the exact line that mends it. Exit code 5 if something is wrong."""
+    found: list[Finding] = []
+    for finding in _findings(robot, peer, camera, camera_sets or [], secure):
+        found.append(finding)
+        if not as_json:
+            typer.echo(finding.line)
+    report = as_object(found)
+    if as_json:
+        typer.echo(json.dumps(report))
+    else:
+        bad = sum(one.ok is False for one in found)
+        typer.echo(f"{bad} of {len(found)} need mending" if bad else "nothing wrong found")
+    return 0 if report["ok"] else 5
+
+
+def _findings(robot: str, peer: str | None, camera: str | None, sets: list[str], secure: str) -> Iterator[Finding]:
+    from operator_side.doctor import between, machine
+
+    yield from machine.findings(secure)
+    if camera is not None:
+        yield _camera(camera, sets)
+    if peer is not None:
+        yield from between.findings(peer, robot, secure)
+
+
+def _camera(kind: str, sets: list[str]) -> Finding:
+    """The rate that a camera really delivers; what it cannot do at all, it says itself."""
+    from operator_side.local_camera import local_camera
+
+    try:
+        with local_camera(kind, sets) as opened:
+            begun_s, stamps_us = time.monotonic(), []
+            while time.monotonic() - begun_s < _LOOK_S:
+                picture = opened.read(0.5)
+                stamps_us += [picture.t_us] if picture else []
+    except SightlineError as error:
+        return Finding(f"camera {kind}", False, str(error))
+    if len(stamps_us) < 2:
+        return Finding(f"camera {kind}", False, "no pictures", "plug it in anew; another program may have it")
+    fps = (len(stamps_us) - 1) / (stamps_us[-1] - stamps_us[0]) * 1e6
+    asked = next((float(one.partition("=")[2]) for one in sets if one.startswith("fps=")), 0.0)
+    fix = "more light (a camera exposes longer in the dark), a smaller size, or another USB port"
+    return Finding(f"camera {kind}", fps >= _ENOUGH * asked, f"{fps:.1f}", fix, "fps", f"{asked:g}")

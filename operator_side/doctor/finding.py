@@ -1,0 +1,47 @@
+"""One finding of the doctor. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Finding:
+    """`value` is what was found; `ok` None for what is only said. `fix` is the exact line that mends it."""
+
+    name: str
+    ok: bool | None
+    value: str
+    fix: str = ""
+    unit: str = ""
+    bound: str = ""
+
+    @property
+    def line(self) -> str:
+        """One line for a person."""
+        sign = {True: "ok  ", False: "BAD ", None: "    "}[self.ok]
+        fix = f"\n{'':25}fix: {self.fix}" if self.fix and self.ok is not True else ""
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{sign} {self.name:<19} {self.value}{unit}{fix}"
+
+
+def as_object(findings: list[Finding]) -> dict[str, Any]:
+    """The shape that everything that judges prints with --json."""
+    return {"ok": all(one.ok is not False for one in findings), "checks": [asdict(one) for one in findings]}
+
+
+def histogram(values_ms: list[float], bins: int = 8, width: int = 40) -> list[str]:
+    """`values_ms` as lines of text: the bin's lower end, a bar, the count. Nothing for no values."""
+    if not values_ms:
+        return []
+    low, high = min(values_ms), max(values_ms)
+    step = (high - low) / bins or 1.0
+    counts = [0] * bins
+    for value in values_ms:
+        counts[min(bins - 1, int((value - low) / step))] += 1
+    top = max(counts)
+    return [
+        f"{low + index * step:9.2f} ms  {'#' * round(width * count / top):<{width}} {count}"
+        for index, count in enumerate(counts)
+    ]

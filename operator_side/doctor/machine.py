@@ -1,0 +1,174 @@
+"""What the doctor finds on this machine. Shell (reads /sys and /proc, asks the system's own tools; Linux)."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+import resource
+import shutil
+import socket
+import subprocess
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+from operator_side.doctor.finding import Finding
+from protocol import VERSION
+from protocol.errors import SightlineError
+from protocol.transports.port_owner import port_owner
+
+PORTS = {7447: "Zenoh", 9090: "sightline.v1", 9091: "the older dialect"}
+_HOT_C = 80.0
+_EXPIRES_SOON = datetime.timedelta(days=30)
+_OURS = ("protocol", "robot_side", "vision_side", "sim", "operator_side", "benchmarks")
+_EXTRAS = {"zenoh": "eclipse-zenoh", "websocket": "websockets", "vision": "opencv-python-headless", "sim": "pybullet"}
+_MULTICAST = ("224.0.0.224", 7446)
+"""Where Zenoh's scouting speaks."""
+
+
+def findings(keys_folder: str) -> Iterator[Finding]:
+    """Everything about this machine alone."""
+    yield _versions()
+    yield _collision()
+    yield from (_port(port, what) for port, what in PORTS.items())
+    yield _real_time()
+    yield _memory_lock()
+    yield from _governor()
+    yield from _temperature()
+    yield from _power_save()
+    yield _multicast()
+    yield _clock()
+    if keys_folder:
+        yield from _certificates(keys_folder)
+
+
+def _versions() -> Finding:
+    installed = {extra: _version(name) for extra, name in _EXTRAS.items()}
+    said = ", ".join(f"{extra} {version}" for extra, version in installed.items() if version)
+    text = f"sightline {_version('sightline')}, protocol {VERSION}, Python {platform.python_version()}; {said}"
+    return Finding("versions", None, text)
+
+
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def _collision() -> Finding:
+    """Another distribution may install a package of the same name as one of ours (`protocol` exists)."""
+    owners = metadata.packages_distributions()
+    others = sorted({other for name in _OURS for other in owners.get(name, ()) if other != "sightline"})
+    fix = f"pip uninstall {' '.join(others)}, or give Sightline an environment of its own: python3 -m venv .venv"
+    return Finding("package names", not others, f"taken by {', '.join(others)}" if others else "no collision", fix)
+
+
+def _port(port: int, what: str) -> Finding:
+    owner = port_owner(port)
+    if not owner:
+        return Finding(f"port {port}", None, f"{what}: free")
+    fix = "if that is not Sightline: end it, or choose another port with --listen"
+    return Finding(f"port {port}", None, f"{what}: in use by {owner}", fix)
+
+
+def _real_time() -> Finding:
+    """Tried for real, and taken back: limits and capabilities differ from system to system."""
+    before = os.sched_getscheduler(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, before, os.sched_param(0))
+    except (OSError, AttributeError):
+        fix = "echo \"$USER - rtprio 60\" | sudo tee /etc/security/limits.d/sightline.conf, then log in anew"
+        return Finding("real-time", False, "not permitted: under load the driver may tick late", fix)
+    return Finding("real-time", True, "permitted")
+
+
+def _memory_lock() -> Finding:
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    ok = soft == resource.RLIM_INFINITY or soft >= 256 << 20 or os.geteuid() == 0
+    fix = "echo \"$USER - memlock unlimited\" | sudo tee -a /etc/security/limits.d/sightline.conf, then log in anew"
+    return Finding("memory lock", ok, "permitted" if ok else f"at most {soft >> 10} kB", fix)
+
+
+def _governor() -> Iterator[Finding]:
+    found = {_text(file) for file in Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")}
+    if found:
+        fix = "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"
+        yield Finding("CPU governor", "powersave" not in found, ", ".join(sorted(found)), fix)
+
+
+def _temperature() -> Iterator[Finding]:
+    zones = [_text(file) for file in Path("/sys/class/thermal").glob("thermal_zone*/temp")]
+    degrees = [int(text) / 1000 for text in zones if text.lstrip("-").isdigit()]
+    if degrees:
+        fix = "a heat sink or a fan: a hot processor is slowed down"
+        yield Finding("temperature", max(degrees) < _HOT_C, f"{max(degrees):.0f}", fix, "C", f"{_HOT_C:.0f}")
+    said = _asked("vcgencmd", "get_throttled")
+    if said:
+        fix = "a stronger power supply, or cooling; sudo reboot clears the mark"
+        yield Finding("throttled", said.endswith("0x0"), said, fix)
+
+
+def _power_save() -> Iterator[Finding]:
+    for device in sorted(Path("/sys/class/net").glob("*/wireless")):
+        name = device.parent.name
+        said = _asked("iw", "dev", name, "get", "power_save")
+        fix = f"sudo iw dev {name} set power_save off"
+        yield Finding(f"power save {name}", "on" not in said.lower().split() if said else None,
+                      said or "cannot be read: apt install iw", fix)
+
+
+def _multicast() -> Finding:
+    """Whether a multicast datagram of ours comes back to us; discovery needs it, explicit endpoints do not."""
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
+            heard.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            heard.bind(("", _MULTICAST[1]))
+            group = socket.inet_aton(_MULTICAST[0]) + socket.inet_aton("0.0.0.0")
+            heard.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
+            heard.settimeout(0.3)
+            heard.sendto(b"sightline doctor", _MULTICAST)
+            heard.recv(64)
+    except OSError as error:
+        fix = "nothing: name the endpoint with --connect, which is surer anyway"
+        return Finding("multicast", None, f"does not work here ({error.strerror or 'nothing came back'})", fix)
+    return Finding("multicast", None, "works on this machine; an access point may still keep it")
+
+
+def _clock() -> Finding:
+    said = _asked("timedatectl", "show", "--property=NTPSynchronized", "--value")
+    words = {"yes": "synchronised", "no": "not synchronised"}.get(said, "unknown")
+    return Finding("clock", None, f"{words}; only certificates and logs need it, no frame or command does")
+
+
+def _certificates(folder: str) -> Iterator[Finding]:
+    from operator_side import keys
+
+    try:
+        certificates = keys.look(Path(folder))
+    except SightlineError as error:
+        yield Finding("certificates", False, str(error))
+        return
+    now = datetime.datetime.now(datetime.UTC)
+    for one in certificates:
+        anew = f"sightline keys add {folder} {one.role}" if one.hosts else f"sightline keys init {folder}-new"
+        yield Finding(f"key {one.file.stem}", one.ends - now > _EXPIRES_SOON, f"until {one.ends:%Y-%m-%d}", anew)
+
+
+def _asked(*command: str) -> str:
+    """What a tool of the system says; "" where it is not there or fails."""
+    if shutil.which(command[0]) is None:
+        return ""
+    try:
+        return subprocess.run(command, check=True, capture_output=True, text=True, timeout=3).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text().strip()
+    except OSError:
+        return ""
