@@ -21,6 +21,7 @@ from operator_side import (
     cli_install,
     cli_judge,
     cli_keys,
+    cli_metrics,
     cli_people,
     cli_services,
 )
@@ -42,7 +43,7 @@ app = typer.Typer(
 )
 for module in (
     cli_services, cli_judge, cli_people, cli_bench, cli_faults,
-    cli_calibrate, cli_keys, cli_install, cli_doctor, cli_config,
+    cli_calibrate, cli_keys, cli_install, cli_doctor, cli_metrics, cli_config,
 ):
     module.register(app)
 

@@ -1,0 +1,69 @@
+"""`sightline metrics` against a real robot, read with Prometheus' own parser; a robot that is gone is down."""
+
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families as parsed
+
+from tests.link_rigs import until
+from tests.robot_process import RobotProcess, Vision, driving
+
+pytestmark = pytest.mark.slow
+
+
+def _free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def _samples(port):
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as answer:
+        text = answer.read().decode()
+    return {(s.name, *sorted(s.labels.values())): s.value for family in parsed(text) for s in family.samples}
+
+
+def _health(port):
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_a_robot_is_measured_and_its_end_is_seen(tmp_path):
+    port = _free_port()
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
+        command = [sys.executable, "-m", "operator_side.cli", "metrics", "r1", "--connect", robot.endpoint]
+        exporter = subprocess.Popen([*command, "--port", str(port)], stdout=subprocess.PIPE, text=True)
+        try:
+            assert exporter.stdout.readline() == f"metrics of r1: http://127.0.0.1:{port}/metrics\n"
+            assert driving(robot)
+            assert until(lambda: _health(port) == 200)
+            vision.twist = b"nan|0"
+            assert until(lambda: _samples(port).get(("sightline_commands_refused_total", "NOT_FINITE", "r1"), 0) > 3)
+            samples = _samples(port)
+            assert samples["sightline_up", "r1"] == 1
+            assert samples["sightline_frames_sent_total", "r1"] > 10
+            assert samples["sightline_commands_accepted_total", "r1"] > 5
+            assert sum(value for key, value in samples.items() if key[0] == "sightline_state") == 1
+            robot.process.terminate()
+            assert until(lambda: _samples(port) == {("sightline_up", "r1"): 0}, 6)
+            assert _health(port) == 503
+        finally:
+            exporter.terminate()
+            assert exporter.wait(5) == 0
+
+
+def test_a_busy_port_is_said_with_its_owner(tmp_path):
+    with RobotProcess(tmp_path) as robot, socket.create_server(("127.0.0.1", 0)) as taken:
+        command = [sys.executable, "-m", "operator_side.cli", "metrics", "--connect", robot.endpoint, "--port"]
+        assert until(lambda: "robot r1: on" in robot.output(), 8)
+        port = str(taken.getsockname()[1])
+        done = subprocess.run([*command, port], capture_output=True, text=True, timeout=20, check=False)
+    assert done.returncode == 4
+    assert f"port {port} is in use by" in done.stderr and "Traceback" not in done.stderr
