@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from protocol.messages import Status
+from protocol.messages import Status, StreamStatus
 
 
 def status_line(robot: str, status: Status) -> str:
@@ -24,11 +24,31 @@ def status_lines(robot: str, status: Status) -> Iterator[str]:
     camera = "calibrated" if stream.calibrated else "not calibrated"
     counts = f"{stream.sent} sent, {stream.credit_timeouts} unanswered"
     yield f"stream    {stream.fps:.0f} fps, {counts}, window {stream.window}, camera {camera}"
+    yield f"pictures  {encoding_text(stream)}"
+    yield f"dropped   {drops_text(stream)}"
     yield f"commands  {status.accepted} accepted, {refusals_text(status)}, {stream.dropped_commands} dropped"
     if status.last_refusal:
         last = status.last_refusal
         yield f"refused   last: {last.reason} from {last.source}: {last.detail}"
     yield f"driver loop late by at most {millis(status.tick_late_max_us)}; network restarts {status.network_restarts}"
+
+
+def encoding_text(stream: StreamStatus) -> str:
+    """How pictures are encoded to fit the link."""
+    if stream.quality_percent == stream.scale_percent == 100:
+        return "as configured"
+    return f"made smaller for this link: quality {stream.quality_percent} %, side length {stream.scale_percent} %"
+
+
+def drops_text(stream: StreamStatus) -> str:
+    """What was replaced by something newer, slot by slot."""
+    parts = [
+        f"{stream.missed_captures} captures in the camera's slot" if stream.missed_captures else "",
+        *(f"{count} {name} on the way out" for name, count in stream.dropped.items()),
+        f"{stream.overtaken} frames overtaken before an answer" if stream.overtaken else "",
+        f"{stream.refused_pictures} pictures refused" if stream.refused_pictures else "",
+    ]
+    return ", ".join(part for part in parts if part) or "nothing"
 
 
 def refusals_text(status: Status) -> str:

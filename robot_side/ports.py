@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import array
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
+from protocol.jpeg import JpegSize
 from protocol.messages import CameraModel
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One JPEG and when it was captured."""
+    """One JPEG, when it was captured, and the share of the side lengths of the camera's model that it has."""
 
     jpeg: bytes
     t_us: int
+    scale_percent: int = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,19 @@ class Camera(Protocol):
     def close(self) -> None: ...
 
 
+@runtime_checkable
+class Adjustable(Protocol):
+    """What a camera that encodes its pictures itself can do besides, so that they fit a thin link."""
+
+    def adjust(self, quality_percent: int, scale_percent: int) -> bool:
+        """Encode so from the next capture on, within a few pictures: shares of the configured quality and side lengths.
+
+        False, and nothing changes, where the device's own JPEGs are passed through. `model` stays that of the full
+        size; each picture says its own scale.
+        """
+        ...
+
+
 class Drive(Protocol):
     """Two wheels. Motors latch: the last speeds given hold until others are given."""
 
@@ -83,3 +98,25 @@ class RangeSensor(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+def scaled_size(width_px: int, height_px: int, scale_percent: int) -> JpegSize:
+    """The size of a picture of that scale."""
+    return JpegSize(max(16, width_px * scale_percent // 100), max(16, height_px * scale_percent // 100), 3)
+
+
+def scaled_model(model: CameraModel, scale_percent: int) -> CameraModel:
+    """The model of a camera's pictures at that scale. Distortion is of the rays, not of the pixels."""
+    if scale_percent == 100:
+        return model
+    size = scaled_size(model.width_px, model.height_px, scale_percent)
+    across, down = size.width_px / model.width_px, size.height_px / model.height_px
+    return model.model_copy(update={
+        "width_px": size.width_px, "height_px": size.height_px, "fx_px": model.fx_px * across,
+        "fy_px": model.fy_px * down, "cx_px": model.cx_px * across, "cy_px": model.cy_px * down,
+    })
+
+
+def share_of(quality: int, percent: int) -> int:
+    """That share of a configured JPEG quality, never below what decoders take."""
+    return max(1, round(quality * percent / 100))

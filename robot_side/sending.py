@@ -4,6 +4,7 @@ from protocol.channels import CAMERA, FRAME
 from protocol.codec import decode, encode
 from protocol.messages import AnswerHeader, CameraModel, FrameHeader, Holder, Planar, Pose, Stamp, StreamStatus
 from protocol.transports.link import Message
+from robot_side.encoding import Wish
 from robot_side.ipc import Judged, Motion
 from robot_side.ports import Picture
 from robot_side.stream import Stream, StreamConfig
@@ -24,6 +25,7 @@ class Sending:
         self._last_t_us = -1
         self._camera_seq = 0
         self._camera_due_us = 0
+        self._told_model: CameraModel | None = None
 
     def may_capture(self, now_us: int, listening: bool) -> bool:
         """Whether to take a picture now."""
@@ -40,7 +42,7 @@ class Sending:
             return None
         self._last_t_us = picture.t_us
         header = self._header(picture.t_us)
-        self._stream.on_sent(self._seq, picture.t_us, now_us)
+        self._stream.on_sent(self._seq, picture.t_us, now_us, len(picture.jpeg))
         self._seq += 1
         return header, Message(FRAME, "", encode(header), picture.jpeg)
 
@@ -72,19 +74,25 @@ class Sending:
         if seq < self._seq:
             self._stream.on_answer(who, seq, compute_us, now_us)
 
+    @property
+    def wish(self) -> Wish:
+        """How the next picture should be encoded, where the camera can."""
+        return self._stream.wish
+
     def camera_message(self, model: CameraModel, now_us: int) -> Message | None:
-        """The camera's model, twice a second."""
-        if now_us < self._camera_due_us:
+        """The model of the pictures that are sent: twice a second, and before the first picture of another model."""
+        if now_us < self._camera_due_us and model == self._told_model:
             return None
+        self._told_model = model
         self._camera_due_us = now_us + _CAMERA_PERIOD_US
         stamp = Stamp(session=self._session, seq=self._camera_seq, t_us=now_us)
         self._camera_seq += 1
         return Message(CAMERA, "", encode(stamp), encode(model))
 
-    def status(self, now_us: int, dropped_commands: int = 0, calibrated: bool = False) -> StreamStatus:
+    def status(self, now_us: int, dropped_commands: int = 0) -> StreamStatus:
         """Counters of the stream."""
         status = self._stream.status(now_us, dropped_commands)
-        return status.model_copy(update={"refused_pictures": self._refused_pictures, "calibrated": calibrated})
+        return status.model_copy(update={"refused_pictures": self._refused_pictures})
 
 
 def _rounded(pair: Planar) -> Planar:

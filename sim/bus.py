@@ -6,8 +6,8 @@ never delays a motor. Formats, all little-endian:
     motion.sock   robot -> sim  MOTION_SET      left_rad_s, right_rad_s; latched
                   sim -> robot  MOTION_ANGLES   left_rad, right_rad, t_us; 100 Hz
     range.sock    sim -> robot  RANGE_HEAD + float32 ranges
-    camera.sock   sim -> robot  first the CameraModel as JSON, then per request PICTURE_HEAD (t_us) + JPEG
-                  robot -> sim  one byte: a request for the next capture
+    camera.sock   sim -> robot  first the CameraModel as JSON, then per request PICTURE_HEAD (t_us, scale_percent), JPEG
+                  robot -> sim  PICTURE_REQUEST (quality_percent, scale_percent): for the next capture
     truth.sock    sim -> reader first what is simulated, then Truth as JSON; 50 Hz
 """
 
@@ -37,8 +37,8 @@ MOTION, RANGE, CAMERA, TRUTH = "motion.sock", "range.sock", "camera.sock", "trut
 MOTION_SET = struct.Struct("<dd")
 MOTION_ANGLES = struct.Struct("<ddq")
 RANGE_HEAD = struct.Struct("<qdddd")
-PICTURE_HEAD = struct.Struct("<q")
-REQUEST = b"\x01"
+PICTURE_HEAD = struct.Struct("<qB")
+PICTURE_REQUEST = struct.Struct("<BB")
 MAX_MESSAGE_BYTES = 1 << 20
 HELLO_TIMEOUT_S = 2.0
 
@@ -154,6 +154,7 @@ class SimCamera:
 
     def __init__(self, config: SimSocketConfig) -> None:
         self._connection = Connection(config.socket_dir, CAMERA)
+        self._request = PICTURE_REQUEST.pack(100, 100)
         self.model: CameraModel
         self._greet()
 
@@ -167,11 +168,17 @@ class SimCamera:
         deadline_s = time.monotonic() + timeout_s
         self._greet()
         self._connection.newest()  # an answer that came too late for an earlier call: old sight
-        self._connection.send(REQUEST)
+        self._connection.send(self._request)
         message = self._connection.wait(deadline_s - time.monotonic())
         if message is None:
             return None
-        return Picture(message[PICTURE_HEAD.size :], PICTURE_HEAD.unpack_from(message)[0])
+        t_us, scale_percent = PICTURE_HEAD.unpack_from(message)
+        return Picture(message[PICTURE_HEAD.size :], t_us, scale_percent)
+
+    def adjust(self, quality_percent: int, scale_percent: int) -> bool:
+        """As `robot_side.ports.Adjustable` says."""
+        self._request = PICTURE_REQUEST.pack(quality_percent, scale_percent)
+        return True
 
     def close(self) -> None:
         """Idempotent."""

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import simplejpeg
 
 from protocol.messages import CameraModel
+from robot_side.ports import scaled_size, share_of
 from sim.engine import pybullet
 from sim.look import Look
 from sim.scenario import Wall
@@ -128,7 +129,7 @@ class Defects:
         pool = (height_px + NOISE_MARGIN_PX, width_px + NOISE_MARGIN_PX, 3)
         self._pool = np.rint(self._draw.normal(0.0, look.noise, pool)).astype(np.int16) if look.noise else None
 
-    def jpeg(self, picture: Picture) -> bytes:
+    def jpeg(self, picture: Picture, quality_percent: int = 100, scale_percent: int = 100) -> bytes:
         """`picture` (RGB, changed in place) as the JPEG that the camera gives."""
         look = self._look
         if not self._is_neutral:
@@ -137,7 +138,14 @@ class Defects:
             cv2.GaussianBlur(picture, (0, 0), look.blur_px, picture)
         if self._pool is not None:
             cv2.add(picture, self._noise(self._pool), picture, dtype=cv2.CV_8U)
-        return bytes(simplejpeg.encode_jpeg(picture, look.jpeg_quality, "RGB", "420"))
+        quality = share_of(look.jpeg_quality, quality_percent)
+        return bytes(simplejpeg.encode_jpeg(self._scaled(picture, scale_percent), quality, "RGB", "420"))
+
+    def _scaled(self, picture: Picture, scale_percent: int) -> Picture:
+        if scale_percent == 100:
+            return picture
+        size = scaled_size(self._size[1], self._size[0], scale_percent)
+        return np.asarray(cv2.resize(picture, (size.width_px, size.height_px), interpolation=cv2.INTER_AREA), np.uint8)
 
     def _noise(self, pool: npt.NDArray[np.int16]) -> npt.NDArray[np.int16]:
         """A randomly placed part of noise drawn beforehand: drawing it anew costs 20 times as much."""

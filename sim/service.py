@@ -110,8 +110,9 @@ class Simulation:
         if self._encoders.due(now_us):
             angles = self._world.wheel_angles()
             self._clients.send(MOTION, MOTION_ANGLES.pack(angles.left_rad, angles.right_rad, t_us))
-        if self._frames.due(now_us) and self._clients.wants_picture():
-            self._clients.send_picture(PICTURE_HEAD.pack(t_us) + self._world.render())
+        if self._frames.due(now_us):
+            for wanted in self._clients.wanted_pictures():  # one, unless cameras differ in what they ask
+                self._clients.send_picture(wanted, PICTURE_HEAD.pack(t_us, wanted[1]) + self._world.render(*wanted))
         if self._scans.due(now_us) and self._clients.has(RANGE):
             self._clients.send(RANGE, self._scan(t_us))
         if self._truth.due(now_us) and self._clients.has(TRUTH):

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from protocol.errors import ConfigError, HardwareError
-from sim.bus import CAMERA, MOTION, RANGE, TRUTH
+from sim.bus import CAMERA, MOTION, PICTURE_REQUEST, RANGE, TRUTH
 
 SEND_BYTES = {MOTION: 4096, RANGE: 16_384, CAMERA: 1 << 20, TRUTH: 1 << 17}
 """How much may wait for a client that does not read; little where only the newest is worth anything."""
@@ -71,7 +71,7 @@ class Clients:
         self._hellos, self._on_motion = hellos, on_motion
         self._lock = threading.Lock()
         self._clients: dict[str, set[socket.socket]] = {name: set() for name in SEND_BYTES}
-        self._wanting: set[socket.socket] = set()
+        self._wanting: dict[socket.socket, tuple[int, int]] = {}
         self._selector = selectors.DefaultSelector()
         self._listeners = {name: folder.listen(name) for name in SEND_BYTES}
         for name, listener in self._listeners.items():
@@ -90,16 +90,17 @@ class Clients:
             for client in self._clients[name]:
                 _send(client, data)
 
-    def wants_picture(self) -> bool:
-        """Whether a camera asked for the next capture."""
-        return bool(self._wanting)
-
-    def send_picture(self, data: bytes) -> None:
-        """Send to the cameras that asked, which settles their requests."""
+    def wanted_pictures(self) -> set[tuple[int, int]]:
+        """The (quality_percent, scale_percent) that cameras asked the next capture in."""
         with self._lock:
-            for client in self._wanting:
+            return set(self._wanting.values())
+
+    def send_picture(self, wanted: tuple[int, int], data: bytes) -> None:
+        """Send to the cameras that asked for it so, which settles their requests."""
+        with self._lock:
+            for client in [one for one, asked in self._wanting.items() if asked == wanted]:
                 _send(client, data)
-            self._wanting.clear()
+                del self._wanting[client]
 
     def _serve(self) -> None:
         while not self._stopping.is_set():
@@ -137,13 +138,13 @@ class Clients:
             self._on_motion(data)
         elif name == CAMERA:
             with self._lock:
-                self._wanting.add(client)
+                self._wanting[client] = _wanted(data)
 
     def _drop(self, client: socket.socket, name: str) -> None:
         self._selector.unregister(client)
         with self._lock:
             self._clients[name].discard(client)
-            self._wanting.discard(client)
+            self._wanting.pop(client, None)
             client.close()
 
     def close(self) -> None:
@@ -165,3 +166,11 @@ def _send(client: socket.socket, data: bytes) -> None:
             raise HardwareError(
                 f"a picture of {len(data)} bytes does not fit a local socket; lower jpeg_quality or the camera's size"
             ) from None
+
+
+def _wanted(data: bytes) -> tuple[int, int]:
+    """How a picture was asked for; what is no such request asks for it as it is."""
+    if len(data) != PICTURE_REQUEST.size:
+        return 100, 100
+    quality_percent, scale_percent = PICTURE_REQUEST.unpack(data)
+    return max(1, min(100, quality_percent)), max(1, min(100, scale_percent))

@@ -50,6 +50,8 @@ class Shapes(Config):
     ab: Shape = Shape()
     ba: Shape = Shape()
     half_duplex: bool = False
+    seed: Annotated[int, Field(ge=0)] | None = None
+    """From now on chance is drawn from this seed."""
 
 
 @dataclass(slots=True)
@@ -81,7 +83,7 @@ class Leg:
         self.shape = Shape()
         self.medium = Medium()
         self.counts = Counts()
-        self._random = Random(seed)
+        self.random = Random(seed)
         self._waiting: list[tuple[float, int, bytes]] = []
         self._order = 0
         self._last_us = 0.0
@@ -100,17 +102,17 @@ class Leg:
             self._accept(packet, now_us)
 
     def _is_lost(self) -> bool:
-        shape, draw = self.shape, self._random.random
+        shape, draw = self.shape, self.random.random
         chance = shape.burst_end if self._in_burst else shape.burst_start
         if chance and draw() < chance:
             self._in_burst = not self._in_burst
         return self._in_burst or draw() < shape.loss
 
     def _accept(self, packet: bytes, now_us: int) -> None:
-        shape, draw = self.shape, self._random.random
+        shape, draw = self.shape, self.random.random
         due_us = self._due_us(len(packet), now_us)
         if draw() < shape.corrupt and len(packet) > IP_HEADER_BYTES:
-            packet = _flipped(packet, self._random)
+            packet = _flipped(packet, self.random)
             self.counts.corrupted += 1
         self._wait(packet, due_us)
         if draw() < shape.duplicate:
@@ -119,13 +121,13 @@ class Leg:
 
     def _due_us(self, size_bytes: int, now_us: int) -> float:
         shape = self.shape
-        if self._random.random() < shape.reorder:
+        if self.random.random() < shape.reorder:
             self.counts.reordered += bool(self._waiting)
             return now_us
         sent_us = float(now_us)
         if shape.rate_bit_s:
             sent_us = self.medium.free_us = max(sent_us, self.medium.free_us) + size_bytes * 8e6 / shape.rate_bit_s
-        jitter_ms = self._random.uniform(-shape.jitter_ms, shape.jitter_ms)
+        jitter_ms = self.random.uniform(-shape.jitter_ms, shape.jitter_ms)
         self._last_us = max(self._last_us, sent_us + max(0.0, shape.delay_ms + jitter_ms) * 1000)
         self.counts.delayed += self._last_us > now_us
         return self._last_us
@@ -165,6 +167,8 @@ class Wire:
     def shape(self, shapes: Shapes) -> None:
         """From now on packets fare so."""
         self.ab.shape, self.ba.shape = shapes.ab, shapes.ba
+        if shapes.seed is not None:
+            self.ab.random, self.ba.random = Random(f"{shapes.seed} ab"), Random(f"{shapes.seed} ba")
         if shapes.half_duplex != (self.ab.medium is self.ba.medium):
             self.ba.medium = self.ab.medium if shapes.half_duplex else Medium()
 

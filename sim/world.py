@@ -115,10 +115,11 @@ class World:
         place, turn = self._mounted(lidar.x_m, lidar.z_m)
         return self._lidar.scan(place, _yaw(turn), self.now_us)
 
-    def render(self) -> bytes:
-        """What the camera sees now, as JPEG."""
+    def render(self, quality_percent: int = 100, scale_percent: int = 100) -> bytes:
+        """What the camera sees now, as JPEG; shares of the look's quality and of the side lengths."""
         camera = self.robot.camera
-        return self._defects.jpeg(self._scene.draw(*self._mounted(camera.x_m, camera.z_m)))
+        picture = self._scene.draw(*self._mounted(camera.x_m, camera.z_m))
+        return self._defects.jpeg(picture, quality_percent, scale_percent)
 
     def _mounted(self, x_m: float, z_m: float) -> tuple[Vector, Any]:
         """Position and orientation of something mounted on the robot."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from protocol.jpeg import read_jpeg_size
 from protocol.messages import CameraModel
-from robot_side.ports import Camera, Picture
+from robot_side.ports import Adjustable, Camera, Picture, scaled_model
 
 MAX_AGE_S = 0.15
 """From capture to the return of `read`: transfer and encoding, but no storing."""
@@ -20,6 +20,7 @@ def check_camera(opened: Callable[[], Camera]) -> None:
         _gives_pictures_of_its_model_in_order(camera)
         _keeps_its_timeouts(camera)
         _hands_over_nothing_old(camera)
+        _adjusts_or_says_that_it_does_not(camera)
     finally:
         camera.close()
         camera.close()  # idempotent
@@ -66,3 +67,29 @@ def _hands_over_nothing_old(camera: Camera) -> None:
     for _ in range(3):
         picture = next_picture(camera)
         assert time.monotonic() - picture.t_us / 1e6 < MAX_AGE_S, "an old picture was handed over"
+
+
+def _adjusts_or_says_that_it_does_not(camera: Camera) -> None:
+    """Smaller when asked, each picture with its own scale and of that size; as before when asked back."""
+    if not isinstance(camera, Adjustable):
+        return
+    full = camera.model
+    before = next_picture(camera)
+    followed = camera.adjust(30, 50)
+    small = _first_of_scale(camera, 50 if followed else 100)
+    size, model = read_jpeg_size(small.jpeg), scaled_model(full, small.scale_percent)
+    assert (size.width_px, size.height_px) == (model.width_px, model.height_px)
+    assert len(small.jpeg) < len(before.jpeg) or not followed
+    assert camera.model == full, "the model stays that of the full size"
+    camera.adjust(100, 100)
+    again = read_jpeg_size(_first_of_scale(camera, 100).jpeg)
+    assert (again.width_px, again.height_px) == (full.width_px, full.height_px)
+
+
+def _first_of_scale(camera: Camera, scale_percent: int) -> Picture:
+    """Within a few pictures of being asked."""
+    for _ in range(5):
+        picture = next_picture(camera)
+        if picture.scale_percent == scale_percent:
+            return picture
+    raise AssertionError(f"no picture of {scale_percent} % came within five")

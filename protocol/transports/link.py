@@ -42,8 +42,10 @@ class LatestSlot(Generic[Item]):
 
     def take(self, timeout_s: float = 0.0) -> Item | None:
         """Remove and return the newest, waiting up to `timeout_s`; None if there is none."""
+        if self._item is None and timeout_s <= 0:
+            return None
         with self._ready:
-            if self._item is None and timeout_s > 0:
+            if self._item is None:
                 self._ready.wait(timeout_s)
             item, self._item = self._item, None
             return item

@@ -5,6 +5,7 @@ A robot may listen on several at once; then its link is all of them, and what an
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from types import TracebackType
@@ -50,7 +51,8 @@ def open_link(
         if any(web):
             from protocol.transports.websocket import open_websocket
 
-            links.append(undo.enter_context(open_websocket(robot, listen=web[0], connect=web[1], **options)))
+            of_web = open_websocket(robot, listen=web[0], connect=web[1], secure=secure, **options)
+            links.append(undo.enter_context(of_web))
         undo.pop_all()
     return links[0] if len(links) == 1 else ManyLinks(links)
 
@@ -88,6 +90,19 @@ class ManyLinks:
     def has_listener(self, channel: Channel) -> bool:
         """Whether somebody listens on any of them."""
         return any(link.has_listener(channel) for link in self._links)
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Publications that were replaced by newer ones before they left, by channel, of all that count them."""
+        return self._counted("dropped")
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Messages and peers turned away, by reason, of all."""
+        return self._counted("refused")
+
+    def _counted(self, name: str) -> Counter[str]:
+        return sum((Counter(dict(getattr(link, name, {}))) for link in self._links), Counter())
 
     def close(self) -> None:
         """Close all, the last opened first."""

@@ -16,6 +16,11 @@ class Newest:
     def __init__(self) -> None:
         self._slot: LatestSlot[tuple[float, Picture]] = LatestSlot()
 
+    @property
+    def dropped(self) -> int:
+        """Pictures replaced before anybody took them."""
+        return self._slot.dropped
+
     def put(self, picture: Picture) -> None:
         """Replace whatever is there; never blocks."""
         self._slot.put((time.monotonic(), picture))

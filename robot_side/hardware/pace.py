@@ -6,7 +6,7 @@ from robot_side.hardware.buffer_time import Clocks
 
 
 class Pace:
-    """Ticks `fps` times a second. Ticks that nobody waited for are not made up for."""
+    """Ticks `fps` times a second. Ticks that nobody waited for are not made up for, and who is late shifts none."""
 
     def __init__(self, fps: float) -> None:
         self._interval_s = 1 / fps
@@ -15,12 +15,12 @@ class Pace:
     def wait(self, timeout_s: float) -> bool:
         """Wait for the next tick; False if it is not due within `timeout_s`."""
         now_s = time.monotonic()
-        due_s = max(self._next_s + self._interval_s, now_s)
+        due_s = self._next_s + self._interval_s
         if due_s - now_s > timeout_s:
             time.sleep(timeout_s)
             return False
-        time.sleep(due_s - now_s)
-        self._next_s = due_s
+        time.sleep(max(0.0, due_s - now_s))
+        self._next_s = due_s if now_s - due_s < self._interval_s / 2 else now_s
         return True
 
 

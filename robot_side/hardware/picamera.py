@@ -84,6 +84,10 @@ class PiCamera:
             )
         return picture
 
+    def missed_captures(self) -> int:
+        """Pictures that nobody took before the next one came."""
+        return self._newest.dropped
+
     def close(self) -> None:
         """Idempotent."""
         camera, self._camera = self._camera, None

@@ -32,6 +32,7 @@ class V4l2Camera:
     ) -> None:
         self._config, self._opening = config, opening
         self._newest = Newest()
+        self._wish = (100, 100)
         self._fault: HardwareError | None = None
         self._ending = threading.Event()
         self._asked_s = self._heard_s = time.monotonic()
@@ -67,6 +68,15 @@ class V4l2Camera:
             raise self._frozen()
         return picture
 
+    def adjust(self, quality_percent: int, scale_percent: int) -> bool:
+        """As `Adjustable` says: with YUYV, which is encoded here; MJPG is the camera's own and stays as it is."""
+        self._wish = (quality_percent, scale_percent)
+        return self._config.format == "YUYV"
+
+    def missed_captures(self) -> int:
+        """Pictures that nobody took before the next one came."""
+        return self._newest.dropped
+
     def close(self) -> None:
         """Idempotent; the device is released by its thread, which a frozen driver can hold up."""
         self._ending.set()
@@ -92,6 +102,7 @@ class V4l2Camera:
     def _capture_one(self) -> None:
         if self._device is None:
             self._device = Device(self._config, self._opening)
+        self._device.wish = self._wish
         self._device.wait()
         asked = time.monotonic() - self._asked_s < _INTEREST_S
         picture = self._device.picture() if asked else None

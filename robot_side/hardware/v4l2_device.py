@@ -18,7 +18,7 @@ from robot_side.hardware.buffer_time import captured_us
 from robot_side.hardware.lens import LensConfig
 from robot_side.hardware.pace import read_clocks
 from robot_side.hardware.v4l2_trouble import check_device, not_opened
-from robot_side.ports import Picture
+from robot_side.ports import Picture, scaled_size, share_of
 
 _SELECT_TIMEOUT_S = 2  # OpenCV waits this long for a picture; its own default of 10 would hide a frozen camera
 _SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
@@ -72,6 +72,8 @@ class Device:
 
     def __init__(self, config: V4l2CameraConfig, opening: Callable[[Path], Capture]) -> None:
         self._config = config
+        self.wish = (100, 100)
+        """Shares of the configured quality and side lengths; for YUYV, whose pictures are encoded here."""
         self._capture = opening(config.device)
         try:
             self._pin_format()
@@ -124,19 +126,26 @@ class Device:
         done, data = self._capture.retrieve()
         if not done:
             return None
-        jpeg = whole_jpeg(data.tobytes()) if self._config.format == "MJPG" else self._encoded(data)
+        if self._config.format == "YUYV":
+            return self._encoded(data, t_us)
+        jpeg = whole_jpeg(data.tobytes())
         return Picture(jpeg, t_us) if jpeg else None
 
-    def _encoded(self, yuyv: Any) -> bytes:
+    def _encoded(self, yuyv: Any, t_us: int) -> Picture:
         import simplejpeg
 
         cv2 = _opencv()
-        size = self.size
-        bgr = cv2.cvtColor(yuyv.reshape(size.height_px, size.width_px, 2), cv2.COLOR_YUV2BGR_YUYV)
+        quality_percent, scale_percent = self.wish
+        full = self.size
+        bgr = cv2.cvtColor(yuyv.reshape(full.height_px, full.width_px, 2), cv2.COLOR_YUV2BGR_YUYV)
+        if scale_percent != 100:
+            size = scaled_size(full.width_px, full.height_px, scale_percent)
+            bgr = cv2.resize(bgr, (size.width_px, size.height_px), interpolation=cv2.INTER_AREA)
         jpeg: bytes = simplejpeg.encode_jpeg(
-            bgr, quality=self._config.quality, colorspace="BGR", colorsubsampling="422", fastdct=True
+            bgr, quality=share_of(self._config.quality, quality_percent), colorspace="BGR", colorsubsampling="422",
+            fastdct=True,
         )
-        return jpeg
+        return Picture(jpeg, t_us, scale_percent)
 
     def close(self) -> None:
         """Idempotent."""

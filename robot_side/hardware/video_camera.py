@@ -14,7 +14,7 @@ from protocol.errors import ConfigError, HardwareError
 from protocol.jpeg import JpegSize
 from robot_side.hardware.lens import LensConfig, camera_model
 from robot_side.hardware.pace import Pace, now_us
-from robot_side.ports import Picture
+from robot_side.ports import Picture, scaled_size, share_of
 
 _USUAL_FPS = 30.0
 _CATCH_UP_S = 1.0  # after a longer pause the video goes on where it was, as if paused
@@ -39,6 +39,7 @@ class VideoCamera:
     def __init__(self, config: VideoCameraConfig) -> None:
         self._config = config
         self._encode, self._cv2 = _packages()
+        self._quality, self._scale_percent = config.quality, 100
         self._open()
         self.model = camera_model(config, self._size())
         fps = config.fps or self._own_fps()
@@ -57,8 +58,18 @@ class VideoCamera:
         if not done:
             raise self._broken()
         t_us = now_us()
-        return Picture(self._encode(bgr, quality=self._config.quality, colorspace="BGR", colorsubsampling="420",
-                                    fastdct=True), t_us)
+        scale = self._scale_percent
+        if scale != 100:
+            size = scaled_size(self.model.width_px, self.model.height_px, scale)
+            bgr = self._cv2.resize(bgr, (size.width_px, size.height_px), interpolation=self._cv2.INTER_AREA)
+        jpeg = self._encode(bgr, quality=self._quality, colorspace="BGR", colorsubsampling="420", fastdct=True)
+        return Picture(jpeg, t_us, scale)
+
+    def adjust(self, quality_percent: int, scale_percent: int) -> bool:
+        """As `Adjustable` says."""
+        self._quality = share_of(self._config.quality, quality_percent)
+        self._scale_percent = scale_percent
+        return True
 
     def close(self) -> None:
         """Idempotent."""

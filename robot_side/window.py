@@ -1,0 +1,164 @@
+"""How many frames may be in flight, from delays alone: enough for a long link, one for a thin or a slow one. Pure.
+
+A frame sent while nothing is in flight shows the link's own delay. One sent behind another shows the same where the
+link is long, and waits where the link is thin or the peer slow. So the window grows while nobody waits, and what gets
+through while somebody does is what the link carries.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+_ALONE_KEPT: Final = 3
+_BEHIND_KEPT: Final = 3
+"""Three waiting frames in a row are a queue; fewer are an accident of the radio."""
+_GROSS: Final = 1.75
+"""So many times the link's own delay: two in a row are enough."""
+_JITTER_US: Final = 5_000
+_JITTER_SHARE: Final = 6
+"""A sixth of the delay may come and go without being a queue."""
+_FIRST_PAUSE_US: Final = 500_000
+_LONGEST_PAUSE_US: Final = 4_000_000
+"""After a window that was too wide: trying it again costs age, so each time in a row it is waited twice as long ..."""
+_HELD_US: Final = 1_000_000
+"""... unless a wider one did well for so long: on a lossy link it is not the width that fails."""
+_PEER_BOUND_SHARE: Final = 0.7
+"""Of the time between answers: a peer that computes for longer than this is what they wait for, not the link."""
+
+_KEEPS_UP: Final = 1.05
+"""Intervals a frame: a link that carries the camera's rate, near enough, is not full, whatever jitters."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """A frame's answer. `delay_us` is without the peer's computing; `alone`: nothing else was in flight when it left;
+    `held_back`: it was due before there was credit for it.
+
+    `gap_us` is from the answer before it, or from when the link began to carry it; `gap_frames` and `gap_bytes` are
+    what it carried in that time, frames that a newer one overtook among them.
+    """
+
+    delay_us: int
+    alone: bool
+    held_back: bool
+    gap_us: int
+    gap_frames: int
+    gap_bytes: int
+    compute_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class Full:
+    """The link carries no more than this; a frame took `delay_us` behind others."""
+
+    bytes_per_s: float
+    delay_us: int
+
+
+class Window:
+    """The number of `frames` that may be in flight, from 1 to `most`; one more for each `interval_us` of delay."""
+
+    def __init__(self, interval_us: int, most: int) -> None:
+        self._interval_us, self._most = interval_us, most
+        self._alone_us: deque[int] = deque(maxlen=_ALONE_KEPT)
+        self._behind: deque[Answered] = deque(maxlen=_BEHIND_KEPT)
+        self._since_change = 0
+        self._compute_us = 0.0
+        self._grow_at_us = self._changed_at_us = 0
+        self._pause_us = _FIRST_PAUSE_US
+        self._failed = False
+        self.frames = 1
+
+    @property
+    def own_delay_us(self) -> int | None:
+        """What the link itself takes, as far as it is known."""
+        return min(self._alone_us, default=None)
+
+    def on_answer(self, answered: Answered, now_us: int) -> Full | None:
+        """Learn from an answer. Returns what the link carries where it falls behind the camera."""
+        self._since_change += 1
+        self._compute_us += 0.3 * (answered.compute_us - self._compute_us)
+        if answered.alone:
+            self._alone_us.append(answered.delay_us)
+        else:
+            self._behind.append(answered)
+            self._lower_own_delay(answered.delay_us)
+        if self._is_queue():
+            return self._narrowed(now_us)
+        self._widen(now_us)
+        return None
+
+    def _lower_own_delay(self, delay_us: int) -> None:
+        """A frame that was not alone and yet quicker: the link has become shorter."""
+        own_us = self.own_delay_us
+        if own_us is None or delay_us < own_us:
+            self._alone_us.append(delay_us)
+
+    def _is_queue(self) -> bool:
+        own_us = self.own_delay_us
+        if own_us is None or not any(one.held_back for one in self._behind):
+            return False  # whatever jitters, the camera was never kept waiting
+        waited_us = [one.delay_us for one in self._behind]
+        if len(waited_us) >= _BEHIND_KEPT - 1 and min(waited_us[1 - _BEHIND_KEPT :]) > _GROSS * own_us + _JITTER_US:
+            return True
+        return len(waited_us) == _BEHIND_KEPT and min(waited_us) > own_us + _slack_us(own_us)
+
+    def _waited_us(self) -> int:
+        return min(one.delay_us for one in self._behind)
+
+    def _narrowed(self, now_us: int) -> Full | None:
+        full = self._full()
+        kept = round(self.frames * (self.own_delay_us or 0) / max(1, self._waited_us()))
+        if kept < self.frames:
+            held = now_us - self._changed_at_us >= _HELD_US
+            self._pause_us = _FIRST_PAUSE_US if held else min(2 * self._pause_us, _LONGEST_PAUSE_US)
+            self._grow_at_us = now_us + self._pause_us
+            self._failed = True
+            self._set(max(1, kept), now_us)
+        return full
+
+    def _full(self) -> Full | None:
+        gap_us = sum(one.gap_us for one in self._behind)
+        keeps_up = gap_us <= _KEEPS_UP * self._interval_us * sum(one.gap_frames for one in self._behind)
+        peer_bound = sum(one.compute_us for one in self._behind) > _PEER_BOUND_SHARE * gap_us
+        if keeps_up or peer_bound:
+            return None
+        return Full(sum(one.gap_bytes for one in self._behind) * 1e6 / gap_us, self._waited_us())
+
+    def _widen(self, now_us: int) -> None:
+        """More, once it is seen that nobody waits; by doubling until it was once too much."""
+        own_us = self.own_delay_us
+        if own_us is None or self._since_change < max(2, self.frames) or now_us < self._grow_at_us:
+            return
+        if self.frames > 1 and (len(self._behind) < _BEHIND_KEPT or self._waited_us() > own_us + _slack_us(own_us)):
+            return
+        useful = min(self._most, self._useful(own_us))
+        wider = self.frames + 1 if self._failed else 2 * self.frames
+        if useful != self.frames:
+            self._set(min(useful, wider), now_us)
+
+    def _useful(self, own_us: int) -> int:
+        """Frames that are made, and looked at, while one is under way.
+
+        With half an interval to spare, so that an answer that late costs no capture; but never for a peer that
+        is slower than the camera: what is spare then waits for the peer.
+        """
+        if self._compute_us > self._interval_us:
+            return 1 + int(own_us / self._compute_us)
+        return 1 + (own_us + self._interval_us // 2) // self._interval_us
+
+    def on_timeout(self, now_us: int) -> None:
+        """An answer is overdue: whatever is under way has to come out first."""
+        self._grow_at_us = max(self._grow_at_us, now_us + (self.own_delay_us or 0))
+        self._set(1, now_us)
+
+    def _set(self, frames: int, now_us: int) -> None:
+        self.frames = frames
+        self._since_change = 0
+        self._changed_at_us = now_us
+        self._behind.clear()
+
+
+def _slack_us(own_us: int) -> int:
+    """What may come and go without being a queue."""
+    return max(_JITTER_US, own_us // _JITTER_SHARE)

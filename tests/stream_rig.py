@@ -1,0 +1,163 @@
+"""A thin, far, lossy or broken link in virtual time, with TCP's habits, for the stream: nothing here waits."""
+
+import heapq
+from dataclasses import dataclass, field
+from itertools import pairwise
+from random import Random
+
+from protocol.messages import Holder
+from robot_side.stream import Stream, StreamConfig
+
+VISION = Holder(source="vision", session="0000bbbb")
+PACKET_BYTES = 1360
+FRAME_US = 33_333
+MAX_AGE_US = 400_000
+TAIL = 3
+"""Of so many last packets a loss is noticed by a probe only, after two round trips."""
+
+
+@dataclass
+class Leg:
+    """One direction: packets leave one after the other, arrive in order, and what is lost is sent again."""
+
+    delay_us: int
+    rate_bit_s: float = 0.0
+    loss: float = 0.0
+    burst: tuple[float, float] = (0.0, 1.0)
+    """Chances per packet that a burst of losses begins, and that it ends."""
+    steps: tuple[tuple[int, float], ...] = ()
+    """(from when, rate)."""
+    down_us: tuple[int, int] = (0, 0)
+    queue_bytes: int = 300_000
+    seed: int = 1
+    free_us: float = 0.0
+    arrived_us: float = 0.0
+    in_burst: bool = False
+    random: Random = field(init=False)
+
+    def __post_init__(self):
+        self.random = Random(self.seed)
+
+    def rate(self, now_us):
+        return next((rate for since, rate in reversed(self.steps) if now_us >= since), self.rate_bit_s)
+
+    def send(self, size_bytes, now_us):
+        """When the last byte arrives; None if the sender's buffer was full and it was dropped whole."""
+        rate = self.rate(now_us)
+        if rate and (self.free_us - now_us) * rate / 8e6 > self.queue_bytes:
+            return None
+        packets = max(1, -(-size_bytes // PACKET_BYTES))
+        at_us = max(float(now_us), self.free_us)
+        for number in range(packets):
+            at_us = self.after_outage(at_us)
+            rate = self.rate(at_us)
+            at_us += PACKET_BYTES * 8e6 / rate if rate else 0.0
+            self.arrived_us = max(self.arrived_us, at_us + self.delay_us + self.recovery_us(packets - number))
+        self.free_us = at_us
+        return self.arrived_us
+
+    def after_outage(self, at_us):
+        """Sent into a dead link: again and again, twice as late each time, until one try falls behind the outage."""
+        begin, end = self.down_us
+        if not begin <= at_us < end:
+            return at_us
+        wait = 200_000.0
+        while at_us < end:
+            at_us += wait
+            wait = min(2 * wait, 1_000_000)  # by then a link is made anew
+        return at_us
+
+    def recovery_us(self, left):
+        chance = self.burst[1] if self.in_burst else self.burst[0]
+        if self.random.random() < chance:
+            self.in_burst = not self.in_burst
+        if not self.in_burst and self.random.random() >= self.loss:
+            return 0.0
+        return (2 if left > TAIL else 4) * self.delay_us + 10_000
+
+
+@dataclass
+class Camera:
+    """Weighs a picture as JPEG encoders do, roughly."""
+
+    full_bytes: int = 46_000
+    adjustable: bool = True
+    seed: int = 1
+
+    def __post_init__(self):
+        self.random = Random(self.seed)
+
+    def bytes_at(self, wish):
+        quality, scale = (share / 100 for share in wish) if self.adjustable else (1.0, 1.0)
+        return round(self.full_bytes * scale**2 * (0.12 + 0.88 * quality**1.3) * self.random.uniform(0.95, 1.05))
+
+
+@dataclass
+class Course:
+    """What came of it: answers (at, age, bytes), and the stream."""
+
+    answers: list
+    stream: Stream
+    windows: list
+    captures: int
+
+    def ages_ms(self, since_s=2.0, until_s=1e9):
+        return sorted(age / 1000 for at, age, _ in self.answers if since_s <= at / 1e6 < until_s)
+
+    def p(self, percent, since_s=2.0, until_s=1e9):
+        ages = self.ages_ms(since_s, until_s)
+        return ages[min(len(ages) - 1, len(ages) * percent // 100)]
+
+    def fps(self, since_s, until_s):
+        return len([1 for at, age, _ in self.answers if since_s <= at / 1e6 < until_s and age <= MAX_AGE_US]) / (
+            until_s - since_s)
+
+    def bytes(self, since_s, until_s):
+        sizes = [size for at, _, size in self.answers if since_s <= at / 1e6 < until_s]
+        return sum(sizes) / max(1, len(sizes))
+
+    def longest_gap_ms(self, since_s=2.0):
+        """Between commands young enough to be driven on."""
+        times = [at / 1000 for at, age, _ in self.answers if at >= since_s * 1e6 and age <= MAX_AGE_US]
+        return max(b - a for a, b in pairwise(times)) if len(times) > 1 else 1e9
+
+
+def run(out, back, *, seconds=20.0, compute_us=3_000, camera=None, config=None, slot_us=500):
+    """A camera that ticks, the stream, `out` and `back`, and a peer that looks at the newest frame."""
+    camera, stream = camera or Camera(), Stream(config or StreamConfig())
+    events, answers, windows = [], [], []
+    state = {"seq": 0, "slot": None, "busy": 0.0, "captures": 0}
+
+    def push(at_us, kind, item):
+        heapq.heappush(events, (at_us, len(answers) + state["seq"] * 10, kind, item))
+
+    def look(now):
+        if state["slot"] and now >= state["busy"]:
+            item, state["slot"] = state["slot"], None
+            state["busy"] = now + compute_us
+            at = back.send(100, round(now + compute_us))
+            if at is not None:
+                push(at + slot_us, "answer", item)
+            push(state["busy"], "look", None)
+
+    for tick in range(round(seconds * 1e6 / 1000)):
+        now = tick * 1000
+        while events and events[0][0] <= now:
+            at, _, kind, item = heapq.heappop(events)
+            if kind == "arrive":
+                state["slot"] = item
+            elif kind == "answer":
+                seq, t_us, size = item
+                stream.on_answer(VISION, seq, compute_us, round(at))
+                answers.append((at, at - t_us, size))
+            look(at)
+        if now % FRAME_US < 1000 and stream.may_capture(now, listening=True):
+            state["captures"] += 1
+            size = camera.bytes_at(stream.wish)
+            stream.on_sent(state["seq"], now, now, size)
+            at = out.send(size, now)
+            if at is not None:
+                push(at, "arrive", (state["seq"], now, size))
+            state["seq"] += 1
+        windows.append(stream.window)
+    return Course(answers, stream, windows, state["captures"])
