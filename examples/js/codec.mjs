@@ -1,0 +1,200 @@
+/**
+ * @file Messages of the Sightline protocol, both ways: keys, headers, payloads, sizes, refusals. Pure; Node and browser.
+ *
+ * Written from `protocol/README.md` alone. Every decoder takes any bytes whatever and throws {@link WireError}.
+ */
+
+import * as tables from "./fields.mjs";
+import { JsonError, parseJson } from "./json.mjs";
+
+export const MAX_HEADER_BYTES = 512;
+export const MAX_TWIST_BYTES = 64;
+export const MAX_PIXELS = 1920 * 1080;
+const MAX_SEGMENTS = 64;
+const MAX_DETAIL = 200;
+
+/** A refusal: `reason` is one of the protocol's, `message` one line for a person. */
+export class WireError extends Error {
+  /** @param {string} reason @param {string} detail */
+  constructor(reason, detail) {
+    super(detail.slice(0, MAX_DETAIL));
+    this.reason = reason;
+  }
+}
+
+/**
+ * @typedef {object} Channel
+ * @property {string} name
+ * @property {boolean} hasSource towards the robot: the key ends in the sender's role
+ * @property {object} header its field table
+ * @property {object|null} payload its field table, if the payload is JSON
+ * @property {number} maxPayloadBytes
+ * @property {number} urgency 0 leaves first
+ */
+const channel = (name, hasSource, header, payload, maxPayloadBytes, urgency) => ({
+  name, hasSource, header, payload, maxPayloadBytes, urgency,
+});
+
+/** @type {Record<string, Channel>} */
+export const CHANNELS = Object.assign(Object.create(null), {
+  frame: channel("frame", false, tables.FrameHeader, null, 1_000_000, 2),
+  twist: channel("twist", true, tables.AnswerHeader, null, MAX_TWIST_BYTES, 0),
+  ack: channel("ack", true, tables.AnswerHeader, null, 0, 0),
+  request: channel("request", true, tables.RequestHeader, tables.Request, 256, 0),
+  reply: channel("reply", false, tables.Stamp, tables.Reply, 1024, 1),
+  status: channel("status", false, tables.Stamp, tables.Status, 4096, 1),
+  odometry: channel("odometry", false, tables.Stamp, tables.Odometry, 256, 2),
+  scan: channel("scan", false, tables.ScanHeader, null, 16_384, 3),
+  camera: channel("camera", false, tables.Stamp, tables.CameraModel, 1024, 1),
+  detections: channel("detections", true, tables.DetectionsHeader, tables.Detections, 32_768, 1),
+});
+
+const ROBOT_ID = /^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/;
+const SOURCE = /^[a-z][a-z0-9_]{0,15}$/;
+const UTF8 = new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }); // a byte order mark stays, and is no JSON
+const ASCII_NUMBER = "[+-]?(?:[0-9]+(?:\\.[0-9]*)?|\\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?";
+const TWIST = new RegExp(`^(${ASCII_NUMBER})\\|(${ASCII_NUMBER})$`);
+const NOT_FINITE = /^[+-]?(?:nan|inf|infinity)$/i;
+
+/**
+ * @param {string} key
+ * @returns {{robot: string, channel: Channel, source: string}|null} null for anything but an exact key
+ */
+export function parseKey(key) {
+  const [prefix, robot, name, ...rest] = key.split("/");
+  const found = name === undefined ? undefined : CHANNELS[name];
+  if (prefix !== "sightline" || found === undefined || !ROBOT_ID.test(robot)) return null;
+  if (rest.length !== (found.hasSource ? 1 : 0)) return null;
+  const source = rest[0] ?? "";
+  return found.hasSource && !SOURCE.test(source) ? null : { robot, channel: found, source };
+}
+
+/** @param {Channel} of @param {Uint8Array} header @param {Uint8Array} payload */
+export function checkSizes(of, header, payload) {
+  if (header.length > MAX_HEADER_BYTES) {
+    throw new WireError("MALFORMED", `${of.name} header is ${header.length} bytes, at most ${MAX_HEADER_BYTES}`);
+  }
+  if (payload.length > of.maxPayloadBytes) {
+    throw new WireError("MALFORMED", `${of.name} payload is ${payload.length} bytes, at most ${of.maxPayloadBytes}`);
+  }
+}
+
+/**
+ * Read a JSON object by its field table.
+ * @param {object} fields a table of `fields.mjs`
+ * @param {Uint8Array} bytes
+ * @throws {WireError} UNSUPPORTED_VERSION or MALFORMED, with the first wrong field named
+ */
+export function decode(fields, bytes) {
+  try {
+    return tables.readFields(fields, parseJson(UTF8.decode(bytes)));
+  } catch (error) {
+    if (error instanceof tables.FieldError && error.where === "v") {
+      throw new WireError("UNSUPPORTED_VERSION", `another version; this peer speaks ${tables.VERSION}`);
+    }
+    const known = error instanceof tables.FieldError || error instanceof JsonError || error instanceof TypeError;
+    if (!known) throw error;
+    throw new WireError("MALFORMED", error instanceof TypeError ? "not UTF-8" : error.message);
+  }
+}
+
+/** JSON without blanks; `null` and absent mean the same, so nulls are left out. */
+export function encode(value) {
+  return new TextEncoder().encode(JSON.stringify(value, (_name, item) => item ?? undefined));
+}
+
+/**
+ * @param {Uint8Array} bytes
+ * @returns {{linear_mps: number, angular_rad_s: number}}
+ */
+export function parseTwist(bytes) {
+  if (bytes.length > MAX_TWIST_BYTES) throw new WireError("MALFORMED", `twist text is ${bytes.length} bytes`);
+  const text = String.fromCharCode(...bytes);
+  const found = TWIST.exec(text);
+  if (found === null) {
+    const fields = text.split("|");
+    const wild = fields.length === 2 && fields.some((field) => NOT_FINITE.test(field));
+    throw new WireError(wild ? "NOT_FINITE" : "MALFORMED", "twist is not linear|angular, e.g. 0.2000|-0.3500");
+  }
+  const [linear, angular] = [Number(found[1]), Number(found[2])];
+  if (!Number.isFinite(linear) || !Number.isFinite(angular)) throw new WireError("NOT_FINITE", "twist overflows");
+  return { linear_mps: linear, angular_rad_s: angular };
+}
+
+/** Four decimals, never `-0.0000`. */
+export function formatTwist({ linear_mps, angular_rad_s }) {
+  const decimals = (value) => value.toFixed(4).replace(/^-(0\.0000)$/, "$1");
+  return new TextEncoder().encode(`${decimals(linear_mps)}|${decimals(angular_rad_s)}`);
+}
+
+/**
+ * The size that a JPEG's frame header states; looks at no more than 64 segments and never decodes.
+ * @param {Uint8Array} jpeg
+ * @returns {{width_px: number, height_px: number, components: number}}
+ */
+export function readJpegSize(jpeg, maxPixels = MAX_PIXELS) {
+  if (jpeg[0] !== 0xff || jpeg[1] !== 0xd8) throw new WireError("MALFORMED", "picture: no JPEG");
+  let at = 2;
+  for (let segment = 0; segment < MAX_SEGMENTS; segment += 1) {
+    if (at + 4 > jpeg.length || jpeg[at] !== 0xff) throw new WireError("MALFORMED", `picture: broken at byte ${at}`);
+    const marker = jpeg[at + 1];
+    if (marker >= 0xc0 && marker <= 0xc2) return sizeFromFrameHeader(jpeg, at, maxPixels);
+    if (isOtherCoding(marker)) throw new WireError("MALFORMED", `picture: marker ${marker.toString(16)}`);
+    at = nextSegment(jpeg, at, marker);
+  }
+  throw new WireError("MALFORMED", `picture: more than ${MAX_SEGMENTS} segments before the frame header`);
+}
+
+/** Lossless, hierarchical and arithmetic frame headers, and a scan before any frame header. */
+function isOtherCoding(marker) {
+  return (marker >= 0xc3 && marker <= 0xcf && marker !== 0xc4 && marker !== 0xc8 && marker !== 0xcc) || marker === 0xda;
+}
+
+function nextSegment(jpeg, at, marker) {
+  if (marker === 0xff) return at + 1; // a fill byte
+  if (marker === 0x01 || (marker >= 0xd0 && marker <= 0xd8)) return at + 2; // markers without a segment
+  const length = jpeg[at + 2] * 256 + jpeg[at + 3];
+  if (length < 2) throw new WireError("MALFORMED", `picture: segment of length ${length}`);
+  return at + 2 + length;
+}
+
+function sizeFromFrameHeader(jpeg, at, maxPixels) {
+  if (at + 10 > jpeg.length) throw new WireError("MALFORMED", "picture: frame header cut short");
+  const height = jpeg[at + 5] * 256 + jpeg[at + 6];
+  const width = jpeg[at + 7] * 256 + jpeg[at + 8];
+  const components = jpeg[at + 9];
+  if (jpeg[at + 4] !== 8 || (components !== 1 && components !== 3)) {
+    throw new WireError("MALFORMED", "picture: 8 bits and 1 or 3 components are supported");
+  }
+  if (width * height === 0 || width * height > maxPixels) {
+    throw new WireError("MALFORMED", `picture: ${width}x${height} pixels, at most ${maxPixels} in all`);
+  }
+  return { width_px: width, height_px: height, components };
+}
+
+/** @param {Uint8Array} bytes little-endian float32 metres @returns {number[]} */
+export function decodeRanges(bytes) {
+  if (bytes.length % 4 !== 0) throw new WireError("MALFORMED", "scan is no whole number of float32");
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
+  const ranges = Array.from({ length: bytes.length / 4 }, (_, index) => view.getFloat32(index * 4, true));
+  if (!ranges.every((range) => range >= 0)) throw new WireError("NOT_FINITE", "scan holds a nan or negative range");
+  return ranges;
+}
+
+/**
+ * A message as its receiver reads it.
+ * @param {Channel} of @param {string} source as in the key @param {Uint8Array} header @param {Uint8Array} payload
+ * @returns {{source: string, header: object|null, payload: unknown}} `header` is null for a guest without one
+ */
+export function readMessage(of, source, header, payload) {
+  checkSizes(of, header, payload);
+  const bare = of.name === "twist" && source === "guest" && header.length === 0;
+  return { source, header: bare ? null : decode(of.header, header), payload: readPayload(of, payload) };
+}
+
+function readPayload(of, payload) {
+  if (of.payload !== null) return decode(of.payload, payload);
+  if (of.name === "frame") return readJpegSize(payload);
+  if (of.name === "twist") return parseTwist(payload);
+  return of.name === "scan" ? decodeRanges(payload) : null;
+}

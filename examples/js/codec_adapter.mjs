@@ -1,0 +1,56 @@
+/**
+ * @file Answers the conformance kit's questions about the codec, a JSON line each way. Shell.
+ *
+ *     sightline conform codec -- node examples/js/codec_adapter.mjs
+ */
+
+import { createInterface } from "node:readline";
+import { fileURLToPath } from "node:url";
+import { WireError, formatTwist, parseKey, readMessage } from "./codec.mjs";
+import { PeerError, parseHello, takeApart } from "./framing.mjs";
+import { parseBoxes, parseDashed, parsePicture } from "./older.mjs";
+
+const fromBase64 = (text) => new Uint8Array(Buffer.from(text, "base64"));
+const fromHex = (text) => new Uint8Array(Buffer.from(text, "hex"));
+const toHex = (bytes) => Buffer.from(bytes).toString("hex");
+
+/** JSON has no infinity: a range without return is the text "inf". */
+const shown = (payload) => (Array.isArray(payload) ? payload.map((range) => (range === Infinity ? "inf" : range)) : payload);
+
+/** What is asked, by kind: `key`, `message` ... as in the golden vectors. */
+const READERS = {
+  message({ key, header, payload }) {
+    const exact = parseKey(key);
+    if (exact === null) throw new WireError("INEXACT_KEY", key);
+    const read = readMessage(exact.channel, exact.source, fromBase64(header), fromBase64(payload));
+    return { ...read, payload: shown(read.payload) };
+  },
+  hello: ({ text }) => parseHello(text),
+  websocket({ message_hex, role, robot }) {
+    const { key, header, payload } = takeApart(fromHex(message_hex), role, robot);
+    return { key, header_hex: toHex(header), payload_hex: toHex(payload) };
+  },
+  older_dashed: ({ text }) => parseDashed(text),
+  older_picture: ({ text, max_bytes }) => ({ jpeg_hex: toHex(parsePicture(text, max_bytes)) }),
+  older_boxes: ({ text }) => ({ boxes: parseBoxes(text) }),
+  write_twist: (twist) => new TextDecoder().decode(formatTwist(twist)),
+};
+
+/** @returns {object} `ok`, `refusal` or `unsupported` */
+export function answerTo(question) {
+  if (!Object.hasOwn(READERS, question.kind)) return { unsupported: true };
+  try {
+    return { ok: READERS[question.kind](question) };
+  } catch (error) {
+    if (error instanceof PeerError) return { refusal: "MALFORMED" }; // what ends a connection stands so in the vectors
+    if (!(error instanceof WireError)) throw error;
+    return { refusal: error.reason };
+  }
+}
+
+if (process.argv[1] === fileURLToPath(import.meta.url)) {
+  for await (const line of createInterface({ input: process.stdin, crlfDelay: Infinity })) {
+    const question = JSON.parse(line);
+    process.stdout.write(`${JSON.stringify({ id: question.id, ...answerTo(question) })}\n`);
+  }
+}

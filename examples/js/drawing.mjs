@@ -1,0 +1,133 @@
+/**
+ * @file A drawn camera: the picture that a robot would see of a yellow ball on a grey floor, as a JPEG. Pure.
+ *
+ * Each 8x8 block has one colour, so that a JPEG is its DC coefficients and nothing else: no transform, no AC codes.
+ */
+
+const WIDTH_PX = 640;
+const HEIGHT_PX = 480;
+const FOCAL_PX = 400;
+const CAMERA_HEIGHT_M = 0.12;
+const BALL_RADIUS_M = 0.1;
+const COLOURS = { ball: [235, 200, 20], floor: [120, 120, 122], wall: [165, 170, 175] };
+const DC_COUNTS = [0, 1, 5, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0]; // T.81, table K.3
+const DC_SYMBOLS = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11];
+const DC_QUANTUM = 8; // then the coefficient of a flat block is its level
+
+/** The CameraModel of what is drawn. */
+export const DRAWN_CAMERA = Object.freeze({
+  width_px: WIDTH_PX, height_px: HEIGHT_PX, fx_px: FOCAL_PX, fy_px: FOCAL_PX, cx_px: WIDTH_PX / 2, cy_px: HEIGHT_PX / 2,
+  z_m: CAMERA_HEIGHT_M, calibrated: true,
+});
+
+/** Where the ball is: it goes round the place where the robot started, once in 40 s. */
+export function ballAt(t_us) {
+  const angle_rad = (t_us / 40e6) * 2 * Math.PI;
+  return { x_m: 1.5 * Math.cos(angle_rad), y_m: 1.5 * Math.sin(angle_rad) };
+}
+
+/**
+ * @param {{x_m: number, y_m: number, yaw_rad: number}} pose of the robot
+ * @param {{x_m: number, y_m: number}} ball
+ * @param {number} [noise] one brightness step, so that no two pictures are the same byte for byte
+ * @returns {Uint8Array} JPEG
+ */
+export function drawPicture(pose, ball, noise = 0) {
+  const circle = projected(pose, ball);
+  const [across, down] = [WIDTH_PX / 8, HEIGHT_PX / 8];
+  return encodeFlat(across, down, (x, y) => {
+    if (x === 0 && y === 0) return COLOURS.wall.map((level) => level + (noise % 8));
+    if (circle !== null && Math.hypot(x * 8 + 4 - circle.x_px, y * 8 + 4 - circle.y_px) <= circle.radius_px) return COLOURS.ball;
+    return y * 8 > HEIGHT_PX / 2 ? COLOURS.floor : COLOURS.wall;
+  });
+}
+
+function projected(pose, ball) {
+  const [dx_m, dy_m] = [ball.x_m - pose.x_m, ball.y_m - pose.y_m];
+  const ahead_m = dx_m * Math.cos(pose.yaw_rad) + dy_m * Math.sin(pose.yaw_rad);
+  const left_m = dy_m * Math.cos(pose.yaw_rad) - dx_m * Math.sin(pose.yaw_rad);
+  if (ahead_m < BALL_RADIUS_M) return null;
+  return {
+    x_px: WIDTH_PX / 2 - (FOCAL_PX * left_m) / ahead_m,
+    y_px: HEIGHT_PX / 2 + (FOCAL_PX * (CAMERA_HEIGHT_M - BALL_RADIUS_M)) / ahead_m,
+    radius_px: (FOCAL_PX * BALL_RADIUS_M) / ahead_m,
+  };
+}
+
+/**
+ * A baseline JPEG of flat blocks.
+ * @param {number} across blocks @param {number} down blocks
+ * @param {(x: number, y: number) => number[]} colourOf red, green, blue of a block, 0 to 255
+ */
+export function encodeFlat(across, down, colourOf) {
+  const bits = new BitWriter();
+  const last = [0, 0, 0];
+  for (let block = 0; block < across * down; block += 1) {
+    levels(colourOf(block % across, Math.floor(block / across))).forEach((level, index) => {
+      bits.difference(level - last[index]);
+      last[index] = level;
+    });
+  }
+  return Uint8Array.from([0xff, 0xd8, ...tables(across * 8, down * 8), ...bits.finish(), 0xff, 0xd9]);
+}
+
+function levels([red, green, blue]) {
+  const luma = 0.299 * red + 0.587 * green + 0.114 * blue;
+  return [luma - 128, (blue - luma) / 1.772, (red - luma) / 1.402].map((level) => Math.max(-128, Math.min(127, Math.round(level))));
+}
+
+const two = (value) => [value >> 8, value & 0xff];
+const segment = (marker, data) => [0xff, marker, ...two(data.length + 2), ...data];
+
+function tables(width_px, height_px) {
+  const components = [1, 2, 3].flatMap((id) => [id, 0x11, 0]);
+  return [
+    ...segment(0xe0, [0x4a, 0x46, 0x49, 0x46, 0, 1, 1, 0, 0, 1, 0, 1, 0, 0]), // JFIF
+    ...segment(0xdb, [0, ...new Array(64).fill(DC_QUANTUM)]),
+    ...segment(0xc0, [8, ...two(height_px), ...two(width_px), 3, ...components]),
+    ...segment(0xc4, [0x00, ...DC_COUNTS, ...DC_SYMBOLS]),
+    ...segment(0xc4, [0x10, 1, ...new Array(15).fill(0), 0x00]), // one code, "0": nothing follows in this block
+    ...segment(0xda, [3, 1, 0, 2, 0, 3, 0, 0, 63, 0]),
+  ];
+}
+
+/** [code, length] of each size of a DC difference. */
+const DC_CODES = (() => {
+  const codes = [];
+  let code = 0;
+  DC_COUNTS.forEach((count, index) => {
+    for (let one = 0; one < count; one += 1) codes.push([code++, index + 1]);
+    code <<= 1;
+  });
+  return codes;
+})();
+
+class BitWriter {
+  constructor() {
+    this.bytes = [];
+    this.buffer = this.held = 0;
+  }
+
+  difference(value) {
+    const size = value === 0 ? 0 : 32 - Math.clz32(Math.abs(value));
+    this.write(...DC_CODES[size]);
+    this.write(value < 0 ? value + (1 << size) - 1 : value, size);
+    this.write(0, 1); // end of block
+  }
+
+  write(value, length) {
+    this.buffer = (this.buffer << length) | value;
+    this.held += length;
+    while (this.held >= 8) {
+      const byte = (this.buffer >> (this.held - 8)) & 0xff;
+      this.bytes.push(byte, ...(byte === 0xff ? [0] : []));
+      this.held -= 8;
+    }
+    this.buffer &= (1 << this.held) - 1;
+  }
+
+  finish() {
+    this.write((1 << (8 - this.held)) - 1, 8 - this.held);
+    return this.bytes;
+  }
+}

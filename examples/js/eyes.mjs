@@ -1,0 +1,118 @@
+/**
+ * @file What a vision or a viewer does with what a robot sends: the newest frame is looked at and answered once. Pure.
+ *
+ * The caller brings the picture decoder, the clock and the link, so that Node and the browser run the same code.
+ */
+
+import { WireError, checkSizes, decode, encode, formatTwist, readJpegSize, readMessage } from "./codec.mjs";
+import { findTarget } from "./vision.mjs";
+
+const NOTHING = new Uint8Array(0);
+/** Channels that these eyes want of a robot. */
+export const EYES_WANT = Object.freeze(["frame", "camera", "status", "reply"]);
+
+export class Eyes {
+  /**
+   * @param {import("./vision.mjs").Vision} vision
+   * @param {object} world
+   * @param {(jpeg: Uint8Array) => object|Promise<object>} world.look decodes (and draws) a picture, for `findTarget`
+   * @param {(name: string, header: object, payload: Uint8Array) => void} world.send
+   * @param {() => number} world.now_us
+   * @param {() => Promise<void>} [world.pause] lets what has arrived be read first, so that the newest frame wins
+   * @param {(what: object) => void} [world.onSeen] told of each answer: {target, twist}
+   * @param {(reply: object) => void} [world.onReply]
+   */
+  constructor(vision, { look, send, now_us, pause = async () => undefined, onSeen = () => undefined, onReply = () => undefined }) {
+    Object.assign(this, { vision, look, send, now_us, pause, onSeen, onReply });
+    this.drives = true; // otherwise frames are acknowledged only
+    this.newest = null;
+    this.busy = false;
+    this.skipped = {}; // reason -> count
+    this.answered = 0;
+  }
+
+  /**
+   * @param {{channel: object, source: string, header: Uint8Array, payload: Uint8Array}} packet
+   * @returns {Promise<void>|undefined} when all that had arrived is answered
+   */
+  onMessage(packet) {
+    try {
+      if (packet.channel.name === "frame") return this.onFrame(packet);
+      if (EYES_WANT.includes(packet.channel.name)) this.onNews(packet);
+    } catch (error) {
+      this.skip(error);
+    }
+    return undefined;
+  }
+
+  onNews({ channel, source, header, payload }) {
+    const read = readMessage(channel, source, header, payload);
+    if (channel.name === "camera") this.vision.onCamera(read.header, read.payload);
+    if (channel.name === "status") this.vision.onStatus(read.header, read.payload);
+    if (channel.name === "reply" && read.payload.to === this.vision.session) this.onReply(read.payload);
+  }
+
+  /** One place for a frame, the newest; whoever was in it is not answered. */
+  onFrame({ channel, header, payload }) {
+    checkSizes(channel, header, payload);
+    const stamp = decode(channel.header, header);
+    if (!this.vision.isNew(stamp)) throw new WireError("OUT_OF_ORDER", `frame ${stamp.seq} is not newer than the last`);
+    this.newest = { stamp, jpeg: payload, arrival_us: this.now_us() };
+    return this.busy ? undefined : this.work();
+  }
+
+  async work() {
+    this.busy = true;
+    await this.pause();
+    while (this.newest !== null) {
+      const frame = this.newest;
+      this.newest = null;
+      this.answer(frame, await this.decide(frame));
+    }
+    this.busy = false;
+  }
+
+  /** The twist for a frame; null where it is only acknowledged: a bad picture, or nobody drives from here. */
+  async decide({ stamp, jpeg }) {
+    try {
+      if (!this.vision.advances(stamp)) throw new WireError("OUT_OF_ORDER", "the robot's clock stands still");
+      this.checkPicture(jpeg);
+      const target = findTarget(await this.look(jpeg));
+      const twist = this.drives ? this.vision.twistFor(target) : null;
+      this.onSeen({ target, twist });
+      return twist;
+    } catch (error) {
+      this.skip(error);
+      return null;
+    }
+  }
+
+  /** @throws {WireError} for what no decoder should see, or is not what the camera's model says */
+  checkPicture(jpeg) {
+    const { width_px, height_px } = readJpegSize(jpeg);
+    const { camera } = this.vision;
+    if (camera !== null && (camera.width_px !== width_px || camera.height_px !== height_px)) {
+      throw new WireError("MALFORMED", `picture of ${width_px}x${height_px}, the camera makes ${camera.width_px}x${camera.height_px}`);
+    }
+  }
+
+  answer({ stamp, arrival_us }, twist) {
+    this.answered += 1;
+    const header = this.vision.answerHeader(stamp, this.now_us() - arrival_us);
+    if (twist === null) this.send("ack", header, NOTHING);
+    else this.send("twist", header, formatTwist(twist));
+  }
+
+  /** @param {string} verb @returns {number} the id that the reply will bear */
+  ask(verb) {
+    const { header, payload } = this.vision.request(verb);
+    this.send("request", header, encode(payload));
+    return payload.id;
+  }
+
+  /** A picture that a browser's decoder refuses is no {@link WireError}, and no reason to end either. */
+  skip(error) {
+    const reason = error instanceof WireError ? error.reason : "UNDECODABLE";
+    this.skipped[reason] = (this.skipped[reason] ?? 0) + 1;
+  }
+}

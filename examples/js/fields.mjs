@@ -1,0 +1,187 @@
+/**
+ * @file The field tables of the protocol: what each header and JSON payload may hold. Pure.
+ *
+ * One entry per row of the tables in `protocol/README.md`. A type is a function `(value, where) -> value` that throws
+ * {@link FieldError}; a field is `[type]`, or `[type, default]` if it may be absent.
+ */
+
+import { Real } from "./json.mjs";
+
+/** The largest integer on the wire: every JSON reader holds it exactly. */
+export const MAX_INTEGER = Number.MAX_SAFE_INTEGER;
+export const VERSION = 1;
+
+/** Thrown for a value outside its table; `where` is the field's name. */
+export class FieldError extends Error {
+  constructor(where, what) {
+    super(`${where}: ${what}`);
+    this.where = where;
+  }
+}
+
+const fail = (where, what) => {
+  throw new FieldError(where, what);
+};
+
+const integer = (least, most) => (value, where) =>
+  typeof value === "number" && value >= least && value <= most ? value : fail(where, `an integer ${least} to ${most}`);
+
+const number = (least, most, open = false) => (value, where) => {
+  const plain = value instanceof Real ? value.value : value;
+  const inside = typeof plain === "number" && plain <= most && (open ? plain > least : plain >= least);
+  return inside ? plain : fail(where, `a number ${open ? "above" : "from"} ${least} to ${most}`);
+};
+
+/** Characters are code points, not UTF-16 units. */
+const text = (most) => (value, where) =>
+  typeof value === "string" && [...value].length <= most ? value : fail(where, `text of at most ${most} characters`);
+
+const matching = (pattern) => (value, where) =>
+  typeof value === "string" && pattern.test(value) ? value : fail(where, `text like ${pattern}`);
+
+const oneOf = (...names) => (value, where) => (names.includes(value) ? value : fail(where, `one of ${names}`));
+
+const boolean = (value, where) => (typeof value === "boolean" ? value : fail(where, "true or false"));
+
+const list = (type, least, most) => (value, where) =>
+  Array.isArray(value) && value.length >= least && value.length <= most
+    ? value.map((item, index) => type(item, `${where}.${index}`))
+    : fail(where, `a list of ${least} to ${most}`);
+
+const map = (type, most = Infinity) => (value, where) => {
+  if (!isObject(value) || Object.keys(value).length > most) fail(where, `an object of at most ${most} fields`);
+  return Object.fromEntries(Object.entries(value).map(([name, item]) => [name, type(item, `${where}.${name}`)]));
+};
+
+const orNull = (type) => (value, where) => (value === null ? null : type(value, where));
+
+const object = (fields) => (value, where) => readFields(fields, value, where);
+
+/** @param {unknown} value */
+function isObject(value) {
+  return typeof value === "object" && value !== null && !Array.isArray(value) && !(value instanceof Real);
+}
+
+/**
+ * `value` with every field of the table checked, defaults filled in and unknown fields left out.
+ * @param {Record<string, Array>} fields
+ * @param {unknown} value as {@link import("./json.mjs").parseJson} gives it
+ */
+export function readFields(fields, value, where = "") {
+  if (!isObject(value)) fail(where, "an object");
+  const read = {};
+  for (const [name, [type, absent]] of Object.entries(fields)) {
+    const path = where ? `${where}.${name}` : name;
+    if (value[name] !== undefined) read[name] = type(value[name], path);
+    else if (absent === undefined) fail(path, "is missing");
+    else read[name] = structuredClone(absent);
+  }
+  return read;
+}
+
+const counter = integer(0, MAX_INTEGER);
+const real = number(-1e6, 1e6);
+const session = matching(/^[0-9a-f]{8}$/);
+const source = matching(/^[a-z][a-z0-9_]{0,15}$/);
+const pose = list(real, 3, 3);
+const planar = list(real, 2, 2);
+const version = integer(VERSION, VERSION);
+const any = (value, where) => (typeof value === "string" ? value : fail(where, "text"));
+
+export const Echo = {
+  channel: [oneOf("frame", "status", "beat")], session: [session], seq: [counter], t_us: [counter],
+};
+export const Stamp = { v: [version, VERSION], session: [session], seq: [counter], t_us: [counter] };
+export const FrameHeader = {
+  ...Stamp,
+  pose: [pose, [0, 0, 0]],
+  moving: [planar, [0, 0]],
+  applied: [planar, [0, 0]],
+  latency_us: [orNull(counter), null],
+};
+export const ScanHeader = {
+  ...Stamp, angle_min_rad: [real], angle_increment_rad: [real], range_min_m: [real], range_max_m: [real],
+};
+const asker = { v: [version, VERSION], source: [source], session: [session], seq: [counter] };
+export const AnswerHeader = { ...asker, echo: [object(Echo)], compute_us: [counter, 0] };
+export const RequestHeader = { ...asker, echo: [orNull(object(Echo)), null] };
+
+export const VERBS = ["arm", "disarm", "stop", "reset", "acquire", "release"];
+export const STATES = ["DISARMED", "HOLD", "ACTIVE", "DEGRADED", "STOPPED", "FAULT"];
+export const Request = { id: [counter], verb: [oneOf(...VERBS)] };
+export const Reply = { to: [session], id: [counter], ok: [boolean], state: [any], detail: [text(200)] };
+export const Odometry = { pose: [pose], moving: [planar] };
+
+export const Holder = { source: [source], session: [session] };
+export const LastRefusal = { source: [text(32)], reason: [text(32)], detail: [text(200)] };
+export const StreamStatus = {
+  sent: [counter, 0],
+  credit_timeouts: [counter, 0],
+  window: [counter, 1],
+  fps: [real, 0],
+  dropped_commands: [counter, 0],
+  refused_pictures: [counter, 0],
+  calibrated: [boolean, false],
+  overtaken: [counter, 0],
+  dropped: [map(counter, 16), {}],
+  missed_captures: [counter, 0],
+  quality_percent: [integer(0, 100), 100],
+  scale_percent: [integer(0, 100), 100],
+};
+export const Status = {
+  state: [oneOf(...STATES)],
+  reason: [text(200)],
+  holder: [orNull(object(Holder)), null],
+  applied: [planar, [0, 0]],
+  frame_age_us: [orNull(counter), null],
+  latency_us: [orNull(counter), null],
+  accepted: [counter, 0],
+  refused: [map(counter), {}],
+  last_refusal: [orNull(object(LastRefusal)), null],
+  stream: [object(StreamStatus), readFields(StreamStatus, {})],
+  auto_arm: [boolean, false],
+  tick_late_max_us: [counter, 0],
+  network_restarts: [counter, 0],
+  max_linear_mps: [real, 0],
+  max_angular_rad_s: [real, 0],
+};
+export const CameraModel = {
+  width_px: [integer(16, 8192)],
+  height_px: [integer(16, 8192)],
+  fx_px: [number(0, 1e5, true)],
+  fy_px: [number(0, 1e5, true)],
+  cx_px: [real],
+  cy_px: [real],
+  distortion: [list(real, 0, 8), []],
+  x_m: [real, 0],
+  y_m: [real, 0],
+  z_m: [real, 0],
+  pitch_rad: [real, 0],
+  calibrated: [boolean, false],
+};
+export const DetectedCircle = { cx_px: [real], cy_px: [real], radius_px: [number(0, 1e6, true)] };
+const corners = {
+  label: [matching(/^[^\x00-\x1f\x7f]{1,64}$/u)],
+  score: [number(0, 1)],
+  x1_px: [real],
+  y1_px: [real],
+  x2_px: [real],
+  y2_px: [real],
+  circle: [orNull(object(DetectedCircle)), null],
+  track: [orNull(counter), null],
+};
+const DetectedBox = (value, where) => {
+  const box = readFields(corners, value, where);
+  return box.x2_px >= box.x1_px && box.y2_px >= box.y1_px ? box : fail(where, "x2_px >= x1_px and y2_px >= y1_px");
+};
+export const DetectionsHeader = { ...asker, echo: [orNull(object(Echo)), null], compute_us: [counter, 0] };
+export const Detections = {
+  width_px: [integer(16, 8192)], height_px: [integer(16, 8192)], boxes: [list(DetectedBox, 0, 64), []],
+};
+export const Hello = {
+  v: [version, VERSION],
+  robot: [matching(/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/)],
+  role: [matching(/^([a-z][a-z0-9_]{0,15})?$/), ""],
+  session: [session],
+  wants: [list(text(32), 0, 32), []],
+};

@@ -1,0 +1,177 @@
+/**
+ * @file The sub-protocol `sightline.v1`: `hello`, and channel messages as one binary message each. Pure; Node and browser.
+ *
+ *     uint16 BE length of the header block | header block | payload
+ */
+
+import { CHANNELS, WireError, decode, encode, parseKey } from "./codec.mjs";
+import { Hello } from "./fields.mjs";
+import { JsonError, parseJson } from "./json.mjs";
+
+export const SUBPROTOCOL = "sightline.v1";
+export const MAX_HELLO_BYTES = 1024;
+export const MAX_BLOCK_BYTES = 576;
+export const MAX_REASON_BYTES = 123; // RFC 6455, 5.5
+
+const UTF8 = new TextDecoder("utf-8", { fatal: true, ignoreBOM: true });
+const LATIN1 = new TextDecoder("latin1");
+const ALONE = /^\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{0,64})")?\}/;
+const FIRST = /^\{"channel":"([^"\\]{1,64})",(?=")/;
+
+/** The connection must end with this close code; the message is the reason, one line for a person. */
+export class PeerError extends Error {
+  /** @param {number} code @param {string} reason */
+  constructor(code, reason) {
+    super(reason);
+    this.code = code;
+  }
+}
+
+/**
+ * @param {string} robot @param {string} session 8 hex digits @param {string[]} wants channels @param {string} [role]
+ * @returns {string}
+ */
+export function helloText(robot, session, wants, role = "") {
+  return JSON.stringify({ v: 1, robot, ...(role ? { role } : {}), session, wants });
+}
+
+/** @param {string} text @throws {WireError} MALFORMED or UNSUPPORTED_VERSION */
+export function parseHello(text) {
+  const bytes = new TextEncoder().encode(text);
+  if (bytes.length > MAX_HELLO_BYTES) throw new WireError("MALFORMED", `a hello has at most ${MAX_HELLO_BYTES} bytes`);
+  return decode(Hello, bytes);
+}
+
+/**
+ * Read a peer's hello, and agree on the robot.
+ * @param {string} text @param {string} robot whose link this is
+ * @returns {{robot: string, role: string, session: string, wants: string[]}}
+ * @throws {PeerError} 1008
+ */
+export function readHello(text, robot) {
+  let hello;
+  try {
+    hello = parseHello(text);
+  } catch (error) {
+    if (!(error instanceof WireError)) throw error;
+    throw new PeerError(1008, `this text is no hello: ${error.message}`);
+  }
+  if (hello.robot !== robot) throw new PeerError(1008, `this is robot ${robot}, not ${hello.robot}`);
+  return hello;
+}
+
+/**
+ * @param {string} name channel @param {object} header @param {Uint8Array} payload
+ * @returns {Uint8Array} one binary message
+ */
+export function pack(name, header, payload) {
+  return join(encode({ channel: name, ...header }), payload);
+}
+
+/** The same for a header as it came: it follows an object of names. @param {Uint8Array} header */
+export function packRaw(name, source, header, payload) {
+  const names = new TextEncoder().encode(`{"channel":"${name}","source":"${source}"}`);
+  const block = new Uint8Array(names.length + header.length);
+  block.set(names);
+  block.set(header, names.length);
+  return join(block, payload);
+}
+
+function join(block, payload) {
+  const message = new Uint8Array(2 + block.length + payload.length);
+  new DataView(message.buffer).setUint16(0, block.length);
+  message.set(block, 2);
+  message.set(payload, 2 + block.length);
+  return message;
+}
+
+/**
+ * Take a binary message apart.
+ * @param {Uint8Array} message @param {string} role of the peer's hello @param {string} robot of the peer's hello
+ * @returns {{channel: object, source: string, header: Uint8Array, payload: Uint8Array}|null} null: dropped, no such key
+ * @throws {PeerError} 1007 for what cannot be taken apart
+ */
+export function unpack(message, role, robot) {
+  const { key, header, payload } = takeApart(message, role, robot);
+  const exact = parseKey(key);
+  return exact && { channel: exact.channel, source: exact.source, header, payload };
+}
+
+/** The same with the key as the peer claims it, still to be checked. */
+export function takeApart(message, role, robot) {
+  const size = message.length < 2 ? MAX_BLOCK_BYTES + 1 : message[0] * 256 + message[1];
+  if (size > MAX_BLOCK_BYTES || message.length < 2 + size) {
+    throw new PeerError(1007, `header block cut or over ${MAX_BLOCK_BYTES} bytes in a message of ${message.length}`);
+  }
+  const { name, source, header } = readBlock(message.subarray(2, 2 + size), role);
+  const tail = CHANNELS[name]?.hasSource && source ? `/${source}` : "";
+  return { key: `sightline/${robot}/${name}${tail}`, header, payload: message.subarray(2 + size) };
+}
+
+/** The names in front of the header are no part of it, and do not count among its bytes. */
+function readBlock(block, role) {
+  const text = LATIN1.decode(block);
+  const alone = ALONE.exec(text);
+  if (alone !== null) {
+    return { name: alone[1], source: alone[2] ?? role, header: block.subarray(alone[0].length) };
+  }
+  const first = FIRST.exec(text);
+  const fields = parseBlock(block) ?? {}; // broken JSON: whoever reads the header refuses it
+  const name = first === null ? fields.channel : first[1];
+  if (typeof name !== "string") throw new PeerError(1007, "the header block names no channel");
+  const source = fields.source ?? role;
+  const header = first === null ? block : withBrace(block.subarray(first[0].length));
+  return { name, source: typeof source === "string" ? source : "", header };
+}
+
+function parseBlock(block) {
+  try {
+    const fields = parseJson(UTF8.decode(block));
+    return typeof fields === "object" ? fields : null;
+  } catch (error) {
+    if (!(error instanceof JsonError || error instanceof TypeError)) throw error;
+    return null;
+  }
+}
+
+function withBrace(rest) {
+  const header = new Uint8Array(rest.length + 1);
+  header[0] = 0x7b; // {
+  header.set(rest, 1);
+  return header;
+}
+
+/**
+ * The largest message that an end which wants these channels accepts.
+ * @param {string[]} wants
+ */
+export function messageBound(wants) {
+  const payloads = wants.map((name) => CHANNELS[name]?.maxPayloadBytes ?? 0);
+  return Math.max(MAX_HELLO_BYTES, 2 + MAX_BLOCK_BYTES + Math.max(0, ...payloads));
+}
+
+/** Slots of messages that have not left: one per channel and source, the newest; the most urgent leaves first. */
+export class Outbox {
+  constructor() {
+    this.slots = new Map();
+    this.dropped = 0;
+  }
+
+  /** @param {string} name channel, "" for a hello @param {string} source @param {string|Uint8Array} message */
+  put(name, source, message) {
+    const slot = `${name}/${source}`;
+    this.dropped += this.slots.has(slot) ? 1 : 0;
+    this.slots.set(slot, { urgency: name === "" ? -1 : CHANNELS[name].urgency, message });
+  }
+
+  /** @returns {string|Uint8Array|undefined} */
+  take() {
+    let best;
+    for (const [slot, { urgency }] of this.slots) {
+      if (best === undefined || urgency < this.slots.get(best).urgency) best = slot;
+    }
+    const taken = this.slots.get(best)?.message;
+    this.slots.delete(best);
+    return taken;
+  }
+}

@@ -1,0 +1,290 @@
+/**
+ * @file The gate: the only road to the wheels. Judges commands, keeps state, lease and STOP latch. Pure.
+ *
+ * `offer` judges a command on arrival; `step` decides at each tick, with the age judged again, what the wheels do.
+ */
+
+import { WireError } from "./codec.mjs";
+import { FreshnessRecord, IssuedRecord, Lease, RANKS, SequenceRecord, isHuman, same } from "./judging.mjs";
+import { LIMITS, Ramp, STILL, ageFactor, clampTwist, isStill } from "./limits.mjs";
+
+const MAX_REQUEST_AGE_US = 2_000_000;
+const GUEST = Object.freeze({ source: "guest", session: "00000000" }); // who speaks without headers
+const ARMED = ["HOLD", "ACTIVE", "DEGRADED"];
+const ALWAYS_GRANTED = ["stop", "disarm"];
+
+export class Gate {
+  /**
+   * @param {string} session 8 hex digits, new at each start
+   * @param {Partial<typeof LIMITS>} limits
+   * @param {boolean} stopped whether the STOP latch was set before the restart
+   */
+  constructor(session, limits = {}, stopped = false) {
+    this.limits = { ...LIMITS, ...limits };
+    this.issued = new IssuedRecord(session);
+    this.pictures = new FreshnessRecord();
+    this.sequence = new SequenceRecord();
+    this.lease = new Lease(this.limits.lease_us);
+    this.ramp = new Ramp(this.limits);
+    this.state = stopped ? "STOPPED" : "DISARMED";
+    this.reason = stopped ? "STOP was set before the restart" : "not armed";
+    this.armsItself = this.limits.autoArm && !stopped;
+    this.command = null; // {twist, echo_us, arrival_us, life_us}
+    this.liveCommands = this.accepted = this.holdSince_us = 0;
+    this.lastStep_us = null;
+    this.refused = {};
+    this.lastRefusal = this.latency_us = null;
+  }
+
+  get armed() {
+    return ARMED.includes(this.state);
+  }
+
+  get applied() {
+    return this.ramp.twist;
+  }
+
+  // --- commands ------------------------------------------------------------------------------------------------
+
+  /**
+   * Judge one command; every refusal is counted and kept in words.
+   * @param {string} source as in the key
+   * @param {object|null} header null for a guest without one
+   * @param {import("./limits.mjs").Twist} twist
+   * @param {number} now_us
+   * @returns {string|null} the refusal, null if it was accepted
+   */
+  offer(source, header, twist, now_us) {
+    try {
+      const { who, age_us } = this.identify(source, header, now_us);
+      this.admit(who, now_us);
+      this.keep(header, twist, now_us, age_us);
+      this.accepted += 1;
+      return null;
+    } catch (error) {
+      return this.refuse(source, error);
+    }
+  }
+
+  /** Count a refusal; anything but a {@link WireError} is a fault of this program and goes on. */
+  refuse(source, error) {
+    if (!(error instanceof WireError)) throw error;
+    this.count(error.reason);
+    this.lastRefusal = { source: source.slice(0, 32), reason: error.reason, detail: error.message };
+    return error.reason;
+  }
+
+  count(reason) {
+    this.refused[reason] = (this.refused[reason] ?? 0) + 1;
+  }
+
+  /** Who sends, and how old the frame behind it is (steps 2 to 6 of the judging order). */
+  identify(source, header, now_us) {
+    if (!(source in RANKS) || (header !== null && header.source !== source)) {
+      throw new WireError("UNKNOWN_SOURCE", `no driver is called ${source}, or key and header disagree`);
+    }
+    if (source === "guest" && !this.limits.guests) throw new WireError("UNKNOWN_SOURCE", "guests are switched off (--guests)");
+    if (header === null) return { who: GUEST, age_us: 0 };
+    if (header.echo.session === this.issued.session && header.echo.channel === "status") {
+      throw new WireError("UNKNOWN_FRAME", "a twist must cite a frame, not a status");
+    }
+    this.issued.age_us(header.echo, now_us, this.limits.zeroSpeedAge_us);
+    const age_us = now_us - this.pictures.shownSince_us(header.echo.t_us);
+    if (age_us > this.limits.zeroSpeedAge_us) throw new WireError("STALE", "the camera's picture does not change");
+    this.sequence.check(header);
+    return { who: { source, session: header.session }, age_us };
+  }
+
+  /** Steps 7 to 9: the latch, the lease, the arming. */
+  admit(who, now_us) {
+    if (this.state === "STOPPED" || this.state === "FAULT") throw new WireError(this.state, this.reason);
+    this.noticeLostHuman(now_us);
+    const holder = this.lease.liveHolder(now_us);
+    if (!this.lease.mayTake(who, now_us)) throw new WireError("NOT_HOLDER", `${holder.source} ${holder.session} drives`);
+    this.liveCommands = same(holder, who) ? this.liveCommands + 1 : 1;
+    this.lease.take(who, now_us);
+    if (!this.armed) throw new WireError("DISARMED", this.reason);
+  }
+
+  keep(header, twist, now_us, age_us) {
+    const limits = this.limits;
+    const guest = header === null || header.source === "guest";
+    const maxLinear_mps = guest ? Math.min(limits.maxLinear_mps, limits.guestMaxLinear_mps) : limits.maxLinear_mps;
+    const maxAngular_rad_s = guest ? Math.min(limits.maxAngular_rad_s, limits.guestMaxAngular_rad_s) : limits.maxAngular_rad_s;
+    const limited = clampTwist(twist, maxLinear_mps, maxAngular_rad_s);
+    if (limited !== twist) this.count("CLAMPED");
+    const life_us = guest ? limits.guestLife_us : limits.silence_us;
+    this.command = { twist: limited, echo_us: now_us - age_us, arrival_us: now_us, life_us };
+    if (!guest) this.latency_us = age_us;
+  }
+
+  // --- the wheels ----------------------------------------------------------------------------------------------
+
+  /** What the wheels do from now until the next step. @returns {import("./limits.mjs").Twist} */
+  step(now_us) {
+    this.noticeLostHuman(now_us);
+    if (this.armsItself && this.state === "DISARMED" && this.missingToArm(now_us) === "") {
+      this.begin("armed by itself (--auto-arm)", now_us);
+    }
+    const goal = this.armed ? this.goal(now_us) : STILL;
+    const elapsed_us = Math.max(0, now_us - (this.lastStep_us ?? now_us));
+    this.lastStep_us = now_us;
+    return this.ramp.step(goal, elapsed_us);
+  }
+
+  goal(now_us) {
+    const { command, limits } = this;
+    if (this.pictures.unchanged_us() > limits.zeroSpeedAge_us) return this.hold("the camera's picture does not change", now_us);
+    if (command === null) return this.hold("armed; no command yet", now_us);
+    if (now_us - command.arrival_us > command.life_us) {
+      return this.hold(`no accepted command for more than ${command.life_us / 1000} ms`, now_us);
+    }
+    const factor = ageFactor(limits, now_us - command.echo_us);
+    if (factor === 0) return this.hold("the frame behind the command is too old", now_us);
+    this.state = factor === 1 ? "ACTIVE" : "DEGRADED";
+    this.reason = factor === 1 ? "driving" : "the frames are ageing; slower";
+    return clampTwist(command.twist, factor * limits.maxLinear_mps, factor * limits.maxAngular_rad_s);
+  }
+
+  hold(reason, now_us) {
+    if (this.state !== "HOLD") this.holdSince_us = now_us;
+    this.state = "HOLD";
+    this.reason = reason;
+    if (now_us - this.holdSince_us > this.limits.disarmAfterHold_us) {
+      this.leave("DISARMED", "disarmed after 10 s without commands", this.armsItself);
+    }
+    return STILL;
+  }
+
+  // --- what people ask -----------------------------------------------------------------------------------------
+
+  /**
+   * Carry out a request.
+   * @param {{source: string, session: string, echo: object|null}} header @param {string} verb
+   * @returns {string} what happened, in words
+   * @throws {WireError} with the reason if it may not be
+   */
+  request(header, verb, now_us) {
+    const who = { source: header.source, session: header.session };
+    if (!ALWAYS_GRANTED.includes(verb) && verb !== "release") this.issued.checkRequest(header.echo, now_us, MAX_REQUEST_AGE_US);
+    this.noticeLostHuman(now_us);
+    switch (verb) {
+      case "stop":
+        return this.stop(`STOP by ${who.source}`);
+      case "disarm":
+        return this.disarm(`disarmed by ${who.source}`);
+      case "release":
+        return this.release(who, now_us);
+      case "acquire":
+        return this.acquire(who, now_us);
+      case "reset":
+        return this.reset(who, now_us);
+      default:
+        return this.arm(who, now_us);
+    }
+  }
+
+  /** Latch STOPPED: wheels to zero and held until `reset`. Always granted. */
+  stop(reason) {
+    this.issued.denyEarlier();
+    this.leave("STOPPED", reason);
+    return "STOPPED";
+  }
+
+  /** The drive failed: wheels to zero until `reset`. */
+  fault(reason) {
+    if (this.state !== "STOPPED") this.leave("FAULT", reason);
+  }
+
+  disarm(reason) {
+    this.issued.denyEarlier();
+    this.armsItself = false;
+    if (this.armed) this.leave("DISARMED", reason);
+    return "disarmed";
+  }
+
+  reset(who, now_us) {
+    this.refuseBesideHuman(who, now_us);
+    if (this.state !== "STOPPED" && this.state !== "FAULT") return `nothing to reset: ${this.state}`;
+    if (!isStill(this.applied)) throw new WireError("NOT_ALLOWED", "the wheels are not at zero yet; ask again");
+    this.leave("DISARMED", `reset by ${who.source}; not armed`);
+    return "reset; arm to drive";
+  }
+
+  arm(who, now_us) {
+    this.refuseBesideHuman(who, now_us);
+    if (this.armed) return "already armed";
+    if (this.state !== "DISARMED") throw new WireError(this.state, `${this.reason}; reset first`);
+    const missing = this.missingToArm(now_us);
+    if (missing !== "") throw new WireError("NOT_ALLOWED", missing);
+    this.armsItself = this.limits.autoArm;
+    this.begin(`armed by ${who.source}`, now_us);
+    return "armed";
+  }
+
+  acquire(who, now_us) {
+    const holder = this.lease.liveHolder(now_us);
+    if (!(who.source in RANKS) || !this.lease.mayTake(who, now_us)) {
+      throw new WireError("NOT_HOLDER", `${holder?.source ?? "nobody"} drives`);
+    }
+    if (same(holder, who)) return "already held";
+    this.liveCommands = 0;
+    this.command = null; // the driver before neither arms nor drives for this one
+    this.lease.take(who, now_us);
+    return "acquired";
+  }
+
+  release(who, now_us) {
+    if (!same(this.lease.liveHolder(now_us), who)) return "not held";
+    this.lease.drop();
+    this.command = null;
+    if (isHuman(who.source)) this.loseHuman("the person driving let go; arm again");
+    return "released";
+  }
+
+  frameAge_us(now_us) {
+    return this.command && Math.max(0, now_us - this.command.echo_us);
+  }
+
+  refuseBesideHuman(who, now_us) {
+    const holder = this.lease.liveHolder(now_us);
+    if (holder !== null && isHuman(holder.source) && !same(holder, who)) {
+      throw new WireError("NOT_ALLOWED", `${holder.source} ${holder.session} drives`);
+    }
+  }
+
+  /** What still stands against arming, "" if nothing. */
+  missingToArm(now_us) {
+    const needed = this.limits.liveCommandsToArm;
+    if (this.lease.liveHolder(now_us) === null) return "nobody sends valid commands yet; is vision running?";
+    if (this.liveCommands < needed) return `${this.liveCommands} of ${needed} live commands seen; ask again`;
+    return isStill(this.applied) ? "" : "the wheels are not at zero yet; ask again";
+  }
+
+  noticeLostHuman(now_us) {
+    if (!this.lease.lostHuman(now_us)) return;
+    this.lease.drop();
+    this.loseHuman("the person driving was lost; arm again");
+  }
+
+  loseHuman(reason) {
+    this.armsItself = false;
+    if (this.armed) this.leave("DISARMED", reason);
+  }
+
+  begin(reason, now_us) {
+    this.command = null;
+    this.holdSince_us = now_us;
+    this.state = "HOLD";
+    this.reason = reason;
+  }
+
+  /** Go where the wheels are off; `again`: it may arm itself later without a person. */
+  leave(state, reason, again = false) {
+    this.state = state;
+    this.reason = reason;
+    this.command = null;
+    this.liveCommands = 0;
+    this.armsItself = again;
+  }
+}

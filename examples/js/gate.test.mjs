@@ -1,0 +1,267 @@
+/** @file The gate, at the boundaries of every rule in the order of judging; times are made up. */
+
+import assert from "node:assert/strict";
+import test from "node:test";
+import { WireError } from "./codec.mjs";
+import { Gate } from "./gate.mjs";
+import { LIMITS, Ramp, TICK_US, ageFactor, clampTwist } from "./limits.mjs";
+
+const ROBOT = "0a1b2c3d";
+const FORWARD = { linear_mps: 0.4, angular_rad_s: 0 };
+const START_US = 50_000_000;
+
+/** A gate with a clock: each `frame` is issued now, each `command` answers one. */
+class Rig {
+  constructor(limits = {}, stopped = false) {
+    this.gate = new Gate(ROBOT, limits, stopped);
+    this.now_us = START_US;
+    this.frames = this.commands = 0;
+  }
+
+  pass(us) {
+    this.now_us += us;
+  }
+
+  frame(channel = "frame") {
+    this.frames += 1;
+    this.gate.issued.add(channel, this.frames, this.now_us);
+    return { channel, session: ROBOT, seq: this.frames, t_us: this.now_us };
+  }
+
+  command(echo, { source = "vision", session = "4e5f6071", twist = FORWARD, seq = undefined } = {}) {
+    this.commands += 1;
+    const header = { source, session, seq: seq ?? this.commands, echo, compute_us: 0 };
+    return this.gate.offer(source, header, twist, this.now_us);
+  }
+
+  ask(verb, { source = "operator", session = "aaaaaaaa", echo = this.frame("status") } = {}) {
+    return this.gate.request({ source, session, echo }, verb, this.now_us);
+  }
+
+  /** Five live commands, then armed. */
+  arm(who = {}) {
+    for (let count = 0; count < 5; count += 1) {
+      this.pass(TICK_US);
+      assert.equal(this.command(this.frame(), who), "DISARMED");
+    }
+    assert.equal(this.ask("arm", who.source === "teleop" ? who : {}), "armed");
+  }
+
+  drive(ticks, who = {}) {
+    for (let count = 0; count < ticks; count += 1) {
+      this.pass(TICK_US);
+      assert.equal(this.command(this.frame(), who), null);
+      this.gate.step(this.now_us);
+    }
+  }
+
+  stepUntil(state, most_us) {
+    const since_us = this.now_us;
+    while (this.gate.state !== state || this.gate.applied.linear_mps !== 0) {
+      assert.ok(this.now_us - since_us <= most_us, `${this.gate.state} after ${most_us} us`);
+      this.pass(TICK_US);
+      this.gate.step(this.now_us);
+    }
+    return this.now_us - since_us;
+  }
+}
+
+const refuses = (reason, act) => assert.throws(act, (error) => error instanceof WireError && error.reason === reason);
+
+test("armed by a person after five live commands, and not before", () => {
+  const rig = new Rig();
+  refuses("NOT_ALLOWED", () => rig.ask("arm"));
+  for (let count = 0; count < 4; count += 1) rig.command(rig.frame());
+  refuses("NOT_ALLOWED", () => rig.ask("arm"));
+  rig.command(rig.frame());
+  assert.equal(rig.ask("arm"), "armed");
+  assert.equal(rig.gate.state, "HOLD");
+  assert.equal(rig.ask("arm"), "already armed");
+});
+
+const JUDGED = [
+  ["another session of the robot", (echo) => ({ ...echo, session: "ffffffff" }), 0, "OTHER_SESSION"],
+  ["a seq never issued", (echo) => ({ ...echo, seq: 999 }), 0, "UNKNOWN_FRAME"],
+  ["another time", (echo) => ({ ...echo, t_us: echo.t_us + 1 }), 0, "UNKNOWN_FRAME"],
+  ["the reserved beat", (echo) => ({ ...echo, channel: "beat" }), 0, "UNKNOWN_FRAME"],
+  ["as old as allowed", (echo) => echo, 400_000, null],
+  ["a microsecond older", (echo) => echo, 400_001, "STALE"],
+  ["from the future", (echo) => echo, -1, "FROM_FUTURE"],
+];
+for (const [name, change, later_us, expected] of JUDGED) {
+  test(`a command that cites ${name}: ${expected ?? "accepted"}`, () => {
+    const rig = new Rig();
+    rig.arm();
+    const echo = change(rig.frame());
+    rig.pass(later_us);
+    assert.equal(rig.command(echo), expected);
+    assert.equal(rig.gate.refused[expected] ?? 0, expected === null ? 0 : 1);
+  });
+}
+
+test("a twist cites no status", () => {
+  const rig = new Rig();
+  assert.equal(rig.command(rig.frame("status")), "UNKNOWN_FRAME");
+});
+
+test("seq counts up within a source and session", () => {
+  const rig = new Rig();
+  rig.arm();
+  assert.equal(rig.command(rig.frame(), { seq: 100 }), null);
+  assert.equal(rig.command(rig.frame(), { seq: 100 }), "OUT_OF_ORDER");
+  assert.equal(rig.command(rig.frame(), { seq: 99 }), "OUT_OF_ORDER");
+  assert.equal(rig.command(rig.frame(), { seq: 101 }), null);
+});
+
+test("a role that may not drive, guests that are off, a header of another role", () => {
+  const rig = new Rig();
+  assert.equal(rig.command(rig.frame(), { source: "viewer" }), "UNKNOWN_SOURCE");
+  assert.equal(rig.command(rig.frame(), { source: "constructor" }), "UNKNOWN_SOURCE");
+  assert.equal(rig.gate.offer("guest", null, FORWARD, rig.now_us), "UNKNOWN_SOURCE");
+  assert.equal(rig.gate.offer("teleop", { source: "vision" }, FORWARD, rig.now_us), "UNKNOWN_SOURCE");
+});
+
+test("a guest is slow, short-lived and lowest", () => {
+  const rig = new Rig({ guests: true, autoArm: true });
+  for (let count = 0; count < 60; count += 1) {
+    rig.pass(TICK_US);
+    rig.gate.offer("guest", null, { linear_mps: 5, angular_rad_s: 0 }, rig.now_us);
+    rig.gate.step(rig.now_us);
+  }
+  assert.ok(Math.abs(rig.gate.applied.linear_mps - 0.2) < 1e-9);
+  rig.pass(250_001);
+  rig.gate.step(rig.now_us);
+  assert.equal(rig.gate.state, "HOLD");
+  assert.equal(rig.command(rig.frame()), null);
+  assert.equal(rig.gate.offer("guest", null, FORWARD, rig.now_us), "NOT_HOLDER");
+});
+
+test("silence stops the robot within 700 ms, ten seconds of it disarm", () => {
+  const rig = new Rig();
+  rig.arm();
+  rig.drive(60);
+  assert.ok(Math.abs(rig.gate.applied.linear_mps - 0.4) < 1e-9);
+  assert.ok(rig.stepUntil("HOLD", 700_000) >= 300_000);
+  assert.ok(rig.stepUntil("DISARMED", 10_100_000) >= 9_900_000);
+});
+
+test("refused commands keep nothing alive", () => {
+  const rig = new Rig();
+  rig.arm();
+  rig.drive(60);
+  const echo = rig.frame();
+  for (let count = 0; count < 35; count += 1) {
+    rig.pass(TICK_US);
+    rig.command({ ...echo, seq: 999 });
+    rig.gate.step(rig.now_us);
+  }
+  assert.equal(rig.gate.state, "HOLD");
+  assert.equal(rig.gate.applied.linear_mps, 0);
+});
+
+test("the age is judged again at every tick", () => {
+  const rig = new Rig();
+  rig.arm();
+  rig.drive(60);
+  const old = rig.frame();
+  rig.pass(250_000);
+  assert.equal(rig.command(old), null);
+  rig.gate.step(rig.now_us);
+  assert.equal(rig.gate.state, "DEGRADED");
+  assert.equal(ageFactor(LIMITS, 150_000), 1);
+  assert.equal(ageFactor(LIMITS, 275_000), 0.5);
+  assert.equal(ageFactor(LIMITS, 400_000), 0);
+});
+
+test("a higher rank takes the lease, an equal one waits", () => {
+  const rig = new Rig();
+  rig.arm();
+  assert.equal(rig.command(rig.frame(), { session: "99999999", seq: 1 }), "NOT_HOLDER");
+  assert.equal(rig.command(rig.frame(), { source: "teleop", session: "bbbbbbbb" }), null);
+  assert.equal(rig.command(rig.frame()), "NOT_HOLDER");
+});
+
+test("a lost human disarms, and vision does not take over", () => {
+  const rig = new Rig({ autoArm: true });
+  const human = { source: "teleop", session: "bbbbbbbb" };
+  rig.arm(human);
+  rig.drive(20, human);
+  rig.pass(1_000_000);
+  assert.equal(rig.command(rig.frame()), "DISARMED");
+  for (let count = 0; count < 20; count += 1) {
+    rig.pass(TICK_US);
+    assert.equal(rig.command(rig.frame()), "DISARMED");
+    rig.gate.step(rig.now_us);
+  }
+});
+
+test("STOP is latched, older statuses cannot undo it, reset starts nothing", () => {
+  const rig = new Rig();
+  rig.arm();
+  rig.drive(60);
+  const before = rig.frame("status");
+  rig.pass(1);
+  assert.equal(rig.gate.request({ source: "x", session: "aaaaaaaa", echo: null }, "stop", rig.now_us), "STOPPED");
+  assert.equal(rig.command(rig.frame()), "STOPPED");
+  refuses("STALE", () => rig.ask("reset", { echo: before }));
+  refuses("NOT_ALLOWED", () => rig.ask("reset"));
+  rig.stepUntil("STOPPED", 400_000);
+  refuses("STOPPED", () => rig.ask("arm"));
+  assert.match(rig.ask("reset"), /^reset/);
+  assert.equal(rig.gate.state, "DISARMED");
+  assert.equal(rig.command(rig.frame()), "DISARMED");
+});
+
+test("a latch from before the restart holds, even where the robot arms itself", () => {
+  const rig = new Rig({ autoArm: true }, true);
+  for (let count = 0; count < 10; count += 1) {
+    rig.pass(TICK_US);
+    assert.equal(rig.command(rig.frame()), "STOPPED");
+    rig.gate.step(rig.now_us);
+  }
+  assert.equal(rig.gate.state, "STOPPED");
+});
+
+test("what lets a robot move cites a status at most 2 s old", () => {
+  const rig = new Rig();
+  refuses("MALFORMED", () => rig.ask("arm", { echo: null }));
+  refuses("MALFORMED", () => rig.ask("arm", { echo: rig.frame() }));
+  const echo = rig.frame("status");
+  rig.pass(2_000_001);
+  refuses("STALE", () => rig.ask("acquire", { source: "teleop", echo }));
+});
+
+test("acquire and release", () => {
+  const rig = new Rig();
+  const human = { source: "teleop", session: "bbbbbbbb" };
+  assert.equal(rig.ask("acquire", human), "acquired");
+  assert.equal(rig.ask("acquire", human), "already held");
+  refuses("NOT_HOLDER", () => rig.ask("acquire", { source: "vision" }));
+  refuses("NOT_ALLOWED", () => rig.ask("arm"));
+  assert.equal(rig.ask("release", { ...human, echo: null }), "released");
+  assert.equal(rig.ask("release", { ...human, echo: null }), "not held");
+});
+
+test("a fault is left by reset", () => {
+  const rig = new Rig();
+  rig.gate.fault("the drive is gone");
+  assert.equal(rig.command(rig.frame()), "FAULT");
+  assert.match(rig.ask("reset"), /^reset/);
+});
+
+test("beyond the limits: one factor for both axes, counted", () => {
+  assert.deepEqual(clampTwist({ linear_mps: 1, angular_rad_s: 1 }, 0.5, 2), { linear_mps: 0.5, angular_rad_s: 0.5 });
+  const rig = new Rig();
+  rig.arm();
+  assert.equal(rig.command(rig.frame(), { twist: { linear_mps: 48, angular_rad_s: 48 } }), null);
+  assert.equal(rig.gate.refused.CLAMPED, 1);
+});
+
+test("the ramp is per elapsed time and never overshoots", () => {
+  const [often, seldom] = [new Ramp(LIMITS), new Ramp(LIMITS)];
+  for (let count = 0; count < 10; count += 1) often.step(FORWARD, 10_000);
+  seldom.step(FORWARD, 100_000);
+  assert.ok(Math.abs(often.twist.linear_mps - 0.2) < 1e-9);
+  assert.ok(Math.abs(seldom.twist.linear_mps - 0.2) < 1e-9);
+  assert.equal(seldom.step(FORWARD, 900_000).linear_mps, 0.4);
+});

@@ -1,0 +1,236 @@
+/**
+ * @file Reads a JPEG at an eighth of its size: the mean colour of each 8x8 block, from the DC coefficients alone. Pure.
+ *
+ * Enough to find a coloured blob, in 200 lines: no inverse DCT, AC coefficients are only skipped. Baseline Huffman, and
+ * the first DC scan of a progressive picture (ITU-T T.81). Bound the picture with `readJpegSize` before it comes here.
+ */
+
+import { WireError } from "./codec.mjs";
+
+const bad = (what) => {
+  throw new WireError("MALFORMED", `picture: ${what}`);
+};
+
+/**
+ * @param {Uint8Array} jpeg
+ * @returns {{width: number, height: number, scale: number, rgb: Uint8ClampedArray}} in blocks; `scale` pixels each way
+ */
+export function decodeDc(jpeg) {
+  const picture = new Picture();
+  let at = 2;
+  while (at + 4 <= jpeg.length) {
+    if (jpeg[at] !== 0xff) bad(`no marker at byte ${at}`);
+    const marker = jpeg[at + 1];
+    if (marker === 0xff || marker === 0x01) {
+      at += marker === 0xff ? 1 : 2;
+      continue;
+    }
+    if (marker === 0xd9) break;
+    const end = at + 2 + jpeg[at + 2] * 256 + jpeg[at + 3];
+    const segment = jpeg.subarray(at + 4, end);
+    at = marker === 0xda ? picture.readScan(segment, jpeg, end) : end;
+    if (marker !== 0xda) picture.readTable(marker, segment);
+    if (picture.isComplete()) return picture.colours();
+  }
+  return bad("ends before its colours");
+}
+
+class Picture {
+  constructor() {
+    this.quantum = [];
+    this.tables = {}; // "0/1": DC table 1, "1/0": AC table 0
+    this.components = [];
+    this.restart = 0;
+    this.progressive = false;
+  }
+
+  readTable(marker, data) {
+    if (marker === 0xdb) this.readQuantisation(data);
+    else if (marker === 0xc4) this.readHuffman(data);
+    else if (marker === 0xdd) this.restart = data[0] * 256 + data[1];
+    else if (marker >= 0xc0 && marker <= 0xc2) this.readFrame(marker, data);
+  }
+
+  readQuantisation(data) {
+    for (let at = 0; at < data.length; ) {
+      const wide = data[at] >> 4;
+      this.quantum[data[at] & 15] = wide ? data[at + 1] * 256 + data[at + 2] : data[at + 1]; // only the DC entry
+      at += 1 + (wide ? 128 : 64);
+    }
+  }
+
+  readHuffman(data) {
+    for (let at = 0; at + 17 <= data.length; ) {
+      const counts = data.subarray(at + 1, at + 17);
+      const total = counts.reduce((sum, count) => sum + count, 0);
+      this.tables[`${data[at] >> 4}/${data[at] & 15}`] = huffmanTable(counts, data.subarray(at + 17, at + 17 + total));
+      at += 17 + total;
+    }
+  }
+
+  readFrame(marker, data) {
+    this.progressive = marker === 0xc2;
+    this.height_px = data[1] * 256 + data[2];
+    this.width_px = data[3] * 256 + data[4];
+    for (let index = 0; index < data[5]; index += 1) {
+      const [id, sampling, quantiser] = data.subarray(6 + index * 3, 9 + index * 3);
+      const [across, down] = [sampling >> 4, sampling & 15];
+      if (!(across >= 1 && across <= 4 && down >= 1 && down <= 4)) bad("sampling factors");
+      this.components.push({ id, across, down, quantiser, values: null, last: 0 });
+    }
+    this.maxAcross = Math.max(...this.components.map((one) => one.across));
+    this.maxDown = Math.max(...this.components.map((one) => one.down));
+    this.mcusAcross = Math.ceil(this.width_px / (8 * this.maxAcross));
+    this.mcusDown = Math.ceil(this.height_px / (8 * this.maxDown));
+    for (const one of this.components) one.stride = this.mcusAcross * one.across;
+  }
+
+  /** @returns {number} where the next marker begins */
+  readScan(head, jpeg, start) {
+    const scanned = [];
+    for (let index = 0; index < head[0]; index += 1) {
+      const one = this.components.find(({ id }) => id === head[1 + index * 2]) ?? bad("a scan of no component");
+      const chosen = head[2 + index * 2];
+      scanned.push({ one, dc: this.tables[`0/${chosen >> 4}`], ac: this.tables[`1/${chosen & 15}`] });
+    }
+    const [from, , approximation] = head.subarray(1 + head[0] * 2);
+    if (from === 0 && approximation >> 4 === 0) this.readBlocks(scanned, new Bits(jpeg, start), approximation & 15);
+    return nextMarker(jpeg, start);
+  }
+
+  readBlocks(scanned, bits, shift) {
+    const alone = scanned.length === 1;
+    for (const { one, dc, ac } of scanned) {
+      if (dc === undefined || (ac === undefined && !this.progressive)) bad("a scan without its Huffman table");
+      one.values = new Int16Array(one.stride * this.mcusDown * one.down);
+      one.last = 0;
+    }
+    const { one } = scanned[0];
+    const across = alone ? Math.ceil((this.width_px * one.across) / (8 * this.maxAcross)) : this.mcusAcross;
+    const down = alone ? Math.ceil((this.height_px * one.down) / (8 * this.maxDown)) : this.mcusDown;
+    for (let mcu = 0; mcu < across * down; mcu += 1) {
+      if (this.restart && mcu > 0 && mcu % this.restart === 0) this.restartAt(bits, scanned);
+      const [x, y] = [mcu % across, Math.floor(mcu / across)];
+      for (const part of scanned) this.readMcu(part, bits, shift, x, y, alone);
+    }
+  }
+
+  restartAt(bits, scanned) {
+    bits.skipRestart();
+    for (const { one } of scanned) one.last = 0;
+  }
+
+  readMcu({ one, dc, ac }, bits, shift, x, y, alone) {
+    const [wide, high] = alone ? [1, 1] : [one.across, one.down];
+    for (let block = 0; block < wide * high; block += 1) {
+      one.last += bits.signed(bits.symbol(dc));
+      if (!this.progressive) skipAc(bits, ac);
+      one.values[(y * high + Math.floor(block / wide)) * one.stride + x * wide + (block % wide)] = one.last << shift;
+    }
+  }
+
+  isComplete() {
+    return this.components.length > 0 && this.components.every((one) => one.values !== null);
+  }
+
+  colours() {
+    const [width, height] = [Math.ceil(this.width_px / 8), Math.ceil(this.height_px / 8)];
+    const rgb = new Uint8ClampedArray(width * height * 3);
+    const levels = [0, 0, 0];
+    for (let y = 0, at = 0; y < height; y += 1) {
+      for (let x = 0; x < width; x += 1, at += 3) {
+        this.components.forEach((one, index) => {
+          const block = Math.floor((y * one.down) / this.maxDown) * one.stride + Math.floor((x * one.across) / this.maxAcross);
+          levels[index] = (one.values[block] * this.quantum[one.quantiser]) / 8;
+        });
+        const [luma, blue, red] = levels;
+        rgb[at] = luma + 128 + 1.402 * red;
+        rgb[at + 1] = luma + 128 - 0.344136 * blue - 0.714136 * red;
+        rgb[at + 2] = luma + 128 + 1.772 * blue;
+      }
+    }
+    return { width, height, scale: 8, rgb };
+  }
+}
+
+function skipAc(bits, table) {
+  for (let index = 1; index < 64; index += 1) {
+    const symbol = bits.symbol(table);
+    if (symbol === 0) return;
+    index += symbol >> 4;
+    bits.skip(symbol & 15);
+  }
+}
+
+function nextMarker(jpeg, start) {
+  for (let at = start; at + 1 < jpeg.length; at += 1) {
+    const next = jpeg[at + 1];
+    if (jpeg[at] === 0xff && next !== 0 && next !== 0xff && (next < 0xd0 || next > 0xd7)) return at;
+  }
+  return jpeg.length;
+}
+
+/** For each 16 bits that may come, symbol * 32 + the length of its code; 0 where there is no code. */
+function huffmanTable(counts, symbols) {
+  const table = new Uint16Array(65_536);
+  let [code, index] = [0, 0];
+  for (let length = 1; length <= 16; length += 1) {
+    const span = 1 << (16 - length);
+    for (let count = 0; count < counts[length - 1]; count += 1) {
+      table.fill(symbols[index] * 32 + length, code, code + span);
+      index += 1;
+      code += span;
+    }
+  }
+  return table;
+}
+
+/** Bits of a scan, most significant first; a stuffed zero after 0xFF is left out. */
+class Bits {
+  constructor(data, at) {
+    this.data = data;
+    this.at = at;
+    this.buffer = this.held = this.invented = 0;
+  }
+
+  fill() {
+    while (this.held < 16) {
+      const byte = this.data[this.at];
+      const ended = byte === undefined || (byte === 0xff && this.data[this.at + 1] !== 0);
+      this.buffer = ((this.buffer << 8) | (ended ? 0 : byte)) & 0xffffff;
+      this.held += 8;
+      if (ended) this.invented += 8;
+      else this.at += byte === 0xff ? 2 : 1;
+    }
+  }
+
+  skip(count) {
+    this.fill();
+    this.held -= count;
+    if (this.held < this.invented) bad("its data is cut short");
+  }
+
+  symbol(table) {
+    this.fill();
+    const found = table[(this.buffer >> (this.held - 16)) & 0xffff];
+    if (found === 0) bad("a code of no table");
+    this.skip(found & 31);
+    return found >> 5;
+  }
+
+  /** A number of `size` bits as T.81 writes it: the upper half positive. */
+  signed(size) {
+    if (size === 0) return 0;
+    if (size > 15) bad("a number of over 15 bits");
+    this.fill();
+    const value = (this.buffer >> (this.held - size)) & ((1 << size) - 1);
+    this.skip(size);
+    return value < 1 << (size - 1) ? value - (1 << size) + 1 : value;
+  }
+
+  skipRestart() {
+    this.buffer = this.held = this.invented = 0;
+    if (this.data[this.at] !== 0xff || (this.data[this.at + 1] & 0xf8) !== 0xd0) bad("a restart marker is missing");
+    this.at += 2;
+  }
+}

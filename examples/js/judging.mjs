@@ -1,0 +1,139 @@
+/**
+ * @file What a robot remembers to judge commands by: what it issued, whose seq it saw, who drives. Pure.
+ *
+ * Nothing here trusts a sender: a frame is known because this robot issued it, and as old as the robot's clock says.
+ *
+ * @typedef {{source: string, session: string}} Holder
+ */
+
+import { WireError } from "./codec.mjs";
+
+const KEPT_PER_CHANNEL = 256; // 8 s of 30 fps frames; anything older is STALE long before
+const KEPT_SENDERS = 64;
+
+/** Roles that may drive, by rank. */
+export const RANKS = Object.freeze(Object.assign(Object.create(null), { guest: 0, vision: 1, teleop: 2 }));
+export const isHuman = (source) => source === "teleop";
+export const same = (one, other) => one !== null && other !== null && one.source === other.source && one.session === other.session;
+
+/** (channel, seq) -> t_us of what this session of the robot has issued. */
+export class IssuedRecord {
+  /** @param {string} session */
+  constructor(session) {
+    this.session = session;
+    this.times = { frame: new Map(), status: new Map(), beat: new Map() };
+    this.deniedSeq = -1;
+    this.lastStatusSeq = -1;
+  }
+
+  /** To be told before it is published: nobody may answer what the robot does not know. */
+  add(channel, seq, t_us) {
+    const times = this.times[channel];
+    times.set(seq, t_us);
+    if (times.size > KEPT_PER_CHANNEL) times.delete(times.keys().next().value);
+    if (channel === "status") this.lastStatusSeq = seq;
+  }
+
+  knows(echo) {
+    return echo.session === this.session && this.times[echo.channel].get(echo.seq) === echo.t_us;
+  }
+
+  /** Age of what `echo` names. @throws {WireError} OTHER_SESSION, UNKNOWN_FRAME, FROM_FUTURE, STALE */
+  age_us(echo, now_us, most_us) {
+    if (echo.session !== this.session) throw new WireError("OTHER_SESSION", `cites robot session ${echo.session}, this is ${this.session}`);
+    if (!this.knows(echo)) throw new WireError("UNKNOWN_FRAME", `cites ${echo.channel} ${echo.seq}, which was not issued so`);
+    const age_us = now_us - echo.t_us;
+    if (age_us < 0) throw new WireError("FROM_FUTURE", `cites ${echo.channel} ${echo.seq} from ${-age_us} us ahead`);
+    if (age_us > most_us) throw new WireError("STALE", `${echo.channel} ${echo.seq} is ${Math.round(age_us / 1000)} ms old, at most ${most_us / 1000}`);
+    return age_us;
+  }
+
+  /** Somebody said STOP or disarm: no request may cite a status from before. */
+  denyEarlier() {
+    this.deniedSeq = this.lastStatusSeq;
+  }
+
+  /** @throws {WireError} unless `echo` names a young status from after the last STOP or disarm */
+  checkRequest(echo, now_us, most_us) {
+    if (echo === null || echo.channel !== "status") throw new WireError("MALFORMED", "what lets a robot move again must cite a status");
+    this.age_us(echo, now_us, most_us);
+    if (echo.seq <= this.deniedSeq) throw new WireError("STALE", "cites a status from before the last STOP or disarm; ask again");
+  }
+}
+
+/** Since when a live camera's picture has been the same, byte for byte: a sensor's noise never repeats. */
+export class FreshnessRecord {
+  constructor() {
+    this.jpeg = null;
+    this.changed_us = 0;
+    this.newest_us = 0;
+  }
+
+  /** @param {Uint8Array|null} jpeg null for a source that is not live, which is never judged */
+  add(t_us, jpeg) {
+    const repeated = jpeg !== null && this.jpeg !== null && jpeg.length === this.jpeg.length && jpeg.every((byte, at) => byte === this.jpeg[at]);
+    if (!repeated) this.changed_us = t_us;
+    this.jpeg = jpeg;
+    this.newest_us = t_us;
+  }
+
+  unchanged_us() {
+    return this.newest_us - this.changed_us;
+  }
+
+  /** Since when has been seen what a frame of `t_us` shows. */
+  shownSince_us(t_us) {
+    return this.jpeg === null ? t_us : Math.min(t_us, this.changed_us);
+  }
+}
+
+/** The newest seq of each (source, session); the longest silent sender is forgotten first. */
+export class SequenceRecord {
+  constructor() {
+    this.last = new Map();
+  }
+
+  /** @throws {WireError} OUT_OF_ORDER unless newer than all before */
+  check({ source, session, seq }) {
+    const sender = `${source}/${session}`;
+    const last = this.last.get(sender) ?? -1;
+    if (seq <= last) throw new WireError("OUT_OF_ORDER", `seq ${seq} of ${source} is not newer than ${last}`);
+    this.last.delete(sender);
+    this.last.set(sender, seq);
+    if (this.last.size > KEPT_SENDERS) this.last.delete(this.last.keys().next().value);
+  }
+}
+
+/** Who drives: one at a time, by rank, for as long as its commands are judged good. */
+export class Lease {
+  /** @param {number} life_us */
+  constructor(life_us) {
+    this.life_us = life_us;
+    this.drop();
+  }
+
+  /** @returns {Holder|null} */
+  liveHolder(now_us) {
+    return now_us < this.expires_us ? this.holder : null;
+  }
+
+  mayTake(who, now_us) {
+    const holder = this.liveHolder(now_us);
+    return holder === null || same(holder, who) || RANKS[who.source] > RANKS[holder.source];
+  }
+
+  take(who, now_us) {
+    this.holder = who;
+    this.expires_us = now_us + this.life_us;
+  }
+
+  drop() {
+    this.holder = null;
+    this.expires_us = 0;
+  }
+
+  /** Whether a human held it and let it run out. */
+  lostHuman(now_us) {
+    return this.holder !== null && isHuman(this.holder.source) && now_us >= this.expires_us;
+  }
+}

@@ -1,0 +1,48 @@
+/**
+ * @file The codecs of the older dialect: base64 pictures, `linear-angular`, boxes joined by `-`. Pure; Node and browser.
+ *
+ * The peers of this folder speak `sightline.v1` only; these are for who meets an older program.
+ */
+
+import { MAX_TWIST_BYTES, WireError, parseTwist } from "./codec.mjs";
+
+const MAX_BOXES = 16;
+const MAX_BOXES_BYTES = 1024;
+const DECIMAL = "(?:[0-9]+(?:\\.[0-9]*)?|\\.[0-9]+)";
+const NUMBER = `[+-]?${DECIMAL}(?:[eE][+-]?[0-9]{1,3})?`;
+const DASHED = new RegExp(`^(${NUMBER})-(${NUMBER})$`);
+const BOX = new RegExp(`^${DECIMAL}(?:,${DECIMAL}){3}$`);
+const BASE64 = /^(?:[A-Za-z0-9+/]{4})*(?:[A-Za-z0-9+/]{2}==|[A-Za-z0-9+/]{3}=)?$/;
+
+const malformed = (what) => {
+  throw new WireError("MALFORMED", what);
+};
+
+/** @param {string} text @returns {import("./limits.mjs").Twist} */
+export function parseDashed(text) {
+  const found = text.length > MAX_TWIST_BYTES ? null : DASHED.exec(text);
+  if (found === null) return malformed("twist is not linear-angular, e.g. 0.2--0.35");
+  return parseTwist(new TextEncoder().encode(`${found[1]}|${found[2]}`));
+}
+
+/** @param {string} text base64, with line ends or without @param {number} maxBytes of the picture @returns {Uint8Array} */
+export function parsePicture(text, maxBytes) {
+  const joined = text.replace(/[\r\n]/g, "");
+  if (joined.length > 4 * Math.ceil(maxBytes / 3) || !BASE64.test(joined)) malformed(`picture is no base64 of at most ${maxBytes} bytes`);
+  const jpeg = Uint8Array.from(atob(joined), (character) => character.charCodeAt(0));
+  return jpeg.length > maxBytes ? malformed(`picture is over ${maxBytes} bytes`) : jpeg;
+}
+
+/** @param {string} text @returns {{y_min: number, x_min: number, y_max: number, x_max: number}[]} fractions of the picture */
+export function parseBoxes(text) {
+  const parts = text === "" ? [] : text.split("-");
+  if (text.length > MAX_BOXES_BYTES || parts.length > MAX_BOXES) malformed(`at most ${MAX_BOXES} boxes`);
+  return parts.map(parseBox);
+}
+
+function parseBox(text) {
+  if (!BOX.test(text)) malformed("box is not y_min,x_min,y_max,x_max");
+  const [y_min, x_min, y_max, x_max] = text.split(",").map(Number);
+  if (y_min > y_max || x_min > x_max || y_max > 1 || x_max > 1) malformed("box does not lie in the picture");
+  return { y_min, x_min, y_max, x_max };
+}

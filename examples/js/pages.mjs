@@ -1,0 +1,35 @@
+/**
+ * @file Serves the viewer's page and the modules it imports, and nothing else. Shell (reads files).
+ *
+ * A page must come from the robot's own host and port: a robot lets in no other site's pages.
+ */
+
+import { readFile } from "node:fs/promises";
+import { admissionProblem } from "./websocket.mjs";
+
+const MODULES = ["codec", "eyes", "fields", "framing", "json", "limits", "page", "viewer", "vision"];
+const FILES = new Map([["/", ["viewer.html", "text/html"]], ...MODULES.map((name) => [`/${name}.mjs`, [`${name}.mjs`, "text/javascript"]])]);
+const HEADERS = {
+  "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; connect-src 'self'; frame-ancestors 'none'",
+  "X-Content-Type-Options": "nosniff",
+  "Cache-Control": "no-store",
+};
+
+/**
+ * @param {string} host that is listened on @param {string} robot
+ * @returns {(request: import("node:http").IncomingMessage, response: import("node:http").ServerResponse) => Promise<void>}
+ */
+export function servePage(host, robot) {
+  return async (request, response) => {
+    const problem = admissionProblem(request.rawHeaders, host);
+    const found = FILES.get(new URL(request.url, "http://robot").pathname);
+    if (problem !== null || found === undefined || request.method !== "GET") {
+      const [status, line] = problem ?? (found === undefined ? [404, "no such page; the viewer is at /"] : [405, "GET only"]);
+      response.writeHead(status, { "Content-Type": "text/plain" }).end(`${line}\n`);
+      return;
+    }
+    const [name, type] = found;
+    const text = await readFile(new URL(name, import.meta.url), "utf8").catch(() => `${name} is not in this checkout`);
+    response.writeHead(200, { ...HEADERS, "Content-Type": `${type}; charset=utf-8` }).end(text.replaceAll("{{robot}}", robot));
+  };
+}

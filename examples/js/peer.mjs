@@ -1,0 +1,79 @@
+/**
+ * @file One peer of `sightline.v1` on an open connection: hello first, then messages, the newest of each kind. Shell.
+ */
+
+import { Outbox, PeerError, messageBound, pack, packRaw, readHello, unpack } from "./framing.mjs";
+import { OPEN_MS } from "./websocket.mjs";
+
+/** Told by whoever made it: `onMessage({channel, source, header, payload})`, `onOpen()`, `onEnd({code, reason})`. */
+export class Peer {
+  /**
+   * @param {import("./websocket.mjs").Connection} connection
+   * @param {{robot: string, hello: string, speaksFirst: boolean, onMessage: Function, onOpen?: Function, onEnd?: Function}} options
+   */
+  constructor(connection, { robot, hello, speaksFirst, onMessage, onOpen = () => undefined, onEnd = () => undefined }) {
+    Object.assign(this, { connection, robot, hello, speaksFirst, onMessage, onOpen });
+    this.outbox = new Outbox();
+    this.wants = new Set();
+    this.role = "";
+    this.isOpen = false;
+    this.dropped = 0; // messages with a bad key
+    connection.next = () => this.outbox.take();
+    connection.onMessage = (message) => this.read(message);
+    connection.onEnd = (end) => {
+      clearTimeout(this.helloTimer);
+      this.isOpen = false;
+      onEnd(end);
+    };
+    this.helloTimer = setTimeout(() => connection.close(1008, "no hello within 2 s"), OPEN_MS);
+    if (speaksFirst) this.tell(hello);
+  }
+
+  /** Say hello again, with other wants. */
+  tell(hello) {
+    this.outbox.put("", "", hello);
+    this.connection.pump();
+  }
+
+  read(message) {
+    if (typeof message === "string") {
+      this.onHello(message);
+      return;
+    }
+    if (!this.isOpen) throw new PeerError(1003, "the first message is a hello, as text");
+    const packet = unpack(message, this.role, this.robot);
+    if (packet === null) this.dropped += 1;
+    else this.onMessage(packet);
+  }
+
+  onHello(text) {
+    const { role, wants } = readHello(text, this.robot);
+    this.role = role;
+    this.wants = new Set(wants);
+    if (this.isOpen) return;
+    clearTimeout(this.helloTimer);
+    this.isOpen = true;
+    this.connection.reader.maxBytes = messageBound(JSON.parse(this.hello).wants);
+    if (!this.speaksFirst) this.tell(this.hello);
+    this.onOpen();
+  }
+
+  /**
+   * Send the newest message of a channel, if the peer wants it.
+   * @param {string} name channel @param {object} header @param {Uint8Array} payload
+   */
+  offer(name, header, payload) {
+    this.post(name, header.source ?? "", () => pack(name, header, payload));
+  }
+
+  /** Pass a packet on as it came. */
+  relay({ channel, source, header, payload }) {
+    this.post(channel.name, source, () => packRaw(channel.name, source, header, payload));
+  }
+
+  post(name, source, write) {
+    if (!this.isOpen || !this.wants.has(name)) return;
+    this.outbox.put(name, source, write());
+    this.connection.pump();
+  }
+}

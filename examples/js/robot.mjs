@@ -1,0 +1,208 @@
+/**
+ * @file A robot of the Sightline protocol: messages in, messages and a twist out. Pure: the caller brings clock, camera, link.
+ *
+ * @typedef {{name: string, header: object, payload: Uint8Array}} Publication
+ */
+
+import { CHANNELS, WireError, encode, readJpegSize, readMessage } from "./codec.mjs";
+import { Gate } from "./gate.mjs";
+import { isStill } from "./limits.mjs";
+import { Stream } from "./stream.mjs";
+
+const PERIODS_US = { status: 100_000, odometry: 50_000, camera: 500_000 };
+/** Channels that a robot wants of its peers. */
+export const ROBOT_WANTS = Object.freeze(["twist", "ack", "request", "detections"]);
+
+export class Robot {
+  /**
+   * @param {{session: string, fps: number, camera: object, live?: boolean, limits?: object, stopped?: boolean}} options
+   *   `camera` is the CameraModel that is published; the pictures of a `live` one never repeat unless it hangs
+   */
+  constructor({ session, fps, camera, live = false, limits = {}, stopped = false }) {
+    this.session = session;
+    this.camera = camera;
+    this.live = live;
+    this.gate = new Gate(session, limits, stopped);
+    this.stream = new Stream(fps);
+    this.pose = { x_m: 0, y_m: 0, yaw_rad: 0 };
+    this.seqs = {};
+    this.due_us = {};
+    this.replies = [];
+    this.lastFrame_us = -1;
+    this.lastTick_us = null;
+    this.refusedPictures = this.tickLateMax_us = this.unwanted = 0;
+  }
+
+  // --- what arrives --------------------------------------------------------------------------------------------
+
+  /**
+   * @param {{channel: object, source: string, header: Uint8Array, payload: Uint8Array}} packet
+   * @param {number} now_us
+   * @returns {boolean} whether it is to be passed on, as it came, to every other peer that wants its channel
+   */
+  onMessage({ channel, source, header, payload }, now_us) {
+    if (!ROBOT_WANTS.includes(channel.name)) {
+      this.unwanted += 1;
+      return false;
+    }
+    try {
+      const read = readMessage(channel, source, header, payload);
+      if (channel.name === "twist") this.onTwist(source, read, now_us);
+      else if (channel.name === "ack") this.onAck(source, read.header, now_us);
+      else if (channel.name === "request") this.onRequest(source, read, now_us);
+      else return read.header.source === source;
+    } catch (error) {
+      if (channel.name === "twist" || channel.name === "request") this.gate.refuse(source, error);
+      else if (!(error instanceof WireError)) throw error; // an ack that cannot be read is dropped
+    }
+    return false;
+  }
+
+  onTwist(source, { header, payload }, now_us) {
+    this.gate.offer(source, header, payload, now_us);
+    if (header === null || header.source !== source) return;
+    this.stream.onHolder(this.gate.lease.liveHolder(now_us), now_us);
+    this.returnCredit(header, now_us);
+  }
+
+  onAck(source, header, now_us) {
+    if (header.source === source) this.returnCredit(header, now_us);
+  }
+
+  /** Only what cites a frame that this robot issued is an answer. */
+  returnCredit({ source, session, echo, compute_us }, now_us) {
+    if (echo.channel !== "frame" || !this.gate.issued.knows(echo)) return;
+    this.stream.onAnswer({ source, session }, echo.seq, compute_us, now_us);
+  }
+
+  onRequest(source, { header, payload }, now_us) {
+    const reply = { to: header.session, id: payload.id, ok: true };
+    try {
+      if (header.source !== source) throw new WireError("UNKNOWN_SOURCE", "key and header disagree on the source");
+      reply.detail = this.gate.request(header, payload.verb, now_us);
+    } catch (error) {
+      this.gate.refuse(source, error);
+      reply.ok = false;
+      reply.detail = `${error.reason}: ${error.message}`.slice(0, 200);
+    }
+    this.replies.push({ ...reply, state: this.gate.state });
+    if (this.replies.length > 16) this.replies.shift(); // a flood of requests piles nothing up
+  }
+
+  // --- what leaves ---------------------------------------------------------------------------------------------
+
+  /** Whether to take a picture now. */
+  mayCapture(now_us) {
+    return this.stream.mayCapture(now_us);
+  }
+
+  /**
+   * A picture was captured at `t_us`.
+   * @param {Uint8Array} jpeg
+   * @returns {Publication|null} null, counted, for a picture that is none, too large, or not newer than the last
+   */
+  onPicture(jpeg, t_us, now_us) {
+    if (t_us <= this.lastFrame_us || jpeg.length > CHANNELS.frame.maxPayloadBytes || !isPicture(jpeg)) {
+      this.refusedPictures += 1;
+      return null;
+    }
+    this.lastFrame_us = t_us;
+    const motion = this.motion();
+    const header = { ...this.stamp("frame", t_us), ...motion, applied: motion.moving, latency_us: this.gate.latency_us };
+    this.gate.issued.add("frame", header.seq, t_us); // before anybody can answer it
+    this.gate.pictures.add(t_us, this.live ? jpeg : null);
+    this.stream.onSent(header.seq, t_us, now_us);
+    return { name: "frame", header, payload: jpeg };
+  }
+
+  /**
+   * 50 times a second.
+   * @param {number} now_us
+   * @returns {Publication[]} what is due now
+   */
+  tick(now_us) {
+    const twist = this.gate.step(now_us);
+    this.move(twist, now_us);
+    const due = this.takeReplies(now_us);
+    if (this.isDue("status", now_us)) due.push(this.publication("status", this.status(now_us), now_us));
+    if (this.isDue("odometry", now_us)) due.push(this.publication("odometry", this.motion(), now_us));
+    if (this.isDue("camera", now_us)) due.push(this.publication("camera", this.camera, now_us));
+    return due;
+  }
+
+  /** Replies that wait; to be sent as soon as their requests are carried out. */
+  takeReplies(now_us) {
+    return this.replies.splice(0).map((reply) => this.publication("reply", reply, now_us));
+  }
+
+  /** Whether the wheels are off and at zero. */
+  get atRest() {
+    return !this.gate.armed && isStill(this.gate.applied);
+  }
+
+  isDue(name, now_us) {
+    if (now_us < (this.due_us[name] ?? 0)) return false;
+    this.due_us[name] = Math.max((this.due_us[name] ?? 0) + PERIODS_US[name], now_us + PERIODS_US[name] / 2);
+    return true;
+  }
+
+  publication(name, payload, t_us) {
+    const header = this.stamp(name, t_us);
+    if (name === "status") this.gate.issued.add("status", header.seq, t_us);
+    return { name, header, payload: encode(payload) };
+  }
+
+  stamp(name, t_us) {
+    const seq = this.seqs[name] ?? 0;
+    this.seqs[name] = seq + 1;
+    return { v: 1, session: this.session, seq, t_us };
+  }
+
+  status(now_us) {
+    const { gate } = this;
+    const stream = { ...this.stream.status(now_us), refused_pictures: this.refusedPictures, calibrated: this.camera.calibrated };
+    return {
+      state: gate.state,
+      reason: gate.reason,
+      holder: gate.lease.liveHolder(now_us),
+      applied: rounded(gate.applied),
+      frame_age_us: gate.frameAge_us(now_us),
+      latency_us: gate.latency_us,
+      accepted: gate.accepted,
+      refused: gate.refused,
+      last_refusal: gate.lastRefusal,
+      stream,
+      auto_arm: gate.armsItself,
+      tick_late_max_us: this.tickLateMax_us,
+      max_linear_mps: gate.limits.maxLinear_mps,
+      max_angular_rad_s: gate.limits.maxAngular_rad_s,
+    };
+  }
+
+  /** Wheels that do at once what they are told, and slip nowhere. */
+  move({ linear_mps, angular_rad_s }, now_us) {
+    const elapsed_s = (now_us - (this.lastTick_us ?? now_us)) / 1e6;
+    this.lastTick_us = now_us;
+    const yaw_rad = this.pose.yaw_rad + (angular_rad_s * elapsed_s) / 2;
+    this.pose.x_m += linear_mps * elapsed_s * Math.cos(yaw_rad);
+    this.pose.y_m += linear_mps * elapsed_s * Math.sin(yaw_rad);
+    this.pose.yaw_rad = wrapped(this.pose.yaw_rad + angular_rad_s * elapsed_s);
+  }
+
+  motion() {
+    const { x_m, y_m, yaw_rad } = this.pose;
+    return { pose: [x_m, y_m, yaw_rad].map((value) => Number(value.toFixed(5))), moving: rounded(this.gate.applied) };
+  }
+}
+
+const rounded = ({ linear_mps, angular_rad_s }) => [Number(linear_mps.toFixed(4)), Number(angular_rad_s.toFixed(4))];
+const wrapped = (angle_rad) => Math.atan2(Math.sin(angle_rad), Math.cos(angle_rad));
+
+function isPicture(jpeg) {
+  try {
+    readJpegSize(jpeg);
+    return true;
+  } catch {
+    return false;
+  }
+}

@@ -1,0 +1,222 @@
+/**
+ * @file A robot for Node: pictures of a folder or drawn ones, wheels that are only computed, on WebSocket. Shell.
+ *
+ *     node examples/js/robot_server.mjs --port 8765 --robot js1 --pictures examples/pictures
+ *
+ * One process, where a robot with motors needs two: whoever owns the motors must outlive what hangs beside it.
+ */
+
+import { randomBytes } from "node:crypto";
+import { closeSync, existsSync, fsyncSync, mkdirSync, openSync, readFileSync, readdirSync, rmSync } from "node:fs";
+import { homedir } from "node:os";
+import { join } from "node:path";
+import { parseArgs } from "node:util";
+import { readJpegSize } from "./codec.mjs";
+import { DRAWN_CAMERA, ballAt, drawPicture } from "./drawing.mjs";
+import { helloText } from "./framing.mjs";
+import { TICK_US } from "./limits.mjs";
+import { servePage } from "./pages.mjs";
+import { Peer } from "./peer.mjs";
+import { ROBOT_WANTS, Robot } from "./robot.mjs";
+import { listen } from "./websocket.mjs";
+
+const USAGE = "node robot_server.mjs --port PORT --robot ID [--host 127.0.0.1] [--pictures FOLDER] [--fps 30] [--auto-arm] [--guests] [--state-dir DIR] [--token-file FILE] [--cert FILE --key FILE]";
+const STOP_AT_END_MS = 1500;
+const LOOPBACK = ["127.0.0.1", "::1", "localhost"];
+const GUESSED_FOCAL = 0.75; // of the width: nobody has measured the folder's camera
+
+const now_us = () => Number(process.hrtime.bigint() / 1000n);
+
+class UsageError extends Error {}
+
+function options() {
+  const stateDir = join(process.env.XDG_STATE_HOME || join(homedir(), ".local", "state"), "sightline-js");
+  const { values } = parseArgs({
+    options: {
+      host: { type: "string", default: "127.0.0.1" },
+      port: { type: "string", default: "9090" },
+      robot: { type: "string", default: "js1" },
+      pictures: { type: "string" },
+      fps: { type: "string", default: "30" },
+      "auto-arm": { type: "boolean", default: false },
+      guests: { type: "boolean", default: false },
+      "state-dir": { type: "string", default: stateDir },
+      "token-file": { type: "string" },
+      cert: { type: "string" },
+      key: { type: "string" },
+    },
+  });
+  const [port, fps] = [Number(values.port), Number(values.fps)];
+  if (!(Number.isInteger(port) && port >= 1 && port <= 65_535)) throw new UsageError("--port is a number from 1 to 65535");
+  if (!(fps > 0 && fps <= 240)) throw new UsageError("--fps is a number above 0, at most 240");
+  if (!/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/.test(values.robot)) throw new UsageError("--robot is 1 to 32 letters, digits, _ . -");
+  if (!LOOPBACK.includes(values.host) && !values["token-file"]) throw new UsageError("--host beyond loopback needs a --token-file");
+  if (!values.cert !== !values.key) throw new UsageError("--cert and --key go together");
+  const tls = values.cert ? { cert: readOption("--cert", values.cert), key: readOption("--key", values.key) } : undefined;
+  return { ...values, port, fps, tls, token: values["token-file"] && readToken(values["token-file"]) };
+}
+
+function readOption(name, path) {
+  try {
+    return readFileSync(path);
+  } catch (error) {
+    throw new UsageError(`${name} ${path}: ${error.message}`);
+  }
+}
+
+function readToken(path) {
+  const token = readOption("--token-file", path).toString("ascii").trim();
+  if (!/^[A-Za-z0-9_-]{16,128}$/.test(token)) throw new UsageError(`--token-file ${path}: a token is 16 to 128 of A-Z a-z 0-9 _ -`);
+  return token;
+}
+
+/** Pictures of a folder in turn, or drawn ones: `read(pose, t_us)` gives a JPEG; `model` is their CameraModel. */
+function openCamera(folder) {
+  if (folder === undefined) {
+    const start_us = now_us();
+    let count = 0;
+    return { model: DRAWN_CAMERA, read: (pose, t_us) => drawPicture(pose, ballAt(t_us - start_us), count++) };
+  }
+  let names = [];
+  try {
+    names = readdirSync(folder).filter((name) => /\.jpe?g$/i.test(name)).sort();
+  } catch (error) {
+    throw new UsageError(`--pictures ${folder}: ${error.message}`);
+  }
+  if (names.length === 0) throw new UsageError(`--pictures ${folder}: no .jpg in it`);
+  const pictures = names.map((name) => new Uint8Array(readFileSync(join(folder, name))));
+  const { width_px, height_px } = readJpegSize(pictures[0]);
+  const focal_px = GUESSED_FOCAL * width_px;
+  const model = { width_px, height_px, fx_px: focal_px, fy_px: focal_px, cx_px: width_px / 2, cy_px: height_px / 2, calibrated: false };
+  let next = 0;
+  return { model, read: () => pictures[next++ % pictures.length] };
+}
+
+/** The STOP latch on disk: a file that is there while the robot is stopped. */
+class Latch {
+  constructor(folder, robot) {
+    mkdirSync(folder, { recursive: true });
+    this.folder = folder;
+    this.path = join(folder, `${robot}.stopped`);
+    this.isSet = existsSync(this.path);
+  }
+
+  keep(stopped) {
+    if (stopped === this.isSet) return;
+    if (stopped) closeSync(openSync(this.path, "w"));
+    else rmSync(this.path, { force: true });
+    const folder = openSync(this.folder, "r");
+    fsyncSync(folder);
+    closeSync(folder);
+    this.isSet = stopped;
+  }
+}
+
+class Server {
+  constructor(chosen) {
+    this.chosen = chosen;
+    this.camera = openCamera(chosen.pictures);
+    this.latch = new Latch(chosen["state-dir"], chosen.robot);
+    const session = randomBytes(4).toString("hex");
+    const { pictures } = chosen;
+    const limits = { autoArm: chosen["auto-arm"], guests: chosen.guests };
+    this.robot = new Robot({ session, fps: chosen.fps, camera: this.camera.model, live: pictures === undefined, limits, stopped: this.latch.isSet });
+    this.hello = helloText(chosen.robot, session, ROBOT_WANTS);
+    this.peers = new Set();
+    this.shown = this.robot.gate.state;
+  }
+
+  async run() {
+    const { host, port, robot, pictures, tls, token } = this.chosen;
+    this.server = await listen({
+      host, port, tls, token, onConnection: (connection) => this.welcome(connection), onPage: servePage(host, robot),
+    });
+    const s = tls ? "s" : "";
+    this.say(`on ws${s}://${host}:${port}, session ${this.robot.session}, camera ${pictures ?? "drawn"}; viewer at http${s}://${host}:${port}/`);
+    if (this.latch.isSet) this.say("STOPPED (STOP was set before the restart)");
+    this.nextTick_us = this.nextPicture_us = now_us();
+    this.tick();
+    this.picture();
+  }
+
+  say(line) {
+    console.log(`robot ${this.chosen.robot}: ${line}`);
+  }
+
+  welcome(connection) {
+    const options = { robot: this.chosen.robot, hello: this.hello, speaksFirst: false };
+    const onEnd = () => this.peers.delete(peer);
+    const peer = new Peer(connection, { ...options, onMessage: (packet) => this.onMessage(packet, peer), onEnd });
+    this.peers.add(peer);
+  }
+
+  onMessage(packet, from) {
+    const at_us = now_us();
+    if (this.robot.onMessage(packet, at_us)) {
+      for (const peer of this.peers) if (peer !== from) peer.relay(packet);
+    }
+    this.showState();
+    this.publish(this.robot.takeReplies(at_us));
+  }
+
+  publish(publications) {
+    for (const { name, header, payload } of publications) {
+      for (const peer of this.peers) peer.offer(name, header, payload);
+    }
+  }
+
+  /** At absolute 20 ms deadlines; what came late is said in `status`. */
+  tick() {
+    const at_us = now_us();
+    this.robot.tickLateMax_us = Math.max(this.robot.tickLateMax_us, at_us - this.nextTick_us);
+    this.nextTick_us = Math.max(this.nextTick_us + TICK_US, at_us);
+    this.publish(this.robot.tick(at_us));
+    this.showState();
+    setTimeout(() => this.tick(), (this.nextTick_us - now_us()) / 1000);
+  }
+
+  /** The camera's own rhythm: a frame is sent at its capture or never. */
+  picture() {
+    const at_us = now_us();
+    this.nextPicture_us = Math.max(this.nextPicture_us + this.robot.stream.interval_us, at_us);
+    const wanted = [...this.peers].some((peer) => peer.wants.has("frame"));
+    if (wanted && this.robot.mayCapture(at_us)) {
+      const frame = this.robot.onPicture(this.camera.read(this.robot.pose, at_us), at_us, now_us());
+      if (frame !== null) this.publish([frame]);
+    }
+    setTimeout(() => this.picture(), (this.nextPicture_us - now_us()) / 1000);
+  }
+
+  /** One line per change of state; the latch is on disk before anybody is told. */
+  showState() {
+    const { state, reason } = this.robot.gate;
+    const [shown, driving] = [this.shown, ["ACTIVE", "DEGRADED"]];
+    if (state === shown) return;
+    this.shown = state;
+    this.latch.keep(state === "STOPPED");
+    if (!(driving.includes(state) && driving.includes(shown))) this.say(`${state} (${reason})`);
+  }
+
+  /** Wheels to zero first, then goodbye. */
+  end() {
+    this.robot.gate.disarm("shutting down");
+    setTimeout(() => process.exit(0), STOP_AT_END_MS);
+    const poll = setInterval(() => {
+      if (!this.robot.atRest) return;
+      clearInterval(poll);
+      this.server.closeAll("the robot is shutting down");
+      setTimeout(() => process.exit(0), 50);
+    }, 20);
+  }
+}
+
+try {
+  const server = new Server(options());
+  for (const signal of ["SIGINT", "SIGTERM", "SIGHUP"]) process.once(signal, () => server.end());
+  await server.run();
+} catch (error) {
+  const usage = error instanceof UsageError || String(error.code).startsWith("ERR_PARSE_ARGS");
+  const busy = error.code === "EADDRINUSE" ? "the port is in use; end what uses it or choose another --port" : error.message;
+  console.error(`error: ${busy}${usage ? `\nusage: ${USAGE}` : ""}`);
+  process.exit(usage ? 2 : 4);
+}

@@ -1,0 +1,103 @@
+/**
+ * @file What a robot sends and when: credit, its timeout, the window, the rate. Pure.
+ *
+ * A frame is captured only while there is credit, so it is young when it leaves and nothing queues behind it.
+ */
+
+import { same } from "./judging.mjs";
+
+const FIRST_TIMEOUT_US = 120_000;
+const LONGEST_TIMEOUT_US = 500_000;
+const OWNER_LIFE_US = 1_000_000;
+const MAX_WINDOW = 12;
+const REMEMBERED = 64;
+const DELAYS_KEPT = 12;
+
+export class Stream {
+  /** @param {number} fps the camera's */
+  constructor(fps) {
+    this.interval_us = Math.round(1e6 / fps);
+    this.expires_us = new Map(); // seq in flight -> when its credit times out
+    this.sentAt_us = new Map(); // also of frames whose credit has timed out
+    this.owner = null;
+    this.ownerUntil_us = 0;
+    this.delays_us = [];
+    this.answer_us = null;
+    this.next_us = 0;
+    this.sent = this.creditTimeouts = 0;
+    this.lastSecond_us = [];
+  }
+
+  /** Whether to take the next picture now. */
+  mayCapture(now_us) {
+    for (const [seq, expires_us] of this.expires_us) {
+      if (now_us >= expires_us) {
+        this.expires_us.delete(seq);
+        this.creditTimeouts += 1;
+      }
+    }
+    return now_us >= this.next_us && this.expires_us.size < this.window;
+  }
+
+  onSent(seq, t_us, now_us) {
+    this.expires_us.set(seq, now_us + this.timeout_us);
+    this.sentAt_us.set(seq, now_us);
+    if (this.sentAt_us.size > REMEMBERED) this.sentAt_us.delete(this.sentAt_us.keys().next().value);
+    this.next_us = Math.max(this.next_us + this.interval_us, t_us + this.interval_us / 2); // a late tick costs no rate
+    this.sent += 1;
+    this.lastSecond_us.push(now_us);
+    while (this.lastSecond_us[0] < now_us - 1_000_000) this.lastSecond_us.shift();
+  }
+
+  /**
+   * A twist or an ack answered frame `seq`: its credit comes back, and that of all older ones.
+   * @param {import("./judging.mjs").Holder} who
+   */
+  onAnswer(who, seq, compute_us, now_us) {
+    if ((this.owner === null || now_us >= this.ownerUntil_us) && !same(who, this.owner)) this.belongTo(who);
+    if (!same(who, this.owner)) return;
+    this.ownerUntil_us = now_us + OWNER_LIFE_US;
+    const sent_us = this.sentAt_us.get(seq);
+    if (sent_us !== undefined) this.measure(now_us - sent_us, compute_us);
+    this.sentAt_us.delete(seq);
+    for (const older of this.expires_us.keys()) if (older <= seq) this.expires_us.delete(older);
+  }
+
+  /** Credit goes to who drives. */
+  onHolder(holder, now_us) {
+    if (holder === null || same(holder, this.owner)) return;
+    this.belongTo(holder);
+    this.ownerUntil_us = now_us + OWNER_LIFE_US;
+    this.expires_us.clear();
+  }
+
+  /** What was measured with the owner before says nothing of this one's link. */
+  belongTo(who) {
+    this.owner = who;
+    this.delays_us = [];
+    this.answer_us = null;
+  }
+
+  measure(answer_us, compute_us) {
+    this.delays_us.push(Math.max(0, answer_us - compute_us));
+    if (this.delays_us.length > DELAYS_KEPT) this.delays_us.shift();
+    this.answer_us = this.answer_us === null ? answer_us : 0.9 * this.answer_us + 0.1 * answer_us;
+  }
+
+  /** Frames that may be in flight: as many as the camera makes while the link alone carries one round trip. */
+  get window() {
+    if (this.delays_us.length === 0) return 1;
+    return Math.min(MAX_WINDOW, 1 + Math.floor(Math.min(...this.delays_us) / this.interval_us));
+  }
+
+  get timeout_us() {
+    if (this.answer_us === null) return FIRST_TIMEOUT_US;
+    return Math.min(LONGEST_TIMEOUT_US, Math.round(1.5 * this.answer_us) + 12_000);
+  }
+
+  /** @returns {object} the `stream` of a status */
+  status(now_us) {
+    const fps = this.lastSecond_us.filter((sent_us) => now_us - sent_us <= 1_000_000).length;
+    return { sent: this.sent, credit_timeouts: this.creditTimeouts, window: this.window, fps };
+  }
+}

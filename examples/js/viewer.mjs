@@ -1,0 +1,150 @@
+/**
+ * @file The viewer in a browser: shows a robot's frames, steers at something yellow if asked to, and says STOP. Shell.
+ *
+ * A frame is acknowledged after it was drawn, so that the robot sends as fast as this page draws and nothing queues.
+ */
+
+import { Eyes, EYES_WANT } from "./eyes.mjs";
+import { PeerError, SUBPROTOCOL, helloText, pack, readHello, unpack } from "./framing.mjs";
+import { Vision } from "./vision.mjs";
+
+const FIRST_PAUSE_MS = 200;
+const LONGEST_PAUSE_MS = 1000;
+const STOP_PERIOD_MS = 50;
+const STOP_SLOW_MS = 300; // a STOP that is not seen to work within this is told to the person
+const MOST_BUFFERED_BYTES = 65_536; // a browser queues without end; beyond this, commands are dropped
+
+/** One robot and one page. Told by `show(what)`: {link}, {status}, {reply}, {target, twist}, {stop}. */
+export class Viewer {
+  /**
+   * @param {{url: string, robot: string, look: (jpeg: Uint8Array) => Promise<object>, show: (what: object) => void,
+   *   token?: string, WebSocket?: typeof WebSocket}} options `look` draws a picture and gives its pixels
+   */
+  constructor({ url, robot, look, show, token = "", WebSocket = globalThis.WebSocket }) {
+    Object.assign(this, { url, robot, show, WebSocket });
+    this.subprotocols = [SUBPROTOCOL, ...(token ? [`sightline.token.${token}`] : [])];
+    this.session = [...crypto.getRandomValues(new Uint8Array(4))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+    this.vision = new Vision(this.session, "viewer");
+    this.eyes = new Eyes(this.vision, {
+      look,
+      send: (name, header, payload) => this.send(name, header, payload),
+      now_us: () => Math.round(performance.now() * 1000),
+      onSeen: show,
+      onReply: (reply) => show({ reply }),
+    });
+    this.eyes.drives = false;
+    this.pause_ms = FIRST_PAUSE_MS;
+    this.socket = null;
+    this.isOpen = this.stopping = this.ended = false;
+  }
+
+  /** Connect, and again whenever the connection is lost. */
+  open() {
+    const socket = new this.WebSocket(this.url, this.subprotocols);
+    socket.binaryType = "arraybuffer";
+    this.socket = socket;
+    socket.onopen = () => socket.send(this.hello());
+    socket.onmessage = ({ data }) => this.read(data);
+    socket.onclose = ({ code, reason }) => this.lost(socket, reason || `code ${code}`);
+    socket.onerror = () => this.lost(socket, "nobody answers"); // not every platform closes what it never opened
+  }
+
+  hello() {
+    return helloText(this.robot, this.session, EYES_WANT, this.vision.source);
+  }
+
+  read(data) {
+    try {
+      if (typeof data === "string") this.met(data);
+      else this.receive(unpack(new Uint8Array(data), "", this.robot));
+    } catch (error) {
+      if (!(error instanceof PeerError)) throw error;
+      this.socket?.close(3000, "not understood"); // a page may not close with 1002 to 1011
+      this.show({ link: error.message });
+    }
+  }
+
+  met(text) {
+    readHello(text, this.robot);
+    this.isOpen = true;
+    this.pause_ms = FIRST_PAUSE_MS;
+    this.show({ link: "connected" });
+  }
+
+  receive(packet) {
+    if (packet === null) return;
+    this.eyes.onMessage(packet);
+    if (packet.channel.name === "status" && this.vision.status !== null) this.show({ status: this.vision.status.payload });
+  }
+
+  lost(socket, why) {
+    if (this.ended || socket !== this.socket) return;
+    this.isOpen = false;
+    this.socket = null;
+    this.show({ link: `no connection: ${why}` });
+    setTimeout(() => this.ended || this.open(), this.pause_ms);
+    this.pause_ms = Math.min(LONGEST_PAUSE_MS, this.pause_ms * 1.5);
+  }
+
+  send(name, header, payload) {
+    const urgent = name === "request";
+    if (this.isOpen && (urgent || this.socket.bufferedAmount < MOST_BUFFERED_BYTES)) this.socket.send(pack(name, header, payload));
+  }
+
+  /** Drive, as `vision`, or only watch, as `viewer`. @param {boolean} drives */
+  setDriving(drives) {
+    this.eyes.drives = drives;
+    this.vision.source = drives ? "vision" : "viewer";
+    if (this.isOpen) this.socket.send(this.hello());
+  }
+
+  /** @param {"arm"|"disarm"|"reset"} verb */
+  ask(verb) {
+    return this.eyes.ask(verb);
+  }
+
+  /** STOP is a level: said every 50 ms until a status shows it. */
+  stop() {
+    if (this.stopping) return;
+    this.stopping = true;
+    const since_ms = performance.now();
+    const again = () => {
+      if (this.vision.status?.payload.state === "STOPPED" || this.ended) {
+        this.stopping = false;
+        this.show({ stop: "STOPPED" });
+        return;
+      }
+      this.eyes.ask("stop");
+      this.show({ stop: performance.now() - since_ms > STOP_SLOW_MS ? "STOP is not confirmed; cut the power by hand" : "STOP ..." });
+      setTimeout(again, STOP_PERIOD_MS);
+    };
+    again();
+  }
+
+  close() {
+    this.ended = true;
+    this.socket?.close(1000);
+  }
+}
+
+/** Decode with the browser, draw on the canvas, and read the pixels back for the scan. */
+export function canvasLook(canvas) {
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  return async (jpeg) => {
+    const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
+    canvas.width = bitmap.width;
+    canvas.height = bitmap.height;
+    context.drawImage(bitmap, 0, 0);
+    bitmap.close();
+    const { data } = context.getImageData(0, 0, canvas.width, canvas.height);
+    return { width: canvas.width, height: canvas.height, scale: 1, data, channels: 4 };
+  };
+}
+
+/** A cross where the target is. */
+export function markTarget(canvas, target) {
+  if (target === null) return;
+  const context = canvas.getContext("2d");
+  context.strokeStyle = "#d00";
+  context.strokeRect(target.x_px - target.width_px / 2, 0, target.width_px, canvas.height);
+}

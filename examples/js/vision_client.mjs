@@ -1,0 +1,119 @@
+/**
+ * @file A vision for Node: looks at a robot's frames for something yellow and steers at it. Shell.
+ *
+ *     node examples/js/vision_client.mjs --connect ws://127.0.0.1:9090 --robot r1
+ */
+
+import { randomBytes } from "node:crypto";
+import { readFileSync } from "node:fs";
+import { parseArgs } from "node:util";
+import { Eyes, EYES_WANT } from "./eyes.mjs";
+import { helloText } from "./framing.mjs";
+import { decodeDc } from "./jpeg_dc.mjs";
+import { Peer } from "./peer.mjs";
+import { Vision } from "./vision.mjs";
+import { connect } from "./websocket.mjs";
+
+const FIRST_PAUSE_MS = 200;
+const LONGEST_PAUSE_MS = 1000;
+const USAGE = "node vision_client.mjs --connect ws://HOST:PORT --robot ID [--role vision] [--token-file FILE] [--ca FILE]";
+
+const say = (line) => console.log(`vision: ${line}`);
+const now_us = () => Math.round(performance.now() * 1000);
+
+/** Prints a line when what it is about has changed, never one per frame. */
+class Teller {
+  constructor() {
+    this.said = {};
+  }
+
+  tell(about, state, line = state) {
+    if (this.said[about] === state) return;
+    this.said[about] = state;
+    say(line);
+  }
+}
+
+function options() {
+  const text = { type: "string" };
+  const given = { connect: text, robot: text, role: { type: "string", default: "vision" }, "token-file": text, ca: text };
+  try {
+    const { values } = parseArgs({ options: given });
+    if (!/^wss?:\/\/([^/:]+|\[[0-9a-fA-F:]+\]):[0-9]+\/?$/.test(values.connect ?? "")) throw new Error("--connect ws://HOST:PORT is needed");
+    if (!/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/.test(values.robot ?? "")) throw new Error("--robot is needed: 1 to 32 letters, digits, _ . -");
+    if (!/^[a-z][a-z0-9_]{0,15}$/.test(values.role)) throw new Error("--role is 1 to 16 lower-case letters, digits or _");
+    const token = values["token-file"] && readFileSync(values["token-file"], "ascii").trim();
+    return { ...values, token, ca: values.ca && readFileSync(values.ca) };
+  } catch (error) {
+    console.error(`error: ${error.message}\nusage: ${USAGE}`);
+    return process.exit(2);
+  }
+}
+
+class Client {
+  constructor(chosen) {
+    this.chosen = chosen;
+    this.teller = new Teller();
+    this.session = randomBytes(4).toString("hex");
+    this.peer = null;
+    const world = {
+      look: (jpeg) => {
+        const { width, height, scale, rgb } = decodeDc(jpeg);
+        return { width, height, scale, data: rgb, channels: 3 };
+      },
+      send: (name, header, payload) => this.peer?.offer(name, header, payload),
+      now_us,
+      pause: () => new Promise(setImmediate),
+      onSeen: ({ target }) => this.teller.tell("target", target === null ? "nothing yellow in sight" : "target seen"),
+    };
+    this.eyes = new Eyes(new Vision(this.session, chosen.role), world);
+    this.ending = false;
+  }
+
+  /** Connect, and again whenever the connection is lost. */
+  async run() {
+    let pause_ms = FIRST_PAUSE_MS;
+    while (!this.ending) {
+      if (await this.once()) pause_ms = FIRST_PAUSE_MS;
+      if (!this.ending) await new Promise((resume) => setTimeout(resume, pause_ms));
+      pause_ms = Math.min(LONGEST_PAUSE_MS, pause_ms * 1.5);
+    }
+  }
+
+  /** One connection from beginning to end; whether it came about. */
+  async once() {
+    const { connect: url, robot, role } = this.chosen;
+    let connection;
+    try {
+      connection = await connect(url, this.chosen);
+    } catch (error) {
+      this.teller.tell("link", `no robot at ${url}: ${error.message}`);
+      return false;
+    }
+    let opened = false;
+    const ended = await new Promise((onEnd) => {
+      const onOpen = () => {
+        opened = true;
+        this.teller.tell("link", `frames from robot ${robot} at ${url}`);
+      };
+      const hello = helloText(robot, this.session, EYES_WANT, role);
+      this.peer = new Peer(connection, { robot, hello, speaksFirst: true, onOpen, onEnd, onMessage: (packet) => this.eyes.onMessage(packet) });
+    });
+    this.peer = null;
+    if (!this.ending) this.teller.tell("link", `link ended: ${ended.reason || "no reason given"} (${ended.code})`);
+    return opened;
+  }
+
+  end() {
+    this.ending = true;
+    this.peer?.connection.close(1001, "vision ends");
+    const skipped = Object.entries(this.eyes.skipped).map(([reason, count]) => `${count} ${reason}`);
+    say(`ended after ${this.eyes.answered} frames; skipped: ${skipped.join(", ") || "none"}`);
+    setTimeout(() => process.exit(0), 100).unref();
+  }
+}
+
+const client = new Client(options());
+for (const signal of ["SIGINT", "SIGTERM"]) process.once(signal, () => client.end());
+say(`looking for robot ${client.chosen.robot} at ${client.chosen.connect}`);
+await client.run();

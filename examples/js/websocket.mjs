@@ -1,0 +1,230 @@
+/**
+ * @file WebSocket on Node's own `http` and `net`: a listening end, a connecting end, one open connection. Shell.
+ *
+ * Node 20 has no WebSocket of its own without a flag; a browser has, and needs none of this.
+ */
+
+import { createHash, randomBytes, timingSafeEqual } from "node:crypto";
+import { createServer, request as httpRequest } from "node:http";
+import { createServer as createTlsServer, request as httpsRequest } from "node:https";
+import { isIP } from "node:net";
+import { MAX_HELLO_BYTES, PeerError, SUBPROTOCOL } from "./framing.mjs";
+import { FrameReader, OPCODE, closePayload, encodeFrame } from "./rfc6455.mjs";
+
+const GUID = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"; // RFC 6455, 1.3
+const PING_MS = 1000;
+const CLOSE_MS = 1000;
+export const OPEN_MS = 2000; // security limit: for the HTTP handshake, and once more for the hello
+const MAX_CLIENTS = 16; // security limit, of the protocol
+const MAX_SOCKETS = 32; // security limit: clients, and those whose handshake goes on
+const EMPTY = new Uint8Array(0);
+
+/** An open connection: whole messages in, the newest of each kind out, pings, a goodbye. */
+export class Connection {
+  /**
+   * @param {import("node:net").Socket} socket
+   * @param {boolean} listening which end this is
+   */
+  constructor(socket, listening) {
+    this.socket = socket;
+    this.listening = listening;
+    this.reader = new FrameReader({ masked: listening, maxBytes: MAX_HELLO_BYTES });
+    this.next = () => undefined; // gives the next message to send, when there is room
+    this.onMessage = () => undefined;
+    this.onEnd = () => undefined;
+    this.writing = this.closing = this.awaitsPong = false;
+    this.pong = null; // only the newest ping is answered: who pings without reading piles nothing up
+    socket.setNoDelay(true);
+    socket.on("data", (chunk) => this.read(chunk));
+    socket.on("error", () => socket.destroy());
+    socket.on("end", () => socket.destroy());
+    socket.on("close", () => this.ended());
+    this.pings = setInterval(() => this.ping(), PING_MS);
+  }
+
+  read(chunk) {
+    try {
+      for (const event of this.reader.feed(chunk)) this.onEvent(event);
+    } catch (error) {
+      if (!(error instanceof PeerError)) console.error(`error: a message broke this end: ${error.stack}`);
+      const ours = { code: 1011, message: "this end failed" }; // it ends one connection, not the robot
+      const { code, message } = error instanceof PeerError ? error : ours;
+      this.close(code, message);
+    }
+  }
+
+  onEvent({ kind, data, code }) {
+    if (kind === "close") this.onClose(code, data);
+    else if (this.closing) return;
+    else if (kind === "pong") this.awaitsPong = false;
+    else if (kind === "ping") this.answerPing(data);
+    else this.onMessage(data);
+  }
+
+  onClose(code, reason) {
+    this.reason ??= { code, reason };
+    if (!this.closing) this.write(OPCODE.CLOSE, code === 1005 ? EMPTY : closePayload(code, ""));
+    this.closing = true;
+    this.socket.end();
+  }
+
+  answerPing(data) {
+    this.pong = data;
+    this.pump();
+  }
+
+  ping() {
+    if (this.awaitsPong) {
+      this.close(1011, "a ping was not answered");
+      return;
+    }
+    this.awaitsPong = true;
+    this.write(OPCODE.PING, EMPTY);
+  }
+
+  /** Send what waits, one message at a time, each only once the one before has left for the kernel. */
+  pump() {
+    if (this.writing || this.closing) return;
+    const message = this.pong ?? this.next();
+    if (message === undefined) return;
+    const opcode = this.pong !== null ? OPCODE.PONG : typeof message === "string" ? OPCODE.TEXT : OPCODE.BINARY;
+    this.pong = null;
+    this.writing = true;
+    this.write(opcode, typeof message === "string" ? Buffer.from(message) : message, () => {
+      this.writing = false;
+      this.pump();
+    });
+  }
+
+  write(opcode, payload, done) {
+    if (this.socket.writable) this.socket.write(encodeFrame(opcode, payload, this.listening ? null : randomBytes(4)), done);
+  }
+
+  /** Say goodbye; the socket is gone within a second. */
+  close(code, reason) {
+    if (this.closing) return;
+    this.closing = true;
+    this.reason = { code, reason };
+    this.write(OPCODE.CLOSE, closePayload(code, reason));
+    this.reader.feed = function* nothing() {}; // what follows a broken rule is not read
+    setTimeout(() => this.socket.destroy(), code === 1001 ? CLOSE_MS : CLOSE_MS / 2).unref();
+    this.socket.end();
+  }
+
+  ended() {
+    clearInterval(this.pings);
+    this.closing = true;
+    this.onEnd(this.reason ?? { code: 1006, reason: "the connection broke" });
+  }
+}
+
+/**
+ * Why a request may not come in, as [HTTP status, one line]; null if it may.
+ *
+ * A page of a foreign site reaches this machine by pointing a name of its own at it, so the name must be one that no
+ * foreign site can own: an address, a name without a dot, one in `.local`, or the one listened on.
+ * @param {string[]} rawHeaders @param {string} listenHost
+ */
+export function admissionProblem(rawHeaders, listenHost) {
+  const all = (name) => rawHeaders.filter((_, index) => index % 2 === 1 && rawHeaders[index - 1].toLowerCase() === name);
+  const [hosts, origins] = [all("host"), all("origin")];
+  const host = (hosts[0] ?? "").toLowerCase();
+  const name = host.replace(/:[0-9]+$/, "").replace(/^\[|\]$/g, "");
+  const local = !name.includes(".") || name.endsWith(".local") || name === listenHost.toLowerCase() || isIP(name) !== 0;
+  if (hosts.length !== 1 || name === "" || !local) return [403, `Host ${host.slice(0, 80)} is not this machine`];
+  const own = [`http://${host}`, `https://${host}`];
+  if (origins.length > 1 || (origins.length === 1 && !own.includes(origins[0].toLowerCase()))) {
+    return [403, `Origin ${origins[0].slice(0, 80)} is another site than Host ${host}`];
+  }
+  return null;
+}
+
+const TOKEN_ENTRY = "sightline.token."; // beside the sub-protocol: all that a browser can do
+
+/** Whether a request shows the token, in the sub-protocols it offers or as `Authorization: Bearer`. */
+function showsToken(headers, offered, token) {
+  const shown = offered.filter((name) => name.startsWith(TOKEN_ENTRY)).map((name) => name.slice(TOKEN_ENTRY.length));
+  const bearer = /^Bearer +(\S+)$/i.exec(headers.authorization ?? "");
+  if (bearer !== null) shown.push(bearer[1]);
+  const digest = (text) => createHash("sha256").update(text).digest(); // of one length, as the comparison needs
+  return shown.some((one) => timingSafeEqual(digest(one), digest(token)));
+}
+
+function upgradeProblem(request, token) {
+  const { headers } = request;
+  const offered = (headers["sec-websocket-protocol"] ?? "").split(",").map((name) => name.trim());
+  if (headers["sec-websocket-version"] !== "13") return [426, "WebSocket version 13 is spoken here"];
+  if (request.method !== "GET" || !/^[A-Za-z0-9+/]{22}==$/.test(headers["sec-websocket-key"] ?? "")) return [400, "no WebSocket handshake"];
+  if (!offered.includes(SUBPROTOCOL)) return [400, `offer the sub-protocol ${SUBPROTOCOL}`];
+  return token === undefined || showsToken(headers, offered, token) ? null : [401, "show the token of this robot"];
+}
+
+const acceptKey = (key) => createHash("sha1").update(key + GUID).digest("base64");
+
+function refuse(socket, [status, line]) {
+  const version = status === 426 ? "Sec-WebSocket-Version: 13\r\n" : "";
+  socket.on("error", () => socket.destroy());
+  socket.end(`HTTP/1.1 ${status} Refused\r\n${version}Connection: close\r\nContent-Type: text/plain\r\nContent-Length: ${line.length + 1}\r\n\r\n${line}\n`);
+}
+
+/**
+ * Listen for peers.
+ * @param {{host: string, port: number, token?: string, tls?: {cert: Buffer, key: Buffer}, onConnection: (connection: Connection) => void,
+ *   onPage: (request: object, response: object) => void}} options
+ * @returns {Promise<import("node:http").Server>} with `closeAll(reason)`; rejects if the port cannot be listened on
+ */
+export function listen({ host, port, token, tls, onConnection, onPage }) {
+  const open = new Set();
+  const limits = { headersTimeout: OPEN_MS, requestTimeout: OPEN_MS, connectionsCheckingInterval: 500, maxHeaderSize: 8192, handshakeTimeout: OPEN_MS };
+  const server = tls ? createTlsServer({ ...limits, ...tls }, onPage) : createServer(limits, onPage);
+  server.maxConnections = MAX_SOCKETS;
+  server.on("upgrade", (request, socket, head) => {
+    const full = open.size >= MAX_CLIENTS ? [503, `${MAX_CLIENTS} clients are connected, which is the limit`] : null;
+    const problem = admissionProblem(request.rawHeaders, host) ?? full ?? upgradeProblem(request, token);
+    if (problem !== null) return refuse(socket, problem);
+    const accept = acceptKey(request.headers["sec-websocket-key"]);
+    socket.write(`HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: ${accept}\r\nSec-WebSocket-Protocol: ${SUBPROTOCOL}\r\n\r\n`);
+    const connection = new Connection(socket, true);
+    open.add(connection);
+    socket.on("close", () => open.delete(connection));
+    onConnection(connection);
+    if (head.length > 0) connection.read(head);
+  });
+  server.closeAll = (reason) => {
+    server.close();
+    for (const connection of open) connection.close(1001, reason);
+  };
+  return new Promise((resolve, reject) => server.once("error", reject).listen(port, host, () => resolve(server)));
+}
+
+/**
+ * One connection to `ws://host:port` or `wss://host:port`.
+ * @param {string} url @param {{token?: string, ca?: Buffer}} [keys] what the robot demands, and whom to believe its name
+ * @returns {Promise<Connection>} rejects with one line for a person
+ */
+export function connect(url, { token, ca } = {}) {
+  const { hostname, port, protocol } = new URL(url);
+  const request = protocol === "wss:" ? httpsRequest : httpRequest;
+  const key = randomBytes(16).toString("base64");
+  const headers = {
+    Connection: "Upgrade", Upgrade: "websocket", "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": key, "Sec-WebSocket-Protocol": SUBPROTOCOL,
+    ...(token ? { Authorization: `Bearer ${token}` } : {}),
+  };
+  return new Promise((resolve, reject) => {
+    const asked = request({ ca, host: hostname.replace(/^\[|\]$/g, ""), port, headers, timeout: OPEN_MS });
+    asked.on("timeout", () => asked.destroy(new Error("no answer within 2 s")));
+    asked.on("error", reject);
+    asked.on("response", (response) => {
+      response.on("data", (body) => reject(new Error(String(body).trim().slice(0, 200)))).on("end", () => reject(new Error(`HTTP ${response.statusCode}`)));
+    });
+    asked.on("upgrade", (response, socket, head) => {
+      const right = response.headers["sec-websocket-accept"] === acceptKey(key) && response.headers["sec-websocket-protocol"] === SUBPROTOCOL;
+      if (!right) return socket.destroy(reject(new Error(`what answers there does not speak ${SUBPROTOCOL}`)));
+      socket.setTimeout(0);
+      const connection = new Connection(socket, false);
+      resolve(connection);
+      if (head.length > 0) setImmediate(() => connection.read(head)); // after the caller has said what it listens for
+    });
+    asked.end();
+  });
+}
