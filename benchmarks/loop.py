@@ -9,9 +9,10 @@ from benchmarks.loop_course import Sample
 from benchmarks.loop_crew import terminated_like_interrupted
 from benchmarks.loop_figures import Figures, LoopCheck, figures_of, judge
 from benchmarks.loop_ours import endpoint_of
+from benchmarks.loop_overload import overloaded
 from benchmarks.loop_pictures import write_pictures
 from benchmarks.loop_sample import take_sample
-from benchmarks.loop_setting import FLOOR, OURS, TCP, LoopSetting
+from benchmarks.loop_setting import LoopSetting
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,8 @@ def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
         pictures.mkdir()
         jpeg_bytes = write_pictures(pictures, setting.width_px, setting.height_px)
         ready = replace(setting, pictures=pictures)
-        names = (FLOOR, OURS, *((TCP, *setting.peers) if setting.peers else ()))
-        samples = {one: take_sample(one, ready, Path(name), say) for one in names}
+        if setting.overload:
+            ready = overloaded(ready, say)
+        samples = {one: take_sample(one, ready, Path(name), say) for one in setting.contestants}
     figures = {one: figures_of(sample) for one, sample in samples.items()}
-    return Race(setting, jpeg_bytes, samples, figures, judge(figures, setting))
+    return Race(ready, jpeg_bytes, samples, figures, judge(figures, ready))

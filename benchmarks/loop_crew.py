@@ -25,9 +25,13 @@ class Crew:
         self._folder = folder
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
-    def start(self, name: str, module: str, *arguments: str) -> int:
-        """Run `python -m MODULE ARGUMENTS`, its output going to `<name>.log`; returns its process id."""
-        command = [sys.executable, "-u", "-m", module, *arguments]
+    def start(self, name: str, module: str, *arguments: str, namespace: str = "") -> int:
+        """Run `python -m MODULE ARGUMENTS`, its output going to `<name>.log`; returns its process id.
+
+        In a network `namespace` if one is named.
+        """
+        entering = ["ip", "netns", "exec", namespace] if namespace else []
+        command = [*entering, sys.executable, "-u", "-m", module, *arguments]
         with self._log(name).open("wb") as log:
             process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True

@@ -1,4 +1,4 @@
-"""The same eyes for every contestant of `bench loop`: one `Pipeline`, with a detector as slow as was asked. Shell."""
+"""Sightline's own eyes for contestants of `bench loop`: one `Pipeline`, with a detector as slow as was asked. Shell."""
 
 import time
 
@@ -13,27 +13,36 @@ from vision_side.pipeline import Frame, Pipeline
 
 
 class SlowDetector:
-    """A detector that takes `delay_s` longer; it waits as for an accelerator, without using the processor."""
+    """A detector that takes longer: it waits `delay_s`, as for an accelerator, and then works for at least `busy_s`.
 
-    def __init__(self, detector: Detector, delay_s: float) -> None:
-        self._detector, self._delay_s = detector, delay_s
+    It works by detecting the same again and again, as the same code on a slower processor.
+    """
+
+    def __init__(self, detector: Detector, delay_s: float, busy_s: float) -> None:
+        self._detector, self._delay_s, self._busy_s = detector, delay_s, busy_s
 
     def detect(self, picture: Picture) -> tuple[Detection, ...]:
         """As the detector inside, later."""
-        time.sleep(self._delay_s)
-        return self._detector.detect(picture)
+        if self._delay_s:
+            time.sleep(self._delay_s)
+        until_s = time.perf_counter() + self._busy_s
+        found = self._detector.detect(picture)
+        while time.perf_counter() < until_s:
+            found = self._detector.detect(picture)
+        return found
 
 
-def build_pipeline(config: VisionConfig, camera: CameraModel, delay_ms: float) -> Pipeline:
-    """The services' own pipeline; with a delay of 0 its detector is the services' own too."""
-    return Pipeline(config, camera, SlowDetector(HsvDetector(config.hsv), delay_ms / 1000) if delay_ms else None)
+def build_pipeline(config: VisionConfig, camera: CameraModel, delay_ms: float, busy_ms: float) -> Pipeline:
+    """The services' own pipeline; unless it is to be slow, its detector is the services' own too."""
+    slow = SlowDetector(HsvDetector(config.hsv), delay_ms / 1000, busy_ms / 1000) if delay_ms or busy_ms else None
+    return Pipeline(config, camera, slow)
 
 
 class Eyes:
     """Pictures in, `linear|angular` out."""
 
-    def __init__(self, width_px: int, height_px: int, delay_ms: float) -> None:
-        self._pipeline = build_pipeline(VisionConfig(), camera_of(width_px, height_px), delay_ms)
+    def __init__(self, width_px: int, height_px: int, delay_ms: float = 0.0, busy_ms: float = 0.0) -> None:
+        self._pipeline = build_pipeline(VisionConfig(), camera_of(width_px, height_px), delay_ms, busy_ms)
         self._seq = 0
 
     def answer(self, t_us: int, jpeg: bytes) -> str:

@@ -12,18 +12,23 @@ P50_OVER_FLOOR_MS: Final = 1.5
 P95_OVER_FLOOR_MS: Final = 5.0
 CPU_OVER_FLOOR_MS: Final = 0.6
 ANSWERED_PERCENT: Final = 99.0
+OVERLOADED_LIKE_MS: Final = 80.0
+"""A detector overloaded by the rate is allowed the same ages as one with this delay."""
 LOADED_P50_OVER_DELAY_MS: Final = 10.0
 LOADED_P99_OVER_DELAY_MS: Final = 40.0
 DRIFT_PERCENT: Final = 10.0
+_PART_US: Final = 10_000_000
 _PARTS: Final = 5
+"""Drift is from the first ten seconds to the last, of a shorter time from its first fifth to its last."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figures:
     """One contestant. Times are from capture to the verdict; None where nothing was answered.
 
-    `first_ms` and `last_ms` are medians of the first and the last fifth of the time; `cpu_ms` is per answered picture
-    and process, `memory_mb` the high-water mark, `bytes_per_picture` what went over the sockets, both ways.
+    `first_ms` and `last_ms` are medians of the first and the last ten seconds, or fifths of a shorter time; `cpu_ms` is
+    per answered picture and process, `memory_mb` the high-water mark, `bytes_per_picture` what went over the sockets,
+    both ways.
     """
 
     name: str
@@ -89,23 +94,25 @@ def figures_of(sample: Sample) -> Figures:
 
 
 def _parts(ages_us: Sequence[tuple[int, int]]) -> tuple[float | None, float | None]:
-    """Medians, in milliseconds, of the first and the last fifth of the time."""
+    """Medians, in milliseconds, of the first and the last part of the time."""
     if not ages_us:
         return None, None
     begin_us, end_us = ages_us[0][0], ages_us[-1][0]
-    fifth_us = (end_us - begin_us) / _PARTS
-    first = [age_us for at_us, age_us in ages_us if at_us <= begin_us + fifth_us]
-    last = [age_us for at_us, age_us in ages_us if at_us >= end_us - fifth_us]
+    part_us = min(_PART_US, (end_us - begin_us) / _PARTS)
+    first = [age_us for at_us, age_us in ages_us if at_us <= begin_us + part_us]
+    last = [age_us for at_us, age_us in ages_us if at_us >= end_us - part_us]
     return median(first) / 1000, median(last) / 1000
 
 
 def judge(figures: Mapping[str, Figures], setting: LoopSetting) -> list[LoopCheck]:
     """Hold Sightline against the floor of the same run, or, with a detector slower than the camera, against its delay.
 
-    And against every rival there is. `figures` has at least the floor and Sightline.
+    And against every rival there is; transports with our eyes are shown and not judged. `figures` has at least the
+    floor and Sightline.
     """
     ours, floor = figures[OURS], figures[FLOOR]
-    checks = _loaded(ours, setting.detector_delay_ms) if setting.is_loaded else _unloaded(ours, floor)
+    like_ms = setting.detector_delay_ms or OVERLOADED_LIKE_MS
+    checks = _loaded(ours, like_ms) if setting.is_loaded else _unloaded(ours, floor)
     rivals = [figures[name] for name in (*PEERS, *((TCP,) if setting.is_loaded else ())) if name in figures]
     for rival in rivals:
         checks.append(at_most(f"p95 behind {rival.name}", _over(ours.p95_ms, rival.p95_ms), "ms", 0.0))

@@ -60,7 +60,8 @@ def running_services(setting: LoopSetting, folder: Path, crew: Crew) -> Iterator
     with open_link(ROBOT, connect=[endpoint], role="operator") as link:
         tally = folder / "headers.json"
         config = {"robot": ROBOT, "connect": [endpoint]}
-        settings = {"config": config, "delay_ms": setting.detector_delay_ms, "tally": str(tally)}
+        slow = {"delay_ms": setting.detector_delay_ms, "busy_ms": setting.busy_ms}
+        settings = {"config": config, "tally": str(tally), **slow}
         vision = crew.start("vision", "benchmarks.loop_vision", json.dumps(settings))
         pids = {"driver": driver, "network": children_of(driver)[0], "vision": vision}
         ours = Ours(pids, (port,), endpoint, tally)

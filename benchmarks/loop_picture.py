@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from benchmarks.loop import Race
-from benchmarks.loop_setting import FLOOR, OURS, TCP
+from benchmarks.loop_setting import FLOOR, OUR_EYES, OURS, TCP, LoopSetting
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 LABELS: Final = {
     FLOOR: "floor (one process)", OURS: "sightline", TCP: "bare TCP", "older": "older write-up",
     "lekiwi": "ZeroMQ as LeKiwi", "openpi": "WebSocket as openpi", "callback": "zenoh, plain callback",
+    "openpi" + OUR_EYES: "openpi's transport alone", "callback" + OUR_EYES: "callback's transport alone",
 }
 
 
@@ -34,14 +35,21 @@ def draw_race(path: Path, race: Race) -> None:
     setting = race.setting
     figure.suptitle(
         f"{setting.width_px}x{setting.height_px} at {setting.fps:g} fps, {setting.transport}, detector "
-        f"{'as it is' if not setting.detector_delay_ms else f'+{setting.detector_delay_ms:g} ms'}, loopback"
+        f"{_slowness(setting)}, loopback"
     )
     canvas.print_png(path)  # type: ignore[no-untyped-call]
 
 
+def _slowness(setting: LoopSetting) -> str:
+    if setting.busy_ms:
+        return f"busy {setting.busy_ms:.0f} ms"
+    return f"+{setting.detector_delay_ms:g} ms" if setting.detector_delay_ms else "as it is"
+
+
 def _draw_one(shares: "Axes", times: "Axes", name: str, ages_us: tuple[tuple[int, int], ...]) -> None:
     ages_ms = sorted(age_us / 1000 for _, age_us in ages_us)
-    width, style = (2.5 if name == OURS else 1.2), ("--" if name in (FLOOR, TCP) else "-")
+    width = 2.5 if name == OURS else 1.2
+    style = ":" if name.endswith(OUR_EYES) else "--" if name in (FLOOR, TCP) else "-"
     percents = [100 * (at + 1) / len(ages_ms) for at in range(len(ages_ms))]
     shares.plot(ages_ms, percents, label=LABELS[name], linewidth=width, linestyle=style)
     begin_us = ages_us[0][0]

@@ -16,7 +16,7 @@ from benchmarks.loop_course import Course, Sample, course_of_tally
 from benchmarks.loop_crew import Crew, free_port
 from benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
 from benchmarks.loop_ours import running_services
-from benchmarks.loop_setting import FLOOR, OURS, TAKEN_BOUND_PERCENT, LoopSetting
+from benchmarks.loop_setting import FLOOR, OUR_EYES, OURS, OWN_EYES, TAKEN_BOUND_PERCENT, LoopSetting
 from benchmarks.loop_sockets import carried_between, carried_bytes
 
 _SETTLE_S: Final = 1.5
@@ -81,7 +81,7 @@ def _take_one(name: str, setting: LoopSetting, folder: Path, number: int) -> Sam
         after, end_us = read_machine(contestant.pids), _now_us()
         carried_after = carried_bytes(contestant.ports)
         memory_mb = {process: high_water_mb(pid) for process, pid in contestant.pids.items()}
-        time.sleep(_DRAIN_S + setting.detector_delay_ms / 1000)
+        time.sleep(_DRAIN_S + (setting.detector_delay_ms + setting.busy_ms) / 1000)
         crew.end()
         cpu_s = {process: after.cpu_s[process] - before.cpu_s[process] for process in after.cpu_s}
         seconds = (end_us - begin_us) / 1e6
@@ -101,14 +101,16 @@ def _running(name: str, setting: LoopSetting, folder: Path, crew: Crew) -> Itera
     tally, port = folder / "tally.json", free_port()
     settings = json.dumps({
         "width_px": setting.width_px, "height_px": setting.height_px, "delay_ms": setting.detector_delay_ms,
+        "busy_ms": setting.busy_ms, "eyes": "classic" if name in OWN_EYES else "ours",
         "fps": setting.fps, "pictures": str(setting.pictures), "tally": str(tally), "port": port,
     })
+    peer = name.removesuffix(OUR_EYES)
     if name == FLOOR:
-        pids = {"vision": crew.start(FLOOR, _MODULE, name, "alone", settings)}
+        pids = {"vision": crew.start(FLOOR, _MODULE, peer, "alone", settings)}
         crew.wait_line(FLOOR, "first answer")
     else:
-        pids = {"robot": crew.start("robot", _MODULE, name, "robot", settings)}
-        pids["vision"] = crew.start("vision", _MODULE, name, "vision", settings)
+        pids = {"robot": crew.start("robot", _MODULE, peer, "robot", settings)}
+        pids["vision"] = crew.start("vision", _MODULE, peer, "vision", settings)
         crew.wait_line("robot", "first answer")
     yield Peer(pids, (port, port + 1), tally)
 

@@ -1,7 +1,7 @@
 """The vision service with a tap: keeps what the frames' headers say, and may be made slow. Shell.
 
 `python -m benchmarks.loop_vision SETTINGS`. The service is `vision_side.service.Service` as it is; the tap costs an
-append per frame, and only a detector with a delay is put into its pipeline.
+append per frame, and only a detector made slow is put into its pipeline.
 """
 
 import json
@@ -30,15 +30,15 @@ def _say(line: str) -> None:
 class TappedService(Service):
     """Remembers the header of every frame it was given."""
 
-    def __init__(self, config: VisionConfig, link: Link, delay_ms: float) -> None:
-        self._delay_ms = delay_ms
+    def __init__(self, config: VisionConfig, link: Link, delay_ms: float, busy_ms: float) -> None:
+        self._delay_ms, self._busy_ms = delay_ms, busy_ms
         super().__init__(config, link, _say)
         self.headers: list[bytes] = []
 
     def _use(self, camera: CameraModel) -> None:
         super()._use(camera)
-        if self._delay_ms:
-            self._pipeline = build_pipeline(self._config, camera, self._delay_ms)
+        if self._delay_ms or self._busy_ms:
+            self._pipeline = build_pipeline(self._config, camera, self._delay_ms, self._busy_ms)
 
     def _frame(self, message: Message, started_ns: int) -> None:
         self.headers.append(message.header)
@@ -51,7 +51,8 @@ def main(settings: dict[str, object]) -> None:
     ending = threading.Event()
     with open_link(config.robot, connect=config.connect, role=SOURCE) as link:
         signal.signal(signal.SIGTERM, lambda *_: ending.set())
-        service = TappedService(config, link, float(str(settings["delay_ms"])))
+        delay_ms, busy_ms = float(str(settings["delay_ms"])), float(str(settings["busy_ms"]))
+        service = TappedService(config, link, delay_ms, busy_ms)
         while not ending.is_set():
             service.turn(_WAIT_S)
     headers = [decode(FrameHeader, header, MAX_HEADER_BYTES) for header in service.headers]

@@ -1,81 +1,76 @@
 """Writes docs/performance.md: runs the judging commands, one after the other, and sets down what each printed. Shell.
 
-Nothing in the page is typed by hand: a figure is there because its command measured it in this run.
+Nothing in the page is typed by hand: a figure is there because its command measured it, on the date and machine that
+its section names.
 """
 
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
+from benchmarks.report_sections import SECTIONS, Section
+from protocol.errors import ConfigError
+
 CHECK_FAILED: Final = 5
+_HEADING: Final = "## "
+_HEAD: Final = (
+    "# Performance\n\nWritten by `sightline bench report`, section by section; each says when and on what machine it "
+    "was measured. Shared machines are noisy: read medians and ratios, not third digits."
+)
 _PACKAGES: Final = ("eclipse-zenoh", "pydantic", "numpy", "opencv-python-headless", "simplejpeg", "pybullet")
 
 
-@dataclass(frozen=True, slots=True)
-class Section:
-    """One command of the page and why it is there."""
-
-    title: str
-    why: str
-    arguments: tuple[str, ...]
-
-
-_SEEDS: Final = "201,202,203,204,205,206"
-SECTIONS: Final = (
-    Section(
-        "Following, in virtual time",
-        "The services' own logic in lockstep with the simulated world; scored from world truth, judged by the worst "
-        "run. Seeds that nothing was tuned on; loss is on each leg.",
-        ("score", "--seeds", _SEEDS, "--latency-ms", "50", "--loss", "0.1"),
-    ),
-    Section(
-        "A figure of eight under latency",
-        "Added latency from capture to command, half on each leg. At 400 ms no frame is young enough: the robot is to "
-        "stand still.",
-        ("score", "--scenario", "eight", "--seeds", _SEEDS, "--latency-ms", "0,100,200,400", "--loss", "0.1"),
-    ),
-    Section(
-        "The same in real time",
-        "`sightline demo`: real processes over Zenoh. The median of six seeds is held against the bounds above x 1.5; "
-        "every run's recorded frames, replayed through a fresh pipeline, must give the twists that were on the wire.",
-        ("bench", "demo", "--seeds", _SEEDS, "--seconds", "12"),
-    ),
-    Section(
-        "Killed at speed",
-        "Vision and the network process, killed with -9 while driving at 0.3 m/s or more, ten times each; judged "
-        "from the simulated motors' own log. [faults.md](faults.md) has more faults.",
-        ("faults", "--only", "vision.kill", "--only", "network.kill", "--only", "vision.restart", "--repeat", "10"),
-    ),
-    Section("Odometry", "Against the simulated world's truth.", ("bench", "odometry")),
-    Section("Gate", "One command judged and one step decided.", ("bench", "gate")),
-    Section("Messages", "Encode and decode, hot.", ("bench", "codec")),
-    Section("Vision", "`Pipeline.step`, decoding included, hot, one thread.", ("bench", "pipeline")),
-    Section(
-        "A robot without NumPy, OpenCV and PyBullet",
-        "`sightline[zenoh]` in a new environment, driving in the simulation; memory is the kernel's high-water mark.",
-        ("bench", "robot", "--seconds", "60"),
-    ),
-)
+def sections_named(names: Sequence[str]) -> tuple[Section, ...]:
+    """Those of `names`, in the page's order; all for none. Raises ConfigError for a name that is none."""
+    known = [section.name for section in SECTIONS]
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"--section {name!r}: of {', '.join(known)}")
+    return tuple(section for section in SECTIONS if not names or section.name in names)
 
 
 def write_report(path: Path, sections: Sequence[Section], say: Callable[[str], None]) -> bool:
-    """Run every section's command and write the page; whether all checks held."""
-    parts, ok = [_head()], True
+    """Run every section's command and write it into the page, where the other sections stay; whether all checks held.
+
+    After each section, so that what was measured before a failure is kept.
+    """
+    ok = True
     for section in sections:
         say(f"sightline {' '.join(section.arguments)}")
-        result = _run(section.arguments)
+        result = _measured(section, path.parent / "img")
         ok &= bool(result["ok"])
-        parts.append(_section(section, result))
-    path.write_text("\n".join(parts), "utf-8")
+        written = path.read_text("utf-8") if path.exists() else ""
+        path.write_text(page_with(written, section, _section(section, result)), "utf-8")
     return ok
+
+
+def page_with(page: str, section: Section, text: str) -> str:
+    """`page` with `text` as that section, all of them in the order of `SECTIONS`; sections of no name come last."""
+    parts = {part.partition("\n")[0]: part.rstrip() for part in page.split(f"\n{_HEADING}")[1:]}
+    parts[section.title] = text.removeprefix(_HEADING).rstrip()
+    titles = [one.title for one in SECTIONS if one.title in parts]
+    titles += [title for title in parts if title not in titles]
+    return "\n\n\n".join([_HEAD, *(_HEADING + parts[title] for title in titles)]) + "\n"
+
+
+def _measured(section: Section, pictures: Path) -> dict[str, Any]:
+    """The command's result; its picture, if it has one, is copied to where the page shows it."""
+    if not section.picture:
+        return _run(section.arguments)
+    with tempfile.TemporaryDirectory(prefix="sightline-report-") as folder:
+        result = _run((*section.arguments, "--out", folder))
+        pictures.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(Path(folder) / "loop.png", pictures / section.picture)
+    return result
 
 
 def _run(arguments: Sequence[str]) -> dict[str, Any]:
@@ -87,13 +82,11 @@ def _run(arguments: Sequence[str]) -> dict[str, Any]:
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
-def _head() -> str:
+def _machine() -> str:
     packages = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
     return (
-        "# Performance\n\nWritten by `sightline bench report`; every figure is of that run. Shared machines are noisy: "
-        "read medians and ratios, not third digits.\n\n"
         f"{datetime.now(UTC):%Y-%m-%d}, {_processor()}, {os.cpu_count()} cores, Linux {platform.release()}, "
-        f"Python {platform.python_version()}, {packages}.\n"
+        f"Python {platform.python_version()}, {packages}."
     )
 
 
@@ -108,7 +101,26 @@ def _section(section: Section, result: dict[str, Any]) -> str:
     rows = [_row(check, with_median) for check in result["checks"]]
     rule = "|---" * (head.count("|") - 1) + "|"
     command = f"`sightline {' '.join(section.arguments)}`"
-    return "\n".join([f"\n## {section.title}\n", f"{section.why}\n", f"{command}\n", head, rule, *rows, ""])
+    shown = [f"![Age at the verdict](img/{section.picture})\n"] if section.picture else []
+    race = [*_race(result["contestants"]), ""] if "contestants" in result else []
+    intro = [f"{_HEADING}{section.title}\n", f"{section.why}\n", f"{command}\n", f"Measured {_machine()}\n"]
+    return "\n".join([*intro, *race, *shown, head, rule, *rows])
+
+
+def _race(contestants: Sequence[dict[str, Any]]) -> list[str]:
+    """One row for each contestant of `bench loop`."""
+    heads = ("", "answered %", "p50 ms", "p95 ms", "p99 ms", "bytes a picture", "CPU ms a picture", "memory MB")
+    rows = [
+        (one["name"], *(_number(one[key]) for key in ("answered_percent", "p50_ms", "p95_ms", "p99_ms")),
+         "none" if one["bytes_per_picture"] is None else f"{one['bytes_per_picture']:.0f}",
+         *(_by_process(one[key]) for key in ("cpu_ms", "memory_mb")))
+        for one in contestants
+    ]
+    return [f"| {' | '.join(cells)} |" for cells in (heads, ("---",) * len(heads), *rows)]
+
+
+def _by_process(figures: dict[str, float]) -> str:
+    return ", ".join(f"{process} {_number(figure)}" for process, figure in figures.items())
 
 
 def _row(check: dict[str, Any], with_median: bool) -> str:
@@ -118,4 +130,4 @@ def _row(check: dict[str, Any], with_median: bool) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.3g}"
+    return "none" if value is None else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"

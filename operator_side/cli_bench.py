@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from operator_side.cli_bench_loop import register_bench
+from operator_side.cli_bench_network import register_network
 from operator_side.cli_judge import CHECK_FAILED, Json, numbers
 from operator_side.extras import needs
 
@@ -24,8 +25,9 @@ def register(app: typer.Typer) -> None:
     group.command(epilog="Example: sightline bench odometry")(odometry)
     group.command(epilog="Example: sightline bench robot --seconds 60")(robot)
     group.command(epilog="Example: sightline bench demo --scenario circle --seeds 201,202,203")(demo)
-    group.command(epilog="Example: sightline bench report --out docs/performance.md")(report)
+    group.command(epilog="Example: sightline bench report --section loop --section watchers")(report)
     register_bench(group)
+    register_network(group)
     app.add_typer(group, name="bench")
 
 
@@ -119,12 +121,16 @@ def demo(
 
 
 def report(
-    *, out: Annotated[Path, typer.Option(metavar="FILE", help="The page to write.")] = Path("docs/performance.md")
+    *,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The page to write.")] = Path("docs/performance.md"),
+    section: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Only this one, e.g. loop; may be given again.")
+    ] = None,
 ) -> int:
-    """Run every measurement that the performance page shows, and write the page. Takes about an hour."""
-    from benchmarks.report import SECTIONS, write_report
+    """Run the measurements that the performance page shows, and write them into it. All of them take over an hour."""
+    from benchmarks.report import sections_named, write_report
 
-    return 0 if write_report(out, SECTIONS, typer.echo) else CHECK_FAILED
+    return 0 if write_report(out, sections_named(section or ()), typer.echo) else CHECK_FAILED
 
 
 def _print_checks(checks: "list[Check]", as_json: bool) -> int:

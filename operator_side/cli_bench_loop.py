@@ -15,7 +15,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from benchmarks.loop import Race
+    from benchmarks.loop_figures import LoopCheck
 
+_ALONE = (
+    "Peers see as the older write-ups do. With `+our eyes` they have Sightline's pipeline instead: what their "
+    "transport alone costs, without credit, age or a gate; shown, not judged."
+)
 Transport = Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")]
 
 
@@ -52,6 +57,7 @@ def register_bench(group: typer.Typer) -> None:
     """Add the commands to the `bench` group."""
     group.command(epilog="Example: sightline bench loop --detector-delay-ms 80 --seconds 20 --out runs/loop")(loop)
     group.command(epilog="Example: sightline bench watchers --viewers 10 --seconds 20")(watchers)
+    group.command(epilog="Example: sightline bench camera --seconds 30")(camera)
 
 
 def loop(
@@ -60,6 +66,9 @@ def loop(
     fps: Annotated[float, typer.Option(help="Pictures a second, 1 to 240.")] = 30.0,
     transport: Transport = "zenoh",
     detector_delay_ms: Annotated[float, typer.Option(help="Make every detector this much slower, 0 to 300.")] = 0.0,
+    overload: Annotated[
+        float, typer.Option(help="So many times more pictures than can be detected, e.g. 2; sets rate or detector.")
+    ] = 0.0,
     seconds: Annotated[float, typer.Option(help="Of each contestant, 2 to 600.")] = 10.0,
     peers: Annotated[str, typer.Option(help="all, none, or of older, lekiwi, openpi, callback.")] = "all",
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Leave loop.json and loop.png here.")] = None,
@@ -73,7 +82,9 @@ def loop(
         if peers != "none":
             import zmq  # noqa: F401  # a peer's need; said here, not by a process that dies
     width_px, height_px = size_of(size)
-    setting = LoopSetting(Path(), width_px, height_px, fps, transport, detector_delay_ms, seconds, peers_of(peers))
+    setting = LoopSetting(
+        Path(), width_px, height_px, fps, transport, detector_delay_ms, overload, seconds=seconds, peers=peers_of(peers)
+    )
     race = run_race(setting, lambda line: typer.echo(line, err=True))
     result = _result_of(race)
     if out is not None:
@@ -98,7 +109,29 @@ def watchers(
         from benchmarks.watchers import measure_watchers
 
     setting = LoopSetting(Path(), transport=transport, seconds=seconds)
-    checks = measure_watchers(setting, viewers, lambda line: typer.echo(line, err=True))
+    return _print_judged(measure_watchers(setting, viewers, lambda line: typer.echo(line, err=True)), as_json)
+
+
+def camera(
+    *,
+    seconds: Annotated[float, typer.Option(min=3, max=600, help="Of pictures at 30 fps.")] = 30.0,
+    as_json: Json = False,
+) -> int:
+    """What passing a camera's own JPEGs through costs the network process; the device is a stand-in."""
+    with needs("camera"):
+        from benchmarks.camera import BOUND_MS, MISSED_BOUND, measure_camera
+    from benchmarks.loop_figures import at_most
+
+    seen = measure_camera(seconds)
+    name = f"camera pass-through, CPU a frame (until the frame is ready {seen.ready_ms:.2f})"
+    checks = [
+        at_most(name, seen.cpu_ms, "ms", BOUND_MS),
+        at_most(f"missed frames of {seen.jpeg_bytes:.0f} bytes", seen.missed, "", MISSED_BOUND),
+    ]
+    return _print_judged(checks, as_json)
+
+
+def _print_judged(checks: "Sequence[LoopCheck]", as_json: bool) -> int:
     ok = all(check.ok for check in checks)
     if as_json:
         typer.echo(json.dumps({"ok": ok, "checks": [asdict(check) for check in checks]}))
@@ -128,9 +161,12 @@ def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
 
 
 def _table(race: "Race") -> list[str]:
+    from benchmarks.loop_setting import OUR_EYES
+
     names = f"{'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'bytes':>8} {'others':>7}"
-    head = f"{'':10} {names}  CPU ms a picture; MB"
-    return [head, *(_row(name, race) for name in race.figures)]
+    head = f"{'':18} {names}  CPU ms a picture; MB"
+    alone = [_ALONE] if any(name.endswith(OUR_EYES) for name in race.figures) else []
+    return [head, *(_row(name, race) for name in race.figures), *alone]
 
 
 def _row(name: str, race: "Race") -> str:
@@ -139,7 +175,7 @@ def _row(name: str, race: "Race") -> str:
     cpu = " ".join(f"{process} {cpu_ms:.2f}" for process, cpu_ms in one.cpu_ms.items())
     memory = " ".join(f"{megabytes:.0f}" for megabytes in one.memory_mb.values())
     carried = f"{one.bytes_per_picture or 0:8.0f} {one.taken_percent:5.1f} %"
-    return f"{name:10} {one.answered_percent:7.1f} % {ages}    {carried}  {cpu}; {memory}"
+    return f"{name:18} {one.answered_percent:7.1f} % {ages}    {carried}  {cpu}; {memory}"
 
 
 def _check_lines(checks: "Sequence[Judged]") -> list[str]:

@@ -1,32 +1,31 @@
-"""`sightline bench loop` and `bench watchers`: their figures, and short runs of real processes; nothing is timed."""
+"""`sightline bench loop`: its figures, what it is held against, and what it may be asked to do."""
 
-import json
-import os
-import socket
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.loop import run_race
 from benchmarks.loop_course import Course, Sample, course_of_headers, course_of_tally
-from benchmarks.loop_crew import free_port
-from benchmarks.loop_eyes import Eyes
 from benchmarks.loop_figures import figures_of, judge, percentile
-from benchmarks.loop_machine import Reading, children_of, taken_percent
-from benchmarks.loop_pictures import camera_of, write_pictures
-from benchmarks.loop_setting import FLOOR, OURS, PEERS, TCP, LoopSetting, peers_of, size_of
-from benchmarks.loop_sockets import carried_between, carried_bytes
-from benchmarks.watchers import measure_watchers
-from operator_side.cli_bench_loop import register_bench
-from protocol.errors import ConfigError, HardwareError
-from robot_side.hardware.folder_camera import FolderCamera, FolderCameraConfig
-from tests.link_rigs import until
+from benchmarks.loop_machine import Reading, taken_percent
+from benchmarks.loop_overload import overloaded, with_overload
+from benchmarks.loop_pictures import write_pictures
+from benchmarks.loop_setting import (
+    FLOOR,
+    MAX_FPS,
+    OUR_EYES,
+    OURS,
+    PEERS,
+    TCP,
+    WITH_OUR_EYES,
+    LoopSetting,
+    peers_of,
+    size_of,
+)
+from protocol.errors import ConfigError
 
 SMALL = LoopSetting(Path(), 160, 120, fps=30.0, seconds=2.0, tries=1)
 MS = 1000
@@ -129,6 +128,30 @@ def test_with_a_slow_detector_age_has_bounds_of_its_own_and_must_not_grow():
     assert not found["age p99"]
 
 
+def test_drift_is_from_the_first_ten_seconds_to_the_last():
+    late = [80.0] * 310 + [200.0] * 1400 + [84.0] * 310  # 33 ms each: a minute, bad in its middle
+    ours = figures_of(sample(OURS, late))
+    assert (ours.first_ms, ours.last_ms) == (80.0, 84.0)
+    short = figures_of(sample(OURS, [80.0] * 60 + [200.0] * 180 + [84.0] * 60))
+    assert (short.first_ms, short.last_ms) == (80.0, 84.0)
+
+
+def test_overload_by_rate_has_the_ages_of_an_80_ms_detector():
+    over = replace(SMALL, fps=60.0, overload=2.0)
+    floor = sample(FLOOR, [36.0] * 100)
+    assert all(judged(over, **{FLOOR: floor, OURS: sample(OURS, [90.0] * 99 + [120.0])}).values())
+    assert not judged(over, **{FLOOR: floor, OURS: sample(OURS, [90.1] * 100)})["age p50"]
+    assert not judged(over, **{FLOOR: floor, OURS: sample(OURS, [60.0] * 98 + [120.1] * 2)})["age p99"]
+    beaten = {FLOOR: floor, OURS: sample(OURS, [60.0] * 99), TCP: sample(TCP, [50.0])}
+    assert not judged(over, **beaten)["p50 behind tcp"]
+
+
+def test_transports_with_our_eyes_are_shown_and_not_judged():
+    samples = {FLOOR: sample(FLOOR, [1.0] * 100), OURS: sample(OURS, [2.0] * 100)}
+    alone = {name + OUR_EYES: sample(name + OUR_EYES, [1.5] * 100) for name in WITH_OUR_EYES}
+    assert judged(**samples, **alone) == judged(**samples)
+
+
 @pytest.mark.parametrize("rival", PEERS)
 def test_every_peer_is_a_rival(rival):
     ours, floor = sample(OURS, [2.0] * 100), sample(FLOOR, [1.0] * 100)
@@ -164,7 +187,35 @@ def test_sizes_and_peers_are_read():
         peers_of("older,zmqq")
 
 
-@pytest.mark.parametrize("change", [{"fps": 0.5}, {"seconds": 1}, {"detector_delay_ms": 301}, {"width_px": 63}])
+def test_a_peer_that_is_quick_also_runs_with_our_eyes():
+    assert replace(SMALL, peers=()).contestants == (FLOOR, OURS)
+    assert replace(SMALL, peers=("older", "callback")).contestants == (
+        FLOOR, OURS, TCP, "older", "callback", "callback" + OUR_EYES
+    )
+
+
+@given(st.floats(0.3, 100), st.floats(1.1, 10), st.sampled_from([15.0, 30.0, 60.0, 240.0]))
+def test_overload_means_so_many_times_more_pictures_than_can_be_detected(step_ms, overload, fps):
+    asked = replace(SMALL, fps=fps, overload=overload)
+    found = with_overload(asked, step_ms)
+    assert found.is_loaded and found.fps <= MAX_FPS
+    assert max(found.busy_ms, step_ms) * found.fps / 1000 == pytest.approx(overload, rel=0.05)
+    assert found.busy_ms == 0 or found.fps == fps
+
+
+def test_small_pictures_are_overloaded_by_a_slower_detector(tmp_path):
+    write_pictures(tmp_path, 160, 120)
+    said = []
+    found = overloaded(replace(SMALL, pictures=tmp_path, fps=60.0, overload=2.0), said.append)
+    assert (found.fps, found.busy_ms) == (60.0, pytest.approx(33.3, abs=0.1))
+    assert "33.3 ms" in said[0]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"fps": 0.5}, {"seconds": 1}, {"detector_delay_ms": 301}, {"width_px": 63}, {"overload": 1.0}, {"overload": 11.0},
+     {"overload": 2.0, "detector_delay_ms": 80.0}],
+)
 def test_what_cannot_be_run_is_refused(change):
     with pytest.raises(ConfigError):
         replace(SMALL, **change)
@@ -173,108 +224,3 @@ def test_what_cannot_be_run_is_refused(change):
 def test_an_unknown_transport_is_refused_before_anything_starts():
     with pytest.raises(ConfigError, match="carrier"):
         run_race(replace(SMALL, transport="carrier"), print)
-
-
-# --- the parts, for real -----------------------------------------------------------------------------------------
-
-
-def test_the_pictures_are_those_of_the_camera_and_every_one_is_answered(tmp_path):
-    mean_bytes = write_pictures(tmp_path, 640, 480)
-    assert 40_000 < mean_bytes < 52_000
-    camera = FolderCamera(FolderCameraConfig(path=tmp_path))
-    assert camera.model == camera_of(640, 480)
-    eyes = Eyes(640, 480, 0.0)
-    answers = {eyes.answer(33_333 * at, path.read_bytes()) for at, path in enumerate(sorted(tmp_path.iterdir()), 1)}
-    assert len(answers) > 20  # the ball goes round, and the command with it
-
-
-def test_the_kernel_counts_the_bytes_of_a_connection():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-        with socket.create_connection(("127.0.0.1", port)) as client, server.accept()[0] as accepted:
-            before = carried_bytes([port])
-            accepted.sendall(bytes(5000))
-            received = client.recv(5000, socket.MSG_WAITALL)
-            client.sendall(bytes(70))
-            received += accepted.recv(70, socket.MSG_WAITALL)
-            assert len(received) == 5070
-            assert carried_between(before, carried_bytes([port])) == 5070
-        assert carried_bytes([free_port()]) == {}
-
-
-def test_of_several_connections_to_a_port_the_busiest_counts():
-    assert carried_between({(1, 5): 10}, {(1, 5): 30, (1, 6): 4, (2, 7): 100}) == 120
-    assert carried_between({}, {}) is None
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("transport", ["zenoh", "websocket"])
-def test_a_short_race_of_the_services_over_each_transport(transport):
-    race = run_race(replace(SMALL, transport=transport, peers=()), lambda _: None)
-    assert list(race.figures) == [FLOOR, OURS]
-    ours = race.figures[OURS]
-    assert ours.captured > 20
-    assert ours.answered_percent > 50
-    assert set(ours.cpu_ms) == {"driver", "network", "vision"}
-    assert ours.bytes_per_picture > race.jpeg_bytes
-    assert race.figures[FLOOR].hot_ms is not None
-
-
-@pytest.mark.slow
-def test_every_peer_answers(tmp_path):
-    pytest.importorskip("zmq")
-    race = run_race(replace(SMALL, detector_delay_ms=40.0), lambda _: None)
-    assert set(race.figures) == {FLOOR, OURS, TCP, *PEERS}
-    for name, one in race.figures.items():
-        assert one.captured > 10, name
-        assert one.p50_ms >= 40, name
-        assert name == FLOOR or one.bytes_per_picture > 1000, name
-
-
-@pytest.mark.slow
-def test_viewers_come_and_stall_and_the_loop_goes_on():
-    checks = {check.name: check for check in measure_watchers(replace(SMALL, tries=1), 3, lambda _: None)}
-    assert checks["not accepted"].value < 50
-    assert checks["memory, more"].value < 50
-
-
-@pytest.mark.slow
-def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkeypatch):
-    app = typer.Typer()
-    register_bench(app)
-    monkeypatch.setattr("benchmarks.loop_sample.TAKEN_BOUND_PERCENT", 100.0)
-    asked = ["--size", "160x120", "--seconds", "2", "--peers", "none", "--out", str(tmp_path / "new"), "--json"]
-    code = app(["loop", *asked], standalone_mode=False)
-    printed = json.loads(capsys.readouterr().out)
-    assert code == (0 if printed["ok"] else 5)
-    assert [one["name"] for one in printed["contestants"]] == [FLOOR, OURS]
-    assert json.loads((tmp_path / "new" / "loop.json").read_text()) == printed
-    assert (tmp_path / "new" / "loop.png").read_bytes()[:4] == b"\x89PNG"
-
-
-@pytest.mark.slow
-def test_terminated_it_leaves_no_process_and_no_folder(tmp_path):
-    code = """
-from pathlib import Path
-from benchmarks.loop import run_race
-from benchmarks.loop_setting import LoopSetting
-run_race(LoopSetting(Path(), 160, 120, seconds=60.0, peers=(), tries=1), print)
-"""
-    bench = subprocess.Popen(
-        [sys.executable, "-c", code], env={**os.environ, "TMPDIR": str(tmp_path)}, stderr=subprocess.DEVNULL
-    )
-    try:
-        assert until(lambda: "first answer" in "".join(path.read_text() for path in tmp_path.rglob("floor.log")), 20)
-        (floor,) = children_of(bench.pid)
-        bench.terminate()
-        assert bench.wait(10) != 0
-    finally:
-        bench.kill()
-    assert not Path(f"/proc/{floor}").exists()
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_process_that_cannot_start_is_said_in_its_own_words(monkeypatch):
-    monkeypatch.setattr("benchmarks.loop_sample._MODULE", "benchmarks.no_such_module")
-    with pytest.raises(HardwareError, match="No module named"):
-        run_race(replace(SMALL, peers=()), lambda _: None)

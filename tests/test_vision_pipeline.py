@@ -13,7 +13,7 @@ from protocol.messages import STILL, AnswerHeader, FrameHeader
 from protocol.twist_text import format_twist
 from tests.vision_rig import Rig, camera, eight, jpeg_of, scene
 from vision_side.config import VisionConfig
-from vision_side.pipeline import Answer, Frame, Pipeline, answer_header
+from vision_side.pipeline import Answer, Frame, Pipeline, answer_header, encode_answer
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -124,4 +124,14 @@ def test_only_the_shells_know_of_clocks_and_links() -> None:
         names = {alias.name.split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import)
                  for alias in node.names}
         names |= {(node.module or "").split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-        assert path.name in ("service.py", "dry_run.py") or not names & forbidden, path.name
+        assert path.name in ("service.py", "boxes_service.py", "dry_run.py") or not names & forbidden, path.name
+
+
+COUNTS = st.integers(0, 2**53 - 1)
+SESSIONS = st.from_regex(r"[0-9a-f]{8}", fullmatch=True)
+
+
+@given(SESSIONS, SESSIONS, COUNTS, COUNTS, COUNTS, COUNTS)
+def test_the_quick_answer_header_is_that_of_the_model(robot, vision, frame_seq, t_us, seq, compute_us) -> None:
+    frame = FrameHeader(session=robot, seq=frame_seq, t_us=t_us)
+    assert encode_answer(frame, vision, seq, compute_us) == encode(answer_header(frame, vision, seq, compute_us))

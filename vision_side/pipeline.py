@@ -4,10 +4,12 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 
+from protocol import VERSION
 from protocol.errors import WireError
-from protocol.messages import STILL, AnswerHeader, CameraModel, Echo, FrameHeader, Twist
+from protocol.messages import STILL, AnswerHeader, CameraModel, Echo, FrameHeader, Pose, Twist
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
+from vision_side.detect.boxes import locate_box
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.port import Detection, Detector
 from vision_side.foretell import Foretelling, Motion
@@ -17,6 +19,7 @@ from vision_side.steer import Aim, Steer
 from vision_side.track import Target, Track, from_odometry
 
 Detections = tuple[Detection, ...]
+Places = list[Sighting | None]
 SOURCE = "vision"
 _MAX_DT_S = 0.5  # a longer gap between frames says nothing more about what happened in it
 
@@ -75,19 +78,33 @@ class Pipeline:
 
     def step(self, frame: Frame) -> Answer:
         """Answer `frame`. Never raises for any JPEG bytes; what cannot be used is counted in `skipped`."""
-        header = frame.header
-        if header.session != self._session:
-            self._session = header.session
-            self._forget()
-        if self._last_us is not None and header.t_us <= self._last_us:
+        if not self._is_new(frame.header):
             return self._skip("OUT_OF_ORDER", "frame is not newer than the last")
         try:
             picture = self._decoder.decode(frame.jpeg)
         except WireError as error:
             return self._skip(error.reason, error.detail)
+        detections, radius_m = self._detector.detect(picture), self._config.target.radius_m
+        return self._follow(frame.header, detections, [locate(one, self._camera, radius_m) for one in detections])
+
+    def follow(self, header: FrameHeader, detections: Detections) -> Answer:
+        """Answer the frame of `header`, in which somebody else found `detections`; empty is "saw nothing"."""
+        if not self._is_new(header):
+            return self._skip("OUT_OF_ORDER", "what was looked at is not newer than the last")
+        otherwise_m, sizes = self._expected_m(header.pose), self._config.boxes
+        places = [locate_box(one, self._camera, sizes, otherwise_m) for one in detections]
+        return self._follow(header, detections, places)
+
+    def _is_new(self, header: FrameHeader) -> bool:
+        """Whether `header` is newer than the last; a robot that started again is met afresh."""
+        if header.session != self._session:
+            self._session = header.session
+            self._forget()
+        return self._last_us is None or header.t_us > self._last_us
+
+    def _follow(self, header: FrameHeader, detections: Detections, places: Places) -> Answer:
         dt_s = self._tick(header)
-        detections = self._detector.detect(picture)
-        seen = self._track.step(dt_s, header.pose, self._sightings(detections))
+        seen = self._track.step(dt_s, header.pose, self._sightings(places))
         answer = self._act(dt_s, header, detections, seen)
         if answer.twist is not None:
             self._foretelling.sent(header.t_us, answer.twist)
@@ -107,10 +124,17 @@ class Pipeline:
             self._steer.unmet(dt_s, -asked[0], -asked[1])
         return dt_s
 
-    def _sightings(self, detections: Detections) -> list[Sighting]:
+    def _sightings(self, places: Places) -> list[Sighting]:
         target = self._config.target
-        located = (locate(one, self._camera, target.radius_m) for one in detections)
-        return [one for one in located if one and one.x_m**2 + one.y_m**2 <= target.max_range_m**2]
+        return [one for one in places if one and one.x_m**2 + one.y_m**2 <= target.max_range_m**2]
+
+    def _expected_m(self, pose: Pose) -> float:
+        """How far from the lens a thing is whose box does not tell: where it was last, or where the robot may stay."""
+        target, boxes = self._track.target, self._config.boxes
+        if target is None or (boxes.height_m is None and boxes.width_m is None):
+            return self._config.target.stand_off_m
+        x, y = from_odometry(pose, target.x_m, target.y_m)
+        return math.hypot(x - self._camera.x_m, y - self._camera.y_m)
 
     def _act(self, dt_s: float, header: FrameHeader, detections: Detections, seen: Sighting | None) -> Answer:
         target = self._track.target
@@ -150,3 +174,9 @@ def answer_header(frame: FrameHeader, session: str, seq: int, compute_us: int = 
     """The header of the answer to `frame`, naming it field for field."""
     echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
     return AnswerHeader(source=SOURCE, session=session, seq=seq, echo=echo, compute_us=compute_us)
+
+
+def encode_answer(frame: FrameHeader, session: str, seq: int, compute_us: int) -> bytes:
+    """`encode(answer_header(...))` byte for byte, without the models: every part of it was checked when it came in."""
+    return (f'{{"v":{VERSION},"source":"{SOURCE}","session":"{session}","seq":{seq},"echo":{{"channel":"frame",'
+            f'"session":"{frame.session}","seq":{frame.seq},"t_us":{frame.t_us}}},"compute_us":{compute_us}}}').encode()

@@ -39,7 +39,7 @@ def locate(detection: Detection, camera: CameraModel, radius_m: float) -> Sighti
     outline = detection.outline_px if detection.outline_px is not None else _box_outline(detection, camera)
     if len(outline) < _MIN_POINTS:
         return None
-    centre = _cone_centre(_points_ahead(outline, camera), radius_m)
+    centre = _cone_centre(points_ahead(outline, camera), radius_m)
     if centre is None:
         return None
     right, down, ahead = centre
@@ -48,7 +48,7 @@ def locate(detection: Detection, camera: CameraModel, radius_m: float) -> Sighti
     return Sighting(x_m, camera.y_m - right, detection)
 
 
-def _points_ahead(outline_px: NDArray[np.float64], camera: CameraModel) -> NDArray[np.float64]:
+def points_ahead(outline_px: NDArray[np.float64], camera: CameraModel) -> NDArray[np.float64]:
     """Where the pixels' rays are one metre ahead: right, down, 1, and how far that is (4, N)."""
     points = np.ones((4, len(outline_px)))
     if camera.distortion:

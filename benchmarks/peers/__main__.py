@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from benchmarks.loop_tally import Tally
+from benchmarks.peers.eyes import Eyes
 from benchmarks.peers.film import Film
 
 _RETRY_S: Final = 0.1
@@ -38,14 +39,20 @@ def _part(peer: ModuleType, role: str, settings: dict[str, Any]) -> Callable[[],
     tally, film = Tally(Path(settings["tally"])), Film(Path(settings["pictures"]), settings["fps"])
     signal.signal(signal.SIGTERM, lambda *_: _end(tally))
     if role == "alone":
-        return partial(peer.alone, film, _eyes(settings), tally, hot=not settings["delay_ms"])
+        slow = settings["delay_ms"] or settings["busy_ms"]
+        return partial(peer.alone, film, _eyes(settings), tally, hot=not slow)
     return partial(peer.robot, film, tally, settings["port"])
 
 
-def _eyes(settings: dict[str, Any]) -> Any:
-    from benchmarks.loop_eyes import Eyes  # a robot has no use for it, and it is large
+def _eyes(settings: dict[str, Any]) -> Eyes:
+    """A robot has no use for any, and they are large; nor has a peer with its own for what ours import and set."""
+    if settings["eyes"] == "classic":
+        from benchmarks.peers.classic_eyes import ClassicEyes
 
-    return Eyes(settings["width_px"], settings["height_px"], settings["delay_ms"])
+        return ClassicEyes(settings["delay_ms"], settings["busy_ms"])
+    from benchmarks.loop_eyes import Eyes as OurEyes
+
+    return OurEyes(settings["width_px"], settings["height_px"], settings["delay_ms"], settings["busy_ms"])
 
 
 def _end(tally: Tally) -> None:

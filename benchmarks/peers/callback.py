@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 if TYPE_CHECKING:
-    from benchmarks.loop_eyes import Eyes
     from benchmarks.loop_tally import Tally
+    from benchmarks.peers.eyes import Eyes
     from benchmarks.peers.film import Film
 
 STAMP: Final = struct.Struct("<Q")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final
 from protocol.twist_text import parse_twist
 
 if TYPE_CHECKING:
-    from benchmarks.loop_eyes import Eyes
     from benchmarks.loop_tally import Tally
+    from benchmarks.peers.eyes import Eyes
     from benchmarks.peers.film import Film
 
 _HOT_STEPS: Final = 150

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import zmq
 
 if TYPE_CHECKING:
-    from benchmarks.loop_eyes import Eyes
     from benchmarks.loop_tally import Tally
+    from benchmarks.peers.eyes import Eyes
     from benchmarks.peers.film import Film
 
 Socket = zmq.Socket[bytes]

@@ -16,8 +16,8 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.sync.client import ClientConnection, connect
 
 if TYPE_CHECKING:
-    from benchmarks.loop_eyes import Eyes
     from benchmarks.loop_tally import Tally
+    from benchmarks.peers.eyes import Eyes
     from benchmarks.peers.film import Film
 
 COMMAND_PERIOD_S: Final = 0.0551

@@ -12,8 +12,8 @@ import time
 from typing import IO, TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from benchmarks.loop_eyes import Eyes
     from benchmarks.loop_tally import Tally
+    from benchmarks.peers.eyes import Eyes
     from benchmarks.peers.film import Film
 
 HEAD: Final = struct.Struct("<IQ")

@@ -1,0 +1,115 @@
+"""What the performance page shows: each section's command, and why it is there. Pure."""
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One command of the page and why it is there; `name` is what `--section` calls it.
+
+    With a `picture` the command gets `--out`, and its loop.png is shown under that name.
+    """
+
+    name: str
+    title: str
+    why: str
+    arguments: tuple[str, ...]
+    picture: str = ""
+
+
+_SEEDS: Final = "201,202,203,204,205,206"
+SECTIONS: Final = (
+    Section(
+        "following",
+        "Following, in virtual time",
+        "The services' own logic in lockstep with the simulated world; scored from world truth, judged by the worst "
+        "run. Seeds that nothing was tuned on; loss is on each leg.",
+        ("score", "--seeds", _SEEDS, "--latency-ms", "50", "--loss", "0.1"),
+    ),
+    Section(
+        "eight",
+        "A figure of eight under latency",
+        "Added latency from capture to command, half on each leg. At 400 ms no frame is young enough: the robot is to "
+        "stand still.",
+        ("score", "--scenario", "eight", "--seeds", _SEEDS, "--latency-ms", "0,100,200,400", "--loss", "0.1"),
+    ),
+    Section(
+        "demo",
+        "The same in real time",
+        "`sightline demo`: real processes over Zenoh. The median of six seeds is held against the bounds above x 1.5; "
+        "every run's recorded frames, replayed through a fresh pipeline, must give the twists that were on the wire.",
+        ("bench", "demo", "--seeds", _SEEDS, "--seconds", "12"),
+    ),
+    Section(
+        "killed",
+        "Killed at speed",
+        "Vision and the network process, killed with -9 while driving at 0.3 m/s or more, ten times each; judged "
+        "from the simulated motors' own log. [faults.md](faults.md) has more faults.",
+        ("faults", "--only", "vision.kill", "--only", "network.kill", "--only", "vision.restart", "--repeat", "10"),
+    ),
+    Section("odometry", "Odometry", "Against the simulated world's truth.", ("bench", "odometry")),
+    Section("gate", "Gate", "One command judged and one step decided.", ("bench", "gate")),
+    Section("messages", "Messages", "Encode and decode, hot.", ("bench", "codec")),
+    Section("vision", "Vision", "`Pipeline.step`, decoding included, hot, one thread.", ("bench", "pipeline")),
+    Section(
+        "loop",
+        "The whole loop",
+        "Capture to the driver's verdict over Zenoh, robot and vision in their own processes on this machine, beside "
+        "the floor (the same pipeline in one process, paced the same), bare TCP, and what others build, on the same "
+        "pictures in the same run. On loopback transports tie: what is compared is what a user gets. Peers see as the "
+        "older write-ups do, with OpenCV's whole-picture pipeline; `+our eyes` shows a peer's transport alone, with "
+        "Sightline's pipeline in it and without credit, age or a gate, and is not judged.",
+        ("bench", "loop", "--seconds", "30"),
+        "loop-zenoh.png",
+    ),
+    Section(
+        "loop-websocket",
+        "The whole loop over WebSocket",
+        "The same with `sightline.v1` between robot and vision.",
+        ("bench", "loop", "--transport", "websocket", "--seconds", "30"),
+        "loop-websocket.png",
+    ),
+    Section(
+        "loop-slow",
+        "A detector of 80 ms",
+        "Every detector waits 80 ms longer, as for an accelerator, while 30 pictures a second come. Age must stay "
+        "flat.",
+        ("bench", "loop", "--detector-delay-ms", "80", "--seconds", "60"),
+        "loop-slow.png",
+    ),
+    Section(
+        "loop-overload",
+        "A colour detector, overloaded twice by the frame rate",
+        "60 pictures a second for detectors that work 33.3 ms on each: the robot takes at most 240 a second, which the "
+        "pipeline as it is keeps up with, so that every detector repeats its own work instead.",
+        ("bench", "loop", "--overload", "2", "--fps", "60", "--seconds", "60"),
+        "loop-overload.png",
+    ),
+    Section(
+        "watchers",
+        "Viewers",
+        "Ten viewers of the control stream itself, one of whom never reads and one reads once a second, and what they "
+        "cost whoever drives.",
+        ("bench", "watchers", "--viewers", "10", "--seconds", "60"),
+    ),
+    Section(
+        "watchers-websocket",
+        "Viewers over WebSocket",
+        "The same with `sightline.v1`.",
+        ("bench", "watchers", "--transport", "websocket", "--viewers", "10", "--seconds", "60"),
+    ),
+    Section(
+        "camera",
+        "Camera pass-through",
+        "A V4L2 camera's own JPEGs through the plug-in, its thread included, into the network process; the device is a "
+        "stand-in that gives 640x480 at 30 fps, and what it takes itself is left out.",
+        ("bench", "camera", "--seconds", "60"),
+    ),
+    Section(
+        "robot",
+        "A robot without NumPy, OpenCV and PyBullet",
+        "`sightline[zenoh]` in a new environment, driving in the simulation; memory is the kernel's high-water mark.",
+        ("bench", "robot", "--seconds", "60"),
+    ),
+)
