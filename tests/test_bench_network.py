@@ -1,0 +1,153 @@
+"""`sightline bench network`: its rows, its figures, what it says without root; one real row where that can be run."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from benchmarks.network import NetworkSetting, write_film
+from benchmarks.network_figures import Stretch, figures_of, judge
+from benchmarks.network_rows import ROWS, Row, chosen, spans_s
+from protocol.errors import ConfigError
+from sim.wire import Shape, Shapes, Wire
+from sim.wire_tun import why_impossible
+
+SECOND_US = 1_000_000
+COMMAND = [sys.executable, "-m", "operator_side.cli", "bench", "network"]
+
+
+def status(at_s, state="ACTIVE", accepted=0, stale=0, age_ms=50):
+    return [round(at_s * SECOND_US), state, age_ms * 1000, accepted, stale, 2, 0, 0.4, 80, 100]
+
+
+def frames(*latencies_ms, begin_s=0.0):
+    return [
+        [number, round((begin_s + number / 30) * SECOND_US), None if ms is None else ms * 1000 + number, 20_000]
+        for number, ms in enumerate(latencies_ms)
+    ]
+
+
+def seen(frame_rows=(), statuses=(), end_s=10.0, judged_s=0.0):
+    stretch = Stretch(0, round(judged_s * SECOND_US), round(end_s * SECOND_US))
+    return figures_of({"frames": list(frame_rows), "statuses": list(statuses)}, stretch)
+
+
+# --- rows --------------------------------------------------------------------------------------------------------
+
+
+def test_every_row_harms_packets_and_demands_something():
+    for row in ROWS:
+        assert any(leg != Shape() for phase in row.phases for leg in (phase.shapes.ab, phase.shapes.ba)), row.name
+        demanded = (row.least_fps, row.p50_ms, row.p95_ms, row.over_first_ms, row.flows_again_s)
+        assert any(bound is not None for bound in demanded), row.name
+
+
+def test_rows_are_chosen_by_name():
+    assert [row.name for row in chosen(["rtt40", "cut"])] == ["rtt40", "cut"]
+    assert chosen([]) == ROWS
+    with pytest.raises(ConfigError, match="'rtt4' is no row; there are: rtt40"):
+        chosen(["rtt4"])
+
+
+def test_time_is_shared_among_phases_without_a_length_of_their_own():
+    cut = next(row for row in ROWS if row.name == "cut")
+    assert spans_s(cut, 20.0) == [10.0, 5.0, 10.0]
+
+
+@pytest.mark.parametrize("changes", [{"transport": "smoke"}, {"seconds": 1.0}])
+def test_a_setting_that_cannot_be_run_is_refused(changes):
+    with pytest.raises(ConfigError):
+        NetworkSetting(**changes)
+
+
+def test_a_seed_makes_the_wire_lose_the_same_packets_again():
+    def lost(seed):
+        wire = Wire()
+        wire.shape(Shapes(ab=Shape(loss=0.3), seed=seed))
+        for number in range(200):
+            wire.ab.put(bytes(40) + bytes([number]), number)
+        return [packet[-1] for packet in wire.ab.take_due(10**9)]
+
+    assert lost(1) == lost(1) != lost(2)
+
+
+# --- figures -----------------------------------------------------------------------------------------------------
+
+
+def test_ages_are_those_of_accepted_commands_and_what_came_too_late_is_infinitely_old():
+    rows = frames(None, 40, 41, 42, 43)
+    assert seen(rows, [status(0), status(10)]).p50_ms == pytest.approx(41, abs=1)
+    late = seen(rows, [status(0), status(9.9, stale=100)])
+    assert late.p50_ms == float("inf")
+    assert seen(rows[:1], [status(0), status(10)]).p50_ms is None
+
+
+def test_a_latency_that_stays_the_same_is_no_news():
+    same = [[number, number * 33_333, 40_000, 1] for number in range(10)]
+    assert seen(same).p50_ms is None
+
+
+def test_rate_and_oldest_executed_are_of_the_judged_time_only():
+    statuses = [status(1, accepted=10, age_ms=900), *(status(2 + n / 10, accepted=100 + n * 2) for n in range(81))]
+    figures = seen((), statuses, judged_s=2.0)
+    assert figures.fps == pytest.approx(20, rel=0.05) and figures.executed_ms == 50
+    held = [status(3, "HOLD", age_ms=800)]
+    assert seen((), statuses + held, judged_s=2.0).executed_ms == 50, "held is not driven"
+
+
+def test_holds_are_counted_after_driving_and_to_the_end():
+    states = ["HOLD", "ACTIVE", "HOLD", "HOLD", "ACTIVE", "DEGRADED", "HOLD", "HOLD"]
+    figures = seen((), [status(number / 10, state) for number, state in enumerate(states)])
+    assert figures.holds_s == pytest.approx((0.2, 0.1))
+
+
+def test_flowing_again_is_the_first_acceptance_of_a_frame_of_the_stretch():
+    rows = frames(30, 30, begin_s=-1.0) + frames(30, 31, begin_s=0.4)
+    assert seen(rows).flows_after_s == pytest.approx(0.433, abs=0.01)
+    assert seen(frames(30, begin_s=-1.0)).flows_after_s is None
+
+
+def test_a_bound_that_is_broken_is_not_ok_and_none_is_never_ok():
+    row = Row("x", "x", ROWS[0].phases, least_fps=28, p50_ms=55, p95_ms=60, flows_again_s=1, most_holds=0)
+    good = judge(row, [seen(frames(*range(40, 50), begin_s=0.1), [status(0), status(9.9, accepted=300)])], "x")
+    assert all(check.ok for check in good)
+    bad = {check.name: check.ok for check in judge(row, [seen((), [status(0), status(1, "HOLD"), status(2)])], "x")}
+    assert bad == {
+        "x age p50": False, "x age p95": False, "x answered": False, "x holds": False, "x flows again": False,
+        "x oldest executed": True,
+    }
+
+
+def test_the_film_is_recorded_pictures(tmp_path):
+    assert write_film(tmp_path).stat().st_size > 100_000
+
+
+# --- the command -------------------------------------------------------------------------------------------------
+
+
+def test_an_unknown_row_is_one_line(tmp_path):
+    done = subprocess.run([*COMMAND, "--only", "moon"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "there are: rtt40" in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="drops root")
+def test_without_root_it_says_what_it_needs():
+    drop = "import os, sys; os.setgid(65534); os.setuid(65534); from operator_side.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", drop, "bench", "network", "--only", "rtt40"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if "ModuleNotFoundError" in done.stderr or "Permission" in done.stderr:
+        pytest.skip("this checkout cannot be read without root")
+    assert done.returncode == 2 and "run it as root on Linux" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(why_impossible()), reason="needs root and /dev/net/tun")
+def test_a_short_row_is_run_for_real():
+    command = [*COMMAND, "--only", "near", "--seconds", "4", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    told = json.loads(done.stdout)
+    names = [check["name"] for check in told["checks"]]
+    assert "near.1 injected" in names and told["rows"][0]["injected"] > 100
+    assert done.returncode == (0 if told["ok"] else 5), done.stderr
