@@ -13,7 +13,7 @@ from operator_side.service_settings import load_service
 
 def register(app: typer.Typer) -> None:
     """Add the command to `app`."""
-    app.command(epilog="Example: sudo sightline install robot --config robot.toml --user pi --yes")(install)
+    app.command(epilog="Example: sightline install robot --config robot.toml --user pi")(install)
 
 
 def install(

@@ -21,7 +21,9 @@ Listen = Annotated[
 Connect = Annotated[
     list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Connect here, e.g. tcp/192.168.1.20:7447.")
 ]
-Secure = Annotated[str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; needs tls/ ends.")]
+_SECURE = typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; endpoints are then tls/...")
+Secure = Annotated[str, _SECURE]
+MaybeSecure = Annotated[str | None, _SECURE]
 RobotName = Annotated[str | None, typer.Option("--robot", metavar="ID", help="The robot's id [default: r1].")]
 SocketDir = Annotated[
     str | None, typer.Option("--socket-dir", metavar="DIR", help="Where the simulation's sockets are.")
@@ -66,6 +68,7 @@ def robot(
     robot: RobotName = None,
     listen: Listen = None,
     connect: Connect = None,
+    secure: MaybeSecure = None,
     profile: Annotated[str | None, typer.Option(help="`sim`: simulated, armed without a person.")] = None,
     zero_motors: Annotated[
         bool, typer.Option("--zero-motors", help="Only set the motors to zero, e.g. after a crash, and end.")
@@ -81,7 +84,7 @@ def robot(
     from robot_side.driver import run
     from robot_side.driver import zero_motors as set_to_zero
 
-    options: dict[str, Any] = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect)}
+    options: dict[str, Any] = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure}
     options |= {f"{device}.options.socket_dir": socket_dir for device in ("camera", "drive")}
     loaded = load_service(
         "robot", profile=profile, file=config, sets=sets or (), options=options, environ=os.environ
@@ -95,6 +98,7 @@ def vision(
     robot: RobotName = None,
     listen: Listen = None,
     connect: Connect = None,
+    secure: MaybeSecure = None,
     config: ConfigFile = None,
     sets: Sets = None,
     detector: Annotated[
@@ -114,7 +118,8 @@ def vision(
         raise ConfigError("--camera looks without a robot, so there is nothing to steer: add --dry-run")
     if camera_sets and camera is None:
         raise ConfigError("--camera-set is for the camera of --camera; name one, e.g. --camera v4l2")
-    options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "detector.kind": detector}
+    options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure,
+               "detector.kind": detector}
     loaded = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
     with needs("vision"):
         if dry_run:

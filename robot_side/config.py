@@ -1,12 +1,14 @@
 """Configuration of the robot service. Pure."""
 
+import ipaddress
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from protocol.config import Config
 from protocol.messages import RobotId
+from protocol.transports.websocket_endpoints import with_allowed
 from robot_side.guard import GuardConfig
 from robot_side.kinematics import DiffDriveConfig
 from robot_side.limits import SafetyConfig
@@ -22,6 +24,23 @@ class PluginChoice(Config):
     options: dict[str, Any] = Field(default_factory=dict)
 
 
+class LegacyConfig(Config):
+    """Clients of the older text dialect, which carry no token."""
+
+    allow_from: Annotated[tuple[str, ...], Field(max_length=64)] = ()
+    """Addresses and networks they may come from, e.g. 192.168.1.7 or 192.168.1.0/24; demanded beyond loopback."""
+
+    @field_validator("allow_from")
+    @classmethod
+    def _are_networks(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for text in value:
+            try:
+                ipaddress.ip_network(text, strict=False)
+            except ValueError:
+                raise ValueError(f"{text!r} is no address or network, e.g. 192.168.1.7 or 192.168.1.0/24") from None
+        return value
+
+
 class RobotConfig(Config):
     """Everything about one robot."""
 
@@ -30,10 +49,13 @@ class RobotConfig(Config):
     """Where peers may connect. Loopback by default; a LAN address such as tcp/0.0.0.0:7447 is a decision."""
     connect: tuple[str, ...] = ()
     """A router or vision box to connect to, beside or instead of listening."""
+    secure: str = ""
+    """A folder of `sightline keys`: mutual TLS and access rules; endpoints are then tls/... or quic/..."""
     camera: PluginChoice = PluginChoice(kind="sim")
     drive: PluginChoice = PluginChoice(kind="sim")
     range_sensor: PluginChoice | None = None
     """None: the simulation's when the drive is the simulation's, else none; kind "none" switches it off."""
+    legacy: LegacyConfig = LegacyConfig()
     safety: SafetyConfig = SafetyConfig()
     guard: GuardConfig = GuardConfig()
     wheels: DiffDriveConfig = DiffDriveConfig()
@@ -41,6 +63,11 @@ class RobotConfig(Config):
     max_frame_bytes: Annotated[int, Field(ge=1_000, le=1_000_000)] = 400_000
     state_dir: Path = Path("~/.local/state/sightline")
     """Where the STOP latch is kept over restarts."""
+
+    @property
+    def doors(self) -> tuple[str, ...]:
+        """`listen`, with who may come in written into the endpoints of the older dialect."""
+        return tuple(with_allowed(endpoint, self.legacy.allow_from) for endpoint in self.listen)
 
     @property
     def ranging(self) -> PluginChoice | None:

@@ -100,11 +100,11 @@ class RobotProcess:
 class Vision:
     """Answers every frame with the same twist, on a thread, until it is closed."""
 
-    def __init__(self, endpoint: str, twist: bytes = b"0.4000|0.0000", echo_channel: str = "frame"):
+    def __init__(self, endpoint: str, twist: bytes = b"0.4000|0.0000", echo_channel: str = "frame", secure: str = ""):
         self.twist = twist
         self.session = secrets.token_hex(4)
         self.headers = []
-        self.link = open_zenoh("r1", connect=[endpoint], role="vision", timeout_s=10)
+        self.link = open_zenoh("r1", connect=[endpoint], role="vision", timeout_s=10, secure=secure)
         self.status_slot = self.link.latest(STATUS)
         self._frames = self.link.latest(FRAME)
         self._running = True

@@ -159,3 +159,24 @@ def test_serve_ends_when_asked(bench: Bench) -> None:
     running.join(1.0)
     assert not running.is_alive()
     assert said[-1].startswith("vision: ended after 0 frames")
+
+
+def test_frames_that_come_again_after_a_silence_are_told_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.camera()
+    bench.frame(BALL, 1)
+    monkeypatch.setattr("vision_side.service._SILENCE_S", -1.0)
+    bench.turn()
+    bench.frame(BALL, 2)
+    bench.frame(BALL, 3)
+    assert len([line for line in bench.said if "no frames from robot r1" in line]) == 1
+    assert len([line for line in bench.said if "frames from robot r1, session 0000abcd" in line]) == 2
+
+
+def test_what_was_skipped_is_counted_over_every_camera(bench: Bench) -> None:
+    bench.camera()
+    for seq in range(1, 4):
+        bench.frame(b"junk", seq)
+    bench.camera(camera(640, 480))
+    bench.frame(b"junk", 4)
+    bench.frame(BALL, 5)  # the last camera's size
+    assert bench.service.skipped == {"MALFORMED": 5}

@@ -1,12 +1,12 @@
 """Every number of the vision side, with its unit, bounds and reason. Pure."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
 from protocol.channels import FRAME
 from protocol.config import Config
-from protocol.messages import CameraModel, RobotId
+from protocol.messages import CameraModel, Source
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 HueDeg = Annotated[float, Field(ge=0, le=360)]
@@ -37,6 +37,26 @@ class HsvConfig(Config):
     """RMS distance of the outline from a circle, in radii; a square has 0.10."""
     min_outline_kept: Annotated[float, Field(ge=0.2, le=1)] = 0.55
     """Share of the outline that must lie on the circle; the rest may be cut off by something in front."""
+
+
+class DetectorConfig(Config):
+    """Whose eyes: own ones, or boxes that somebody publishes on the channel `detections`."""
+
+    kind: Literal["hsv", "boxes"] = "hsv"
+
+
+class BoxesConfig(Config):
+    """What is steered by when the detector is `boxes`. Without a size the robot only turns towards the box."""
+
+    source: Source = "guest"
+    """Whose boxes."""
+    label: Annotated[str, Field(max_length=64)] = ""
+    """The label that is meant, exactly; empty for any."""
+    min_score: Fraction = 0.25
+    height_m: Annotated[float | None, Field(gt=0.01, le=10)] = None
+    """How tall the thing is; its range follows from it while top and bottom are in view."""
+    width_m: Annotated[float | None, Field(gt=0.01, le=10)] = None
+    """How wide it is, for when the height is not given or not in view."""
 
 
 class TargetConfig(Config):
@@ -119,14 +139,19 @@ def _camera_of_file(value: Any) -> Any:
 class VisionConfig(Config):
     """The vision service."""
 
-    robot: RobotId = "r1"
+    robot: Annotated[str, Field(pattern=r"^[A-Za-z0-9*?][A-Za-z0-9_.*?-]{0,31}$")] = "r1"
+    """A robot's id; with `*` or `?` every robot that fits, each with a pipeline of its own."""
     connect: Annotated[tuple[str, ...], Field(max_length=16)] = ("tcp/127.0.0.1:7447",)
     listen: Annotated[tuple[str, ...], Field(max_length=16)] = ()
+    secure: str = ""
+    """A folder of `sightline keys`: mutual TLS and access rules; endpoints are then tls/... or quic/..."""
     max_frame_bytes: Annotated[int, Field(ge=1_000, le=FRAME.max_payload_bytes)] = 400_000
     """Security limit: larger frames are refused by the link."""
     max_pixels: Annotated[int, Field(ge=256, le=4096 * 4096)] = 1920 * 1080
     """Security limit: larger pictures are never decoded."""
+    detector: DetectorConfig = DetectorConfig()
     hsv: HsvConfig = HsvConfig()
+    boxes: BoxesConfig = BoxesConfig()
     target: TargetConfig = TargetConfig()
     track: TrackConfig = TrackConfig()
     steer: SteerConfig = SteerConfig()

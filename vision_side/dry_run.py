@@ -50,7 +50,7 @@ def watch_robot(config: VisionConfig, say: Say, seconds: float | None = None) ->
     from protocol.transports.opening import open_link
 
     opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
-                       max_frame_bytes=config.max_frame_bytes)
+                       max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     with opened as link:
         say(f"vision: dry run with robot {config.robot}; nothing is driven")
         service = AckingService(config, link, say)

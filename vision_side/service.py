@@ -7,28 +7,29 @@ import secrets
 import signal
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import TypeVar
 
 from protocol.channels import ACK, CAMERA, FRAME, MAX_HEADER_BYTES, TWIST
-from protocol.codec import decode, encode
+from protocol.codec import decode
 from protocol.errors import WireError
-from protocol.messages import CameraModel, FrameHeader
+from protocol.messages import CameraModel, FrameHeader, Stamp
 from protocol.refusals import Refusal
 from protocol.transports.link import LatestSlot, Link, Message
 from protocol.twist_text import format_twist
 from vision_side.config import VisionConfig
-from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, Seen, answer_header
+from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, Seen, encode_answer
 
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 _SILENCE_S = 3.0
 _CAMERA_PATIENCE_S = 1.5
+_SESSIONS_KEPT = 8
 _TOLD_COUNTS = tuple(10**power for power in range(10))  # a camera gone bad is told at 1, 10, 100 ... pictures
 Say = Callable[[str], None]
-Model = TypeVar("Model", CameraModel, FrameHeader)
+Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
 
 
 def run(config: VisionConfig) -> int:
@@ -39,8 +40,10 @@ def run(config: VisionConfig) -> int:
     from protocol.transports.opening import open_link
 
     ending = threading.Event()
+    if set("*?") & set(config.robot):
+        return _run_fleet(config, ending)
     opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
-                        max_frame_bytes=config.max_frame_bytes)
+                        max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     # Signals are caught only from here on: until the link is open, they end the process by themselves.
     with opened as link, _ends_on_signal(ending):
         _say(f"vision: looking for robot {config.robot} at {_endpoints(config)}")
@@ -50,10 +53,31 @@ def run(config: VisionConfig) -> int:
 
 def serve(config: VisionConfig, link: Link, ending: threading.Event, say: Say) -> None:
     """Answer frames that come over `link` until `ending` is set."""
-    service = Service(config, link, say)
+    service = open_service(config, link, say)
     while not ending.is_set():
         service.turn(_WAIT_S)
     say(f"vision: ended after {service.answered} frames; skipped: {dict(service.skipped) or 'none'}")
+
+
+def _run_fleet(config: VisionConfig, ending: threading.Event) -> int:
+    from protocol.transports.zenoh_site import open_site
+    from vision_side.fleet import Fleet
+
+    opened = open_site(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
+                       max_frame_bytes=config.max_frame_bytes, secure=config.secure)
+    with opened as site, _ends_on_signal(ending):
+        _say(f"vision: looking for robots {config.robot} at {_endpoints(config)}")
+        Fleet(config, site, _say).serve(ending)
+    return 0
+
+
+def open_service(config: VisionConfig, link: Link, say: Say) -> "Service":
+    """The service that fits the configured detector, for one robot."""
+    if config.detector.kind == "boxes":
+        from vision_side.boxes_service import BoxesService
+
+        return BoxesService(config, link, say)
+    return Service(config, link, say)
 
 
 class Service:
@@ -62,12 +86,14 @@ class Service:
     def __init__(self, config: VisionConfig, link: Link, say: Say) -> None:
         self._config, self._link, self._say = config, link, say
         self._cameras: LatestSlot[Message] = link.latest(CAMERA)
-        self._frames: LatestSlot[Message] = link.latest(FRAME)
+        self._frames = self._arrivals(link)
         self._camera: CameraModel | None = None
         self._pipeline: Pipeline | None = None
         self._session = secrets.token_hex(4)
         self._robot_session = ""
+        self._sessions: deque[str] = deque(maxlen=_SESSIONS_KEPT)
         self._said: dict[str, str] = {}
+        self._counted: Counter[str] = Counter()
         if config.camera is not None:
             self._use(config.camera)
         self._heard_s = time.monotonic()
@@ -75,27 +101,39 @@ class Service:
         self.answered = 0
         self.skipped: Counter[str] = Counter()
 
+    def _arrivals(self, link: Link) -> LatestSlot[Message]:
+        """Where what is to be answered arrives."""
+        return link.latest(FRAME)
+
     def turn(self, wait_s: float) -> None:
         """Wait up to `wait_s` for a frame and answer it."""
         message = self._frames.take(wait_s)
         started_ns = time.perf_counter_ns()
+        if message is not None and self._pipeline is not None:
+            self._frame(message, started_ns)
+            self._look_at_camera()  # afterwards: it says the same twice a second, and frames are in a hurry
+            return
         self._look_at_camera()
         if message is not None:
             self._frame(message, started_ns)
         elif time.monotonic() - self._heard_s > _SILENCE_S:
+            self._robot_session = ""
             self._tell("link", f"no frames from robot {self._config.robot} at {_endpoints(self._config)}; is "
                                "`sightline robot` running there, with this robot id?")
 
     def _look_at_camera(self) -> None:
         """Take in the camera's model; a new one needs a new pipeline."""
         message = self._cameras.take()
-        camera = self._decoded(CameraModel, message.payload, CAMERA.max_payload_bytes) if message else None
+        if message is None or self._decoded(Stamp, message.header, MAX_HEADER_BYTES) is None:
+            return
+        camera = self._decoded(CameraModel, message.payload, CAMERA.max_payload_bytes)
         if camera is not None and camera != self._camera:
             self._use(camera)
 
     def _use(self, camera: CameraModel) -> None:
         self._camera = camera
         self._pipeline = Pipeline(self._config, camera)
+        self._counted.clear()
         lens = "calibrated" if camera.calibrated else "not calibrated"
         self._tell("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")
 
@@ -103,17 +141,33 @@ class Service:
         header = self._decoded(FrameHeader, message.header, MAX_HEADER_BYTES)
         if header is None:
             return
+        if self._is_over(header.session):
+            self.skipped["OTHER_SESSION"] += 1
+            return
         self._heard_s = time.monotonic()
-        self._tell("link", f"frames from robot {self._config.robot}, session {header.session}")
+        if header.session != self._robot_session:
+            self._robot_session = header.session
+            self._tell("link", f"frames from robot {self._config.robot}, session {header.session}")
         if self._pipeline is None:
             self._wait_for_camera()
             self._publish(header, Answer(None, Seen("no picture", note="no camera model yet")), 0)
             return
-        before = self._pipeline.skipped.copy()
         answer = self._pipeline.step(Frame(header, message.payload))
-        self.skipped.update(self._pipeline.skipped - before)
+        if answer.twist is None:
+            self._count_skipped(self._pipeline.skipped)
         self._publish(header, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._tell_phase(answer)
+
+    def _is_over(self, session: str) -> bool:
+        """Whether the robot has started again since: who sends frames of `session` now is late, or repeats them."""
+        if session not in self._sessions:
+            self._sessions.append(session)
+        return session != self._sessions[-1]
+
+    def _count_skipped(self, skipped: Counter[str]) -> None:
+        """Add what this pipeline has skipped since the last time to what earlier ones did."""
+        self.skipped.update(skipped - self._counted)
+        self._counted = skipped.copy()
 
     def _wait_for_camera(self) -> None:
         """The model comes twice a second; only a longer wait is worth a word."""
@@ -123,7 +177,7 @@ class Service:
 
     def _publish(self, header: FrameHeader, answer: Answer, compute_us: int) -> None:
         self.answered += 1
-        stamp = encode(answer_header(header, self._session, self.answered, compute_us))
+        stamp = encode_answer(header, self._session, self.answered, compute_us)
         if answer.twist is None:
             self._link.publish(ACK, stamp, b"")
         else:

@@ -75,7 +75,7 @@ def secured_for(folder: str, source: str) -> Secured | None:
     """What a link of role `source` shows and checks; None for no folder. Raises ConfigError for a missing file."""
     if not folder:
         return None
-    role = certificate_role(source)
+    role, folder = certificate_role(source), str(Path(folder).expanduser())
     missing = [name for name in ("ca.pem", f"{role}.pem", f"{role}.key") if not (Path(folder) / name).is_file()]
     if missing:
         raise ConfigError(f"{missing[0]} is missing in {folder}: make keys with `sightline keys init`, and copy "

@@ -87,16 +87,17 @@ def _parts(sample: zenoh.Sample) -> tuple[bytes, bytes]:
 
 
 class ZenohLink:
-    """A `Link` over one Zenoh session of its own. A link does not hear what it publishes itself."""
+    """A `Link` over one Zenoh session. A link does not hear what it publishes itself."""
 
-    def __init__(self, session: zenoh.Session, rules: LinkRules) -> None:
-        """Take over an open `session`; closing the link closes it."""
+    def __init__(self, session: zenoh.Session, rules: LinkRules, shared: bool = False) -> None:
+        """Use an open `session`; closing the link closes it unless it is `shared` with others."""
         self.robot = rules.robot
         self._session = session
         self._rules = rules
         self._outlets: dict[str, _Outlet] = {}
         self._ending = ExitStack()
-        self._ending.callback(session.close)  # first in, so last to run
+        if not shared:
+            self._ending.callback(session.close)  # first in, so last to run
         self._declaring = threading.Lock()
         self._closed = False
         self._in_callback = threading.local()
@@ -183,7 +184,9 @@ class ZenohLink:
         self.close()
 
     def _receive(self, channel: Channel, sample: zenoh.Sample, callback: Callable[[Message], None]) -> None:
-        if str(sample.kind) != "SampleKind.PUT":
+        import zenoh
+
+        if sample.kind != zenoh.SampleKind.PUT:
             self._rules.refuse(NOT_A_PUT)
             return
         header, payload = _parts(sample)

@@ -1,0 +1,100 @@
+"""Many robots over one Zenoh session: who is there, and a `Link` to each. Shell.
+
+    with open_site("r*", connect=["tcp/127.0.0.1:7447"], role="vision") as site:
+        link = site.link("r1")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from fnmatch import fnmatchcase
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from protocol.channels import FRAME, KEY_PREFIX, STATUS, parse_key
+from protocol.errors import ConfigError
+from protocol.transports.endpoints import check_endpoints
+from protocol.transports.link import Link
+from protocol.transports.link_rules import LinkRules
+from protocol.transports.secured import secured_for
+from protocol.transports.zenoh import MAX_ROBOTS, ZenohLink
+from protocol.transports.zenoh_session import open_session
+
+if TYPE_CHECKING:
+    import zenoh
+
+
+def open_site(
+    pattern: str,
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    role: str = "",
+    timeout_s: float = 5.0,
+    max_frame_bytes: int = FRAME.max_payload_bytes,
+    secure: str = "",
+) -> ZenohSite:
+    """Open a session for every robot whose id fits `pattern` (`*` any text, `?` any letter); use it in a `with`.
+
+    Raises ConfigError for an endpoint that is none or not of Zenoh, LinkError as `open_zenoh` does.
+    """
+    for endpoint in (*listen, *connect):
+        if "://" in endpoint:
+            raise ConfigError(f"{endpoint}: several robots (--robot {pattern!r}) need Zenoh; write tcp/<host>:<port>")
+    check_endpoints(listen, connect)
+    session = open_session(listen, connect, timeout_s, secured_for(secure, role))
+    return ZenohSite(session, pattern, role, max_frame_bytes)
+
+
+class ZenohSite:
+    """One session. Robots are noticed by their status; a link to one shares the session."""
+
+    def __init__(self, session: zenoh.Session, pattern: str, role: str, max_frame_bytes: int) -> None:
+        """Take over an open `session`."""
+        self._session, self._pattern, self._role, self._max_frame_bytes = session, pattern, role, max_frame_bytes
+        self._ending = ExitStack()
+        self._ending.callback(session.close)
+        self._seen: dict[str, None] = {}
+        self._news: Callable[[], None] = lambda: None
+        self._listen()
+
+    def robots(self) -> list[str]:
+        """Ids of all that were heard so far, in the order of their first word."""
+        return list(self._seen)
+
+    def on_news(self, callback: Callable[[], None]) -> None:
+        """Call `callback`, on Zenoh's thread, when a robot is heard for the first time."""
+        self._news = callback
+
+    def link(self, robot: str) -> Link:
+        """A link to `robot` over the shared session, closed with the site."""
+        rules = LinkRules(robot, self._role, self._max_frame_bytes)
+        return self._ending.enter_context(ZenohLink(self._session, rules, shared=True))
+
+    def close(self) -> None:
+        """Close all links and the session."""
+        self._ending.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _listen(self) -> None:
+        import zenoh
+
+        handler = zenoh.handlers.Callback(self._note, indirect=False)
+        subscriber = self._session.declare_subscriber(f"{KEY_PREFIX}/*/{STATUS.name}", handler)
+        self._ending.callback(subscriber.undeclare)
+
+    def _note(self, sample: zenoh.Sample) -> None:
+        parsed = parse_key(str(sample.key_expr))
+        if parsed is None or parsed[0] in self._seen or len(self._seen) >= MAX_ROBOTS:
+            return
+        if fnmatchcase(parsed[0], self._pattern):
+            self._seen[parsed[0]] = None
+            self._news()

@@ -1,0 +1,105 @@
+"""Several robots, one vision: a pipeline for each, newest frames only, in fair turns. Shell.
+
+    sightline vision --robot 'r*' --listen tcp/0.0.0.0:7447
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from types import TracebackType
+from typing import Protocol, Self
+
+from protocol.channels import Channel
+from protocol.transports.link import LatestSlot, Link, Message
+from vision_side.config import VisionConfig
+from vision_side.service import Say, Service, open_service
+
+_LONGEST_WAIT_S = 0.2
+
+
+class Site(Protocol):
+    """Where robots are met."""
+
+    def robots(self) -> list[str]:
+        """Ids of all heard so far."""
+        ...
+
+    def on_news(self, callback: Callable[[], None]) -> None:
+        """Call `callback` when another one is heard."""
+        ...
+
+    def link(self, robot: str) -> Link:
+        """A link to one of them."""
+        ...
+
+
+class _Belled:
+    """A link whose slots ring `bell` when something is put into them; all else is the link's own."""
+
+    def __init__(self, link: Link, bell: threading.Event) -> None:
+        self._link, self._bell = link, bell
+        self.robot = link.robot
+
+    def latest(self, channel: Channel) -> LatestSlot[Message]:
+        slot: LatestSlot[Message] = LatestSlot()
+        self.subscribe(channel, slot.put)
+        return slot
+
+    def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
+        def ring(message: Message) -> None:
+            callback(message)
+            self._bell.set()
+
+        self._link.subscribe(channel, ring)
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        return self._link.publish(channel, header, payload, source)
+
+    def has_listener(self, channel: Channel) -> bool:
+        return self._link.has_listener(channel)
+
+    def close(self) -> None:
+        self._link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Fleet:
+    """A service for each robot that is heard. One turn gives every robot with something new its turn."""
+
+    def __init__(self, config: VisionConfig, site: Site, say: Say) -> None:
+        self._config, self._site, self._say = config, site, say
+        self._bell = threading.Event()
+        self.services: dict[str, Service] = {}
+        site.on_news(self._bell.set)
+
+    def serve(self, ending: threading.Event) -> None:
+        """Until `ending` is set."""
+        while not ending.is_set():
+            self._bell.wait(_LONGEST_WAIT_S)
+            self._bell.clear()
+            self.turn()
+        for robot, service in self.services.items():
+            skipped = dict(service.skipped) or "none"
+            self._say(f"vision: {robot}: ended after {service.answered} frames; skipped: {skipped}")
+
+    def turn(self) -> None:
+        """Answer at most one frame of each robot: whatever came meanwhile waits one round, whoever sends more."""
+        for robot in self._site.robots():
+            if robot not in self.services:
+                self._welcome(robot)
+            self.services[robot].turn(0.0)
+
+    def _welcome(self, robot: str) -> None:
+        config = self._config.model_copy(update={"robot": robot})
+        self.services[robot] = open_service(config, _Belled(self._site.link(robot), self._bell), self._of(robot))
+
+    def _of(self, robot: str) -> Say:
+        return lambda line: self._say(line.replace("vision: ", f"vision: {robot}: ", 1))
