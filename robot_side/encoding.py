@@ -66,9 +66,9 @@ class Encoding:
     # --- what is heard -------------------------------------------------------------------------------------------
 
     def on_sent(self, size_bytes: int, now_us: int) -> None:
-        """A picture of this size left."""
+        """A picture of this size left; 0 for one whose size is not told, from which nothing is learnt."""
         self._frames += 1
-        if self._frames <= _LAG_FRAMES:
+        if self._frames <= _LAG_FRAMES or not size_bytes:
             return
         self._bytes = size_bytes if not self._bytes else 0.7 * self._bytes + 0.3 * size_bytes
         self._choose(now_us)

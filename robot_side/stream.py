@@ -76,7 +76,9 @@ class Stream:
     @property
     def _has_credit(self) -> bool:
         """While answers are overdue, one frame for each time that nothing came back: what is under way comes first."""
-        return self._may_probe if self._overdue else len(self._in_flight) < self.window
+        if self._overdue:
+            return self._may_probe or not self._in_flight
+        return len(self._in_flight) < self.window
 
     @property
     def wish(self) -> Wish:

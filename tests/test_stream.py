@@ -108,3 +108,21 @@ def test_the_rate_is_bounded_whatever_the_camera_does():
             sent += 1
     assert sent <= 23
     assert stream.status(2_000_000).fps <= 12
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_whatever_happens_a_picture_is_taken_again(seed):
+    """Frames lost, late, answered out of order, by whom it may be, and changes of the holder: credit always returns."""
+    chance, stream, sent, now = random.Random(seed), Stream(StreamConfig()), 0, 0
+    for _ in range(400):
+        now += chance.choice((1_000, 20_000, 90_000, 400_000))
+        if stream.may_capture(now, listening=True):
+            stream.on_sent(sent, now, now, chance.choice((0, 12_000, 48_000)))
+            sent += 1
+        for _ in range(chance.choice((0, 0, 1, 2))):
+            who, seq = chance.choice((VISION, VIEWER)), chance.randrange(sent + 1)
+            stream.on_answer(who, seq, chance.choice((0, 80_000)), now)
+        if chance.random() < 0.05:
+            stream.on_holder(chance.choice((VISION, VIEWER, None)), now)
+    until = now + 3_000_000
+    assert any(stream.may_capture(later, listening=True) for later in range(now, until, 10_000)), "it is stuck"
