@@ -21,6 +21,9 @@ REFUSED_EXIT = 5
 
 Robot = Annotated[str, typer.Argument(metavar="[ROBOT]", help="The robot's id.")]
 Connect = Annotated[list[str], typer.Option("--connect", metavar="ENDPOINT", help="Where the robot or router listens.")]
+Secure = Annotated[
+    str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; endpoints are then tls/...")
+]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
 DEFAULT_CONNECT = [DEFAULT_ENDPOINT]
 
@@ -37,11 +40,12 @@ def register(app: typer.Typer) -> None:
 
 def robots(
     connect: Connect = DEFAULT_CONNECT,
+    secure: Secure = "",
     seconds: Annotated[float, typer.Option(min=0.2, max=60, help="How long to listen.")] = 1.0,
     as_json: Json = False,
 ) -> None:
     """List the robots that are heard."""
-    heard = list_robots(connect, seconds)
+    heard = list_robots(connect, seconds, secure)
     if as_json:
         typer.echo(json.dumps({"robots": [_as_object(name, heard[name]) for name in sorted(heard)]}))
         return
@@ -68,11 +72,12 @@ def _as_object(name: str, message: Message) -> dict[str, Any]:
 def status(
     robot: Robot = "r1",
     connect: Connect = DEFAULT_CONNECT,
+    secure: Secure = "",
     watch: Annotated[bool, typer.Option("--watch", help="Once a second, until Ctrl-C.")] = False,
     as_json: Json = False,
 ) -> None:
     """Say what a robot does and why: state, driver, twist, frame age, latency, every refusal."""
-    with _operator(robot, connect) as operator:
+    with _operator(robot, connect, secure) as operator:
         while True:
             report = operator.wait_report()
             if as_json:
@@ -87,33 +92,34 @@ def status(
 def arm(
     robot: Robot = "r1",
     connect: Connect = DEFAULT_CONNECT,
+    secure: Secure = "",
     wait: Annotated[float, typer.Option(min=0, max=60, help="Seconds to wait for live commands.")] = 5.0,
     as_json: Json = False,
 ) -> int:
     """Let whoever drives a robot move its wheels. The robot must be seeing live commands."""
-    with _operator(robot, connect) as operator:
+    with _operator(robot, connect, secure) as operator:
         return _tell(robot, operator.arm(wait), as_json)
 
 
-def disarm(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, as_json: Json = False) -> int:
+def disarm(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> int:
     """Wheels to zero; commands are judged but not obeyed until armed again."""
-    with _operator(robot, connect) as operator:
+    with _operator(robot, connect, secure) as operator:
         return _tell(robot, operator.ask(Verb.DISARM), as_json)
 
 
-def reset(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, as_json: Json = False) -> int:
+def reset(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> int:
     """Leave STOPPED or FAULT. Permits arming, starts nothing."""
-    with _operator(robot, connect) as operator:
+    with _operator(robot, connect, secure) as operator:
         return _tell(robot, operator.ask(Verb.RESET), as_json)
 
 
-def stop(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, as_json: Json = False) -> None:
+def stop(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> None:
     """STOP a robot: wheels to zero, latched until `sightline reset`. Not an emergency stop: it needs the network."""
 
     def on_slow() -> None:
         typer.echo(f"STOP of {robot} is not confirmed yet; repeating. Be ready to cut its power by hand", err=True)
 
-    with _operator(robot, connect) as operator:
+    with _operator(robot, connect, secure) as operator:
         _tell_stopped(robot, operator.stop(on_slow), as_json)
 
 
@@ -136,6 +142,6 @@ def _tell(robot: str, reply: Reply, as_json: bool) -> int:
 
 
 @contextmanager
-def _operator(robot: str, connect: list[str]) -> Iterator[Operator]:
-    with open_link(robot, connect=connect, role=SOURCE) as link:
+def _operator(robot: str, connect: list[str], secure: str) -> Iterator[Operator]:
+    with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
         yield Operator(link)

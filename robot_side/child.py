@@ -13,6 +13,8 @@ from robot_side import ipc
 from robot_side.config import RobotConfig
 
 _PACKETS_PER_WAKE = 64  # a flood is drained in portions, so that no tick waits for its end
+_PACKETS_ASIDE = 1024  # more than that socket holds: all of it, but not for ever
+_LAST_WORDS_US = 500_000  # to read what a dead process sent; a descendant may hold its end open
 _FIRST_BACKOFF_US = 700_000  # the wheels are at zero before anybody can drive them again
 _LONGEST_BACKOFF_US = 2_000_000
 _WEDGED_US = 2_000_000
@@ -39,6 +41,10 @@ class NetworkChild:
         self._session = session
         self._process: subprocess.Popen[bytes] | None = None
         self.socket: socket.socket | None = None
+        """To wait on: commands from it, verdicts and messages to it."""
+        self._aside: socket.socket | None = None
+        """Nobody waits on it: frames issued, and the robot's motion. It wakes neither end."""
+        self._gone_us = 0
         self._start_at_us = 0
         self._backoff_us = _FIRST_BACKOFF_US
         self._was_ready = False
@@ -48,7 +54,7 @@ class NetworkChild:
 
     def keep_alive(self, now_us: int, first_seq: int) -> None:
         """Start it if it is not there and its time has come."""
-        if self._process is not None and self._process.poll() is not None:
+        if self._process is not None and self._process.poll() is not None and self._is_read(now_us):
             self._on_exit(self._process.returncode, now_us)
         if self._heard:
             self._heard, self._heard_us = False, now_us
@@ -64,22 +70,28 @@ class NetworkChild:
 
     def _start(self, first_seq: int) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with ExitStack() as undo, theirs:
-            undo.callback(ours.close)
-            ours.setblocking(False)
+        aside, their_aside = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with ExitStack() as undo, theirs, their_aside:
+            for end in (ours, aside):
+                undo.callback(end.close)
+                end.setblocking(False)
             setup = Setup(config=self._config, session=self._session, first_seq=first_seq)
             ours.send(setup.model_dump_json().encode())
-            command = [sys.executable, "-m", "robot_side.network", str(theirs.fileno())]
-            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
+            ends = (theirs.fileno(), their_aside.fileno())
+            command = [sys.executable, "-m", "robot_side.network", *map(str, ends)]
+            self._process = subprocess.Popen(command, pass_fds=ends, stdin=subprocess.DEVNULL)
             undo.pop_all()
-        self.socket = ours
+        self.socket, self._aside = ours, aside
         self.restarts += 1
 
+    def _is_read(self, now_us: int) -> bool:
+        """Whether all is read that the dead process sent: its last packet may be a STOP."""
+        self._gone_us = self._gone_us or now_us
+        return self.socket is None or now_us - self._gone_us >= _LAST_WORDS_US
+
     def _on_exit(self, code: int, now_us: int) -> None:
-        self._process = None
-        if self.socket:
-            self.socket.close()
-            self.socket = None
+        self._process, self._gone_us = None, 0
+        self._hang_up()
         if not self._was_ready:  # it said why itself
             self.failed_at_start, self.exit_code = True, code if code > 0 else 1
             return
@@ -94,40 +106,43 @@ class NetworkChild:
 
     def send(self, packet: bytes) -> None:
         """Hand over a packet or drop it: a child that does not read must not slow the driver."""
-        if self.socket:
-            try:
-                self.socket.send(packet)
-            except OSError:
-                return
+        _send(self.socket, packet)
+
+    def send_aside(self, packet: bytes) -> None:
+        """As `send`, without waking it: it looks when it needs to know."""
+        _send(self._aside, packet)
 
     def packets(self) -> Iterator[bytes]:
-        """What it has sent, a bounded portion."""
-        for _ in range(_PACKETS_PER_WAKE):
-            packet = self._receive()
+        """What it has sent, a bounded portion: first all that it sent aside before."""
+        arrived = list(self._arrived())
+        for _ in range(_PACKETS_ASIDE):
+            packet = _receive(self._aside) if self._aside else None
             if not packet:
-                return
-            self._heard = True
+                break
             yield packet
+        self._heard = self._heard or bool(arrived)
+        yield from arrived
 
-    def _receive(self) -> bytes:
-        if self.socket is None:
-            return b""
-        try:
-            packet = self.socket.recv(ipc.MAX_PACKET_BYTES)
-        except BlockingIOError:
-            return b""
-        except OSError:
-            packet = b""
-        if not packet:  # it is gone, or will be: nothing more to wait for on this socket
-            self.socket.close()
-            self.socket = None
-        return packet
+    def _arrived(self) -> Iterator[bytes]:
+        for _ in range(_PACKETS_PER_WAKE):
+            packet = _receive(self.socket) if self.socket else None
+            if packet:
+                yield packet
+            elif packet is None:
+                return
+            elif self.socket:  # it is gone, and all that it sent is read
+                self.socket.close()
+                self.socket = None
+
+    def _hang_up(self) -> None:
+        for end in (self.socket, self._aside):
+            if end:
+                end.close()
+        self.socket = self._aside = None
 
     def close(self) -> None:
         """End it: it leaves when its socket closes, and is killed if it does not within a second."""
-        if self.socket:
-            self.socket.close()
-            self.socket = None
+        self._hang_up()
         if self._process is None:
             return
         deadline_s = time.monotonic() + _END_S
@@ -135,3 +150,23 @@ class NetworkChild:
             time.sleep(0.01)
         self._process.kill()
         self._process.wait()
+
+
+def _send(end: socket.socket | None, packet: bytes) -> None:
+    if end:
+        try:
+            end.send(packet)
+        except OSError:
+            return
+
+
+def _receive(end: socket.socket) -> bytes | None:
+    """The next packet; None while there is none; empty when the other end is gone and all it sent has been read."""
+    for _ in range(2):
+        try:
+            return end.recv(ipc.MAX_PACKET_BYTES)
+        except BlockingIOError:
+            return None
+        except OSError:  # that it left packets of ours unread is told first, once; what it sent still waits
+            continue
+    return b""

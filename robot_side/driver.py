@@ -15,7 +15,7 @@ from types import FrameType
 from protocol.channels import REQUEST, TWIST, check_robot_id
 from protocol.codec import decode
 from protocol.errors import WireError
-from protocol.messages import State, StreamStatus
+from protocol.messages import LastRefusal, State, StreamStatus
 from robot_side import ipc
 from robot_side.child import NetworkChild
 from robot_side.config import RobotConfig
@@ -24,6 +24,7 @@ from robot_side.latch import StopLatch
 from robot_side.limits import TICK_US
 from robot_side.plugins import build
 from robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
+from robot_side.refusal_log import RefusalLog
 from robot_side.scribe import Scribe
 from robot_side.supervision import ServiceManager, become_punctual
 
@@ -82,6 +83,8 @@ class Driver:
         self._manager = ServiceManager()
         self._watchdog_due_us = self._ticked_us = 0
         self._obeyed = False
+        self._verdicts: list[ipc.Judged] = []
+        self._refusals = RefusalLog()
         self.child = NetworkChild(config, self._driving.session, self.scribe.say)
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, self._on_signal)
@@ -103,6 +106,8 @@ class Driver:
                 self._tick(now_us, punctual=True)
             elif arrived and now_us - self._ticked_us >= _MIN_TICK_US:
                 self._tick(now_us, punctual=False)
+            elif arrived:
+                self._answer()
         self._manager.tell("STOPPING=1")
         return self.child.exit_code
 
@@ -128,7 +133,7 @@ class Driver:
     def _tick(self, now_us: int, *, punctual: bool) -> None:
         self._ticked_us = now_us
         self._move(now_us)
-        self.child.send(ipc.pack_motion(self._driving.motion()))
+        self._answer()
         if punctual:
             for message in self._driving.messages(now_us):
                 self.child.send(ipc.pack_message(ipc.Kind.PUBLISH, message))
@@ -136,6 +141,13 @@ class Driver:
             self._driving.network_restarts = max(0, self.child.restarts)
             self._show(self._driving.gate.state, self._driving.gate.reason)
             self._feed_watchdog(now_us)
+
+    def _answer(self) -> None:
+        """Verdicts, once the wheels obey; motion first, for the frame that a verdict permits tells of it."""
+        self.child.send_aside(ipc.pack_motion(self._driving.motion()))
+        verdicts, self._verdicts = self._verdicts, []
+        for judged in verdicts:
+            self.child.send(ipc.pack_judged(judged))
 
     def _feed_watchdog(self, now_us: int) -> None:
         if now_us >= self._watchdog_due_us:
@@ -186,19 +198,36 @@ class Driver:
             self._driving.on_issued(*ipc.unpack_issued(packet))
         elif kind is ipc.Kind.STREAM:
             self._driving.stream = decode(StreamStatus, packet[1:])
+        elif kind is ipc.Kind.REFUSED:
+            self._on_turned_away(ipc.unpack_refused(packet))
         elif kind is ipc.Kind.READY:
             self.child.on_ready()
         return False
 
+    def _on_turned_away(self, counts: dict[str, int]) -> None:
+        """Counts of one network process; those of an earlier one are lost with it."""
+        before, self._driving.turned_away = self._driving.turned_away, counts
+        for reason, count in counts.items():
+            if count > before.get(reason, 0):
+                refusal = LastRefusal(source="the network", reason=reason, detail="turned away by the transport")
+                self._tell(refusal, count - before.get(reason, 0))
+
     def _on_raw(self, packet: bytes) -> bool:
-        message = ipc.unpack_message(packet)
+        message, refused_before = ipc.unpack_message(packet), self._driving.gate.last_refusal
         if message.channel is TWIST:
             judged = self._driving.on_twist(message, _now_us())
             if judged is not None:
-                self.child.send(ipc.pack_judged(judged))
+                self._verdicts.append(judged)
         elif message.channel is REQUEST:
             self._driving.on_request(message, _now_us())
+        refusal = self._driving.gate.last_refusal
+        if refusal is not None and refusal is not refused_before:
+            self._tell(refusal)
         return True
+
+    def _tell(self, refusal: LastRefusal, times: int = 1) -> None:
+        if line := self._refusals.line(refusal, _now_us(), times):
+            self.scribe.say(f"robot {self._driving.config.robot}: {line}")
 
 
 def _now_us() -> int:

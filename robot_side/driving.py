@@ -1,5 +1,6 @@
 """The driver process's own logic: messages in, wheel speeds and messages out. Pure; `driver.py` is its shell."""
 
+from collections import Counter
 from collections.abc import Iterator
 
 from protocol.channels import ODOMETRY, REPLY, SCAN, STATUS, Channel
@@ -62,6 +63,8 @@ class Driving:
         self.stream = StreamStatus()
         self.tick_late_max_us = 0
         self.network_restarts = 0
+        self.turned_away: dict[str, int] = {}
+        """By the transport, before the gate could judge it: how often, by reason."""
         self._seqs: dict[str, int] = {}
         self._due_us: dict[str, int] = {}
         self._outbox: list[Message] = []
@@ -148,7 +151,7 @@ class Driving:
             frame_age_us=gate.frame_age_us(now_us),
             latency_us=gate.latency_us,
             accepted=gate.accepted,
-            refused=dict(gate.counters),
+            refused=dict(gate.counters + Counter(self.turned_away)),
             last_refusal=gate.last_refusal,
             stream=self.stream,
             auto_arm=gate.arms_itself,

@@ -1,15 +1,22 @@
 """What the driver process and its network child say to each other, one SOCK_SEQPACKET packet each. Pure.
 
-    network -> driver   ISSUED  a frame is about to be published: seq, capture time, fingerprint
-                        RAW     bytes of a twist or request as they came: channel, source, header, payload
+    network -> driver   RAW     bytes of a twist or request as they came: channel, source, header, payload
                         STREAM  stream counters, JSON
+                        REFUSED what the transport turned away so far: how often, by reason
                         READY   the endpoint is open
-    driver -> network   MOTION  what the next frame's header says of the robot
-                        VERDICT a twist was judged: whose, which frame, computing time, and who drives
+              aside     ISSUED  a frame is about to be published: seq, capture time, fingerprint
+    driver -> network   VERDICT a twist was judged: whose, which frame, computing time, and who drives
                         PUBLISH bytes to publish: channel, header, payload
+              aside     MOTION  what the next frame's header says of the robot
+
+`aside` is a second socket that nobody waits on: whoever needs what is there reads it all first. So a frame that leaves
+wakes no driver just when vision wants the processor, and no tick wakes the network process. The driver reads ISSUED
+before it judges a RAW: it was sent before the frame, so it is there before any answer.
 """
 
+import json
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -34,6 +41,7 @@ class Kind(IntEnum):
     MOTION = 5
     VERDICT = 6
     PUBLISH = 7
+    REFUSED = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +116,17 @@ def _pack_holder(holder: Holder | None) -> tuple[bytes, bytes]:
 def _unpack_holder(source: bytes, session: bytes) -> Holder | None:
     name = source.rstrip(b"\0").decode()
     return Holder(source=name, session=session.decode()) if name else None
+
+
+def pack_refused(counts: Mapping[str, int]) -> bytes:
+    """What never reached the driver, by reason."""
+    return bytes([Kind.REFUSED]) + json.dumps(dict(counts)).encode()
+
+
+def unpack_refused(packet: bytes) -> dict[str, int]:
+    """The inverse."""
+    counts = json.loads(packet[1:])
+    return {str(reason): int(count) for reason, count in counts.items()}
 
 
 def pack_message(kind: Kind, message: Message) -> bytes:

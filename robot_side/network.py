@@ -1,6 +1,6 @@
 """The network process: camera and link; forwards raw commands to the driver, publishes for it. Shell.
 
-Started by `robot_side.child` with one end of a socket pair; it ends when that socket closes.
+Started by `robot_side.child` with its ends of two socket pairs; it ends when the first closes.
 """
 
 import os
@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import zlib
+from collections import Counter
 from contextlib import ExitStack, suppress
 
 from protocol.channels import ACK, FRAME, REQUEST, TWIST
@@ -18,7 +19,9 @@ from protocol.errors import HardwareError, SightlineError, WireError
 from protocol.transports.link import Link, Message
 from protocol.transports.opening import open_link
 from robot_side import ipc
+from robot_side.adjusting import Adjusting
 from robot_side.child import Setup
+from robot_side.parent import ParentDriver
 from robot_side.plugins import build
 from robot_side.ports import Camera, Picture
 from robot_side.sending import Sending
@@ -33,23 +36,25 @@ _LEAVES_WITHIN_S = 3.0
 class Network:
     """The camera loop (main thread), the driver's packets (a thread), the link's callbacks (its thread)."""
 
-    def __init__(self, setup: Setup, driver: socket.socket, link: Link, camera: Camera) -> None:
+    def __init__(self, setup: Setup, driver: ParentDriver, link: Link, camera: Camera) -> None:
         self._driver = driver
         self._link = link
         self._camera = camera
+        self._adjusting = Adjusting(camera)
         config = setup.config
         self._sending = Sending(config.stream, setup.session, setup.first_seq, config.max_frame_bytes)
         self._lock = threading.Lock()
         self._credit = threading.Event()
-        self._dropped_commands = 0
         self._camera_fault = ""
+        self._refused_acks: Counter[str] = Counter()
+        self._refused_told: Counter[str] = Counter()
         self.running = True
 
     def run(self) -> None:
         """Until the driver closes its end."""
-        self._to_driver(bytes([ipc.Kind.READY]))
-        self._link.subscribe(TWIST, self._forward)
-        self._link.subscribe(REQUEST, self._forward)
+        self._driver.tell(bytes([ipc.Kind.READY]))
+        self._link.subscribe(TWIST, self._driver.forward)
+        self._link.subscribe(REQUEST, self._driver.forward)
         self._link.subscribe(ACK, self._on_ack)
         threading.Thread(target=self._read_driver, daemon=True).start()
         while self.running:
@@ -59,6 +64,7 @@ class Network:
 
     def _stream_one(self) -> None:
         listening = self._link.has_listener(FRAME)
+        self._sending.motion = self._driver.motion(self._sending.motion)
         with self._lock:
             due = self._sending.may_capture(_now_us(), listening)
             nap_s = self._sending.wait_us(_now_us()) / 1e6
@@ -66,6 +72,7 @@ class Network:
             self._credit.wait(min(nap_s, _LONGEST_NAP_S) if listening and nap_s > 0 else _LONGEST_NAP_S)
             self._credit.clear()
             return
+        self._adjusting.follow(self._sending.wish)
         picture = self._read_camera()
         if picture is not None:
             self._send(picture)
@@ -86,35 +93,28 @@ class Network:
         return picture
 
     def _send(self, picture: Picture) -> None:
+        self._sending.motion = self._driver.motion(self._sending.motion)
         with self._lock:
             sent = self._sending.on_camera(picture, _now_us())
+            camera = self._sending.camera_message(self._adjusting.seen(picture), _now_us())
+        if camera is not None:  # before the first picture that it is the model of
+            self._link.publish(camera.channel, camera.header, camera.payload)
         if sent is None:
             return
         header, message = sent
         # The driver must know a frame before anybody can answer it.
         fingerprint = zlib.crc32(picture.jpeg) if self._camera.live else 0
-        if self._to_driver(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
+        if self._driver.tell_aside(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
             self._link.publish(message.channel, message.header, message.payload)
 
     # --- the driver ----------------------------------------------------------------------------------------------
-
-    def _to_driver(self, packet: bytes) -> bool:
-        try:
-            self._driver.send(packet, socket.MSG_DONTWAIT)
-        except OSError:
-            return False
-        return True
-
-    def _forward(self, message: Message) -> None:
-        """A command goes on at once, undecoded; when the driver does not keep up, it is dropped and counted."""
-        if not self._to_driver(ipc.pack_message(ipc.Kind.RAW, message)):
-            self._dropped_commands += 1
 
     def _read_driver(self) -> None:
         """Until the driver closes its end; then the camera loop ends, or the whole process if it hangs."""
         status_due_us = 0
         try:
-            while packet := self._receive():
+            while packet := self._driver.receive():
+                self._driver.retry()
                 with suppress(ValueError):  # a message over its bounds: one lost message
                     self._on_packet(packet)
                 now_us = _now_us()
@@ -127,17 +127,9 @@ class Network:
             time.sleep(_LEAVES_WITHIN_S)
             os._exit(1)
 
-    def _receive(self) -> bytes:
-        try:
-            return self._driver.recv(ipc.MAX_PACKET_BYTES)
-        except OSError:
-            return b""
-
     def _on_packet(self, packet: bytes) -> None:
         kind = ipc.kind_of(packet)
-        if kind is ipc.Kind.MOTION:
-            self._sending.motion = ipc.unpack_motion(packet)
-        elif kind is ipc.Kind.VERDICT:
+        if kind is ipc.Kind.VERDICT:
             with self._lock:
                 self._sending.on_judged(ipc.unpack_judged(packet), _now_us())
             self._credit.set()
@@ -148,17 +140,27 @@ class Network:
     def _report(self, now_us: int) -> None:
         """Tell the driver how the stream does, and everybody what the camera is."""
         with self._lock:
-            status = self._sending.status(now_us, self._dropped_commands, self._camera.model.calibrated)
-            camera = self._sending.camera_message(self._camera.model, now_us)
-        self._to_driver(bytes([ipc.Kind.STREAM]) + encode(status))
+            status = self._sending.status(now_us, self._driver.dropped_commands)
+            status = self._adjusting.shown_in(status, getattr(self._link, "dropped", {}))
+            camera = self._sending.camera_message(self._adjusting.model, now_us)
+        self._driver.tell(bytes([ipc.Kind.STREAM]) + encode(status))
+        self._report_refused()
         if camera is not None:
             self._link.publish(camera.channel, camera.header, camera.payload)
+
+    def _report_refused(self) -> None:
+        """What never reached the driver is shown in `status` too."""
+        by_link: dict[str, int] = dict(getattr(self._link, "refused", {}))  # copied at once: other threads count in it
+        refused = Counter(dict(self._refused_acks)) + Counter(by_link)
+        if refused != self._refused_told and self._driver.tell(ipc.pack_refused(refused)):
+            self._refused_told = refused
 
     def _on_ack(self, message: Message) -> None:
         try:
             with self._lock:
                 self._sending.on_ack(message, _now_us())
-        except WireError:
+        except WireError as error:
+            self._refused_acks[error.reason] += 1
             return
         self._credit.set()
 
@@ -167,14 +169,16 @@ def _now_us() -> int:
     return time.monotonic_ns() // 1000
 
 
-def _run(driver: socket.socket) -> None:
-    setup = Setup.model_validate_json(driver.recv(ipc.MAX_PACKET_BYTES))
+def _run(driver: ParentDriver) -> None:
+    setup = Setup.model_validate_json(driver.receive())
     config = setup.config
     with ExitStack() as ending:
         camera: Camera = build("cameras", config.camera)
         ending.callback(camera.close)
         link = ending.enter_context(
-            open_link(config.robot, listen=config.listen, connect=config.connect, role="robot")
+            open_link(
+                config.robot, listen=config.listen, connect=config.connect, role="robot", secure=config.secure
+            )
         )
         where = ", ".join(config.listen) or "connected to " + ", ".join(config.connect)
         print(f"robot {config.robot}: on {where}, camera {config.camera.kind}", flush=True)
@@ -182,9 +186,9 @@ def _run(driver: socket.socket) -> None:
 
 
 def main() -> None:
-    """Entry of the child process: argv[1] is the socket's descriptor."""
+    """Entry of the child process: argv[1] and argv[2] are the sockets' descriptors."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the driver ends us, after zero
-    driver = socket.socket(fileno=int(sys.argv[1]))
+    driver = ParentDriver(*(socket.socket(fileno=int(number)) for number in sys.argv[1:3]))
     code = 1
     try:
         _run(driver)

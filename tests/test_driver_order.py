@@ -1,0 +1,143 @@
+"""What the driver and its network process tell each other, and in which order: issued before judged, motion before
+verdict, and nobody woken by what can wait."""
+
+import select
+import signal
+import socket
+
+import pytest
+
+from protocol.channels import TWIST
+from protocol.codec import encode
+from protocol.messages import AnswerHeader, Echo
+from protocol.transports.link import Message
+from robot_side import ipc
+from robot_side.child import NetworkChild
+from robot_side.config import RobotConfig
+from robot_side.driver import Driver
+from robot_side.limits import SafetyConfig
+from robot_side.parent import ParentDriver
+
+SEQ, T_US = 7, 1_000
+
+
+class StillDrive:
+    """Obeys, and has no encoder."""
+
+    def set(self, left_rad_s, right_rad_s):
+        pass
+
+    def wheels(self):
+        return None
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def ends(tmp_path):
+    """The driver's hold on its child and the child's on its driver, joined by real sockets."""
+    waited, aside = (socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2))
+    child = NetworkChild(RobotConfig(state_dir=tmp_path), "0a0a0a0a", lambda line: None)
+    child.socket, child._aside = waited[0], aside[0]
+    for end in (waited[0], aside[0]):
+        end.setblocking(False)
+    yield child, ParentDriver(waited[1], aside[1])
+    for end in (*waited, *aside):
+        end.close()
+
+
+@pytest.fixture
+def driver(tmp_path, ends):
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    config = RobotConfig(state_dir=tmp_path, safety=SafetyConfig(auto_arm=True))
+    made = Driver(config, StillDrive(), None)
+    made.child = ends[0]
+    yield made
+    made.scribe.close()
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def answer(session, seq=SEQ, t_us=T_US):
+    echo = Echo(channel="frame", session=session, seq=seq, t_us=t_us)
+    header = AnswerHeader(source="vision", session="0b0b0b0b", seq=1, echo=echo, compute_us=900)
+    return Message(TWIST, "vision", encode(header), b"0.1|0")
+
+
+def test_a_frame_that_is_told_after_its_answer_is_still_read_before_it(ends):
+    child, parent = ends
+    parent.forward(answer("0a0a0a0a"))
+    parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
+    assert [ipc.kind_of(packet) for packet in child.packets()] == [ipc.Kind.ISSUED, ipc.Kind.RAW]
+
+
+def test_all_frames_are_read_before_a_portion_of_commands(ends):
+    child, parent = ends
+    for seq in range(100):
+        assert parent.tell_aside(ipc.pack_issued(seq, T_US, 0))
+    for _ in range(80):
+        parent.forward(answer("0a0a0a0a"))
+    kinds = [ipc.kind_of(packet) for packet in child.packets()]
+    assert kinds == [ipc.Kind.ISSUED] * 100 + [ipc.Kind.RAW] * 64
+    assert [ipc.kind_of(packet) for packet in child.packets()] == [ipc.Kind.RAW] * 16
+
+
+def test_a_frame_that_leaves_does_not_wake_the_driver(ends):
+    child, parent = ends
+    parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
+    assert select.select([child.socket], [], [], 0.05)[0] == []
+    assert [ipc.kind_of(packet) for packet in child.packets()] == [ipc.Kind.ISSUED]
+
+
+def test_a_tick_does_not_wake_the_network_process_and_the_newest_motion_is_what_it_reads(ends):
+    child, parent = ends
+    for latency_us in (1, 2, 3):
+        child.send_aside(ipc.pack_motion(ipc.Motion(latency_us=latency_us)))
+    assert select.select([parent._waited], [], [], 0.05)[0] == []
+    assert parent.motion(ipc.Motion()).latency_us == 3
+    assert parent.motion(ipc.Motion(latency_us=4)).latency_us == 4, "nothing new: the last stays"
+
+
+def test_motions_that_nobody_reads_hold_nobody_up_and_the_next_are_heard(ends):
+    child, parent = ends
+    for latency_us in range(5000):
+        child.send_aside(ipc.pack_motion(ipc.Motion(latency_us=latency_us)))
+    assert parent.motion(ipc.Motion()).latency_us < 5000
+    child.send_aside(ipc.pack_motion(ipc.Motion(latency_us=5001)))
+    assert parent.motion(ipc.Motion()).latency_us == 5001
+
+
+def test_the_frame_that_a_verdict_permits_carries_the_latency_of_that_verdict(driver, ends, monkeypatch):
+    _, parent = ends
+    driver._driving.gate.arms_itself = False
+    told = []
+    monkeypatch.setattr(driver.child, "send_aside", lambda packet: told.append(ipc.unpack_motion(packet)))
+    monkeypatch.setattr(driver.child, "send", lambda packet: told.append(ipc.unpack_judged(packet)))
+    driver._driving.gate.latency_us = None
+    monkeypatch.setattr("robot_side.driver._now_us", lambda: T_US + 4_000)
+    _arm(driver)
+    parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
+    parent.forward(answer(driver._driving.session))
+    assert driver._drain()
+    driver._tick(T_US + 4_000, punctual=False)
+    motion, judged = told
+    assert motion.latency_us == 4_000 and judged.seq == SEQ and judged.compute_us == 900
+
+
+def test_a_verdict_is_told_though_the_next_tick_is_not_due(driver, ends):
+    _, parent = ends
+    parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
+    parent.forward(answer(driver._driving.session))
+    assert driver._drain()
+    driver._answer()
+    assert ipc.unpack_judged(parent.receive()).seq == SEQ
+    driver._answer()
+    assert select.select([parent._waited], [], [], 0.05)[0] == [], "once"
+
+
+def _arm(driver):
+    """Bring the gate to HOLD as its own table would; how it arms is tested with the gate."""
+    from robot_side.states import Event
+
+    driver._driving.gate._go(Event.ARM, "armed for the test")
