@@ -1,6 +1,7 @@
 """The command `faults`: break things on purpose and judge what the wheels did. Shell. Exit code 5 when a row fails."""
 
 import json
+import os
 import tempfile
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from operator_side.faults.report import Results
 
 CHECK_FAILED = 5
+JOBS = min(4, (os.cpu_count() or 1) + 1)
+"""A row waits more than it computes; a row that was disturbed too much says so and runs again."""
+SAFETY_PAGE = "safety.md"
 
 
 def register(app: typer.Typer) -> None:
@@ -29,15 +33,21 @@ def faults(
     ] = None,
     short: Annotated[bool, typer.Option("--short", help="The short set, as in CI.")] = False,
     repeat: Annotated[int, typer.Option(min=1, max=100, help="Run each row so often.")] = 1,
+    jobs: Annotated[
+        int, typer.Option(min=1, max=16, help="Rows at once; those that take the whole machine run alone.")
+    ] = JOBS,
     listing: Annotated[bool, typer.Option("--list", help="Name the rows and what each demands; run nothing.")] = False,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the report, e.g. docs/faults.md.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the report, e.g. docs/faults.md; its worst goes into safety.md."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> int:
     """Start real processes, break one thing at a time, and judge from the simulated motors' own log."""
     with needs("all"):
-        from operator_side.faults.bench import run_rows
         from operator_side.faults.machine import describe_machine
-        from operator_side.faults.report import markdown, passed, run_line, to_dict
+        from operator_side.faults.parallel import run_rows
+        from operator_side.faults.report import markdown, passed, progress_line, to_dict
         from operator_side.faults.rows import chosen
     rows = chosen(only or (), short=short)
     if listing:
@@ -46,16 +56,28 @@ def faults(
     if out is not None and not out.absolute().parent.is_dir():
         raise ConfigError(f"--out {out}: there is no folder {out.parent}; name a file in one that exists")
     machine, folder = describe_machine(), Path(tempfile.mkdtemp(prefix="sightline-faults-"))
-    results = run_rows(rows, repeat, folder, lambda one: typer.echo(run_line(one), err=as_json))
+    results = run_rows(
+        rows, repeat, folder, jobs, lambda one, progress: typer.echo(progress_line(one, *progress), err=as_json)
+    )
     _remove_if_empty(folder)
     if out is not None:
-        out.write_text(markdown(results, machine, _command(only, short, repeat), repeat), "utf-8")
+        _write(out, markdown(results, machine, _command(only, short, repeat, jobs), repeat))
     typer.echo(json.dumps(to_dict(results)) if as_json else _summary(results, folder))
     return 0 if passed(results) else CHECK_FAILED
 
 
-def _command(only: list[str] | None, short: bool, repeat: int) -> str:
-    options = [*(f" --only {name}" for name in only or ()), " --short" * short, f" --repeat {repeat}"]
+def _write(out: Path, report: str) -> None:
+    """The report, and its worst values into the page of promises beside it."""
+    from operator_side.faults.worst import page_with_worst
+
+    out.write_text(report, "utf-8")
+    page = out.with_name(SAFETY_PAGE)
+    if page.exists():
+        page.write_text(page_with_worst(page.read_text("utf-8"), report), "utf-8")
+
+
+def _command(only: list[str] | None, short: bool, repeat: int, jobs: int) -> str:
+    options = [*(f" --only {name}" for name in only or ()), " --short" * short, f" --repeat {repeat} --jobs {jobs}"]
     return "sightline faults" + "".join(options)
 
 

@@ -31,7 +31,7 @@ from operator_side.faults.machine import describe_machine
 from operator_side.faults.report import markdown, passed, run_line, to_dict, worst_checks
 from operator_side.faults.row import Outcome
 from operator_side.faults.rows import ROWS, chosen
-from operator_side.faults.sampler import stalled_us
+from operator_side.faults.sampler import read_holes, stalled_us
 from operator_side.score import Check
 from protocol.channels import TWIST
 from protocol.errors import ConfigError, WireError
@@ -171,8 +171,8 @@ def test_a_ledger_is_read_as_it_was_written_and_a_torn_line_is_left_out(tmp_path
 def test_only_holes_in_the_window_spoil_a_row(tmp_path):
     path = tmp_path / "holes.csv"
     path.write_text("100,200\n5000,9000\n20000,20100\n")
-    assert stalled_us(path, 300, 4000) == 0
-    assert stalled_us(path, 150, 6000) == 4000
+    assert stalled_us(read_holes(path), 300, 4000) == 0
+    assert stalled_us(read_holes(path), 150, 6000) == 4000
 
 
 @pytest.mark.parametrize("text", [*MALFORMED, *OVERSIZED], ids=lambda text: repr(text[:12]))

@@ -25,22 +25,29 @@ OVERSIZED: Final = (b"0" * 63 + b"|0", b"0.5|" + b"0" * 253, b"0.5|" + b"0" * HU
 
 
 def _frames(script: Script) -> Iterator[FrameHeader]:
-    """Every new frame, for ever."""
+    """Every new frame, for ever; while none comes (who sends nonsense gets few) the last again, 20 times a second."""
+    last: FrameHeader | None = None
     while True:
-        frame = script.frame()
-        if frame is not None:
-            yield frame
+        last = script.frame() or last
+        if last is not None:
+            yield last
 
 
 def late(script: Script) -> None:
-    """Each command half a second after its frame."""
+    """Each command half a second after its frame, or later where no newer frame is as old as that."""
     waiting: deque[FrameHeader] = deque(maxlen=64)
     while True:
         frame = script.frame()
         if frame is not None:
             waiting.append(frame)
-        while waiting and time.monotonic() - waiting[0].t_us / 1e6 > LATE_S:
-            script.attack(script.answer(waiting.popleft()))
+        while len(waiting) > 1 and _is_late(waiting[1]):
+            waiting.popleft()
+        if waiting and _is_late(waiting[0]):
+            script.attack(script.answer(waiting[0]))
+
+
+def _is_late(frame: FrameHeader) -> bool:
+    return time.monotonic() - frame.t_us / 1e6 > LATE_S
 
 
 def replay(script: Script) -> None:

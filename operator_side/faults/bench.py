@@ -1,11 +1,8 @@
-"""Runs rows of the fault bench and judges them. Shell (processes, files)."""
+"""Runs a row of the fault bench and judges it. Shell (processes, files)."""
 
 import shutil
-import signal
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
-from types import FrameType
 from typing import Final
 
 from operator_side.faults.judge import (
@@ -31,12 +28,12 @@ _WATCHED_US: Final = 1_000_000
 """After the injection: the time in which a stop is measured, and a stalled sampler spoils it."""
 
 
-def run_row(row: Row, folder: Path) -> Outcome:
-    """Run one row, again while its sampler stalled; its files stay in `folder` unless all was well."""
+def run_row(row: Row, folder: Path, run: int = 1) -> Outcome:
+    """Run a row, again while its sampler stalled; its files stay in `folder` unless all was well."""
     if row.setup.wired and (why := why_impossible()):
         return Outcome(row, skipped=why)
     for number in range(1, MOST_TRIES + 1):
-        place = folder / f"{row.id}-{number}"
+        place = folder / f"{row.id}-{run}-{number}"
         shutil.rmtree(place, ignore_errors=True)
         try:
             checks, stalled_us = _run_once(row, place)
@@ -77,30 +74,3 @@ def _motion_checks(row: Row, rig: Rig, injected: Injected) -> Iterable[Check]:
     yield at_most("on old sight", moved_on_old_sight(rows, sent, blind), "lines", 0)
     if row.again:
         yield at_least("drives again", bool(injected.again), "", 1)
-
-
-def run_rows(rows: Iterable[Row], repeat: int, folder: Path, say: Callable[[Outcome], None]) -> list[list[Outcome]]:
-    """Every row `repeat` times; one that is skipped is not repeated."""
-    results: list[list[Outcome]] = []
-    with _terminated_like_interrupted():
-        for row in rows:
-            outcomes: list[Outcome] = []
-            while len(outcomes) < repeat and not any(outcome.skipped for outcome in outcomes):
-                outcomes.append(run_row(row, folder))
-                say(outcomes[-1])
-            results.append(outcomes)
-    return results
-
-
-@contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM ends the bench as Ctrl-C does: no process is left behind."""
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -62,11 +62,12 @@ class Fleet(Processes):
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii").split()
         return int(children[-1]) if children else 0
 
-    def memory_kib(self, names: Iterable[str]) -> dict[int, int]:
-        """Memory that each of these that runs, and each one's child, holds for itself."""
+    def memory_kib(self, names: Iterable[str]) -> dict[tuple[str, bool], int]:
+        """Memory that each of these that runs holds for itself, and (True) its child: one started anew counts as it."""
         running = self._running.keys() & names
-        pids = [pid for name in running for pid in (self.pid(name), self.child(name)) if pid]
-        return {pid: held for pid in pids if (held := _resident_kib(pid)) is not None}
+        pids = {(name, is_child): self.child(name) if is_child else self.pid(name)
+                for name in running for is_child in (False, True)}
+        return {who: held for who, pid in pids.items() if pid and (held := _resident_kib(pid)) is not None}
 
     def end(self) -> list[str]:
         """As `Processes.end`, after waking whoever is stopped."""

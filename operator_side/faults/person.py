@@ -1,4 +1,4 @@
-"""A person at the robot, as a process: asks for STOP (and for reset while it still moves) when triggered. Shell."""
+"""A person at the robot, as a process: asks for STOP (then reset), or for what the robot says of itself. Shell."""
 
 import threading
 from typing import TYPE_CHECKING
@@ -19,6 +19,9 @@ def run_person(options: "PeerOptions", pulled: threading.Event, ledger: Ledger) 
         operator.wait_report(10.0)
         print("person ready", flush=True)
         pulled.wait()
+        if options.fault == "lateness":
+            print(f"late by {operator.wait_report(10.0).status.tick_late_max_us} us", flush=True)
+            return 0
         ledger.note(TOLD)
         ledger.note(INJECTED)
         print(f"state {operator.stop(lambda: None).state}", flush=True)

@@ -10,7 +10,7 @@ from operator_side.score import Check
 
 Results = Sequence[Sequence[Outcome]]
 _LOWEST_IS_WORST: Final = ("injected", "drives again", "sent", "speed kept", "commands after it", "reset refused",
-                           "next driver after")
+                           "next driver after", "came", "admitted", "pictures seen", "ticks")
 _TOLD_IF_WRONG: Final = ("on old sight", "drives again", "reset refused", "exit code", "last speed told")
 """Yes or no: in the table they are in what was demanded."""
 _COUNTED_FROM: Final = 1000
@@ -44,6 +44,12 @@ def run_line(outcome: Outcome) -> str:
     wrong = [_figure(check) + f" (bound {number(check.bound)})" for check in outcome.checks if not check.ok]
     text = ", ".join([outcome.trouble] * bool(outcome.trouble) + (wrong or _figures(outcome.checks)))
     return f"{outcome.row.id:<22} {'ok  ' if outcome.ok else 'FAIL'}  {text}"
+
+
+def progress_line(outcome: Outcome, done: int, total: int, left_s: float) -> str:
+    """`run_line` with how far the whole is."""
+    left = f"{left_s / 60:.0f} min" if left_s >= 90 else f"{left_s:.0f} s"
+    return f"{done:>{len(str(total))}}/{total} ({left} left)  {run_line(outcome)}"
 
 
 def _figures(checks: Iterable[Check]) -> list[str]:

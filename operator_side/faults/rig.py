@@ -18,7 +18,7 @@ from operator_side.faults.fleet import COMMAND_LINE, Fleet, raise_priority
 from operator_side.faults.judge import Motors, Sent, wheel_mps
 from operator_side.faults.ledger import GOOD, INJECTED, now_us, read_ledger
 from operator_side.faults.peer import PeerOptions, Role
-from operator_side.faults.sampler import stalled_us
+from operator_side.faults.sampler import Hole, read_holes, stalled_us
 from operator_side.faults.wires import BenchWire
 from operator_side.toml_text import toml_text
 from protocol.errors import SightlineError
@@ -32,6 +32,8 @@ AT_SPEED_S: Final = 25.0
 STEADY_US: Final = 500_000
 PORT: Final = 7447
 _POLL_S: Final = 0.01
+_TAIL_BYTES: Final = 8192
+"""More than a second of the motors' log."""
 _PROBES: Final = 25
 _CHASE: Final[dict[str, Any]] = {
     "summary": "a ball on a circle at 0.4 m/s", "stand_off_m": 0.8, "look": "plain",
@@ -55,6 +57,8 @@ class Setup:
     """Python expression that is added to the wall clock of vision and robot, in seconds; "" leaves it."""
     camera: str = ""
     """Camera mode from the beginning."""
+    web: bool = False
+    """The robot listens for WebSocket clients too."""
 
     @property
     def at_speed_mps(self) -> float:
@@ -70,9 +74,9 @@ class Rig:
         self._ending = ExitStack()
         self.fleet = Fleet(folder)
         self.wire: BenchWire | None = None
-        self.endpoint = ""
+        self.endpoint = self.web_endpoint = ""
         self._peers: list[str] = []
-        self._before_kib: dict[int, int] = {}
+        self._before_kib: dict[tuple[str, bool], int] = {}
         self._sockets = ""
 
     def __enter__(self) -> Self:
@@ -93,6 +97,7 @@ class Rig:
         if self.setup.wired:
             self.wire = self._ending.enter_context(BenchWire(self.folder / "wire.log"))
         self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"tcp/127.0.0.1:{_free_port()}"
+        self.web_endpoint = f"ws://127.0.0.1:{_free_port()}" if self.setup.web else ""
         self._write_files(self._sockets)
         self.fleet.run("sim", COMMAND_LINE, ["sim", "--config", str(self.folder / "sim.toml")])
         self.fleet.run("sampler", "operator_side.faults.sampler", [str(self.folder / "holes.csv")])
@@ -129,6 +134,7 @@ class Rig:
     def start_robot(self) -> None:
         """Start the robot and wait until it listens."""
         arguments = ["robot", "--config", str(self.folder / "robot.toml"), "--listen", self.endpoint]
+        arguments += ["--listen", self.web_endpoint] if self.web_endpoint else []
         self.fleet.log("robot").unlink(missing_ok=True)
         self.fleet.run("robot", COMMAND_LINE, arguments, namespace=self.wire.robot_side if self.wire else "",
                        environment=self._environment())
@@ -143,6 +149,11 @@ class Rig:
         self._peers.append(name)
         self.fleet.run(name, "operator_side.faults.peer", [options.model_dump_json()],
                        namespace=self.wire.far_side if self.wire else "", environment=self._environment())
+
+    def start_crowd(self, kind: str) -> None:
+        """Let many WebSocket clients come; what they do is noted as by a peer called `crowd`."""
+        arguments = [kind, self.web_endpoint, str(self.folder / "crowd.ledger")]
+        self.fleet.run("crowd", "operator_side.faults.crowd", arguments)
 
     def _environment(self) -> dict[str, str]:
         return {"PYTHONPATH": str(self.folder)} if self.setup.clock else {}
@@ -185,7 +196,7 @@ class Rig:
         self.until(lambda: self._is_steady(mps), seconds, f"{mps} m/s")
 
     def _is_steady(self, mps: float) -> bool:
-        late = [row for row in self.motors() if row.t_us > now_us() - STEADY_US]
+        late = [row for row in self._latest_motors() if row.t_us > now_us() - STEADY_US]
         return len(late) > STEADY_US / 40_000 and all(wheel_mps(row) >= mps for row in late)
 
     def probe_motors(self) -> float:
@@ -204,6 +215,15 @@ class Rig:
         """The motors' log so far."""
         path = self.folder / "motors.csv"
         return judge.read_motors(path.read_text("ascii")) if path.exists() else []
+
+    def _latest_motors(self) -> list[Motors]:
+        """The end of the motors' log: who waits looks often, and the log grows."""
+        path = self.folder / "motors.csv"
+        if not path.exists():
+            return []
+        with path.open("rb") as log:
+            log.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+            return judge.read_motors(log.read().decode("ascii"))  # its first line, cut or a heading, is left out
 
     def sent(self, name: str | None = None) -> list[Sent]:
         """Good commands by one peer, or by all, oldest first."""
@@ -226,12 +246,16 @@ class Rig:
     def grown_mb(self) -> float:
         """The most that any judged process has grown since the wheels were at speed."""
         after_kib = self.fleet.memory_kib(self._judged)
-        grown_kib = (after_kib[pid] - before for pid, before in self._before_kib.items() if pid in after_kib)
+        grown_kib = (after_kib[who] - before for who, before in self._before_kib.items() if who in after_kib)
         return max(grown_kib, default=0) / 1024
 
     def stalled_us(self, from_us: int, to_us: int) -> int:
         """The longest time in the window for which stamps cannot be trusted."""
-        return stalled_us(self.folder / "holes.csv", from_us, to_us)
+        return stalled_us(self.holes(), from_us, to_us)
+
+    def holes(self) -> list[Hole]:
+        """When this machine stood still."""
+        return read_holes(self.folder / "holes.csv")
 
 
 def _free_port() -> int:

@@ -43,6 +43,8 @@ class Row:
     """In words, what `Injected.checks` demand."""
     short: bool = False
     """Part of the short set."""
+    alone: bool = False
+    """It takes the whole machine: no other row runs beside it."""
 
     @property
     def demanded(self) -> str:

@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from typing import Final
 
-from operator_side.faults import rows_commands, rows_network, rows_people, rows_processes
+from operator_side.faults import rows_commands, rows_crowd, rows_network, rows_people, rows_processes
 from operator_side.faults.row import Row
 from operator_side.settings_errors import no_such_name
 from protocol.errors import ConfigError
 
-ROWS: Final[tuple[Row, ...]] = (*rows_processes.ROWS, *rows_network.ROWS, *rows_commands.ROWS, *rows_people.ROWS)
+ROWS: Final[tuple[Row, ...]] = (
+    *rows_processes.ROWS, *rows_network.ROWS, *rows_commands.ROWS, *rows_crowd.ROWS, *rows_people.ROWS,
+)
 
 
 def chosen(only: Sequence[str], *, short: bool) -> list[Row]:

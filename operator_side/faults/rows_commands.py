@@ -111,7 +111,7 @@ ROWS: Final = (
     _row("wrapped", "their numbers wrap"),
     _row("malformed", "nan, inf, 1e400, underscores, full-width, empty, 3 fields, 257 bytes, 10 MB, binary ..."),
     Row("command.flood", "commands: an old one at 10 kHz", partial(_attack, at_least_times=FLOOD_AT_LEAST),
-        Setup(fault="flood"), also=f">= {FLOOD_AT_LEAST} sent", short=True),
+        Setup(fault="flood"), also=f">= {FLOOD_AT_LEAST} sent", short=True, alone=True),
     Row("command.reversal", "commands: full speed ahead and back at 50 Hz", _reverse, Setup(fault="reversal"),
         also=f"speed changes by <= {GAIN_MPS2:g} m/s2"),
     _row("heartbeat", "none, but frames are acknowledged and the link is alive", short=True),

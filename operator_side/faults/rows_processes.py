@@ -98,7 +98,8 @@ def _hold_gil(rig: Rig) -> Injected:
 
 
 @contextmanager
-def _busy_processes() -> Iterator[None]:
+def busy_processes() -> Iterator[None]:
+    """Four processes that want all the processor they can get."""
     busy = [subprocess.Popen([sys.executable, "-c", _BUSY_LOOP]) for _ in range(BUSY)]
     try:
         yield
@@ -109,7 +110,7 @@ def _busy_processes() -> Iterator[None]:
 
 
 def _starve(rig: Rig) -> Injected:
-    with _busy_processes():
+    with busy_processes():
         rig.watch(SETTLED_S)
         injected = _kill_vision(rig)
     return Injected(BUSY, injected.at_us)
@@ -154,7 +155,7 @@ ROWS: Final = (
     Row("network.pause", "network process: SIGSTOP 3 s", _pause_network, _SCRIPT, blind=True, again=True),
     Row("network.gil", "network process: C code holds the interpreter 1 s", _hold_gil, _SCRIPT, blind=True, again=True,
         short=True),
-    Row("driver.starved", "four busy processes beside it; then vision: SIGKILL", _starve, _SCRIPT),
+    Row("driver.starved", "robot: four busy processes beside it; then vision: SIGKILL", _starve, _SCRIPT, alone=True),
     *(
         Row(f"end.{number.name.lower()}", f"robot: {number.name} while moving", partial(_end_robot, number=number),
             _SCRIPT, blind=True, also=_ENDED, short=number is signal.SIGTERM)

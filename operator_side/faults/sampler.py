@@ -8,13 +8,21 @@ A process of its own beside the simulation's receiving thread and at its priorit
 import os
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from operator_side.faults.ledger import now_us
 
 PERIOD_S: Final = 0.005
 STALL_US: Final = 20_000
+
+
+class Hole(NamedTuple):
+    """Nothing ran here from `from_us` to `to_us`."""
+
+    from_us: int
+    to_us: int
 
 
 def sample(path: Path) -> None:
@@ -30,9 +38,13 @@ def sample(path: Path) -> None:
         last_us = woke_us
 
 
-def stalled_us(path: Path, from_us: int, to_us: int) -> int:
+def read_holes(path: Path) -> list[Hole]:
+    """All that were noted so far."""
+    return [Hole(*map(int, line.split(","))) for line in path.read_text("ascii").split("\n")[:-1]]
+
+
+def stalled_us(holes: Iterable[Hole], from_us: int, to_us: int) -> int:
     """The longest hole that touches the window, 0 without one."""
-    holes = [tuple(map(int, line.split(","))) for line in path.read_text("ascii").split("\n")[:-1]]
     return max((end - start for start, end in holes if start < to_us and end > from_us), default=0)
 
 

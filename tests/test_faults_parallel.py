@@ -1,0 +1,101 @@
+"""Rows of the fault bench side by side: order, turns alone, skips, a row whose process dies, an interrupt."""
+
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from operator_side.faults import parallel
+from operator_side.faults.parallel import run_rows
+from operator_side.faults.report import progress_line
+from operator_side.faults.rig import Setup
+from operator_side.faults.row import Outcome, Row
+from operator_side.score import Check
+
+GOOD = (Check("zero", 1.0, "ms", 2.0, True),)
+
+
+def row(name, **changes):
+    return Row(f"made.{name}", f"made up: {name}", lambda rig: None, Setup(), **changes)
+
+
+@pytest.fixture
+def bench(monkeypatch, tmp_path):
+    """Rows that run nothing but note when they did, in a process of their own as real ones."""
+
+    def run(made, folder, number):
+        began_s = time.monotonic()
+        if made.id.endswith("dies"):
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(0.15)
+        skipped = "needs root" if made.id.endswith("skips") else ""
+        (folder / f"{made.id}-{number}").write_text(f"{began_s} {time.monotonic()}")
+        return Outcome(made, () if skipped else GOOD, skipped=skipped)
+
+    monkeypatch.setattr(parallel, "run_row", run)
+    return tmp_path
+
+
+def spans(folder: Path, name: str):
+    return [tuple(map(float, path.read_text().split())) for path in sorted(folder.glob(f"made.{name}-*"))]
+
+
+def overlaps(one, other):
+    return one[0] < other[1] and other[0] < one[1]
+
+
+def test_the_results_stand_in_the_order_of_the_rows_and_each_run_is_told(bench):
+    told = []
+    rows = [row("a"), row("b"), row("c")]
+    results = run_rows(rows, 2, bench, 2, lambda outcome, progress: told.append((outcome.row.id, progress)))
+    assert [[one.row.id for one in outcomes] for outcomes in results] == [[f"made.{name}"] * 2 for name in "abc"]
+    assert [progress.done for _, progress in told] == [1, 2, 3, 4, 5, 6]
+    assert told[-1][1].left_s == 0 and 0 < told[2][1].left_s < 5
+
+
+def test_as_many_run_at_once_as_was_said(bench):
+    run_rows([row("a"), row("b")], 2, bench, 2, lambda *_: None)
+    everything = spans(bench, "a") + spans(bench, "b")
+    beside = [sum(overlaps(one, other) for other in everything) - 1 for one in everything]
+    assert max(beside) >= 1
+    for moment in [(begin + end) / 2 for begin, end in everything]:
+        assert sum(begin < moment < end for begin, end in everything) <= 2
+
+
+def test_a_row_that_wants_the_machine_alone_gets_it_last(bench):
+    run_rows([row("alone", alone=True), row("a"), row("b")], 2, bench, 3, lambda *_: None)
+    (first, second), others = spans(bench, "alone"), spans(bench, "a") + spans(bench, "b")
+    assert not overlaps(first, second) and first[0] > max(end for _, end in others)
+
+
+def test_what_is_skipped_is_told_but_not_repeated(bench):
+    told = []
+    (outcomes,) = run_rows([row("skips")], 5, bench, 1, lambda outcome, progress: told.append(progress.done))
+    assert [one.skipped for one in outcomes] == ["needs root"] and len(spans(bench, "skips")) == 1
+    assert told == [1, 2, 3, 4, 5]
+
+
+def test_a_row_whose_own_process_dies_fails_and_ends_nothing_else(bench):
+    died, well = run_rows([row("dies"), row("a")], 1, bench, 1, lambda *_: None)
+    assert "ended" in died[0].trouble and not died[0].ok and well[0].ok
+
+
+def test_whoever_interrupts_the_bench_interrupts_its_rows(bench):
+    def interrupt(outcome, progress):
+        raise KeyboardInterrupt
+
+    began_s = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        run_rows([row("a"), row("b"), row("c")], 3, bench, 3, interrupt)
+    assert time.monotonic() - began_s < 5 and not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize(
+    ("left_s", "says"), [(0.0, "0 s left"), (89.0, "89 s left"), (90.0, "2 min left"), (3000.0, "50 min left")]
+)
+def test_a_run_is_told_with_how_long_the_rest_takes(left_s, says):
+    line = progress_line(Outcome(row("a"), GOOD), 3, 520, left_s)
+    assert line.startswith("  3/520 (") and says in line and "made.a" in line
