@@ -11,15 +11,28 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.channels import CHANNELS, SCAN, check_robot_id, key_for, parse_key
+from protocol.channels import CHANNELS, MAX_HEADER_BYTES, SCAN, check_robot_id, key_for, parse_key
 from protocol.codec import decode, decode_ranges, encode, encode_ranges
 from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
+from protocol.legacy import (
+    MAX_BOXES,
+    MAX_BOXES_BYTES,
+    decode_picture,
+    encode_picture,
+    format_boxes,
+    parse_boxes,
+    parse_dashed,
+    text_bound,
+)
 from protocol.messages import Wire
 from protocol.refusals import Refusal
+from protocol.transports.websocket_framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
 from protocol.twist_text import MAX_TWIST_BYTES, format_twist, parse_twist
 
 CORPUS = Path(__file__).parent / "fuzz_corpus"
+MOST_PICTURE_BYTES = 120
+"""Small, so that what is over the bound fits into a corpus."""
 MODELS = {
     model.__name__: (model, size)
     for channel in CHANNELS.values()
@@ -60,6 +73,43 @@ def check_key(data):
         assert key_for(check_robot_id(robot), channel, source).encode() == data
 
 
+def check_picture(data):
+    jpeg = decode_picture(data, MOST_PICTURE_BYTES)
+    assert len(jpeg) <= MOST_PICTURE_BYTES and len(data) <= text_bound(MOST_PICTURE_BYTES)
+    for newlines in (False, True):
+        assert decode_picture(encode_picture(jpeg, newlines), MOST_PICTURE_BYTES) == jpeg
+
+
+def check_dashed(data):
+    twist = parse_dashed(data)
+    assert len(data) <= MAX_TWIST_BYTES
+    assert math.isfinite(twist.linear_mps) and math.isfinite(twist.angular_rad_s)
+
+
+def check_boxes(data):
+    boxes = parse_boxes(data)
+    assert len(boxes) <= MAX_BOXES and len(data) <= MAX_BOXES_BYTES
+    assert all(0 <= box.y_min <= box.y_max <= 1 and 0 <= box.x_min <= box.x_max <= 1 for box in boxes)
+    written = format_boxes(boxes)
+    assert format_boxes(parse_boxes(written)) == written
+
+
+def check_hello(data):
+    hello = parse_hello(data.decode("utf-8", "surrogateescape"))
+    assert len(data) <= MAX_HELLO_BYTES and parse_hello(encode(hello).decode("utf-8")) == hello
+
+
+def check_packet(data):
+    packet = unpack(data, "r1", "vision")
+    assert len(packet.header) <= MAX_BLOCK_BYTES and packet.key.startswith("sightline/r1/")
+    assert data.endswith(packet.payload) and len(packet.payload) <= len(data) - 2
+    parsed = parse_key(packet.key)
+    if parsed is not None and len(packet.header) <= MAX_HEADER_BYTES:
+        _, channel, source = parsed
+        again = unpack(pack(channel, source, "vision", packet.header, packet.payload), "r1", "vision")
+        assert (again.header, again.payload) == (packet.header, packet.payload)
+
+
 def check_model(model, size):
     def check(data):
         message: Wire = decode(model, data, size)
@@ -74,6 +124,11 @@ PARSERS = {
     "jpeg": check_jpeg,
     "ranges": check_ranges,
     "key": check_key,
+    "picture": check_picture,
+    "dashed": check_dashed,
+    "boxes": check_boxes,
+    "hello": check_hello,
+    "packet": check_packet,
     **{name: check_model(model, size) for name, (model, size) in MODELS.items()},
 }
 SEEDS = {name: [path.read_bytes() for path in sorted((CORPUS / name).iterdir())] for name in PARSERS}

@@ -1,5 +1,8 @@
 """The mutation gate's own eyes: which changes it makes to a line, and that each is named once and compiles."""
 
+import subprocess
+import sys
+
 import pytest
 
 from tests.mutation.mutants import mutants
@@ -54,3 +57,27 @@ def test_equal_changes_in_one_place_are_told_apart():
 def test_where_is_the_qualified_name():
     (mutant,) = mutants("example.py", "class A:\n    def f(self):\n        assert not a\n")
     assert (mutant.where, mutant.line, mutant.file) == ("A.f", 3, "example.py")
+
+
+def test_the_gate_itself_imports_no_judged_file():
+    """Else every mutant of it counts as killed, though none was ever run."""
+    code = """
+import sys
+import tests.mutation.__main__ as gate
+from tests.mutation.trial import module_name
+print([file for file in gate.TABLES if module_name(file) in sys.modules])
+"""
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"
+
+
+def test_a_mutant_whose_module_is_there_already_is_no_trial():
+    code = """
+import protocol.jpeg
+from pathlib import Path
+from tests.mutation.mutants import mutants
+from tests.mutation.trial import start
+start(next(mutants("protocol/jpeg.py", Path("protocol/jpeg.py").read_text())), ["tests/test_wire_boundaries.py"])
+"""
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert told.returncode == 1 and "imported before its mutants" in told.stderr

@@ -1,4 +1,4 @@
-"""Every number of what the gate remembers (frames, pictures, sequence numbers) and of the lease: at, before, after."""
+"""Every number of what the gate remembers (frames, pictures, sequence numbers): at it, before, after."""
 
 import pytest
 
@@ -6,7 +6,6 @@ from protocol.errors import WireError
 from protocol.messages import AnswerHeader, Echo, Holder
 from protocol.refusals import Refusal
 from robot_side.judge import FreshnessRecord, IssuedRecord, SequenceRecord, Verdict
-from robot_side.lease import HUMANS, RANKS, Lease
 
 ROBOT, OTHER = "0000aaaa", "0000cccc"
 VISION, OTHER_VISION = Holder(source="vision", session="0000bbbb"), Holder(source="vision", session="0000cccc")
@@ -248,60 +247,3 @@ def test_the_longest_silent_sender_is_forgotten_first():
     record.check(header(5, "0000ffff"))
     refusal(record.check, header(6, "00000000"))
     record.check(header(5, "00000001"))
-
-
-# --- lease -------------------------------------------------------------------------------------------------------
-
-
-def held_by(who, now_us=1_000, life_us=500):
-    lease = Lease(life_us)
-    lease.take(who, now_us)
-    return lease
-
-
-def test_the_roles_and_who_of_them_is_human():
-    assert sorted(RANKS, key=RANKS.__getitem__) == ["guest", "vision", "teleop"]
-    assert len(set(RANKS.values())) == 3
-    assert set(HUMANS) == {"teleop"}
-
-
-@pytest.mark.parametrize(("now_us", "held"), [(1_000, True), (1_499, True), (1_500, False), (1_501, False)])
-@pytest.mark.parametrize("who", [VISION, HUMAN, GUEST])
-def test_a_lease_lives_its_time(who, now_us, held):
-    lease = held_by(who)
-    assert lease.live_holder(now_us) == (who if held else None)
-    assert lease.lost_human(now_us) == (who is HUMAN and not held)
-    assert lease.may_take(OTHER_VISION, now_us) == (not held or who is GUEST)
-
-
-def test_a_new_lease_is_held_by_nobody():
-    lease = Lease(500)
-    assert lease == Lease(500, None, 0)
-    for now_us in (-1, 0, 1):
-        assert lease.live_holder(now_us) is None and not lease.lost_human(now_us) and lease.may_take(GUEST, now_us)
-
-
-@pytest.mark.parametrize("who", [VISION, HUMAN])
-def test_a_dropped_lease_was_not_lost(who):
-    lease = held_by(who)
-    lease.drop()
-    assert lease == Lease(500, None, 0)
-    assert lease.live_holder(1_001) is None and not lease.lost_human(9_000)
-
-
-def test_taking_again_renews():
-    lease = held_by(VISION)
-    lease.take(VISION, 1_400)
-    assert lease.live_holder(1_899) == VISION and lease.live_holder(1_900) is None
-
-
-@pytest.mark.parametrize(
-    ("holder", "who", "may"),
-    [
-        (VISION, VISION, True), (VISION, OTHER_VISION, False), (VISION, HUMAN, True), (VISION, GUEST, False),
-        (HUMAN, HUMAN, True), (HUMAN, OTHER_HUMAN, False), (HUMAN, VISION, False), (HUMAN, GUEST, False),
-        (GUEST, GUEST, True), (GUEST, VISION, True), (GUEST, HUMAN, True),
-    ],
-)  # fmt: skip
-def test_the_holder_and_whoever_outranks_it_may_take_the_lease(holder, who, may):
-    assert held_by(holder).may_take(who, 1_200) == may

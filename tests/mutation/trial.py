@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-# Everything that no judged file is imported by: loaded once here, shared by all children.
-import robot_side.ports  # noqa: F401
+# Loaded once here, shared by all children; it imports no judged file, or no mutant of that file would ever run.
+import protocol.messages  # noqa: F401
 from tests.mutation.mutants import Mutant
 
 _CPU_SECONDS = 5  # a table takes well under one; a mutant that loops for ever is ended here
@@ -37,7 +37,12 @@ def module_name(file: str) -> str:
 
 
 def start(mutant: Mutant, suites: Sequence[str]) -> int:
-    """Fork a child that runs `suites` with `mutant` in place; return its pid."""
+    """Fork a child that runs `suites` with `mutant` in place; return its pid.
+
+    Raises RuntimeError if the mutant's module is imported here already: every trial would then end as if killed.
+    """
+    if module_name(mutant.file) in sys.modules:
+        raise RuntimeError(f"{mutant.file} was imported before its mutants; see what imports it in this process")
     pid = os.fork()
     if pid:
         return pid
@@ -86,8 +91,6 @@ def _run(mutant: Mutant, suites: Sequence[str]) -> int:
 def _install(mutant: Mutant) -> None:
     """Let the mutant be what every later import of its module finds."""
     name = module_name(mutant.file)
-    if name in sys.modules:
-        raise RuntimeError(f"{name} was imported before its mutant; the trial would prove nothing")
     module = types.ModuleType(name)
     module.__file__ = str(Path(mutant.file).resolve())
     sys.modules[name] = module
