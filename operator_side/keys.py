@@ -1,13 +1,15 @@
-"""A private authority and a certificate for each role, for `--secure DIR`: made, added to, looked at. Shell.
+"""A private authority, a certificate and a token for each role, for `--secure DIR`: made, added, looked at. Shell.
 
 Written with `cryptography`, which is what Python's own packaging relies on; elliptic-curve keys (P-256) keep the TLS
-handshake short on a small robot. Only `ca.pem` and the two files of its own role belong on a machine; `ca.key` on none.
+handshake short on a small robot. Only `ca.pem` and the files of its own role belong on a machine, and all tokens on a
+robot that serves WebSocket; `ca.key` belongs on none.
 """
 
 from __future__ import annotations
 
 import datetime
 import ipaddress
+import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 DAYS = 825
 """The longest life that common TLS stacks accept of a certificate."""
+_TOKEN_BYTES = 24  # 192 bits, 32 letters
 LOOPBACK = ("localhost", "127.0.0.1")
 _BEGUN_EARLIER = datetime.timedelta(days=1)  # machines whose clocks differ by hours must still agree
 
@@ -63,7 +66,7 @@ def make(folder: Path, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
 
 
 def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
-    """A new certificate of `role`, in place of the old; signed by the authority in `folder`.
+    """A new certificate and WebSocket token of `role`, in place of the old; signed by the authority in `folder`.
 
     Raises ConfigError for a role or host that is none, or without the authority's own key.
     """
@@ -83,7 +86,7 @@ def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> li
         .add_extension(x509.ExtendedKeyUsage([Usage.SERVER_AUTH, Usage.CLIENT_AUTH]), False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.public_key()), False)
     )
-    return _write(folder, role, key, _signed(builder, authority))
+    return _write(folder, role, key, _signed(builder, authority)) + _write_token(folder, role)
 
 
 def look(folder: Path) -> list[Certificate]:
@@ -138,12 +141,24 @@ def _write(folder: Path, name: str, key: EllipticCurvePrivateKey, certificate: x
     from cryptography.hazmat.primitives import serialization as forms
 
     key_file, certificate_file = folder / f"{name}.key", folder / f"{name}.pem"
-    key_file.touch(mode=0o600)
+    _private(key_file)
     key_file.write_bytes(
         key.private_bytes(forms.Encoding.PEM, forms.PrivateFormat.PKCS8, forms.NoEncryption())
     )
     certificate_file.write_bytes(certificate.public_bytes(forms.Encoding.PEM))
     return [key_file, certificate_file]
+
+
+def _write_token(folder: Path, role: str) -> list[Path]:
+    file = folder / f"{role}.token"
+    _private(file)
+    file.write_text(secrets.token_urlsafe(_TOKEN_BYTES) + "\n")
+    return [file]
+
+
+def _private(file: Path) -> None:
+    file.touch(mode=0o600)
+    file.chmod(0o600)
 
 
 def _authority_key(folder: Path) -> EllipticCurvePrivateKey:

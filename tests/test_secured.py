@@ -10,6 +10,7 @@ from operator_side import keys
 from protocol.channels import ACK, CHANNELS, FRAME, REQUEST, STATUS, TWIST, Direction
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.secured import ROLES, SOURCES, certificate_role, may_hear, may_publish
+from protocol.transports.websocket_keys import read_tokens
 from protocol.transports.zenoh import list_robots, open_zenoh
 from tests.link_rigs import free_endpoint, until
 
@@ -142,9 +143,19 @@ def test_robots_are_listed_over_a_secured_link(folder, endpoint):
 
 
 def test_keys_are_for_their_owner_only_and_never_overwritten(folder):
-    assert all(file.stat().st_mode & 0o077 == 0 for file in folder.glob("*.key"))
+    kept = [file for file in folder.iterdir() if file.suffix in (".key", ".token")]
+    assert len(kept) == 1 + 2 * len(ROLES)
+    assert all(file.stat().st_mode & 0o077 == 0 for file in kept)
     with pytest.raises(ConfigError, match="holds keys already"):
         keys.make(folder, [])
+
+
+def test_a_new_token_is_another_and_is_read_as_its_role(broken):
+    before = read_tokens(str(broken))
+    keys.add(broken, "operator", [])
+    after = read_tokens(str(broken))
+    assert sorted(before.values()) == sorted(after.values()) == sorted(ROLES)
+    assert len(set(before) & set(after)) == len(ROLES) - 1
 
 
 def test_certificates_are_told_with_their_hosts_and_end(folder):
