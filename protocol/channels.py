@@ -11,6 +11,8 @@ from protocol.errors import ConfigError
 from protocol.messages import (
     AnswerHeader,
     CameraModel,
+    Detections,
+    DetectionsHeader,
     FrameHeader,
     Odometry,
     Reply,
@@ -56,6 +58,8 @@ class Channel:
     rate: str
     max_payload_bytes: int
     purpose: str
+    when_full: str = "a newer one takes its place"
+    """What becomes of a message that cannot leave at once."""
 
     @property
     def has_source(self) -> bool:
@@ -67,13 +71,13 @@ _OUT, _IN = Direction.FROM_ROBOT, Direction.TO_ROBOT
 _JSON = "application/json"
 
 FRAME = Channel("frame", _OUT, FrameHeader, None, "image/jpeg", Priority.DATA, "camera rate, by credit", 1_000_000,
-                "a picture, JPEG and nothing else")
+                "a picture, JPEG and nothing else", "none is taken without credit; a newer one takes its place")
 TWIST = Channel("twist", _IN, AnswerHeader, None, "text/plain", Priority.REAL_TIME, "one per frame answered",
                 MAX_TWIST_BYTES, "`linear|angular` in m/s and rad/s")
 ACK = Channel("ack", _IN, AnswerHeader, None, "application/octet-stream", Priority.REAL_TIME,
               "one per frame seen but not answered by a twist", 0, "returns credit, drives nothing; empty payload")
 REQUEST = Channel("request", _IN, RequestHeader, Request, _JSON, Priority.REAL_TIME, "as a person asks", 256,
-                  "arm, disarm, stop, reset, acquire, release")
+                  "arm, disarm, stop, reset, acquire, release", "a newer one takes its place; who asks asks again")
 REPLY = Channel("reply", _OUT, Stamp, Reply, _JSON, Priority.INTERACTIVE_HIGH, "one per request", 1024,
                 "the answer to a request")
 STATUS = Channel("status", _OUT, Stamp, Status, _JSON, Priority.INTERACTIVE_HIGH, "10 Hz", 4096,
@@ -83,10 +87,12 @@ SCAN = Channel("scan", _OUT, ScanHeader, None, "application/octet-stream", Prior
                "lidar ranges, little-endian float32, metres, inf = no return")
 CAMERA = Channel("camera", _OUT, Stamp, CameraModel, _JSON, Priority.INTERACTIVE_HIGH, "2 Hz", 1024,
                  "the camera's model and mounting")
+DETECTIONS = Channel("detections", _IN, DetectionsHeader, Detections, _JSON, Priority.INTERACTIVE_HIGH,
+                     "one per picture looked at", 32_768, "boxes that somebody found; the robot passes them on")
 
 CHANNELS: dict[str, Channel] = {
     channel.name: channel
-    for channel in (FRAME, TWIST, ACK, REQUEST, REPLY, STATUS, ODOMETRY, SCAN, CAMERA)
+    for channel in (FRAME, TWIST, ACK, REQUEST, REPLY, STATUS, ODOMETRY, SCAN, CAMERA, DETECTIONS)
 }
 
 _ROBOT_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")

@@ -1,12 +1,13 @@
 """Golden vectors: what a message must be read as, or why it must be refused, for peers in any language. Pure.
 
-`golden_cases.py` states each case and its outcome by hand; a file is made only if the decoders agree. Each lies in
-`vectors/<channel>/<case>.json`:
+`golden_cases.py` and `golden_wires.py` state each case and its outcome by hand; a file is made only if the decoders
+agree. A message lies in `vectors/<channel>/<case>.json`:
 
     {"purpose", "key", "header_hex", "payload_hex", "accept": {"source", "header", "payload"} or "refuse": reason}
 
 `header` and `payload` are as read, with defaults filled in; `null` is a header that may be missing. A picture's payload
-is its size, a scan's the ranges with "inf" for no return.
+is its size, a scan's the ranges with "inf" for no return. What carries messages lies beside them, in folders that
+`golden_wires.py` lists: fields to read instead of key, header and payload, and what they give.
 """
 
 import json
@@ -17,13 +18,16 @@ from typing import Any
 from protocol.channels import ACK, FRAME, SCAN, TWIST, Channel, parse_key
 from protocol.codec import check_sizes, decode, decode_ranges
 from protocol.errors import WireError
-from protocol.golden_cases import CASES, Case
+from protocol.golden_case import Case
+from protocol.golden_cases import CASES
+from protocol.golden_wires import WIRE_CASES, WireCase, wire_outcome
 from protocol.jpeg import read_jpeg_size
 from protocol.twist_text import parse_twist
 
 INEXACT_KEY = "INEXACT_KEY"
 """The outcome of a key that is not exact: nobody is told, the receiver counts it."""
 Outcome = dict[str, Any]
+_SAID = ("purpose", "accept", "refuse")
 
 
 def outcome(key: str, header: bytes, payload: bytes) -> Outcome:
@@ -75,12 +79,40 @@ def vector(case: Case) -> Outcome:
     }
 
 
+def _wire_vector(case: WireCase) -> Outcome:
+    got = wire_outcome(case.folder, case.given)
+    if got.get("refuse") != case.refuse:
+        raise ValueError(f"{case.folder}/{case.name}: stated {case.refuse or 'accept'}, decoded to {got}")
+    return {"purpose": case.purpose, **case.given, **got}
+
+
+def read_again(folder: str, vector: Outcome) -> Outcome:
+    """What a receiver makes of a file's contents, from these alone."""
+    if "key" in vector:
+        return outcome(vector["key"], bytes.fromhex(vector["header_hex"]), bytes.fromhex(vector["payload_hex"]))
+    return wire_outcome(folder, {name: value for name, value in vector.items() if name not in _SAID})
+
+
 def files() -> dict[Path, str]:
     """Every vector file below `vectors/` and its text."""
-    return {
-        Path(case.channel, f"{case.name}.json"): json.dumps(vector(case), indent=1, ensure_ascii=False) + "\n"
-        for case in CASES
-    }
+    vectors = {Path(case.channel, case.name): vector(case) for case in CASES}
+    vectors |= {Path(case.folder, case.name): _wire_vector(case) for case in WIRE_CASES}
+    return {Path(f"{path}.json"): _text(contents) + "\n" for path, contents in vectors.items()}
+
+
+def _text(contents: Outcome) -> str:
+    return json.dumps(contents, indent=1, ensure_ascii=False)
+
+
+def vector_table() -> str:
+    """How many vectors there are of what, as a Markdown table."""
+    stated = [(case.channel, case.refuse) for case in CASES] + [(case.folder, case.refuse) for case in WIRE_CASES]
+    rows = ["| folder | accepted | refused |", "|---|---|---|"]
+    for folder in dict.fromkeys(name for name, _ in stated):
+        accepted = sum(name == folder and refuse is None for name, refuse in stated)
+        refused = sum(name == folder for name, _ in stated) - accepted
+        rows.append(f"| `vectors/{folder}/` | {accepted} | {refused} |")
+    return "\n".join(rows) + "\n"
 
 
 def examples() -> str:
@@ -88,7 +120,7 @@ def examples() -> str:
     first = {case.channel: case for case in reversed(CASES)}
     blocks = [
         f"`vectors/{case.channel}/{case.name}.json`, {case.purpose}:\n\n```json\n"
-        + json.dumps(vector(case), indent=1, ensure_ascii=False)
+        + _text(vector(case))
         + f"\n```\n\nheader as text: `{case.header.decode()}`\n"
         for case in reversed(first.values())
     ]

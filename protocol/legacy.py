@@ -2,8 +2,9 @@
 
     picture   base64 of the JPEG, a newline after every 76 characters and at the end
     twist     `linear|angular`, as in `protocol.twist_text`
-    dashed    `linear-angular`, opt-in: the older robot read the two the wrong way round, so ask which one is meant
-    boxes     `y_min,x_min,y_max,x_max` joined by `-`, opt-in: fractions of the picture's height and width
+    dashed    `linear-angular`, opt-in; swapped, another option, `angular-linear`: as the older robot took the two
+    boxes     `y_min,x_min,y_max,x_max` or `class,x_min,y_min,x_max,y_max`, joined by `-`, opt-in: fractions of the
+              picture's height and width; either way a reader of the older write-up finds x in the 2nd and 4th field
 """
 
 import binascii
@@ -13,18 +14,22 @@ from dataclasses import dataclass
 from typing import Final
 
 from protocol.errors import WireError
-from protocol.messages import Twist
+from protocol.jpeg import JpegSize
+from protocol.messages import DetectedBox, Detections, Twist
 from protocol.refusals import Refusal
 from protocol.twist_text import MAX_TWIST_BYTES, parse_twist
 
 LINE_CHARACTERS: Final = 76
 MAX_BOXES: Final = 16
 MAX_BOXES_BYTES: Final = 1024
+BOX_LABEL: Final = "box"
+"""What a box is called whose text does not say what is in it."""
 
 _NUMBER: Final = rb"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
 _DASHED: Final = re.compile(rb"(%b)-(%b)" % (_NUMBER, _NUMBER))
 _FRACTION: Final = rb"(0(?:\.[0-9]{1,17})?|1(?:\.0{1,17})?)"
 _BOX: Final = re.compile(rb",".join([_FRACTION] * 4))
+_CLASSED_BOX: Final = re.compile(rb"([A-Za-z0-9_ ]{1,32})," + _BOX.pattern)
 
 
 def text_bound(picture_bytes: int) -> int:
@@ -57,15 +62,16 @@ def decode_picture(text: bytes, max_bytes: int) -> bytes:
     return jpeg
 
 
-def parse_dashed(text: bytes) -> Twist:
-    """Read `linear-angular` (m/s, rad/s); either may be negative: `0.2--0.35`.
+def parse_dashed(text: bytes, swapped: bool = False) -> Twist:
+    """Read `linear-angular` (m/s, rad/s), or `angular-linear` if `swapped`; either may be negative: `0.2--0.35`.
 
     Raises WireError as `parse_twist` does.
     """
     match = _DASHED.fullmatch(text) if len(text) <= MAX_TWIST_BYTES else None
     if match is None:
         raise WireError(Refusal.MALFORMED, f"twist {text[:MAX_TWIST_BYTES]!r} is not `linear-angular`, e.g. 0.2--0.35")
-    return parse_twist(match[1] + b"|" + match[2])
+    first, second = match.groups()
+    return parse_twist(second + b"|" + first if swapped else first + b"|" + second)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +82,7 @@ class Box:
     x_min: float
     y_max: float
     x_max: float
+    label: str = BOX_LABEL
 
     def __post_init__(self) -> None:
         """Raise ValueError for what is no box inside the picture."""
@@ -84,7 +91,7 @@ class Box:
 
 
 def format_boxes(boxes: Sequence[Box]) -> bytes:
-    """`boxes` as text with four decimals; empty for none. Raises ValueError for more than 16."""
+    """`boxes` as text with four decimals, without their labels; empty for none. Raises ValueError for more than 16."""
     if len(boxes) > MAX_BOXES:
         raise ValueError(f"{len(boxes)} boxes, at most {MAX_BOXES}")
     return "-".join(f"{box.y_min:.4f},{box.x_min:.4f},{box.y_max:.4f},{box.x_max:.4f}" for box in boxes).encode("ascii")
@@ -98,9 +105,25 @@ def parse_boxes(text: bytes) -> tuple[Box, ...]:
     return tuple(_parse_box(part) for part in parts)
 
 
+def detections_of(boxes: Sequence[Box], size: JpegSize) -> Detections:
+    """`boxes` in pixels of a picture of `size`, in their order. They carry no score of their own."""
+    width_px, height_px = size.width_px, size.height_px
+    found = tuple(
+        DetectedBox(label=box.label, score=1.0, x1_px=box.x_min * width_px, y1_px=box.y_min * height_px,
+                    x2_px=box.x_max * width_px, y2_px=box.y_max * height_px)
+        for box in boxes
+    )  # fmt: skip
+    return Detections(width_px=width_px, height_px=height_px, boxes=found)
+
+
 def _parse_box(text: bytes) -> Box:
-    match = _BOX.fullmatch(text)
     try:
-        return Box(*(float(number) for number in match.groups())) if match else Box(-1, 0, 0, 0)
+        if plain := _BOX.fullmatch(text):
+            return Box(*(float(number) for number in plain.groups()))
+        if classed := _CLASSED_BOX.fullmatch(text):
+            x_min, y_min, x_max, y_max = (float(number) for number in classed.groups()[1:])
+            return Box(y_min, x_min, y_max, x_max, classed[1].decode("ascii"))
     except ValueError:
-        raise WireError(Refusal.MALFORMED, f"box {text[:80]!r} is not y_min,x_min,y_max,x_max within 0..1") from None
+        pass
+    said = f"box {text[:80]!r} is neither y_min,x_min,y_max,x_max nor class,x_min,y_min,x_max,y_max within 0..1"
+    raise WireError(Refusal.MALFORMED, said)

@@ -5,21 +5,28 @@ names; signs as in REP 103: x forward, y left, counter-clockwise positive. Times
 """
 
 from enum import StrEnum
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from protocol import VERSION
 
 MAX_INTEGER = 2**53 - 1  # the largest integer that every JSON reader holds exactly
+MAX_CHANNELS_SHOWN = 16
+"""Of a status, so that it stays small."""
+MAX_DETECTED_BOXES = 64
+"""Security limit: more is no scene that a robot steers by."""
 
 Version = Annotated[int, Field(ge=VERSION, le=VERSION)]  # a Literal would let `true` and 1.0 pass as 1
 SessionId = Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")]
 Source = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,15}$")]
 RobotId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
 Counter = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
+Percent = Annotated[int, Field(ge=0, le=100)]
 Microseconds = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
 Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+PixelCount = Annotated[int, Field(ge=16, le=8192)]
+"""Width or height of a picture."""
 Planar = tuple[Number, Number]
 """(linear_mps, angular_rad_s)."""
 Pose = tuple[Number, Number, Number]
@@ -106,6 +113,18 @@ class RequestHeader(Wire):
     echo: Echo | None = None
 
 
+class DetectionsHeader(Wire):
+    """Header of detections: who looked and, where known, at which frame; without `echo` they may be shown, not obeyed.
+    """
+
+    v: Version = VERSION
+    source: Source
+    session: SessionId
+    seq: Counter
+    echo: Echo | None = None
+    compute_us: Microseconds = 0
+
+
 # --- payloads ----------------------------------------------------------------------------------------------------
 
 
@@ -133,7 +152,7 @@ class Reply(Wire):
     to: SessionId
     id: Counter
     ok: bool
-    state: str
+    state: Annotated[str, Field(max_length=32)]
     detail: Annotated[str, Field(max_length=200)]
 
 
@@ -174,6 +193,15 @@ class StreamStatus(Wire):
     refused_pictures: Counter = 0
     calibrated: bool = False
     """Whether the camera's model was measured."""
+    overtaken: Counter = 0
+    """Frames that a newer one replaced on the way: in a slot of the peer, or on the link."""
+    dropped: Annotated[dict[str, Counter], Field(max_length=MAX_CHANNELS_SHOWN)] = {}
+    """By channel: what was published and replaced by something newer before a peer had room for it."""
+    missed_captures: Counter = 0
+    """Captures that the camera's slot dropped because the stream asked for none."""
+    quality_percent: Percent = 100
+    scale_percent: Percent = 100
+    """How pictures are encoded to fit the link: shares of the configured quality and of the side lengths."""
 
 
 class Status(Wire):
@@ -203,6 +231,42 @@ class Odometry(Wire):
     moving: Planar
 
 
+class DetectedCircle(Wire):
+    """A circle in pixels of the encoded picture, where the detector knows one."""
+
+    cx_px: Number
+    cy_px: Number
+    radius_px: Annotated[float, Field(gt=0, le=1e6)]
+
+
+class DetectedBox(Wire):
+    """One object in pixels of the encoded picture; `x2_px` >= `x1_px` and `y2_px` >= `y1_px`, which are exclusive."""
+
+    label: Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,64}$")]
+    score: Annotated[float, Field(ge=0, le=1)]
+    x1_px: Number
+    y1_px: Number
+    x2_px: Number
+    y2_px: Number
+    circle: DetectedCircle | None = None
+    track: Counter | None = None
+    """The detector's own number for an object that it follows from frame to frame."""
+
+    @model_validator(mode="after")
+    def _is_not_inside_out(self) -> Self:
+        if self.x2_px < self.x1_px or self.y2_px < self.y1_px:
+            raise ValueError("the second corner of a box is not left of or above the first")
+        return self
+
+
+class Detections(Wire):
+    """What was found in one picture of this size, best first. No boxes: looked, and saw nothing."""
+
+    width_px: PixelCount
+    height_px: PixelCount
+    boxes: Annotated[tuple[DetectedBox, ...], Field(max_length=MAX_DETECTED_BOXES)] = ()
+
+
 class CameraModel(Wire):
     """Pinhole model of the encoded picture. Pixel (0, 0) is the top-left corner of the top-left pixel.
 
@@ -210,8 +274,8 @@ class CameraModel(Wire):
     tilted up by `pitch_rad`.
     """
 
-    width_px: Annotated[int, Field(ge=16, le=8192)]
-    height_px: Annotated[int, Field(ge=16, le=8192)]
+    width_px: PixelCount
+    height_px: PixelCount
     fx_px: Annotated[float, Field(gt=0, le=1e5)]
     fy_px: Annotated[float, Field(gt=0, le=1e5)]
     cx_px: Number

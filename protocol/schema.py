@@ -1,4 +1,4 @@
-"""Writes, or verifies, what is generated from the models: README tables, schema.json, golden vectors. Shell.
+"""Writes, or verifies, what is generated from the models: README tables, schemas, golden vectors. Shell.
 
     python -m protocol.schema --verify    exit code 5 and the names of what differs, if anything does
     python -m protocol.schema --write
@@ -17,8 +17,11 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from protocol import golden, refusals
+from protocol.asyncapi import document
 from protocol.channels import CHANNELS, key_for
+from protocol.field_words import meaning_of, unit_of
 from protocol.refusals import CLAMPED, Refusal
+from protocol.transports.websocket_framing import Hello
 
 HERE: Final = Path(__file__).parent
 _BLOCK = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- /generated -->)", re.DOTALL)
@@ -26,17 +29,21 @@ Schema = dict[str, Any]
 
 
 def channel_table() -> str:
-    """The channels as a Markdown table."""
-    rows = ["| channel | key | header | payload | encoding | priority | payload bytes | rate |", "|---" * 8 + "|"]
-    for channel in CHANNELS.values():
-        key = key_for("R", channel, "s" if channel.has_source else "").replace("/R/", "/<robot>/")
+    """The channels as Markdown tables: what they are, and how they are carried."""
+    rows = ["| channel | direction | key | header | payload | what it is |", "|---" * 6 + "|"]
+    carried = ["| channel | payload bytes | encoding | priority | rate | when a link is full |", "|---" * 6 + "|"]
+    for one in CHANNELS.values():
+        key = key_for("R", one, "s" if one.has_source else "").replace("/R/", "/<robot>/")
         key = re.sub(r"/s$", "/<source>", key)
-        payload = (channel.payload.__name__ if channel.payload else channel.purpose).replace("|", "\\|")
-        rows.append(
-            f"| {channel.name} | `{key}` | {channel.header.__name__} | {payload} | {channel.encoding} | "
-            f"{channel.priority.value} | <= {channel.max_payload_bytes} | {channel.rate} |"
+        payload = one.payload.__name__ if one.payload else one.encoding
+        purpose = one.purpose.replace("|", "\\|")
+        what = f"{one.header.__name__} | {payload} | {purpose}"
+        rows.append(f"| `{one.name}` | {one.direction.value} | `{key}` | {what} |")
+        carried.append(
+            f"| `{one.name}` | <= {one.max_payload_bytes} | {one.encoding} | {one.priority.value} | {one.rate} | "
+            f"{one.when_full} |"
         )
-    return "\n".join(rows) + "\n"
+    return "\n".join([*rows, "", *carried]) + "\n"
 
 
 def refusal_table() -> str:
@@ -56,11 +63,11 @@ def field_tables() -> str:
 def _models() -> list[type[BaseModel]]:
     headers = [channel.header for channel in CHANNELS.values()]
     payloads = [channel.payload for channel in CHANNELS.values() if channel.payload]
-    return list(dict.fromkeys([*headers, *payloads]))
+    return list(dict.fromkeys([*headers, *payloads, Hello]))
 
 
 def json_schema() -> Schema:
-    """JSON Schema of every header and JSON payload, under `$defs`."""
+    """JSON Schema of every header, JSON payload and the WebSocket hello, under `$defs`."""
     return models_json_schema([(model, "validation") for model in _models()], title="Sightline wire protocol 1")[1]
 
 
@@ -72,12 +79,19 @@ def _definitions() -> Schema:
 
 
 def _model_table(name: str, schema: Schema) -> str:
-    rows = [f"**{name}**: {_first_line(schema)}", "", "| field | type | if absent |", "|---|---|---|"]
+    rows = [f"**{name}**: {_first_line(schema)}", "", "| field | type and range | unit | if absent | meaning |"]
+    rows.append("|---" * 5 + "|")
     required = schema.get("required", [])
     for field, definition in schema["properties"].items():
-        default = "refused" if field in required else f"`{json.dumps(definition.get('default'))}`"
-        rows.append(f"| `{field}` | {_type_of(definition)} | {default} |")
+        default = "refused" if field in required else _default_of(definition)
+        words = f"{unit_of(field)} | {default} | {meaning_of(name, field)}"
+        rows.append(f"| `{field}` | {_type_of(definition)} | {words} |")
     return "\n".join(rows) + "\n"
+
+
+def _default_of(definition: Schema) -> str:
+    default = definition.get("default")
+    return "its own defaults" if isinstance(default, dict) and default else f"`{json.dumps(default)}`"
 
 
 def _first_line(schema: Schema) -> str:
@@ -128,6 +142,7 @@ GENERATED: Final = {
     "channels": channel_table,
     "fields": field_tables,
     "refusals": refusal_table,
+    "vectors": golden.vector_table,
     "examples": golden.examples,
 }
 
@@ -140,7 +155,9 @@ def readme(text: str) -> str:
 def expected_files() -> dict[Path, str]:
     """Every generated file, relative to this package, and what it must hold."""
     files = {Path("README.md"): readme((HERE / "README.md").read_text("utf-8"))}
-    files[Path("schema.json")] = json.dumps(json_schema(), indent=1) + "\n"
+    schema = json_schema()
+    files[Path("schema.json")] = json.dumps(schema, indent=1) + "\n"
+    files[Path("asyncapi.json")] = json.dumps(document(schema["$defs"]), indent=1) + "\n"
     return files | {Path("vectors") / path: text for path, text in golden.files().items()}
 
 

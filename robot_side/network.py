@@ -13,7 +13,7 @@ import zlib
 from collections import Counter
 from contextlib import ExitStack, suppress
 
-from protocol.channels import ACK, FRAME, REQUEST, TWIST
+from protocol.channels import ACK, DETECTIONS, FRAME, REQUEST, TWIST
 from protocol.codec import encode
 from protocol.errors import HardwareError, SightlineError, WireError
 from protocol.transports.link import Link, Message
@@ -56,6 +56,7 @@ class Network:
         self._link.subscribe(TWIST, self._driver.forward)
         self._link.subscribe(REQUEST, self._driver.forward)
         self._link.subscribe(ACK, self._on_ack)
+        self._link.subscribe(DETECTIONS, self._pass_on)
         threading.Thread(target=self._read_driver, daemon=True).start()
         while self.running:
             self._stream_one()
@@ -154,6 +155,10 @@ class Network:
         refused = Counter(dict(self._refused_acks)) + Counter(by_link)
         if refused != self._refused_told and self._driver.tell(ipc.pack_refused(refused)):
             self._refused_told = refused
+
+    def _pass_on(self, message: Message) -> None:
+        """Peers of a WebSocket do not hear one another: what somebody found goes on to whoever wants it."""
+        self._link.publish(DETECTIONS, message.header, message.payload, message.source)
 
     def _on_ack(self, message: Message) -> None:
         try:

@@ -7,10 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import WireError
+from protocol.jpeg import JpegSize
 from protocol.legacy import (
     MAX_BOXES,
     Box,
     decode_picture,
+    detections_of,
     encode_picture,
     format_boxes,
     parse_boxes,
@@ -66,6 +68,23 @@ def test_dashed_twists_read_what_the_write_up_writes(linear, angular):
     assert twist == parse_twist(f"{linear}|{angular}".encode())
 
 
+@given(FINITE, FINITE)
+def test_swapped_axes_are_the_same_two_numbers_the_other_way_round(linear, angular):
+    twist = parse_dashed(f"{angular}-{linear}".encode(), swapped=True)
+    assert (twist.linear_mps, twist.angular_rad_s) == (linear, angular)
+
+
+@pytest.mark.parametrize(
+    ("text", "linear", "angular"),
+    [(b"-1-2", -1, 2), (b"1--2", 1, -2), (b"-1--2", -1, -2), (b"1e-2-3", 0.01, 3), (b"1E+1--2e-1", 10, -0.2),
+     (b"-1e-1--1e-1", -0.1, -0.1), (b"+1-+2", 1, 2), (b".5-5.", 0.5, 5),
+     (b"2.302820955670696-0", 2.302820955670696, 0)],
+)  # fmt: skip
+def test_negatives_and_exponents_in_dashed_twists(text, linear, angular):
+    twist = parse_dashed(text)
+    assert (twist.linear_mps, twist.angular_rad_s) == (linear, angular)
+
+
 @pytest.mark.parametrize(
     "text",
     [b"", b"-", b"1", b"1-", b"-1", b"1-2-3", b"1---2", b"1|2", b"1 - 2", b"nan-1", b"1-inf", b"1_0-2",
@@ -97,7 +116,7 @@ def test_boxes_survive_the_way_there_and_back(corners):
 @pytest.mark.parametrize(
     "text",
     [b"-", b"0,0,1", b"0,0,1,1-", b"0,0,1,1.1", b"0,0,1,-1", b"0.5,0,0.4,1", b"0,1,1,0", b"0,0,1,1e-5", b"nan,0,1,1",
-     b"0,0,1,1,1", b" 0,0,1,1", b"-".join([b"0,0,1,1"] * (MAX_BOXES + 1)), b"0,0,1,1." + b"0" * 1024],
+     b"0,0,1,1,1,1", b" 0,0,1,1", b"-".join([b"0,0,1,1"] * (MAX_BOXES + 1)), b"0,0,1,1." + b"0" * 1024],
 )  # fmt: skip
 def test_what_is_no_list_of_boxes_is_refused(text):
     with pytest.raises(WireError) as refusal:
@@ -111,3 +130,11 @@ def test_a_box_outside_the_picture_cannot_exist():
             Box(*corners)
     with pytest.raises(ValueError, match="at most 16"):
         format_boxes([Box(0, 0, 1, 1)] * (MAX_BOXES + 1))
+
+
+def test_boxes_become_detections_in_pixels_of_the_picture_in_their_order():
+    found = detections_of(parse_boxes(b"0.25,0.5,0.75,1-0,0,1,0.125"), JpegSize(640, 480, 3))
+    assert (found.width_px, found.height_px) == (640, 480)
+    corners = [(box.label, box.x1_px, box.y1_px, box.x2_px, box.y2_px) for box in found.boxes]
+    assert corners == [("box", 320, 120, 640, 360), ("box", 0, 0, 80, 480)]
+    assert detections_of((), JpegSize(16, 16, 1)).boxes == ()

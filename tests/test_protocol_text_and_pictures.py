@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from protocol.errors import WireError
-from protocol.golden_cases import jpeg, segments
+from protocol.golden_case import jpeg, segments
 from protocol.jpeg import MAX_SEGMENTS, JpegSize, read_jpeg_size
 from protocol.messages import Twist
 from protocol.refusals import Refusal

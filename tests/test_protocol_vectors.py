@@ -11,7 +11,10 @@ from pydantic import TypeAdapter
 
 from protocol import golden, schema
 from protocol.channels import CHANNELS
-from protocol.golden_cases import CASES, Case
+from protocol.field_words import meaning_of, unit_of
+from protocol.golden_case import Case
+from protocol.golden_cases import CASES
+from protocol.golden_wires import READERS, WIRE_CASES
 from protocol.refusals import Refusal
 from protocol.twist_text import MAX_TWIST_BYTES
 
@@ -23,7 +26,7 @@ README = (Path(schema.__file__).parent / "README.md").read_text("utf-8")
 def test_a_vector_is_read_as_it_says(path):
     """From the file alone, as a peer in another language would run it."""
     vector = json.loads(path.read_text("utf-8"))
-    got = golden.outcome(vector["key"], bytes.fromhex(vector["header_hex"]), bytes.fromhex(vector["payload_hex"]))
+    got = golden.read_again(path.parent.name, vector)
     expected = {name: vector[name] for name in ("accept", "refuse") if name in vector}
     assert json.loads(json.dumps(got)) == expected
 
@@ -35,7 +38,14 @@ def test_generated_files_are_up_to_date():
 def test_every_channel_has_vectors_that_are_accepted_and_refused():
     outcomes = Counter((case.channel, case.refuse is None) for case in CASES)
     assert set(outcomes) == {(channel, accepted) for channel in CHANNELS for accepted in (True, False)}
-    assert len(CASES) == len({(case.channel, case.name) for case in CASES}) >= 60
+    assert len(CASES) == len({(case.channel, case.name) for case in CASES})
+
+
+def test_every_transport_and_dialect_has_vectors_that_are_accepted_and_refused():
+    outcomes = {(case.folder, case.refuse is None) for case in WIRE_CASES}
+    assert outcomes == {(folder, accepted) for folder in READERS for accepted in (True, False)}
+    assert not set(READERS) & set(CHANNELS)
+    assert len(golden.files()) == len(CASES) + len(WIRE_CASES) >= 200
 
 
 def test_a_case_that_the_decoders_contradict_is_no_vector():
@@ -47,7 +57,7 @@ def test_a_case_that_the_decoders_contradict_is_no_vector():
 def test_verify_finds_what_was_changed_and_write_restores_it(tmp_path, monkeypatch, capsys):
     package = tmp_path / "protocol"
     shutil.copytree(VECTORS, package / "vectors")
-    for name in ("README.md", "schema.json"):
+    for name in ("README.md", "schema.json", "asyncapi.json"):
         shutil.copy(VECTORS.parent / name, package)
     monkeypatch.setattr(schema, "HERE", package)
     assert schema.main(["--verify"]) == 0
@@ -70,6 +80,23 @@ def test_the_specification_holds_every_generated_table_once():
 def test_the_specification_names_every_refusal_and_bound():
     assert all(f"`{reason}`" in README for reason in Refusal)
     assert f"{MAX_TWIST_BYTES} bytes" in README
+
+
+def test_every_field_has_a_meaning_and_what_has_a_unit_says_it():
+    models = schema.json_schema()["$defs"].items()
+    named = [(name, field) for name, model in models for field in model.get("properties", ())]
+    assert len(named) > 80
+    assert [field for field in named if not meaning_of(*field)] == [], "add them to protocol/field_words.py"
+    assert [unit_of(field) for field in ("t_us", "angular_rad_s", "pitch_rad", "x_m")] == ["µs", "rad/s", "rad", "m"]
+    assert unit_of("seq") == unit_of("session") == ""
+
+
+def test_every_clause_has_its_number_once():
+    headings = re.findall(r"^## (\d+)\. ", README, re.MULTILINE)
+    clauses = re.findall(r"\*\*(\d+\.\d+)\b", README)
+    assert headings == [str(number) for number in range(1, len(headings) + 1)]
+    assert len(clauses) == len(set(clauses)) > 60
+    assert {clause.partition(".")[0] for clause in clauses} <= set(headings)
 
 
 def test_the_json_schema_accepts_what_the_models_accept():

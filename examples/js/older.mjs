@@ -12,6 +12,7 @@ const DECIMAL = "(?:[0-9]+(?:\\.[0-9]*)?|\\.[0-9]+)";
 const NUMBER = `[+-]?${DECIMAL}(?:[eE][+-]?[0-9]{1,3})?`;
 const DASHED = new RegExp(`^(${NUMBER})-(${NUMBER})$`);
 const BOX = new RegExp(`^${DECIMAL}(?:,${DECIMAL}){3}$`);
+const CLASSED_BOX = new RegExp(`^([A-Za-z0-9_ ]{1,32}),(${DECIMAL}),(${DECIMAL}),(${DECIMAL}),(${DECIMAL})$`);
 const BASE64 = /^(?:[A-Za-z0-9+/]{4})*(?:[A-Za-z0-9+/]{2}==|[A-Za-z0-9+/]{3}=)?$/;
 
 const malformed = (what) => {
@@ -33,7 +34,7 @@ export function parsePicture(text, maxBytes) {
   return jpeg.length > maxBytes ? malformed(`picture is over ${maxBytes} bytes`) : jpeg;
 }
 
-/** @param {string} text @returns {{y_min: number, x_min: number, y_max: number, x_max: number}[]} fractions of the picture */
+/** @param {string} text @returns {{y_min: number, x_min: number, y_max: number, x_max: number, label: string}[]} fractions of the picture */
 export function parseBoxes(text) {
   const parts = text === "" ? [] : text.split("-");
   if (text.length > MAX_BOXES_BYTES || parts.length > MAX_BOXES) malformed(`at most ${MAX_BOXES} boxes`);
@@ -41,8 +42,19 @@ export function parseBoxes(text) {
 }
 
 function parseBox(text) {
-  if (!BOX.test(text)) malformed("box is not y_min,x_min,y_max,x_max");
-  const [y_min, x_min, y_max, x_max] = text.split(",").map(Number);
+  const { y_min, x_min, y_max, x_max, label } = BOX.test(text) ? plainBox(text) : classedBox(text);
   if (y_min > y_max || x_min > x_max || y_max > 1 || x_max > 1) malformed("box does not lie in the picture");
-  return { y_min, x_min, y_max, x_max };
+  return { y_min, x_min, y_max, x_max, label };
+}
+
+function plainBox(text) {
+  const [y_min, x_min, y_max, x_max] = text.split(",").map(Number);
+  return { y_min, x_min, y_max, x_max, label: "box" };
+}
+
+function classedBox(text) {
+  const found = CLASSED_BOX.exec(text);
+  if (found === null) malformed("box is neither y_min,x_min,y_max,x_max nor class,x_min,y_min,x_max,y_max");
+  const [x_min, y_min, x_max, y_max] = found.slice(2).map(Number);
+  return { y_min, x_min, y_max, x_max, label: found[1] };
 }

@@ -1,0 +1,98 @@
+"""Every accepted golden vector, cut short at every byte and with every bit of its header flipped.
+
+What comes of it is a value within the bounds of the specification or a refusal with one of its reasons; nothing else.
+"""
+
+import math
+
+import pytest
+
+from protocol.golden import INEXACT_KEY, outcome
+from protocol.golden_cases import CASES
+from protocol.golden_wires import WIRE_CASES, wire_outcome
+from protocol.messages import MAX_INTEGER
+from protocol.refusals import Refusal
+
+ACCEPTED = [case for case in CASES if case.refuse is None]
+WIRED = [case for case in WIRE_CASES if case.refuse is None]
+REASONS = {*map(str, Refusal), INEXACT_KEY}
+LONGEST_TEXT = 4_096
+WHOLE_UP_TO = 2_000  # longer payloads (bounds padded with blanks, 64 boxes) are cut at every 61st byte
+
+
+def flipped(data):
+    """`data` with each of its bits changed, one at a time."""
+    for at in range(len(data)):
+        for bit in range(8):
+            yield data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
+
+
+def cut(data):
+    """All beginnings of `data` but the whole."""
+    return (data[:length] for length in range(0, len(data), 1 if len(data) <= WHOLE_UP_TO else 61))
+
+
+def check(got):
+    """`got` is one of the two outcomes that there are."""
+    assert len(got) == 1
+    if "refuse" in got:
+        assert got["refuse"] in REASONS
+    else:
+        within_bounds(got["accept"])
+    return "refuse" in got
+
+
+def within_bounds(value):
+    if isinstance(value, dict):
+        assert value.get("v", 1) == 1
+        for name, inner in value.items():
+            within_bounds(name)
+            within_bounds(inner)
+    elif isinstance(value, list | tuple):
+        assert len(value) <= 4096
+        for inner in value:
+            within_bounds(inner)
+    elif isinstance(value, float):
+        assert math.isfinite(value)
+    elif isinstance(value, int):
+        assert 0 <= value <= MAX_INTEGER
+    elif isinstance(value, str):
+        assert len(value) <= LONGEST_TEXT
+        value.encode()  # no half of a surrogate pair
+    else:
+        assert value is None
+
+
+@pytest.mark.parametrize("case", ACCEPTED, ids=lambda case: f"{case.channel}/{case.name}")
+def test_a_message_cut_or_changed_anywhere_is_read_or_refused(case):
+    refused = [check(outcome(case.key, header, case.payload)) for header in (*cut(case.header), *flipped(case.header))]
+    for payload in cut(case.payload):
+        check(outcome(case.key, case.header, payload))
+    assert not check(outcome(case.key, case.header, case.payload))
+    if case.header:
+        assert all(refused[: len(case.header.rstrip())]), "a header that is cut short is refused"
+        assert any(not one for one in refused) and refused.count(True) > 100, "some bits do not matter, most do"
+
+
+@pytest.mark.parametrize("case", [one for one in WIRED if one.folder == "websocket"], ids=lambda case: case.name)
+def test_a_websocket_message_cut_or_changed_anywhere_is_taken_apart_or_refused(case):
+    message = bytes.fromhex(case.given["message_hex"])
+    block = 2 + int.from_bytes(message[:2])
+    changed = [one + message[block:] for one in flipped(message[:block])]
+    for one in (*cut(message), *changed):
+        got = wire_outcome("websocket", case.given | {"message_hex": one.hex()})
+        check(got)
+        if "accept" in got:
+            assert len(got["accept"]["header_hex"]) // 2 <= 576 and len(one) >= len(got["accept"]["payload_hex"]) // 2
+    for one in cut(message[:block]):
+        assert check(wire_outcome("websocket", case.given | {"message_hex": one.hex()})), "a block cut short is refused"
+
+
+@pytest.mark.parametrize(
+    "case", [one for one in WIRED if one.folder != "websocket"], ids=lambda case: f"{case.folder}/{case.name}"
+)
+def test_a_text_cut_or_changed_anywhere_is_read_or_refused(case):
+    """A transport hands over no text that is not UTF-8, so a changed byte stands for the character of that number."""
+    text = case.given["text"].encode()
+    for one in (*cut(text), *flipped(text)):
+        check(wire_outcome(case.folder, case.given | {"text": one.decode("latin-1")}))
