@@ -1,0 +1,41 @@
+"""A codec on a pipe, as `sightline conform codec -- python examples/codec_adapter.py` asks it. Shell.
+
+One question per line of stdin, one answer per line of stdout, JSON both. This one asks Sightline's own codec; write its
+like in the language of yours, with your own codec in the place of `outcome` and `format_twist`.
+"""
+
+import base64
+import json
+import sys
+from typing import Any
+
+from protocol.golden import outcome
+from protocol.golden_wires import READERS, wire_outcome
+from protocol.messages import Twist
+from protocol.twist_text import format_twist
+
+
+def answer(question: dict[str, Any]) -> dict[str, Any]:
+    """What is answered, but for the id."""
+    if question["kind"] == "message":
+        header, payload = (base64.b64decode(question[name]) for name in ("header", "payload"))
+        came_to = outcome(question["key"], header, payload)
+        return {"ok": came_to["accept"]} if "accept" in came_to else {"refusal": came_to["refuse"]}
+    if question["kind"] == "write_twist":
+        twist = Twist(linear_mps=question["linear_mps"], angular_rad_s=question["angular_rad_s"])
+        return {"ok": format_twist(twist).decode("ascii")}
+    if question["kind"] in READERS:
+        came_to = wire_outcome(question["kind"], question)
+        return {"ok": came_to["accept"]} if "accept" in came_to else {"refusal": came_to["refuse"]}
+    return {"unsupported": True}
+
+
+def main() -> None:
+    """Answer until stdin ends."""
+    for line in sys.stdin:
+        question = json.loads(line)
+        print(json.dumps({"id": question["id"], **answer(question)}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

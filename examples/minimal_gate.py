@@ -1,0 +1,143 @@
+"""The gate of `minimal_robot.py`: what is obeyed, and what the wheels do. Pure.
+
+Numbers in comments are clauses of protocol/README.md.
+"""
+
+import math
+import re
+import secrets
+from collections import Counter
+from typing import Any
+
+SESSION = secrets.token_hex(4)
+FULL_SPEED_US, MAX_AGE_US, SILENCE_US, LEASE_US, STATUS_US = 150_000, 400_000, 300_000, 1_000_000, 2_000_000
+MAX_LINEAR_MPS, MAX_ANGULAR_RAD_S = 0.3, 1.5
+NOTHING = (0.0, 0.0, -MAX_AGE_US, -SILENCE_US)  # linear, angular, when the frame was captured, when it came
+NUMBER = rb"([+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)"
+TWIST = re.compile(NUMBER + rb"\|" + NUMBER)  # 4.1
+Header = dict[str, Any]
+
+
+class Gate:
+    """The only road to the wheels: judges on arrival, and again whenever it is asked what the wheels do."""
+
+    def __init__(self) -> None:
+        self.issued: dict[tuple[str, int], int] = {}  # 5.2: (channel, seq) -> t_us
+        self.denied = -1  # 8.3: no status up to this one lets anything move
+        self.last_seq: dict[tuple[str, str], int] = {}
+        self.holder, self.held_us, self.good = ("", ""), -LEASE_US, 0
+        self.stopped, self.armed, self.arms_itself = False, False, True
+        self.command = NOTHING
+        self.accepted, self.refused = 0, Counter[str]()
+
+    def offer(self, header: Header, text: bytes, now: int) -> None:
+        try:
+            reason = self.judge(header, text, now)
+        except (KeyError, TypeError, ValueError):
+            reason = "MALFORMED"
+        self.refused[reason] += bool(reason)
+        self.accepted += not reason
+
+    def judge(self, header: Header, text: bytes, now: int) -> str:
+        """The reason of 5.1 that stands against a twist, or "" with the command taken over."""
+        match, echo, who = TWIST.fullmatch(text[:65]), header["echo"], (header["source"], header["session"])
+        linear, angular = (float(match[1]), float(match[2])) if match else (math.nan, math.nan)
+        checks = {
+            "UNSUPPORTED_VERSION": header.get("v", 1) == 1,
+            "MALFORMED": match is not None and len(text) <= 64,
+            "NOT_FINITE": math.isfinite(linear) and math.isfinite(angular),
+            "UNKNOWN_SOURCE": who[0] in ("vision", "teleop"),
+            **self.young(echo, "frame", now, MAX_AGE_US),
+            "OUT_OF_ORDER": header["seq"] > self.last_seq.get(who, -1),
+        }
+        wrong = next((reason for reason, holds in checks.items() if not holds), "")
+        return wrong or self.take(who, header["seq"], (linear, angular, echo["t_us"], now))
+
+    def issue(self, channel: str, seq: int, t_us: int) -> None:
+        """Write down what is about to leave, so that nobody can answer it before."""
+        self.issued = dict([*self.issued.items(), ((channel, seq), t_us)][-512:])
+
+    def young(self, echo: Header, channel: str, now: int, most_us: int) -> dict[str, bool]:
+        """By this robot's own record and clock: the checks of 5.1 on what a message cites."""
+        own = self.issued.get((channel, echo["seq"])) == echo["t_us"]
+        return {
+            "OTHER_SESSION": echo["session"] == SESSION,
+            "UNKNOWN_FRAME": echo["channel"] == channel and own,
+            "FROM_FUTURE": echo["t_us"] <= now,
+            "STALE": now - echo["t_us"] <= most_us,
+        }
+
+    def take(self, who: tuple[str, str], seq: int, command: tuple[float, float, int, int]) -> str:
+        self.last_seq = dict([*self.last_seq.items(), (who, seq)][-64:])
+        linear, angular, frame_us, now = command
+        live = self.live(now)
+        if self.stopped or (live and who != self.holder):  # 6.5, 6.1
+            return "STOPPED" if self.stopped else "NOT_HOLDER"
+        self.good = self.good + 1 if live else 1
+        self.holder, self.held_us = who, now
+        if not self.armed:  # 6.4
+            self.armed = self.arms_itself and self.good >= 5
+            return "DISARMED"
+        scale = max(1.0, abs(linear) / MAX_LINEAR_MPS, abs(angular) / MAX_ANGULAR_RAD_S)  # 4.3
+        self.refused["CLAMPED"] += scale > 1
+        self.command = (linear / scale, angular / scale, frame_us, now)
+        return ""
+
+    def live(self, now: int) -> bool:
+        return now - self.held_us < LEASE_US
+
+    def disarm(self) -> None:
+        """Wheels off, and nobody but a person lets them turn again."""
+        self.armed, self.arms_itself, self.good, self.command = False, False, 0, NOTHING
+        self.denied = max((seq for channel, seq in self.issued if channel == "status"), default=-1)
+
+    def request(self, verb: str, who: tuple[str, str], echo: Any, now: int) -> str:
+        """Do what is asked; the reason against it, with words, or "" (8.2)."""
+        mine = self.live(now) and self.holder == who
+        if verb in ("stop", "disarm"):
+            self.stopped = self.stopped or verb == "stop"
+            self.disarm()
+        elif verb == "release":
+            self.held_us = -LEASE_US if mine else self.held_us
+        elif verb in ("arm", "reset", "acquire"):
+            return self.permit(verb, who, echo, now)
+        else:
+            raise ValueError(verb)
+        return ""
+
+    def permit(self, verb: str, who: tuple[str, str], echo: Any, now: int) -> str:
+        """What lets the robot move again cites a fresh status (8.3)."""
+        if not isinstance(echo, dict):
+            return "MALFORMED: cite a status"
+        checks = {**self.young(echo, "status", now, STATUS_US), "STALE ": echo["seq"] > self.denied,
+                  "NOT_HOLDER": verb != "acquire" or not self.live(now) or self.holder == who,
+                  "STOPPED": verb != "arm" or not self.stopped,
+                  "NOT_ALLOWED": verb != "arm" or self.armed or (self.live(now) and self.good >= 5)}
+        wrong = next((reason.strip() for reason, holds in checks.items() if not holds), "")
+        if wrong:
+            return f"{wrong}: {verb} is not possible now"
+        if verb == "acquire" and not (self.live(now) and self.holder == who):
+            self.holder, self.held_us, self.good = who, now, 0
+        self.stopped = self.stopped and verb != "reset"
+        self.armed = self.armed or verb == "arm"
+        return ""
+
+    def wheels(self, now: int) -> tuple[float, float]:
+        """Linear and angular velocity for now: less the older the frame, none after silence (5.3, 5.4)."""
+        linear, angular, frame_us, came_us = self.command
+        share = min(1.0, max(0.0, (MAX_AGE_US - (now - frame_us)) / (MAX_AGE_US - FULL_SPEED_US)))
+        if not self.armed or now - came_us > SILENCE_US or share == 0.0:
+            return 0.0, 0.0
+        factor = min(1.0, share / max(abs(linear) / MAX_LINEAR_MPS, abs(angular) / MAX_ANGULAR_RAD_S, 1e-9))
+        return linear * factor, angular * factor
+
+    def status(self, now: int) -> Header:
+        """Clause 9, the least of it."""
+        linear, angular = self.wheels(now)
+        commanded = now - self.command[3] <= SILENCE_US
+        state = "STOPPED" if self.stopped else "DISARMED" if not self.armed else "ACTIVE" if commanded else "HOLD"
+        holder = {"source": self.holder[0], "session": self.holder[1]} if self.live(now) else None
+        refused = {reason: count for reason, count in self.refused.items() if reason and count}
+        return {"state": state, "reason": "a minimal robot", "holder": holder, "applied": [linear, angular],
+                "accepted": self.accepted, "refused": refused, "auto_arm": self.arms_itself,
+                "max_linear_mps": MAX_LINEAR_MPS, "max_angular_rad_s": MAX_ANGULAR_RAD_S}
