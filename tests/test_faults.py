@@ -138,6 +138,15 @@ def test_commands_while_blind_allow_nothing_until_sight_is_back():
     assert moved_on_old_sight(rows, sent, Blind(1_000_000, 1_200_000)) == 0
 
 
+def test_a_picture_under_way_when_pictures_are_cut_off_may_still_be_answered():
+    rows = log([0.5] * 51 + [0.5 - 0.02 * k for k in range(25)] + [0.0] * 40)
+    sent = [*commands(900_000), Sent(1_090_000, 990_000)]
+    assert moved_on_old_sight(rows, sent, Blind(1_000_000)) > 0
+    assert moved_on_old_sight(rows, sent, Blind(1_000_000, by_frame=True)) == 0
+    assert last_valid_us(sent, Blind(1_000_000, by_frame=True)) == 1_090_000
+    assert last_valid_us(sent, Blind(1_000_000)) <= 1_000_000
+
+
 def test_without_any_command_no_motion_is_allowed():
     assert moved_on_old_sight(log([0.5] * 10), [], None) == 9
 

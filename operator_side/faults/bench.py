@@ -65,7 +65,7 @@ def _run_once(row: Row, place: Path) -> tuple[tuple[Check, ...], int]:
 
 def _motion_checks(row: Row, rig: Rig, injected: Injected) -> Iterable[Check]:
     rows, sent = rig.motors(), rig.sent()
-    blind = Blind(injected.at_us, injected.resumed_us) if row.blind else None
+    blind = Blind(injected.at_us, injected.resumed_us, row.by_frame) if row.blind else None
     if row.stops:
         until_us = injected.resumed_us or rows[-1].t_us
         since_us = last_valid_us(sent, blind or Blind(until_us))

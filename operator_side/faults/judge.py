@@ -49,14 +49,22 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Blind:
-    """From `from_us` on nothing that is sent counts as sight any more, until `until_us` (None: to the end)."""
+    """From `from_us` on nothing that is sent counts as sight any more, until `until_us` (None: to the end).
+
+    With `by_frame`, nothing that is captured: where only pictures are cut off, one under way may still be answered.
+    """
 
     from_us: int
     until_us: int | None = None
+    by_frame: bool = False
 
-    def hides(self, command_us: int, now_us: int) -> bool:
-        """Whether a command sent at `command_us` must not move the wheels at `now_us`."""
-        return command_us > self.from_us and (self.until_us is None or now_us < self.until_us)
+    def is_earlier(self, one: Sent) -> bool:
+        """Whether a command is from before the blindness."""
+        return (one.frame_us if self.by_frame else one.t_us) <= self.from_us
+
+    def hides(self, one: Sent, now_us: int) -> bool:
+        """Whether a command must not move the wheels at `now_us`."""
+        return not self.is_earlier(one) and (self.until_us is None or now_us < self.until_us)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +144,7 @@ def _ms_after(window: Sequence[Motors], index: int, since_us: int) -> float | No
 
 def last_valid_us(sent: Iterable[Sent], blind: Blind) -> int | None:
     """When the last command left that still counted when the blindness began; None without one."""
-    return max((one.t_us for one in sent if one.t_us <= blind.from_us), default=None)
+    return max((one.t_us for one in sent if blind.is_earlier(one)), default=None)
 
 
 def moved_on_old_sight(rows: Sequence[Motors], sent: Sequence[Sent], blind: Blind | None) -> int:
@@ -158,7 +166,7 @@ def _ages_us(rows: Iterable[Motors], sent: Sequence[Sent], blind: Blind | None) 
     for row in rows:
         frames = (
             one.frame_us for one in ordered
-            if one.t_us <= row.t_us and not (blind and blind.hides(one.t_us, row.t_us))
+            if one.t_us <= row.t_us and not (blind and blind.hides(one, row.t_us))
         )
         yield row.t_us - max(frames, default=float("-inf"))
 

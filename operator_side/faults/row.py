@@ -34,6 +34,8 @@ class Row:
     setup: "Setup"
     blind: bool = False
     """Commands go on while they must not be obeyed any more: from the injection on, none counts as good."""
+    by_frame: bool = False
+    """It is pictures that end, not commands: one under way may still be answered."""
     stops: bool = True
     """A stop is demanded after the last valid command."""
     again: bool = False

@@ -62,7 +62,7 @@ ROWS: Final = (
     Row("wire.cut15", "network: partition 15 s", partial(_cut, shapes=Shapes(ab=CUT, ba=CUT), seconds=15.0), _WIRED,
         blind=True, again=True),
     Row("wire.no_frames", "network: one direction only, frames lost", partial(_cut, shapes=Shapes(ab=CUT), seconds=3.0),
-        _WIRED, blind=True, again=True),
+        _WIRED, blind=True, by_frame=True, again=True),
     Row("wire.no_commands", "network: one direction only, commands lost",
         partial(_cut, shapes=Shapes(ba=CUT), seconds=3.0), _WIRED, blind=True, again=True),
     Row("wire.delay", "network: 300 ms each way", partial(_worsen, shapes=Shapes(ab=_SLOW, ba=_SLOW)), _WIRED,
