@@ -39,7 +39,7 @@ def faults(
     listing: Annotated[bool, typer.Option("--list", help="Name the rows and what each demands; run nothing.")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write the report, e.g. docs/faults.md; its worst goes into safety.md."),
+        typer.Option(metavar="FILE", help="Write the report, or with --only its rows into one; its worst goes into safety.md."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> int:
@@ -47,7 +47,7 @@ def faults(
     with needs("all"):
         from operator_side.faults.machine import describe_machine
         from operator_side.faults.parallel import run_rows
-        from operator_side.faults.report import markdown, passed, progress_line, to_dict
+        from operator_side.faults.report import markdown, passed, progress_line, to_dict, with_rows_of
         from operator_side.faults.rows import chosen
     rows = chosen(only or (), short=short)
     if listing:
@@ -61,7 +61,8 @@ def faults(
     )
     _remove_if_empty(folder)
     if out is not None:
-        _write(out, markdown(results, machine, _command(only, short, repeat, jobs), repeat))
+        report = markdown(results, machine, _command(only, short, repeat, jobs), repeat)
+        _write(out, with_rows_of(out.read_text("utf-8"), report) if only and out.exists() else report)
     typer.echo(json.dumps(to_dict(results)) if as_json else _summary(results, folder))
     return 0 if passed(results) else CHECK_FAILED
 

@@ -7,6 +7,7 @@ import typer
 
 from operator_side import cli_faults
 from operator_side.faults.judge import Motors
+from operator_side.faults.report import with_rows_of
 from operator_side.faults.rows_crowd import _tick_checks, permille_us, undisturbed_gaps_us
 from operator_side.faults.sampler import Hole
 from operator_side.faults.worst import page_with_worst
@@ -125,3 +126,26 @@ def _measured(row):
     from operator_side.faults.row import Outcome
 
     return Outcome(row, tuple(stop_checks(Stop(150.0, 560.0, 0.19))))
+
+
+# --- a report of which some rows ran again -----------------------------------------------------------------------
+
+
+def _report(command, **rows):
+    lines = [f"| {fault} | stop | falls 1 ms | {verdict} |" for fault, verdict in rows.items()]
+    good = sum(verdict == "yes" for verdict in rows.values())
+    return "\n".join([f"Written by `{command}`; do not edit. {good} of {len(rows)} rows passed.", "", "- CPU: one", "",
+                      "| fault | demanded | worst of 2 | pass |", "|---|---|---|---|", *lines, ""])
+
+
+def test_rows_that_ran_again_replace_their_own_and_no_others():
+    old = _report("faults --repeat 2", a="yes", b="**no**", c="yes")
+    report = with_rows_of(old, _report("faults --only b", b="yes"))
+    assert "3 of 3 rows passed" in report and "Written by `faults --repeat 2`" in report
+    assert "- run again by `faults --only b`: b\n\n| fault" in report
+    assert [line.split(" | ")[0] for line in report.splitlines() if "stop" in line] == ["| a", "| b", "| c"]
+
+
+def test_a_row_that_fails_when_run_again_is_told():
+    report = with_rows_of(_report("x", a="yes", b="yes"), _report("y", b="**no**"))
+    assert "1 of 2 rows passed" in report

@@ -1,5 +1,6 @@
 """The fault bench's report: a line per run, JSON for scripts, and the table that `docs/faults.md` holds. Pure."""
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any, Final
@@ -97,6 +98,28 @@ def markdown(results: Results, machine: Sequence[str], command: str, repeat: int
         *map(_table_row, results),
         "",
     ])
+
+
+def with_rows_of(report: str, newer: str) -> str:
+    """`report` with the rows that `newer` ran in place of its own, and said to be; what only `newer` has is added."""
+    rows, again = _rows(report), _rows(newer)
+    rows.update(again)
+    head, _, _ = report.partition("|---|---|---|---|\n")
+    passed_rows = sum(line.endswith("| yes |") for line in rows.values())
+    ran = sum(not line.endswith("| not run |") for line in rows.values())
+    head = re.sub(r"[0-9]+ of [0-9]+ rows passed", f"{passed_rows} of {ran} rows passed", head)
+    note = f"- run again by `{_COMMAND.search(newer)[1]}`: {'; '.join(again)}"  # type: ignore[index]
+    head = head.replace("\n\n| fault ", f"\n{note}\n\n| fault ")
+    return head + "|---|---|---|---|\n" + "\n".join(rows.values()) + "\n"
+
+
+_COMMAND: Final = re.compile(r"^Written by `([^`]+)`", re.MULTILINE)
+
+
+def _rows(report: str) -> dict[str, str]:
+    """Lines of the table by their fault."""
+    lines = report.partition("|---|---|---|---|\n")[2].splitlines()
+    return {line.split(" | ")[0].removeprefix("| "): line for line in lines if line.startswith("| ")}
 
 
 _LEGEND: Final = (
