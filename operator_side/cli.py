@@ -16,6 +16,7 @@ from operator_side import (
     cli_bench,
     cli_calibrate,
     cli_config,
+    cli_conform,
     cli_doctor,
     cli_faults,
     cli_install,
@@ -43,7 +44,7 @@ app = typer.Typer(
 )
 for module in (
     cli_services, cli_judge, cli_people, cli_bench, cli_faults,
-    cli_calibrate, cli_keys, cli_install, cli_doctor, cli_metrics, cli_config,
+    cli_calibrate, cli_keys, cli_install, cli_doctor, cli_metrics, cli_config, cli_conform,
 ):
     module.register(app)
 

@@ -118,6 +118,8 @@ def vision(
         raise ConfigError("--camera looks without a robot, so there is nothing to steer: add --dry-run")
     if camera_sets and camera is None:
         raise ConfigError("--camera-set is for the camera of --camera; name one, e.g. --camera v4l2")
+    if robot is not None and "://" in robot:  # the address of a robot that has one endpoint and no other name
+        robot, connect = None, [*(connect or ()), robot]
     options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure,
                "detector.kind": detector}
     loaded = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)

@@ -182,7 +182,7 @@ def _run(driver: ParentDriver) -> None:
         ending.callback(camera.close)
         link = ending.enter_context(
             open_link(
-                config.robot, listen=config.listen, connect=config.connect, role="robot", secure=config.secure
+                config.robot, listen=config.doors, connect=config.connect, role="robot", secure=config.secure
             )
         )
         where = ", ".join(config.listen) or "connected to " + ", ".join(config.connect)

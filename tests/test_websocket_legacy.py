@@ -1,26 +1,27 @@
 """The older text dialect over real sockets: the write-up's client, and vision against the write-up's robot."""
 
 import base64
-import threading
+import random
+import socket
 import time
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
-from websockets.sync.server import serve
 
-from protocol.channels import ACK, CAMERA, FRAME, STATUS, TWIST
+from protocol.channels import ACK, DETECTIONS, FRAME, STATUS, TWIST
 from protocol.codec import decode, encode
-from protocol.messages import AnswerHeader, FrameHeader
+from protocol.messages import AnswerHeader, Detections, DetectionsHeader, FrameHeader
 from protocol.refusals import Refusal
 from protocol.transports.link import Message
 from protocol.transports.link_rules import OVERSIZE
 from protocol.transports.websocket import open_websocket
 from protocol.transports.websocket_dialects import BAD_FRAMING
-from protocol.transports.websocket_endpoints import parse_endpoint
 from protocol.transports.websocket_listen import CROSS_SITE
 from tests.link_rigs import free_endpoint, until
+from tests.robot_process import JPEG as SMALL_JPEG
+from tests.websocket_rig import address_of, received, upgrade
 
 JPEG = bytes(range(256)) * 40
 TEXT = base64.encodebytes(JPEG).decode("ascii")
@@ -64,10 +65,17 @@ def test_a_picture_goes_out_as_base64_lines_and_a_twist_comes_in_as_a_guests():
         assert twists.take(2) == Message(TWIST, "guest", b"", b"2.3028209556706964|0")
 
 
-def test_the_text_costs_at_most_1_36_times_the_picture():
-    with robot_and_client() as (robot, client):
-        robot.publish(FRAME, encode(header_of(1)), bytes(46_000))
-        assert len(client.recv(2)) <= 1.36 * 46_000
+@pytest.mark.parametrize("picture_bytes", [12_000, 46_000])
+def test_on_the_socket_a_picture_costs_at_most_1_36_times_its_bytes(picture_bytes):
+    endpoint = free_legacy()
+    with open_websocket("r1", listen=endpoint) as robot, socket.create_connection(address_of(endpoint)) as near:
+        near.sendall(upgrade("127.0.0.1").replace(b"Sec-WebSocket-Protocol: sightline.v1\r\n", b""))
+        assert received(near).startswith(b"HTTP/1.1 101 ")
+        got = 0
+        for seq in range(5):
+            robot.publish(FRAME, encode(header_of(seq)), random.Random(seq).randbytes(picture_bytes))
+            got += len(received(near, 0.1))
+    assert 1.33 < got / (5 * picture_bytes) <= 1.36
 
 
 def test_one_line_and_dashed_twists_are_opt_in():
@@ -78,6 +86,60 @@ def test_one_line_and_dashed_twists_are_opt_in():
         for sent, got in (("0.2--0.35", b"0.2000|-0.3500"), ("0.2|-0.35", b"0.2|-0.35"), ("left", b"left")):
             client.send(sent)
             assert twists.take(2).payload == got
+
+
+def test_swapped_axes_are_another_option():
+    with robot_and_client("?dashed&swapped") as (robot, client):
+        twists = robot.latest(TWIST)
+        for sent, got in (("0.2--0.35", b"-0.3500|0.2000"), ("-1e-1-+2.5E-1", b"0.2500|-0.1000"), ("1|2", b"1|2")):
+            client.send(sent)
+            assert twists.take(2).payload == got
+
+
+def test_boxes_come_in_as_a_guests_detections_of_the_picture_it_was_sent_and_go_on_to_who_wants_them():
+    modern, older = free_endpoint().replace("tcp/", "ws://"), free_legacy() + "?boxes"
+    with open_websocket("r1", listen=[modern, older]) as robot, open_websocket("r1", connect=modern) as vision:
+        found, passed_on = robot.latest(DETECTIONS), vision.latest(DETECTIONS)
+        twists, acks = robot.latest(TWIST), robot.latest(ACK)
+        with connect(plain(older), **OLD) as client:
+            assert until(lambda: robot.has_listener(FRAME) and robot.has_listener(DETECTIONS))
+            for seq in (7, 8):  # which of the two was looked at is not known: the older one
+                robot.publish(FRAME, encode(header_of(seq)), SMALL_JPEG)
+                client.recv(2)
+            client.send("0.25,0.5,0.75,1.0-0,0,1,0.5")
+            message = found.take(2)
+            assert passed_on.take(2) == message
+            assert message.source == "guest"
+            header = decode(DetectionsHeader, message.header)
+            assert (header.source, header.session, header.echo.seq) == ("guest", "00000000", 7)
+            boxes = decode(Detections, message.payload, DETECTIONS.max_payload_bytes)
+            corners = [(box.x1_px, box.y1_px, box.x2_px, box.y2_px) for box in boxes.boxes]
+            assert (boxes.width_px, boxes.height_px, corners) == (16, 16, [(8, 4, 16, 12), (0, 0, 8, 16)])
+            assert decode(AnswerHeader, acks.take(2).header).echo.seq == 8
+            client.send("0.1,0,0.2,1")  # an answer to nothing
+            assert until(lambda: robot.refused == {Refusal.UNKNOWN_FRAME: 1})
+            robot.publish(FRAME, encode(header_of(9)), SMALL_JPEG)
+            client.recv(2)
+            client.send("0.1,0,0.2,7")
+            assert until(lambda: robot.refused[Refusal.MALFORMED] == 1)
+            robot.publish(FRAME, encode(header_of(10)), SMALL_JPEG)
+            client.recv(2)
+            client.send("")  # looked, and saw nothing
+            nothing = found.take(2)
+            assert decode(Detections, nothing.payload, DETECTIONS.max_payload_bytes).boxes == ()
+            assert decode(DetectionsHeader, nothing.header).echo.seq == 10
+            client.send("0.1|0")
+            assert twists.take(2).payload == b"0.1|0"
+
+
+def test_boxes_are_not_taken_where_nobody_asked_for_them():
+    with robot_and_client() as (robot, client):
+        twists, found = robot.latest(TWIST), robot.latest(DETECTIONS)
+        robot.publish(FRAME, encode(header_of(1)), SMALL_JPEG)
+        client.recv(2)
+        client.send("0.25,0.5,0.75,1.0")
+        assert twists.take(2).payload == b"0.25,0.5,0.75,1.0"  # the robot refuses it, and says why
+        assert found.take() is None
 
 
 def test_each_twist_also_acknowledges_the_newest_picture_once():
@@ -183,113 +245,3 @@ def test_both_dialects_may_be_listened_for_at_once():
             assert until(lambda: len(robot._peers) == 2 and robot.has_listener(FRAME) and peer.connected)
             assert until(lambda: robot.publish(FRAME, b"{}", JPEG) and frames.take(0.05))
             assert base64.b64decode(client.recv(2)) == JPEG
-
-
-# --- vision's end ----------------------------------------------------------------------------------------------------
-
-
-class OldRobot:
-    """The write-up's robot: sends what it is told to each client, keeps what they say."""
-
-    def __init__(self, endpoint: str) -> None:
-        self.said: list[str | bytes] = []
-        self.clients = []
-        address = parse_endpoint(endpoint)
-        self._server = serve(self._handle, address.host, address.port, compression=None)
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
-
-    def _handle(self, client) -> None:
-        self.clients.append(client)
-        try:
-            for message in client:
-                self.said.append(message)
-        except ConnectionClosed as closed:
-            self.said.append(f"closed {closed.rcvd.code if closed.rcvd else 0}")
-        self.clients.remove(client)
-
-    def send(self, text: str | bytes) -> None:
-        for client in list(self.clients):
-            client.send(text)
-
-    def close(self) -> None:
-        self._server.shutdown()
-
-
-@contextmanager
-def old_robot_and_vision(options: str = ""):
-    endpoint = free_legacy() + options
-    robot = OldRobot(endpoint)
-    try:
-        with open_websocket("r1", connect=endpoint, role="vision", max_frame_bytes=20_000) as vision:
-            assert until(lambda: robot.clients and vision.connected)
-            yield robot, vision
-    finally:
-        robot.close()
-
-
-def test_text_becomes_frames_with_a_header_of_their_own_and_twists_become_text():
-    with old_robot_and_vision() as (robot, vision):
-        frames, headers = vision.latest(FRAME), []
-        for number in range(3):
-            before_us = time.monotonic_ns() // 1000
-            robot.send(base64.encodebytes(JPEG + bytes([number])).decode("ascii"))
-            frame = frames.take(2)
-            assert frame.payload == JPEG + bytes([number])
-            headers.append(decode(FrameHeader, frame.header))
-            assert before_us <= headers[-1].t_us <= time.monotonic_ns() // 1000
-        assert [header.seq for header in headers] == [1, 2, 3]
-        assert len({header.session for header in headers}) == 1
-        assert vision.has_listener(TWIST)
-        assert not vision.has_listener(ACK)
-        vision.publish(ACK, b"{}", b"")
-        vision.publish(TWIST, b"{}", b"0.2000|-0.3500")
-        assert until(lambda: robot.said == ["0.2000|-0.3500"])
-        assert vision.latest(CAMERA).take() is None
-
-
-def test_dashed_twists_go_out_dashed():
-    with old_robot_and_vision("?dashed") as (robot, vision):
-        vision.publish(TWIST, b"{}", b"0.2000|-0.3500")
-        assert until(lambda: robot.said == ["0.2000--0.3500"])
-
-
-@pytest.mark.parametrize(
-    ("message", "code", "counted"),
-    [(JPEG, 1003, BAD_FRAMING), ("A" * 10_000_000, 1009, OVERSIZE)],
-)
-def test_what_is_no_picture_ends_the_connection_which_comes_back_by_itself(message, code, counted):
-    with old_robot_and_vision() as (robot, vision):
-        frames = vision.latest(FRAME)
-        with suppress(ConnectionClosed):  # 10 MB may break on a socket that is closed already
-            robot.send(message)
-        assert until(lambda: vision.refused == {counted: 1})
-        assert until(lambda: robot.said in ([f"closed {code}"], ["closed 0"]) and robot.clients)
-        assert until(lambda: robot.send(TEXT) or frames.take(0.05))
-
-
-@pytest.mark.parametrize("text", ["no base64", "AAA", "0|0", base64.b64encode(bytes(20_001)).decode("ascii")])
-def test_a_text_that_is_no_picture_is_counted_and_skipped(text):
-    with old_robot_and_vision() as (robot, vision):
-        frames = vision.latest(FRAME)
-        robot.send(text)
-        robot.send(TEXT)
-        assert frames.take(2).payload == JPEG
-        assert frames.dropped == 0
-        assert vision.refused == {Refusal.MALFORMED: 1}
-        assert robot.said == []
-
-
-def test_a_robot_that_restarts_is_found_again_and_has_a_new_session():
-    endpoint = free_legacy()
-    robot, sessions = OldRobot(endpoint), set()
-    with open_websocket("r1", connect=endpoint, role="vision") as vision:
-        frames = vision.latest(FRAME)
-        for _ in range(2):
-            assert until(lambda: robot.clients and vision.connected)  # noqa: B023
-            robot.send(TEXT)
-            sessions.add(decode(FrameHeader, frames.take(2).header).session)
-            robot.close()
-            assert until(lambda: not vision.connected)
-            robot = OldRobot(endpoint)
-        robot.close()
-    assert len(sessions) == 2

@@ -75,7 +75,7 @@ export class Connection {
 
   ping() {
     if (this.awaitsPong) {
-      this.close(1011, "a ping was not answered");
+      this.close(1011, "silent for too long");
       return;
     }
     this.awaitsPong = true;

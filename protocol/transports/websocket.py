@@ -3,35 +3,41 @@
     with open_websocket("r1", listen="ws://127.0.0.1:9090") as link:
         link.publish(STATUS, header, payload)
 
-Nothing is passed on between peers: who listens speaks with each who connects, and they do not hear one another.
+Nothing but detections is passed on between peers: who listens speaks with each who connects, and they do not hear one
+another.
 """
 
 from __future__ import annotations
 
 import secrets
+import sys
 import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
-from protocol.channels import CHANNELS, FRAME, Channel, parse_key
+from protocol.channels import CHANNELS, DETECTIONS, FRAME, TWIST, Channel, parse_key
 from protocol.codec import encode
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.link_rules import INEXACT_KEY, LinkRules
 from protocol.transports.websocket_dial import Dialer
-from protocol.transports.websocket_dialects import BAD_HELLO, V1, Dialect, LegacyToRobot, LegacyToVision, PeerError
+from protocol.transports.websocket_dialects import V1, Dialect
+from protocol.transports.websocket_doorlog import DoorLog
 from protocol.transports.websocket_endpoints import Endpoint, parse_endpoint
 from protocol.transports.websocket_framing import Hello, Packet
-from protocol.transports.websocket_listen import Listener
-from protocol.transports.websocket_peer import OPEN_S, Peer
+from protocol.transports.websocket_legacy import Client, LegacyToRobot, LegacyToVision
+from protocol.transports.websocket_listen import Keys, Listener
+from protocol.transports.websocket_outbox import Post
+from protocol.transports.websocket_peer import Peer, greet
+from protocol.transports.websocket_seat import Seat
+from protocol.transports.websocket_wire import Wire
 
-if TYPE_CHECKING:
-    from websockets.sync.connection import Connection
-
+NOT_GRANTED: Final = "NOT_GRANTED"
+"""Counted for a message that the role of the sender's token may not publish."""
 CLOSE_S: Final = 1.5
 """A close that takes longer is left to daemon threads, so that no process hangs on a dead peer."""
 
@@ -44,13 +50,16 @@ def open_websocket(
     role: str = "",
     timeout_s: float = 5.0,
     max_frame_bytes: int = FRAME.max_payload_bytes,
+    secure: str = "",
 ) -> WebSocketLink:
     """Open a link to `robot`; use it in a `with`.
 
-    Endpoints are `ws://host:port` and `ws-legacy://host:port` (`protocol.transports.websocket_endpoints`). Who listens
+    Endpoints are `ws://host:port`, `wss://` and `ws-legacy://` (`protocol.transports.websocket_endpoints`). Who listens
     reaches `connect` in the background; a lost connection is made again by itself. `role` is the default source of what
-    is published towards the robot. Raises ConfigError for a robot id, endpoint or limit that is none or for a missing
-    `websockets`; LinkError for a port in use, if nobody answers within `timeout_s`, or if who answers will not speak.
+    is published towards the robot. `secure` is a folder of tokens and certificates (`websocket_keys`, `websocket_tls`).
+    Raises ConfigError for a robot id, endpoint, limit or folder that is none, for an endpoint open to anybody, and for
+    a missing `websockets`; LinkError for a port in use, if nobody answers within `timeout_s`, or if who answers will
+    not speak.
     """
     rules = LinkRules(robot, role, max_frame_bytes)
     doors, far = [[parse_endpoint(text) for text in _listed(ends)] for ends in (listen, connect)]
@@ -62,10 +71,10 @@ def open_websocket(
         raise ConfigError("websockets is not installed: pip install 'sightline[websocket]'") from None
     link = WebSocketLink(rules)
     try:
-        link.open(doors, far)
+        link.open(doors, far, secure)
         if not doors:
             link.wait_connected(timeout_s)
-    except LinkError:
+    except (LinkError, ConfigError):
         link.close()
         raise
     return link
@@ -84,7 +93,8 @@ class WebSocketLink:
         self._rules = rules
         self._session = secrets.token_hex(4)
         self._callbacks: defaultdict[str, list[Callable[[Message], None]]] = defaultdict(list)
-        self._peers: tuple[Peer, ...] = ()  # replaced, never changed, so that publishing needs no lock
+        # Who drives comes first. Replaced, never changed, so that publishing needs no lock.
+        self._peers: tuple[Peer, ...] = ()
         self._joining = threading.Lock()
         self._joined = threading.Event()
         self._listeners: list[Listener] = []
@@ -92,6 +102,8 @@ class WebSocketLink:
         self._closed = False
         self._in_callback = threading.local()
         self._dropped: Counter[str] = Counter()
+        self._seat = Seat()
+        self._log = DoorLog()
 
     @property
     def refused(self) -> Counter[str]:
@@ -119,9 +131,9 @@ class WebSocketLink:
         key = self._rules.key(channel, source)
         if not self.connected:
             return False
-        message = Message(channel, key.rpartition("/")[2] if channel.has_source else "", header, payload)
+        post = Post(Message(channel, key.rpartition("/")[2] if channel.has_source else "", header, payload))
         for peer in self._peers:
-            peer.offer(message)
+            peer.offer(post)
         return True
 
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
@@ -150,16 +162,14 @@ class WebSocketLink:
             self._closed = True
         for dialer in self._dialers:
             dialer.close()
-        reason = f"this end of the link to robot {self.robot} is closing"
-        closes: list[Callable[[str], None]] = [peer.close for peer in self._peers]
-        closes += [listener.close for listener in self._listeners]
-        threads = [threading.Thread(target=end, args=(reason,), name="websocket-close", daemon=True) for end in closes]
-        for thread in threads:
-            thread.start()
-        if not getattr(self._in_callback, "now", False):  # a peer is gone when its callbacks are: one cannot wait
-            deadline_s = time.monotonic() + CLOSE_S
-            for thread in threads:
-                thread.join(max(0.0, deadline_s - time.monotonic()))
+        reason, peers = f"this end of the link to robot {self.robot} is closing", self._peers
+        for peer in peers:
+            peer.close(reason)
+        for listener in self._listeners:
+            listener.close(reason)
+        deadline_s = time.monotonic() + CLOSE_S
+        for peer in () if getattr(self._in_callback, "now", False) else peers:  # a callback's own peer waits for it
+            peer.wait_gone(max(0.0, deadline_s - time.monotonic()))
 
     def __enter__(self) -> Self:
         return self
@@ -171,13 +181,13 @@ class WebSocketLink:
 
     # --- opening -------------------------------------------------------------------------------------------------
 
-    def open(self, doors: Sequence[Endpoint], far: Sequence[Endpoint]) -> None:
-        """Listen on `doors` and begin to connect to `far`. Raises LinkError for a door that cannot be listened on."""
-        refuse = self._rules.refuse
-        self._listeners = []
+    def open(self, doors: Sequence[Endpoint], far: Sequence[Endpoint], secure: str) -> None:
+        """Listen on `doors` and begin to connect to `far`. Raises what `open_websocket` does."""
+        refuse, keys = self._rules.refuse, Keys(secure, self._rules.role)
         for end in doors:
-            self._listeners.append(Listener(end, partial(self._serve, end, True), refuse))
-        self._dialers = [Dialer(end, partial(self._serve, end, False), refuse) for end in far]
+            self._listeners.append(Listener(end, partial(self._serve, end, True), refuse, self._tell, keys))
+        for end in far:
+            self._dialers.append(Dialer(end, partial(self._serve, end, False), refuse, keys))
 
     def wait_connected(self, timeout_s: float) -> None:
         """Wait for the first peer. Raises LinkError with the reason if there is none."""
@@ -193,20 +203,21 @@ class WebSocketLink:
 
     # --- peers, on threads of their own ------------------------------------------------------------------------------
 
-    def _serve(self, end: Endpoint, listening: bool, connection: Connection) -> None:
+    def _serve(self, end: Endpoint, listening: bool, wire: Wire) -> None:
         """Speak with one peer until it is gone. Raises PeerError or ConnectionClosed if it says no proper hello."""
-        dialect = self._dialect(end, listening)
+        dialect = self._dialect(end, listening, "{}:{}".format(*wire.address))
         with self._joining:
             hello, wanted_bytes = self._hello(), self._wanted_bytes()
-        connection.protocol.max_message_size = dialect.bound(wanted_bytes)
+        peer = Peer(wire, dialect)
+        peer.limit(wanted_bytes)
         if isinstance(dialect, V1):
-            _greet(connection, dialect, hello, listening)
-        peer = Peer(connection, dialect)
+            greet(wire, dialect, hello, listening)
         if self._join(peer, hello):
             try:
                 peer.run(self._deliver, self._rules.refuse)
             finally:
                 self._leave(peer)
+                dialect.note_gone()
 
     def _join(self, peer: Peer, told: str) -> bool:
         with self._joining:
@@ -224,13 +235,32 @@ class WebSocketLink:
             self._peers = tuple(other for other in self._peers if other is not peer)
             self._dropped += peer.outbox.dropped
 
-    def _dialect(self, end: Endpoint, listening: bool) -> Dialect:
+    def _put_first(self, peer: Peer) -> None:
+        """Who drives is sent everything before those who watch."""
+        with self._joining:
+            self._peers = (peer, *(other for other in self._peers if other is not peer))
+
+    def _pass_on(self, sender: Peer, message: Message) -> None:
+        """Where all connect, what one has found is for the others too."""
+        post = Post(message)
+        for peer in self._peers:
+            if peer is not sender:
+                peer.offer(post)
+
+    def _dialect(self, end: Endpoint, listening: bool, who: str) -> Dialect:
         if end.legacy is None:
             return V1(self.robot, self._rules.role)
         if listening:
-            return LegacyToVision(self.robot, end.legacy, _now_us)
+            return LegacyToVision(self.robot, end.legacy, _now_us, Client(who, self._seat, self._tell))
         bound = self._rules.payload_bound(FRAME)
         return LegacyToRobot(self.robot, end.legacy, _now_us, secrets.token_hex(4), bound)
+
+    def _tell(self, text: str) -> None:
+        """One line to the log, of not too many."""
+        with self._joining:
+            line = self._log.line(text, _now_us())
+        if line:
+            print(line, file=sys.stderr, flush=True)
 
     def _hello(self) -> str:
         wants, role = tuple(self._callbacks), self._rules.role
@@ -240,32 +270,25 @@ class WebSocketLink:
         """The largest payload that this end has asked for."""
         return max((self._rules.payload_bound(CHANNELS[name]) for name in self._callbacks), default=0)
 
-    def _deliver(self, packet: Packet) -> None:
+    def _deliver(self, peer: Peer, packet: Packet) -> None:
         parsed = parse_key(packet.key)
         if parsed is None:
             self._rules.refuse(INEXACT_KEY)
             return
+        if not peer.may_publish(packet.key):
+            self._rules.refuse(NOT_GRANTED)
+            return
+        if parsed[1] is TWIST and self._peers[0] is not peer:
+            self._put_first(peer)
+        callbacks = tuple(self._callbacks.get(parsed[1].name, ()))
+        if parsed[1] is DETECTIONS and self._listeners:
+            callbacks = (partial(self._pass_on, peer), *callbacks)
         self._in_callback.now = True
         try:
-            for callback in tuple(self._callbacks.get(parsed[1].name, ())):
+            for callback in callbacks:
                 self._rules.deliver(parsed[1], packet.key, packet.header, packet.payload, callback)
         finally:
             self._in_callback.now = False
-
-
-def _greet(connection: Connection, dialect: V1, hello: str, listening: bool) -> None:
-    """Exchange hellos; who connects speaks first."""
-    if not listening:
-        connection.send(hello)
-    try:
-        answer = connection.recv(OPEN_S)
-    except TimeoutError:
-        raise PeerError(BAD_HELLO, 1008, f"no hello within {OPEN_S:g} s") from None
-    if not isinstance(answer, str):
-        raise PeerError(BAD_HELLO, 1003, "the first message must be a hello, as text")
-    dialect.accept(answer)
-    if listening:
-        connection.send(hello)
 
 
 def _now_us() -> int:

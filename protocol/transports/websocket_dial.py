@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import socket
+import ssl
 import threading
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 from protocol.transports.endpoints import SEND_BUFFER_BYTES
+from protocol.transports.websocket_access import bearer
 from protocol.transports.websocket_dialects import PeerError
 from protocol.transports.websocket_endpoints import Endpoint
 from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
-from protocol.transports.websocket_peer import CONNECTION_OPTIONS, OPEN_S, drop
+from protocol.transports.websocket_keys import own_token
+from protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS
+from protocol.transports.websocket_tls import connecting_context, shake_hands
+from protocol.transports.websocket_wire import Wire
 
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed
-    from websockets.sync.client import ClientConnection
     from websockets.typing import Subprotocol
 
 FIRST_PAUSE_S: Final = 0.2
@@ -27,10 +32,20 @@ class Dialer:
     """Keeps one connection to `endpoint` until closed."""
 
     def __init__(
-        self, endpoint: Endpoint, serve: Callable[[ClientConnection], None], refuse: Callable[[str], None]
+        self,
+        endpoint: Endpoint,
+        serve: Callable[[Wire], None],
+        refuse: Callable[[str], None],
+        keys: tuple[str, str] = ("", ""),
     ) -> None:
-        """`serve` is called for each connection and returns when it is gone; it may raise PeerError to drop it."""
+        """`serve` is called for each connection and returns when it is gone; it may raise PeerError to drop it.
+
+        `keys` are a folder with this end's token and whom it trusts, and the role of the link. Raises ConfigError for
+        a folder with broken files.
+        """
         self.endpoint = endpoint
+        self._token = "" if endpoint.legacy else own_token(*keys)
+        self._context = connecting_context(keys[0]) if endpoint.secure else None
         self._serve, self._refuse = serve, refuse
         self._closing = threading.Event()
         self.trouble = ""
@@ -56,9 +71,7 @@ class Dialer:
         from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
         try:
-            with self._open() as connection:
-                self._check(connection)
-                self._serve_one(connection)
+            self._speak(self._open())
             return True
         except InvalidStatus as error:
             answer = (error.response.body or b"").decode("utf-8", "replace").strip()
@@ -69,41 +82,55 @@ class Dialer:
             self._turned_away(str(error), True)
         except InvalidHandshake as error:
             self._turned_away(f"what answers there is no Sightline WebSocket ({type(error).__name__})", True)
+        except ssl.SSLError as error:
+            why = getattr(error, "verify_message", "") or error.reason or type(error).__name__
+            self._turned_away(f"no TLS with it: {why}; is the ca.pem of --secure its authority's?", True)
         except OSError:  # nobody there, or not in time
             self.trouble = ""
         except Exception as error:  # whatever a broken peer makes the library raise, this thread must try again
             self._turned_away(f"{type(error).__name__}: {error}"[:200], False)
         return False
 
-    def _open(self) -> ClientConnection:
-        from websockets.sync.client import connect
+    def _open(self) -> Wire:
+        from websockets.client import ClientProtocol
+        from websockets.uri import parse_uri
 
-        near = socket.create_connection((self.endpoint.host, self.endpoint.port), OPEN_S)
-        near.settimeout(None)
+        end = self.endpoint
+        near = socket.create_connection((end.host, end.port), OPEN_S)
         near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-        name = f"[{self.endpoint.host}]" if ":" in self.endpoint.host else self.endpoint.host
+        if self._context is not None:
+            near = shake_hands(near, self._context, end.host, time.monotonic() + OPEN_S)
+        name = f"[{end.host}]" if ":" in end.host else end.host
         subprotocol: Subprotocol = SUBPROTOCOL  # type: ignore[assignment]
-        opened: ClientConnection = connect(
-            f"ws://{name}:{self.endpoint.port}/",
-            sock=near,
-            subprotocols=None if self.endpoint.legacy else [subprotocol],
-            open_timeout=OPEN_S,
+        protocol = ClientProtocol(
+            parse_uri(f"{'wss' if end.secure else 'ws'}://{name}:{end.port}/"),
+            subprotocols=None if end.legacy else [subprotocol],
             max_size=MAX_HELLO_BYTES,
-            **CONNECTION_OPTIONS,
+            **PROTOCOL_OPTIONS,
         )
-        return opened
+        request = protocol.connect()
+        if self._token:
+            request.headers["Authorization"] = bearer(self._token)
+        protocol.send_request(request)
+        return Wire(near, protocol)
 
-    def _check(self, connection: ClientConnection) -> None:
-        if not self.endpoint.legacy and connection.subprotocol != SUBPROTOCOL:
-            raise PeerError("WRONG_SUBPROTOCOL", 1002, f"what answers there does not speak {SUBPROTOCOL}")
-
-    def _serve_one(self, connection: ClientConnection) -> None:
+    def _speak(self, wire: Wire) -> None:
+        """Shake hands, and serve until it is over."""
         try:
-            self._serve(connection)
+            wire.flush()
+            wire.receive_one(time.monotonic() + OPEN_S)
+            if wire.protocol.handshake_exc is not None:
+                raise wire.protocol.handshake_exc
+            if not self.endpoint.legacy and wire.protocol.subprotocol != SUBPROTOCOL:
+                raise PeerError("WRONG_SUBPROTOCOL", 1002, f"what answers there does not speak {SUBPROTOCOL}")
+            self._serve(wire)
         except PeerError as error:
             self._refuse(error.counted)
-            drop(connection, error)
+            wire.close(error.code, str(error))
+            wire.linger()
             raise
+        finally:
+            wire.shut()
 
     def _turned_away(self, why: str, final: bool) -> None:
         self.trouble = why

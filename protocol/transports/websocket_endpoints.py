@@ -1,7 +1,10 @@
 """WebSocket endpoints as people write them, and whose browser may come in. Pure.
 
-    ws://127.0.0.1:9090           `sightline.v1`
-    ws-legacy://127.0.0.1:9091    the older text dialect; `?dashed`: linear-angular, `?oneline`: no newlines
+    ws://127.0.0.1:9090           `sightline.v1`; wss:// with TLS
+    ws-legacy://127.0.0.1:9091    the older text dialect, with options after a `?`, joined by `&`:
+        dashed     linear-angular instead of the bar        swapped    angular-linear, with dashed
+        oneline    base64 without newlines                  boxes      takes boxes beside twists, see `protocol.legacy`
+        from=192.168.1.7,10.0.0.0/24                        who may come in
 """
 
 import ipaddress
@@ -11,11 +14,13 @@ from dataclasses import dataclass
 from typing import Final
 
 from protocol.errors import ConfigError
-from protocol.transports.websocket_dialects import LegacyOptions
+from protocol.transports.websocket_legacy import LegacyOptions
 
 _ENDPOINT: Final = re.compile(
-    r"(ws|ws-legacy)://(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]@]+):([0-9]{1,5})/?(?:\?((?:dashed|oneline|&)*))?", re.ASCII
+    r"(ws|wss|ws-legacy)://(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]@]+):([0-9]{1,5})/?(?:\?([^\s?#]*))?", re.ASCII
 )
+_WORDS: Final = ("dashed", "swapped", "oneline", "boxes")
+_FROM: Final = "from="
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,20 +32,59 @@ class Endpoint:
     port: int
     legacy: LegacyOptions | None
     """How the older dialect is spoken there; None for `sightline.v1`."""
+    secure: bool = False
+    """Whether it is TLS."""
+    allow_from: tuple[str, ...] = ()
+    """Addresses and networks that may come in at an endpoint of the older dialect; none listed: all that get there."""
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine reaches who listens there."""
+        return self.host == "localhost" or (_is_address(self.host) and ipaddress.ip_address(self.host).is_loopback)
 
 
 def parse_endpoint(text: str) -> Endpoint:
     """Check an endpoint; raise ConfigError with the right form otherwise."""
     match = _ENDPOINT.fullmatch(text)
     port = int(match[3]) if match else 0
-    if match is None or not 1 <= port <= 65_535 or (match[4] is not None and match[1] == "ws"):
+    if match is None or not 1 <= port <= 65_535 or (match[4] is not None and match[1] != "ws-legacy"):
         raise ConfigError(
-            f"endpoint {text!r} is none: write ws://<host>:<port> or ws-legacy://<host>:<port> with a port from 1 to "
-            "65535, e.g. ws://127.0.0.1:9090"
+            f"endpoint {text!r} is none: write ws://<host>:<port>, wss://<host>:<port> or ws-legacy://<host>:<port> "
+            "with a port from 1 to 65535, e.g. ws://127.0.0.1:9090"
         )
-    words = (match[4] or "").split("&")
-    options = LegacyOptions(newlines="oneline" not in words, dashed="dashed" in words)
-    return Endpoint(text, match[2].strip("[]"), port, options if match[1] == "ws-legacy" else None)
+    host = match[2].strip("[]")
+    if match[1] != "ws-legacy":
+        return Endpoint(text, host, port, None, match[1] == "wss")
+    return Endpoint(text, host, port, *_legacy(text, [word for word in (match[4] or "").split("&") if word]))
+
+
+def _legacy(text: str, words: Sequence[str]) -> tuple[LegacyOptions, bool, tuple[str, ...]]:
+    """The options, no TLS, and who may come in."""
+    unknown = [word for word in words if word not in _WORDS and not word.startswith(_FROM)]
+    if unknown or ("swapped" in words and "dashed" not in words):
+        raise ConfigError(
+            f"endpoint {text!r}: after the ? write {', '.join(_WORDS)} (swapped only with dashed) or from=<address>, "
+            "joined by &, e.g. ws-legacy://127.0.0.1:9091?oneline"
+        )
+    networks = [part for word in words if word.startswith(_FROM) for part in word[len(_FROM) :].split(",")]
+    options = LegacyOptions(newlines="oneline" not in words, dashed="dashed" in words, swapped="swapped" in words,
+                            boxes="boxes" in words)
+    return options, False, tuple(check_network(network) for network in networks)
+
+
+def check_network(text: str) -> str:
+    """Return an address or network that may come in; raise ConfigError for what is none."""
+    try:
+        return str(ipaddress.ip_network(text, strict=False))
+    except ValueError:
+        raise ConfigError(f"{text!r} is no address or network, e.g. 192.168.1.7 or 192.168.1.0/24") from None
+
+
+def with_allowed(endpoint: str, allow_from: Sequence[str]) -> str:
+    """`endpoint` with those who may come in written into it, if it is one of the older dialect without a list."""
+    if not allow_from or not endpoint.startswith("ws-legacy://") or _FROM in endpoint:
+        return endpoint
+    return f"{endpoint}{'&' if '?' in endpoint else '?'}{_FROM}{','.join(allow_from)}"
 
 
 def host_problem(hosts: Sequence[str], listen_host: str) -> str:
@@ -67,6 +111,7 @@ def _is_address(name: str) -> bool:
 
 def origin_problem(origins: Sequence[str], host: str) -> str:
     """What is wrong with a request's `Origin` headers; "" if nothing. Only browsers send one: the page's own site."""
-    if not origins or [origin.lower() for origin in origins] in ([f"http://{host.lower()}"], [f"https://{host.lower()}"]):
+    sites = [f"http://{host.lower()}"], [f"https://{host.lower()}"]
+    if not origins or [origin.lower() for origin in origins] in sites:
         return ""
     return f"Origin {origins[0][:80]!r} is another site than Host {host[:80]!r}"

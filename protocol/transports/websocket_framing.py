@@ -26,6 +26,7 @@ MAX_HELLO_BYTES: Final = 1024
 """Security limit: the text of a hello; also the least that a peer must be ready to receive as one message."""
 
 _LENGTH_BYTES: Final = 2
+_WITHOUT_SOURCE: Final = frozenset(name.encode("ascii") for name, row in CHANNELS.items() if not row.has_source)
 _FIRST: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})",(?=")')
 _ALONE: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{0,64})")?\}')
 
@@ -57,12 +58,17 @@ def parse_hello(text: str) -> Hello:
 
 def pack(channel: Channel, source: str, role: str, header: bytes, payload: bytes) -> bytes:
     """One binary message from a peer whose hello said `role`."""
+    return b"".join(pack_pieces(channel, source, role, header, payload))
+
+
+def pack_pieces(channel: Channel, source: str, role: str, header: bytes, payload: bytes) -> tuple[bytes, bytes]:
+    """The same in two pieces, the second being `payload` itself: a picture need not be copied."""
     if header[:2] == b'{"' and source in ("", role):
         block = b'{"channel":"%b",%b' % (channel.name.encode("ascii"), header[1:])
     else:
         named = f',"source":"{source}"' if source else ""
         block = f'{{"channel":"{channel.name}"{named}}}'.encode("ascii") + header
-    return b"".join((len(block).to_bytes(_LENGTH_BYTES), block, payload))
+    return len(block).to_bytes(_LENGTH_BYTES) + block, payload
 
 
 def unpack(message: bytes, robot: str, role: str) -> Packet:
@@ -79,6 +85,8 @@ def unpack(message: bytes, robot: str, role: str) -> Packet:
         source = role if alone[2] is None else alone[2].decode("utf-8", "replace")
         return Packet(_key(robot, alone[1].decode("utf-8", "replace"), source), block[alone.end() :], payload)
     first = _FIRST.match(block)
+    if first is not None and first[1] in _WITHOUT_SOURCE:  # most bytes of a link: no need to look any further
+        return Packet(_key(robot, first[1].decode("ascii"), ""), b"{" + block[first.end() :], payload)
     fields = _fields(block)
     name = fields.get("channel") if first is None else first[1].decode("utf-8", "replace")
     if not isinstance(name, str):

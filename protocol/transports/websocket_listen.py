@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
-import errno
-import os
+import select
 import socket
 import threading
+import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Final
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
-from protocol.errors import LinkError
-from protocol.transports.endpoints import SEND_BUFFER_BYTES
-from protocol.transports.port_owner import port_owner
-from protocol.transports.websocket_dialects import PeerError
+from protocol.transports.websocket_access import (
+    NO_TOKEN,
+    NOT_LISTED,
+    address_problem,
+    check_listening,
+    grant_of,
+    role_of,
+)
+from protocol.transports.websocket_dialects import BAD_FRAMING, PeerError
+from protocol.transports.websocket_door import listening_socket
 from protocol.transports.websocket_endpoints import Endpoint, host_problem, origin_problem
 from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
-from protocol.transports.websocket_peer import CONNECTION_OPTIONS, OPEN_S, count_end, drop
+from protocol.transports.websocket_keys import read_tokens
+from protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS, count_end
+from protocol.transports.websocket_tls import listening_context, shake_hands
+from protocol.transports.websocket_wire import CLOSE_S, Wire
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
-    from websockets.sync.server import ServerConnection
+    from websockets.server import ServerProtocol
     from websockets.typing import Subprotocol
 
 MAX_CLIENTS: Final = 16
@@ -33,95 +43,197 @@ WRONG_SUBPROTOCOL: Final = "WRONG_SUBPROTOCOL"
 """Counted for a client that does not offer `sightline.v1`."""
 TOO_MANY_CLIENTS: Final = "TOO_MANY_CLIENTS"
 """Counted for a client over the limit."""
+NO_TLS: Final = "NO_TLS"
+"""Counted for a client of wss:// that does not agree on TLS."""
+
+_PAUSE_S: Final = 0.1  # after an accept that failed, e.g. without descriptors left
+
+
+class Keys(NamedTuple):
+    """A folder of keys and tokens, "" for none, and the role of the link that uses it."""
+
+    folder: str
+    source: str
 
 
 class Listener:
-    """Accepts clients at `endpoint`, each on threads of its own, until closed."""
+    """Accepts clients at `endpoint`, each on a thread of its own, until closed."""
 
     def __init__(
-        self, endpoint: Endpoint, serve: Callable[[ServerConnection], None], refuse: Callable[[str], None]
+        self,
+        endpoint: Endpoint,
+        serve: Callable[[Wire], None],
+        refuse: Callable[[str], None],
+        tell: Callable[[str], None],
+        keys: Keys,
     ) -> None:
         """`serve` is called for each client and returns when it is gone; it may raise PeerError to drop it.
 
-        Raises LinkError if the endpoint cannot be listened on.
+        `tell` writes one line to the log. Raises LinkError if the endpoint cannot be listened on, ConfigError if it
+        would be open to anybody, or if `keys` lack what it needs.
         """
-        from websockets.sync import server
-
-        self._endpoint, self._serve, self._refuse = endpoint, serve, refuse
-        self._server = server.serve(
-            self._handle,
-            sock=_listening_socket(endpoint),
-            process_request=self._admit,
-            select_subprotocol=None if endpoint.legacy else self._select,
-            create_connection=self._connection,  # type: ignore[arg-type]  # annotated as a class, used as a factory
-            open_timeout=OPEN_S,
-            max_size=MAX_HELLO_BYTES,
-            **CONNECTION_OPTIONS,
-        )
-        # Threads of clients are daemons like the thread that starts them: none keeps a finished process alive.
-        threading.Thread(target=self._server.serve_forever, name="websocket-listen", daemon=True).start()
+        self._endpoint, self._serve, self._refuse, self._tell = endpoint, serve, refuse, tell
+        self._tokens = {} if endpoint.legacy else read_tokens(keys.folder)
+        check_listening(endpoint, self._tokens)
+        self._context = listening_context(keys.folder, keys.source) if endpoint.secure else None
+        self._door = listening_socket(endpoint)
+        self._alarm, self._bell = socket.socketpair()
+        self._counting = threading.Lock()
+        self._threads: set[threading.Thread] = set()
+        self._wires: set[Wire] = set()
+        self._admitted = 0
+        # Daemons: no client keeps a finished process alive.
+        self._acceptor = threading.Thread(target=self._accept_all, name="websocket-listen", daemon=True)
+        self._acceptor.start()
 
     def close(self, reason: str) -> None:
-        """Stop listening and tell every client why; returns when all are gone, within about two seconds."""
-        self._server.shutdown(reason=reason)
+        """Stop listening and tell every client why; the threads end by themselves."""
+        with suppress(OSError):
+            self._bell.send(b"!")
+        self._acceptor.join(CLOSE_S)
+        with self._counting:
+            wires = tuple(self._wires)
+        for wire in wires:
+            wire.close(1001, reason)
 
-    def _connection(self, *arguments: object, **options: object) -> ServerConnection:
-        from websockets.sync.server import ServerConnection
+    def _accept_all(self) -> None:
+        waiting = select.poll()
+        waiting.register(self._door, select.POLLIN)
+        waiting.register(self._alarm, select.POLLIN)
+        while not any(descriptor == self._alarm.fileno() for descriptor, _ in waiting.poll()):
+            try:
+                self._welcome(self._door.accept()[0])
+            except OSError:  # gone again, or no descriptor left
+                time.sleep(_PAUSE_S)
+        for end in (self._door, self._alarm, self._bell):
+            end.close()
 
-        if len(self._server.handler_threads) > MAX_CLIENTS + MAX_HANDSHAKES:
-            self._refuse(TOO_MANY_CLIENTS)
-            raise ConnectionAbortedError("too many connections")
-        return ServerConnection(*arguments, **options)  # type: ignore[arg-type]
+    def _welcome(self, near: socket.socket) -> None:
+        thread = threading.Thread(target=self._handle, args=(near,), name="websocket-peer", daemon=True)
+        with self._counting:
+            full = len(self._threads) >= MAX_CLIENTS + MAX_HANDSHAKES
+            if not full:
+                self._threads.add(thread)
+        if full:
+            self._turn_away(TOO_MANY_CLIENTS, near.getpeername()[0], "too many connections at once")
+            near.close()
+        else:
+            thread.start()
 
-    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+    def _turn_away(self, counted: str, address: str, why: str) -> None:
+        self._refuse(counted)
+        self._tell(f"{self._endpoint.text}: turned {address or 'a client'} away: {why}")
+
+    def _handle(self, near: socket.socket) -> None:
+        try:
+            secured = self._secured(near)
+            if secured is not None:
+                self._welcome_on(secured)
+        finally:
+            with self._counting:
+                self._threads.discard(threading.current_thread())
+
+    def _secured(self, near: socket.socket) -> socket.socket | None:
+        """`near`, with TLS where that is asked for; None for a client that does not agree."""
+        if self._context is None:
+            return near
+        address = ""
+        try:
+            address = near.getpeername()[0]
+            return shake_hands(near, self._context, "", time.monotonic() + OPEN_S)
+        except OSError as error:  # SSLError and TimeoutError among them
+            self._turn_away(NO_TLS, address, f"no TLS: {getattr(error, 'reason', '') or type(error).__name__}")
+            near.close()
+            return None
+
+    def _welcome_on(self, near: socket.socket) -> None:
+        from websockets.server import ServerProtocol
+
+        protocol = ServerProtocol(max_size=MAX_HELLO_BYTES, **PROTOCOL_OPTIONS)
+        if self._endpoint.legacy is None:
+            protocol.select_subprotocol = self._select  # type: ignore[method-assign,assignment]
+        wire = Wire(near, protocol)
+        with self._counting:
+            self._wires.add(wire)
+        try:
+            self._speak(wire, protocol)
+        finally:
+            wire.shut()
+            with self._counting:
+                self._wires.discard(wire)
+
+    def _speak(self, wire: Wire, protocol: ServerProtocol) -> None:
+        from websockets.exceptions import ConnectionClosed, InvalidHandshake
+
+        try:
+            if self._shake_hands(wire, protocol):
+                self._count_in(wire)
+        except PeerError as error:
+            self._turn_away(error.counted, wire.address[0], str(error))
+            wire.close(error.code, str(error))
+            wire.linger()
+        except ConnectionClosed as closed:  # before it said who it is
+            count_end(closed, self._refuse)
+        except (InvalidHandshake, TimeoutError):
+            pass
+
+    def _count_in(self, wire: Wire) -> None:
+        try:
+            self._serve(wire)
+        finally:
+            with self._counting:
+                self._admitted -= 1
+
+    def _shake_hands(self, wire: Wire, protocol: ServerProtocol) -> bool:
+        """Whether the client came in; else it has been told why not."""
+        request: Request = cast(Any, wire.receive_one(time.monotonic() + OPEN_S))
+        if protocol.close_expected():  # what came with it is so broken that the protocol has hung up
+            self._turn_away(BAD_FRAMING, wire.address[0], "nonsense behind its request")
+            return False
+        response = self._answer(wire, protocol, request)
+        with wire.lock:
+            protocol.send_response(response)
+        wire.flush()
+        if response.status_code != 101:
+            wire.linger()
+        return response.status_code == 101
+
+    def _answer(self, wire: Wire, protocol: ServerProtocol, request: Request) -> Response:
+        address = wire.address[0]
+        refusal = self._refusal(wire, address, request)
+        with self._counting:
+            if refusal is None and self._admitted >= MAX_CLIENTS:
+                refusal = TOO_MANY_CLIENTS, 503, f"{MAX_CLIENTS} clients are connected, which is the limit"
+            if refusal is None:
+                response = protocol.accept(request)
+                self._admitted += response.status_code == 101
+                return response
+        self._turn_away(refusal[0], address, refusal[2])
+        return protocol.reject(refusal[1], refusal[2] + "\n")
+
+    def _refusal(self, wire: Wire, address: str, request: Request) -> tuple[str, int, str] | None:
+        """What it counts as, HTTP status, and why; None for a client that may come in."""
+        headers = request.headers
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         problem = host_problem(hosts, self._endpoint.host) or origin_problem(origins, hosts[0])
         if problem:
-            self._refuse(CROSS_SITE)
-            return connection.respond(403, problem + "\n")
-        if len(self._server.connections) >= MAX_CLIENTS:
-            self._refuse(TOO_MANY_CLIENTS)
-            return connection.respond(503, f"{MAX_CLIENTS} clients are connected, which is the limit\n")
+            return CROSS_SITE, 403, problem
+        if self._endpoint.legacy is not None:
+            problem = address_problem(address, self._endpoint.allow_from) if address else "gone already"
+            return (NOT_LISTED, 403, problem) if problem else None
+        if self._tokens:
+            offers = headers.get_all("Sec-WebSocket-Protocol")
+            role = role_of(self._tokens, headers.get_all("Authorization"), offers)
+            if role is None:
+                return NO_TOKEN, 401, "show the token of your role: Authorization: Bearer TOKEN, or --secure DIR"
+            wire.granted = grant_of(role)
         return None
 
-    def _select(self, _connection: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol:
+    def _select(self, offered: Sequence[Subprotocol]) -> Subprotocol:
         from websockets.exceptions import NegotiationError
 
         for subprotocol in offered:
             if subprotocol == SUBPROTOCOL:
                 return subprotocol
-        self._refuse(WRONG_SUBPROTOCOL)
+        self._turn_away(WRONG_SUBPROTOCOL, "", f"it does not offer {SUBPROTOCOL}")
         raise NegotiationError(f"offer the sub-protocol {SUBPROTOCOL}; the older text dialect has a port of its own")
-
-    def _handle(self, connection: ServerConnection) -> None:
-        from websockets.exceptions import ConnectionClosed
-
-        try:
-            self._serve(connection)
-        except PeerError as error:
-            self._refuse(error.counted)
-            drop(connection, error)
-        except ConnectionClosed as closed:  # before it said who it is
-            count_end(closed, self._refuse)
-
-
-def _listening_socket(endpoint: Endpoint) -> socket.socket:
-    family = socket.AF_INET6 if ":" in endpoint.host else socket.AF_INET
-    try:
-        listening = socket.create_server((endpoint.host, endpoint.port), family=family)
-    except OSError as error:
-        raise _cannot_listen(endpoint, error) from None
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)  # accepted sockets inherit it
-    return listening
-
-
-def _cannot_listen(endpoint: Endpoint, error: OSError) -> LinkError:
-    if error.errno == errno.EADDRINUSE:
-        owner = port_owner(endpoint.port) or "another process"
-        fix = f"port {endpoint.port} is in use by {owner}; end it or choose another port"
-        return LinkError(f"cannot listen on {endpoint.text}: {fix}")
-    # create_server adds to strerror what it attempted; a name that is not known has an errno of its own below zero.
-    cause = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
-    return LinkError(
-        f"cannot listen on {endpoint.text}: {cause}; use an address of this machine, e.g. ws://127.0.0.1:{endpoint.port}"
-    )

@@ -1,193 +1,170 @@
-"""One WebSocket peer: newest-only slots towards it, a thread that sends from them, a loop that reads. Shell.
-
-`websockets` writes to the socket under the lock that reading needs too. So nothing is given to it before the socket has
-room: a peer that reads slowly or never keeps its own slots full, and is still heard.
-"""
+"""One WebSocket peer: what waits for it is sent by whoever has something new; a thread of its own reads. Shell."""
 
 from __future__ import annotations
 
 import logging
-import select
 import threading
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+import time
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from protocol.channels import CHANNELS, Channel, Priority
+from protocol.channels import Channel
 from protocol.errors import WireError
-from protocol.transports.link import Message
 from protocol.transports.link_rules import OVERSIZE
-from protocol.transports.websocket_dialects import BAD_FRAMING, V1, Dialect, PeerError
+from protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, V1, Dialect, PeerError
 from protocol.transports.websocket_framing import Packet
+from protocol.transports.websocket_life import Life
+from protocol.transports.websocket_outbox import Outbox, Post
+from protocol.transports.websocket_wire import CLOSE_S, Wire
 
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed
-    from websockets.sync.connection import Connection
 
-PIECE_BYTES: Final = 32_768
-"""Fits into a 64 KiB send buffer whenever the kernel calls it writable, so that no write ever blocks."""
 OPEN_S: Final = 2.0
-"""Security limit: for connecting and the HTTP handshake, and once more for the hello."""
-CONNECTION_OPTIONS: Final[dict[str, Any]] = {
-    "compression": None,  # pictures do not shrink, and trying costs three times the CPU
-    "ping_interval": 1,
-    "ping_timeout": 1,
-    "close_timeout": 1,
-    "max_queue": 4,
-    "logger": logging.getLogger("sightline.websocket"),
-}
+"""Security limit: for connecting and the handshake, and once more for the hello."""
+PROTOCOL_OPTIONS: Final[dict[str, Any]] = {"extensions": None, "logger": logging.getLogger("sightline.websocket")}
+"""No compression: pictures do not shrink, and trying costs three times the CPU."""
 SILENT: Final = "SILENT"
-"""Counted for a peer that left a ping unanswered."""
+"""Counted for a peer that left a ping unanswered, or took nothing for long."""
 
 logging.getLogger("sightline.websocket").addHandler(logging.NullHandler())  # else Python prints to the terminal
 
-_NAP_S: Final = 0.1  # how late the end of a connection may be noticed while waiting
-_RANKS: Final = {priority: rank for rank, priority in enumerate(Priority)}
-_COUNTED_FOR_CODE: Final = {1002: BAD_FRAMING, 1007: BAD_FRAMING, 1009: OVERSIZE, 1011: SILENT}
-_MAX_REASON_BYTES: Final = 123  # RFC 6455, 5.5
-_Item = Message | str
-
-
-class Outbox:
-    """A slot for each channel and source, and one for a hello; the most urgent is taken first."""
-
-    def __init__(self) -> None:
-        self._ready = threading.Condition()
-        self._slots: dict[tuple[str, str], _Item] = {}
-        self.dropped = Counter(dict.fromkeys(CHANNELS, 0))  # never grows, so that others may read it meanwhile
-        """Publications replaced by a newer one before they were sent, by channel."""
-
-    def put(self, message: Message) -> None:
-        """Replace what is in the message's slot; never blocks."""
-        name = (message.channel.name, message.source)
-        with self._ready:
-            self.dropped[name[0]] += name in self._slots
-            self._slots[name] = message
-            self._ready.notify()
-
-    def put_hello(self, text: str) -> None:
-        """A hello goes before everything else."""
-        with self._ready:
-            self._slots["", ""] = text
-            self._ready.notify()
-
-    def wait(self, timeout_s: float) -> bool:
-        """Whether something is there, waiting up to `timeout_s`."""
-        with self._ready:
-            return bool(self._ready.wait_for(lambda: self._slots, timeout_s))
-
-    def take(self) -> _Item | None:
-        """Remove and return the most urgent; None if there is nothing."""
-        with self._ready:
-            name = min(self._slots, key=lambda name: _rank(self._slots[name]), default=None)
-            return None if name is None else self._slots.pop(name)
-
-
-def _rank(item: _Item) -> int:
-    return -1 if isinstance(item, str) else _RANKS[item.channel.priority]
+_TICK_US: Final = 250_000  # how late a ping may be, and silence be noticed
+_COUNTED_FOR_CODE: Final = {1002: BAD_FRAMING, 1007: BAD_FRAMING, 1009: OVERSIZE}
 
 
 class Peer:
     """An open connection whose other end is known, and the dialect that it speaks."""
 
-    def __init__(self, connection: Connection, dialect: Dialect) -> None:
+    def __init__(self, wire: Wire, dialect: Dialect) -> None:
         self.outbox = Outbox()
-        self._connection, self._dialect = connection, dialect
+        self._wire, self._dialect = wire, dialect
+        self._reader = threading.current_thread()
+        self._gone = threading.Event()
+        self._look_us = 0
 
     def hears(self, channel: Channel) -> bool:
         """Whether the peer wants `channel`."""
         return self._dialect.hears(channel)
 
-    def offer(self, message: Message) -> None:
-        """Send `message` if the peer wants it; never blocks."""
-        if self.hears(message.channel):
-            self.outbox.put(message)
+    def may_publish(self, key: str) -> bool:
+        """Whether what it showed when it came in lets it publish on `key`."""
+        return self._wire.granted is None or tuple(key.split("/")[2:]) in self._wire.granted
+
+    def offer(self, post: Post) -> None:
+        """Send it if the peer wants it, now or when there is room and nothing newer; never blocks."""
+        if self._dialect.hears(post.message.channel):
+            self.outbox.put(post)
+            self._send()
 
     def tell(self, hello: str) -> None:
         """Say who this end is and what it wants now, in a dialect that has words for it."""
         if isinstance(self._dialect, V1):
             self.outbox.put_hello(hello)
+            self._send()
 
     def limit(self, wanted_bytes: int) -> None:
         """Accept no larger messages than what this end wants makes necessary."""
-        self._connection.protocol.max_message_size = self._dialect.bound(wanted_bytes)
+        with self._wire.lock:
+            self._wire.protocol.max_message_size = self._dialect.bound(wanted_bytes)
+        self._send()  # whoever found the lock taken left it to this thread
 
-    def run(self, deliver: Callable[[Packet], None], refuse: Callable[[str], None]) -> None:
-        """Send and read until the connection ends; a peer that breaks the rules is dropped and told why."""
+    def run(self, deliver: Callable[[Peer, Packet], None], refuse: Callable[[str], None]) -> None:
+        """Read until the connection ends; a peer that breaks the rules is dropped and told why."""
         from websockets.exceptions import ConnectionClosed
 
-        sender = threading.Thread(target=self._send_all, name="websocket-send", daemon=True)
-        sender.start()
+        life = Life(_now_us())
         try:
-            while True:
-                self._read(self._connection.recv(), deliver, refuse)
+            while self._turn(life, deliver, refuse):
+                self._wire.wait(_TICK_US / 1e6)
+            refuse(SILENT)
+            self._wire.close(1011, "silent for too long")
         except PeerError as refusal:
             refuse(refusal.counted)
-            drop(self._connection, refusal)
+            self._wire.close(refusal.code, str(refusal))
+            self._wire.linger()
         except ConnectionClosed as closed:
             count_end(closed, refuse)
         finally:
-            self._connection.close()
-            sender.join()
+            self._wire.shut()
+            self._gone.set()
 
-    def _read(self, message: str | bytes, deliver: Callable[[Packet], None], refuse: Callable[[str], None]) -> None:
+    def _turn(self, life: Life, deliver: Callable[[Peer, Packet], None], refuse: Callable[[str], None]) -> bool:
+        """Read what there is, and send; False if the other end is to be given up."""
+        now_us = _now_us()  # before reading: however long this end stood still, what came meanwhile counts
+        for message in self._wire.receive():
+            self._read(message, deliver, refuse)
+        if now_us < self._look_us:  # whoever was given a message waits for this thread to rest
+            self._send()
+            return True
+        self._look_us = now_us + _TICK_US
+        life.hear(self._wire.heard_us)
+        if life.is_ping_due(now_us):
+            self._wire.ping()
+        self._send()
+        return not life.is_over(now_us, self._wire.way_out)
+
+    def _read(self, message: Any, deliver: Callable[[Peer, Packet], None], refuse: Callable[[str], None]) -> None:
         try:
             packets = self._dialect.read(message)
         except WireError as error:
             refuse(error.reason)
             return
         for packet in packets:
-            deliver(packet)
+            deliver(self, packet)
 
     def close(self, reason: str) -> None:
-        """Say goodbye and wait, at most a second, until the peer is gone."""
-        self._connection.close(1001, reason)
+        """Begin to say goodbye."""
+        self._wire.close(1001, reason)
 
-    @property
-    def _open(self) -> bool:
-        from websockets.protocol import State
+    def wait_gone(self, timeout_s: float = CLOSE_S) -> None:
+        """Until the peer is gone, but not for the thread that is about to see to that."""
+        if threading.current_thread() is not self._reader:
+            self._gone.wait(timeout_s)
 
-        return self._connection.state is State.OPEN
+    def _send(self) -> None:
+        """Send while there is room. Who finds another thread at it leaves the rest to that one."""
+        lock = self._wire.lock
+        while self.outbox.waiting and lock.acquire(blocking=False):
+            try:
+                has_room = self._wire.fill(self._take)
+            finally:
+                lock.release()
+            if not has_room:
+                return
 
-    def _send_all(self) -> None:
-        with suppress(Exception):  # whatever a broken connection raises: the reading end reports how it ended
-            while self._open:
-                # First room, then the choice: what is taken is the newest there is when it leaves.
-                if self.outbox.wait(_NAP_S) and self._has_room():
-                    self._send(self.outbox.take())
-
-    def _send(self, item: _Item | None) -> None:
+    def _take(self) -> tuple[Sequence[bytes], bool] | None:
+        item = self.outbox.take()
+        if item is None:
+            return None
         if isinstance(item, str):
-            self._connection.send(item)
-        elif item is not None:
-            data = self._dialect.write(item)
-            self._connection.send(data if len(data) <= PIECE_BYTES else self._pieces(data), text=self._dialect.text)
-
-    def _pieces(self, data: bytes) -> Iterator[memoryview]:
-        for at in range(0, len(data), PIECE_BYTES):
-            while at and self._open and not self._has_room():
-                pass
-            yield memoryview(data)[at : at + PIECE_BYTES]
-
-    def _has_room(self) -> bool:
-        """Whether the socket takes a piece without blocking; waits a little for it."""
-        descriptor = self._connection.socket.fileno()
-        if descriptor < 0:
-            return True  # closed: sending says so
-        poll = select.poll()
-        poll.register(descriptor, select.POLLOUT)
-        return bool(poll.poll(_NAP_S * 1000))
+            return (item.encode("utf-8"),), True
+        pieces = item.written(self._dialect)
+        self._dialect.note_sent(item.message)
+        return pieces, self._dialect.text
 
 
-def drop(connection: Connection, refusal: PeerError) -> None:
-    """Close with the refusal's code and reason."""
-    reason = str(refusal).encode("utf-8", "replace")[:_MAX_REASON_BYTES].decode("utf-8", "ignore")
-    connection.close(refusal.code, reason)
+def greet(wire: Wire, dialect: V1, hello: str, listening: bool) -> None:
+    """Exchange hellos; who connects speaks first."""
+    if not listening:
+        wire.say(hello)
+    try:
+        answer = wire.receive_one(time.monotonic() + OPEN_S)
+    except TimeoutError:
+        raise PeerError(BAD_HELLO, 1008, f"no hello within {OPEN_S:g} s") from None
+    if not isinstance(answer, str):
+        raise PeerError(BAD_HELLO, 1003, "the first message must be a hello, as text")
+    dialect.accept(answer)
+    if listening:
+        wire.say(hello)
 
 
 def count_end(closed: ConnectionClosed, refuse: Callable[[str], None]) -> None:
-    """Count a connection that `websockets` ended because the peer broke a rule; one that the peer ended is no fault."""
+    """Count a connection that this end closed because the peer broke a rule; one that the peer ended is no fault."""
     counted = _COUNTED_FOR_CODE.get(closed.sent.code) if closed.sent and not closed.rcvd_then_sent else None
     if counted is not None:
         refuse(counted)
+
+
+def _now_us() -> int:
+    return time.monotonic_ns() // 1000

@@ -1,0 +1,217 @@
+"""The commands `conform robot | vision | codec | page`: does any peer speak the protocol, point by point. Shell."""
+
+import json
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from operator_side.conform_table import listing, print_results, progress
+from protocol.conformance.html_report import to_html
+from protocol.conformance.live import LiveBench
+from protocol.conformance.report import to_dict, to_junit, to_page
+from protocol.conformance.runner import Result, chosen, passed, run_cases
+from protocol.errors import ConfigError
+
+CHECK_FAILED = 5
+TRIES = 2
+"""A message may be lost on any network; a case that fails twice in a row failed."""
+
+Only = Annotated[
+    list[str] | None, typer.Option("--only", metavar="ID", help="A case, or how several begin: R-CAUS; repeatable.")
+]
+Groups = Annotated[list[str] | None, typer.Option("--group", metavar="NAME", help="A group such as lease; repeatable.")]
+Listing = Annotated[bool, typer.Option("--list", help="Name the cases and what each demands; test nothing.")]
+Robot = Annotated[str, typer.Option("--robot", metavar="ID", help="The robot's id.")]
+Secure = Annotated[str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`.")]
+Token = Annotated[
+    str, typer.Option("--token", metavar="TEXT", help="WebSocket token of role vision; other roles are then kept out.")
+]
+Junit = Annotated[Path | None, typer.Option("--junit", metavar="FILE", help="Write JUnit XML, for a CI.")]
+Html = Annotated[Path | None, typer.Option("--html", metavar="FILE", help="Write one HTML file, for a person.")]
+Save = Annotated[Path | None, typer.Option("--save", metavar="FILE", help="Write the JSON, for `conform page`.")]
+Name = Annotated[str, typer.Option("--name", metavar="TEXT", help="The peer's name in reports [default: where it is].")]
+Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    group = typer.Typer(
+        help="Test any robot, vision or codec against the wire protocol, case by case.",
+        no_args_is_help=False, rich_markup_mode=None,
+    )  # fmt: skip
+    group.command(epilog="Example: sightline conform robot ws://192.168.1.20:9090 --html report.html")(robot)
+    group.command(epilog="Example: sightline conform vision tcp/127.0.0.1:7447")(vision)
+    group.command(epilog="Example: sightline conform codec -- node codec.js")(codec)
+    group.command(epilog="Example: sightline conform page --out docs/conformance.md robot.json vision.json")(page)
+    app.add_typer(group, name="conform")
+
+
+def robot(
+    endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Where it listens: tcp/..., ws:// or wss://.")],
+    *,
+    robot: Robot = "r1",
+    older: Annotated[
+        str, typer.Option("--older", metavar="ENDPOINT", help="Its older dialect's port, ws-legacy://HOST:9091.")
+    ] = "",
+    secure: Secure = "",
+    token: Token = "",
+    only: Only = None,
+    groups: Groups = None,
+    list_cases: Listing = False,
+    junit: Junit = None,
+    html: Html = None,
+    save: Save = None,
+    name: Name = "",
+    as_json: Json = False,
+) -> int:
+    """Test a robot as its driver, its watcher and its enemy. It is armed and its wheels turn: lift it off the floor."""
+    from protocol.conformance import robot as side
+    from protocol.conformance.robot_sockets import put_over_websocket
+    from protocol.conformance.virtual import FROM_ROBOT
+    from protocol.transports.opening import open_link
+
+    cases = chosen(side.CASES, only or (), groups or ())
+    if list_cases:
+        typer.echo(listing(cases))
+        return 0
+    _check_files(junit, html, save)
+    with ExitStack() as ending:
+        secure = secure or _folder_of(token, ending)
+
+        def open_it() -> Any:
+            return open_link(robot, connect=[endpoint], role="vision", secure=secure)
+
+        def put_it(key: str, header: bytes, payload: bytes) -> None:
+            put_over_websocket(bench, key, header, payload)
+
+        put = put_it if "://" in endpoint else None
+        bench = LiveBench(robot, open_it, FROM_ROBOT, put, endpoint=endpoint, older=older, token=token)
+        ending.enter_context(bench)
+        tell = ending.enter_context(progress(len(cases)))
+        results = run_cases(cases, bench, side.prepare, tell, TRIES)
+    return _report(results, "robot", name or endpoint, (junit, html, save), as_json)
+
+
+def vision(
+    endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Where the kit listens, as a robot would.")],
+    *,
+    robot: Robot = "r1",
+    dial: Annotated[bool, typer.Option("--dial", help="Connect to a vision or router that listens there.")] = False,
+    secure: Secure = "",
+    only: Only = None,
+    groups: Groups = None,
+    list_cases: Listing = False,
+    junit: Junit = None,
+    html: Html = None,
+    save: Save = None,
+    name: Name = "",
+    as_json: Json = False,
+) -> int:
+    """Test a vision: the kit plays its robot at ENDPOINT; start the vision against it, before or after."""
+    from protocol.conformance import vision as side
+    from protocol.conformance.virtual import TO_ROBOT
+    from protocol.transports.opening import open_link
+
+    cases = chosen(side.CASES, only or (), groups or ())
+    if list_cases:
+        typer.echo(listing(cases))
+        return 0
+    _check_files(junit, html, save)
+    with ExitStack() as ending:
+
+        def open_it() -> Any:
+            ends: dict[str, Any] = {"connect": [endpoint]} if dial else {"listen": [endpoint]}
+            return open_link(robot, role="robot", secure=secure, **ends)
+
+        bench = ending.enter_context(LiveBench(robot, open_it, TO_ROBOT, endpoint=endpoint))
+        tell = ending.enter_context(progress(len(cases)))
+        results = run_cases(cases, bench, side.prepare, tell, TRIES)
+    return _report(results, "vision", name or endpoint, (junit, html, save), as_json)
+
+
+def codec(
+    command: Annotated[list[str] | None, typer.Argument(metavar="-- COMMAND", help="The adapter.")] = None,
+    *,
+    only: Only = None,
+    groups: Groups = None,
+    list_cases: Listing = False,
+    junit: Junit = None,
+    html: Html = None,
+    save: Save = None,
+    name: Name = "",
+    as_json: Json = False,
+) -> int:
+    """Test a codec in any language: a program that answers one line of JSON with one line of JSON."""
+    from protocol.conformance import codec as side
+
+    cases = chosen(side.CASES, only or (), groups or ())
+    if list_cases:
+        typer.echo(listing(cases))
+        return 0
+    if not command:
+        raise ConfigError("no command: write it after two dashes, e.g. sightline conform codec -- node codec.js")
+    _check_files(junit, html, save)
+    with progress(len(cases)) as tell:
+        results = side.run_codec(command, cases, tell)
+    return _report(results, "codec", name or " ".join(command), (junit, html, save), as_json)
+
+
+def page(
+    runs: Annotated[list[Path], typer.Argument(metavar="FILE...", help="What --save wrote, one for each peer.")],
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write it here, e.g. docs/conformance.md.")] = None,
+) -> None:
+    """Make one Markdown page of several runs."""
+    text = to_page([_read(path) for path in runs])
+    if out is None:
+        typer.echo(text)
+    else:
+        _check_files(out)
+        out.write_text(text, "utf-8")
+
+
+def _folder_of(token: str, ending: ExitStack) -> str:
+    """A folder of keys with this token alone, gone at the end; "" without one."""
+    if not token:
+        return ""
+    folder = ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-conform-"))
+    (Path(folder) / "vision.token").write_text(token, "utf-8")
+    (Path(folder) / "vision.token").chmod(0o600)
+    return folder
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        run = json.loads(path.read_text("utf-8"))
+        return {name: run[name] for name in ("ok", "side", "peer", "counts", "checks")}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        what = f"{path}: not a run of this kit ({type(error).__name__}); make one with --save {path}"
+        raise ConfigError(what) from None
+
+
+def _check_files(*files: Path | None) -> None:
+    """So that a folder that is not there is missed before the run. Raises ConfigError."""
+    for path in files:
+        if path is not None and not path.absolute().parent.is_dir():
+            raise ConfigError(f"{path}: there is no folder {path.parent}; name a file in one that exists")
+
+
+def _report(
+    results: Sequence[Result], side: str, peer: str, files: tuple[Path | None, Path | None, Path | None], as_json: bool
+) -> int:
+    junit, html, save = files
+    for path, text in (
+        (junit, to_junit(results, side, peer)),
+        (html, to_html(results, side, peer)),
+        (save, json.dumps(to_dict(results, side, peer), indent=1) + "\n"),
+    ):
+        if path is not None:
+            path.write_text(text, "utf-8")
+    if as_json:
+        typer.echo(json.dumps(to_dict(results, side, peer)))
+    else:
+        print_results(results)
+    return 0 if passed(results) else CHECK_FAILED

@@ -1,0 +1,66 @@
+"""How `sightline conform` shows itself: a bar on stderr while it runs, then a table by group. Shell (a terminal)."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import groupby
+from typing import Final
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.table import Table
+
+from protocol.conformance.case import Case, Level
+from protocol.conformance.report import summary
+from protocol.conformance.runner import Outcome, Result
+
+_COLOURS: Final = {Outcome.PASSED: "green", Outcome.FAILED: "red", Outcome.SKIPPED: "dim"}
+
+
+@contextmanager
+def progress(total: int) -> Iterator[Callable[[Result], None]]:
+    """A bar over `total` cases with what has failed above it; a line per failure where stderr is no terminal."""
+    console = Console(stderr=True)
+    with Progress(
+        TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), console=console, transient=True,
+        disable=not console.is_terminal,
+    ) as bar:  # fmt: skip
+        task = bar.add_task("cases", total=total)
+
+        def show(result: Result) -> None:
+            bar.update(task, advance=1, description=result.case.id)
+            if result.outcome is Outcome.FAILED:
+                console.print(f"{result.case.id}: {result.reason}", markup=False, highlight=False)
+
+        yield show
+
+
+def print_results(results: Sequence[Result]) -> None:
+    """The table on stdout, group by group, with the reason of whatever did not pass; then the summary."""
+    console = Console()
+    table = Table(box=None, pad_edge=False, show_header=False)
+    for _ in range(4):
+        table.add_column()
+    for group, members in groupby(results, lambda one: one.case.group):
+        listed = list(members)
+        good = sum(one.outcome is Outcome.PASSED for one in listed)
+        table.add_row(f"[bold]{group}[/bold]", "", "", f"[bold]{good} of {len(listed)} passed[/bold]")
+        for one in listed:
+            table.add_row(*_row(one))
+    console.print(table)
+    console.print(summary(results), markup=False, highlight=False)
+
+
+def _row(one: Result) -> tuple[str, str, str, str]:
+    weak = one.outcome is Outcome.FAILED and one.case.level is Level.SHOULD
+    colour = "yellow" if weak else _COLOURS[one.outcome]
+    said = f"\n[dim]{escape(one.reason)}[/dim]" if one.reason else ""
+    outcome = f"[{colour}]{one.outcome.value}[/{colour}]"
+    return f"  {one.case.id}", one.case.level.value, outcome, f"{escape(one.case.title)}{said}"
+
+
+def listing(cases: Sequence[Case]) -> str:
+    """Every case in a line, for `--list`."""
+    return "\n".join(
+        f"{case.id:<12} {case.level.value:<6} {case.group:<14} {case.title} [{case.clause}]" for case in cases
+    )

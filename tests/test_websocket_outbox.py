@@ -1,0 +1,108 @@
+"""What waits for a peer without room: the newest of each place, and never a STOP that another request replaced."""
+
+import random
+import threading
+
+import pytest
+
+from protocol.channels import FRAME, REPLY, REQUEST, SCAN, STATUS, TWIST
+from protocol.codec import encode
+from protocol.legacy import encode_picture
+from protocol.messages import Request
+from protocol.transports.link import Message
+from protocol.transports.websocket import open_websocket
+from protocol.transports.websocket_dialects import V1
+from protocol.transports.websocket_legacy import Client, LegacyOptions, LegacyToVision
+from protocol.transports.websocket_outbox import Outbox, Post
+from protocol.transports.websocket_seat import Seat
+from tests.link_rigs import until
+from tests.websocket_rig import free_ws
+
+VERBS = ("arm", "disarm", "stop", "reset", "acquire", "release")
+
+
+def request(verb: str, number: int = 1, source: str = "teleop") -> Post:
+    return Post(Message(REQUEST, source, b"", encode(Request(id=number, verb=verb))))
+
+
+def taken(outbox: Outbox) -> list[Post | str]:
+    return list(iter(outbox.take, None))
+
+
+def test_the_newest_and_the_most_urgent_first():
+    outbox = Outbox()
+    for number in b"123":
+        for channel, source in ((SCAN, ""), (FRAME, ""), (REPLY, ""), (TWIST, "teleop"), (TWIST, "console")):
+            outbox.put(Post(Message(channel, source, b"", bytes([number]))))
+    outbox.put_hello("old hello")
+    outbox.put_hello("hello")
+    assert outbox.waiting
+    hello, *posts = taken(outbox)
+    assert hello == "hello"
+    assert [post.message for post in posts] == [
+        Message(channel, source, b"", b"3")
+        for channel, source in ((TWIST, "teleop"), (TWIST, "console"), (REPLY, ""), (FRAME, ""), (SCAN, ""))
+    ]
+    assert not outbox.waiting
+    assert +outbox.dropped == {"scan": 2, "frame": 2, "reply": 2, "twist": 4}
+
+
+def test_a_stop_is_replaced_by_nothing_but_a_stop_and_goes_first():
+    outbox = Outbox()
+    outbox.put(Post(Message(TWIST, "teleop", b"", b"1|0")))
+    for verb in ("reset", "stop", "arm", "acquire", "release", "disarm", "reset"):
+        outbox.put(request(verb))
+    outbox.put(request("stop", 2))
+    got = [post.message for post in taken(outbox)]
+    assert got[0] == request("stop", 2).message
+    assert sorted(message.payload for message in got[1:]) == sorted(
+        [b"1|0", *(request(verb).message.payload for verb in VERBS if verb != "stop")]
+    )
+    assert +outbox.dropped == {"request": 2}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_however_requests_come_every_asker_s_stop_is_there(seed):
+    dice, outbox, stopped = random.Random(seed), Outbox(), set()
+    for number in range(200):
+        source, verb = dice.choice(["teleop", "vision", "operator"]), dice.choice(VERBS)
+        outbox.put(request(verb, number, source))
+        stopped |= {source} if verb == "stop" else set()
+    got = taken(outbox)
+    assert {post.message.source for post in got[: len(stopped)]} == stopped
+    assert all(b'"stop"' in post.message.payload for post in got[: len(stopped)])
+    assert len(got) <= 3 * len(VERBS)  # bounded, however many are asked
+
+
+def test_requests_that_cannot_be_read_share_one_place():
+    outbox = Outbox()
+    for payload in (b"", b"{}", b"stop", bytes(REQUEST.max_payload_bytes)):
+        outbox.put(Post(Message(REQUEST, "teleop", b"", payload)))
+    assert [post.message.payload for post in taken(outbox)] == [bytes(REQUEST.max_payload_bytes)]
+
+
+def test_a_publication_is_written_once_for_all_who_are_sent_the_same():
+    post = Post(Message(FRAME, "", b'{"v":1}', b"picture"))
+    modern, other = V1("r1", ""), V1("r1", "")
+    assert post.written(modern) is post.written(other)
+    client = Client("here", Seat(), print)
+    lines, line = (LegacyToVision("r1", LegacyOptions(newlines=newlines), int, client) for newlines in (True, False))
+    assert post.written(lines) == (encode_picture(b"picture"),)
+    assert post.written(line) == (encode_picture(b"picture", False),)
+    assert post.written(lines) is post.written(LegacyToVision("r1", LegacyOptions(), int, client))
+
+
+def test_a_stop_reaches_a_robot_that_was_not_reading_whatever_was_asked_after_it():
+    endpoint, go_on, asked = free_ws(), threading.Event(), []
+    with open_websocket("r1", listen=endpoint) as robot, open_websocket("r1", connect=endpoint, role="teleop") as peer:
+        robot.subscribe(STATUS, lambda _message: None)
+        robot.subscribe(TWIST, lambda _message: go_on.wait(5) and None)  # as if its process stood still
+        robot.subscribe(REQUEST, asked.append)
+        assert until(lambda: peer.has_listener(REQUEST) and peer.has_listener(TWIST))
+        while not peer.dropped["twist"]:  # until not even the kernel takes more
+            peer.publish(TWIST, bytes(500), b"0|0")
+        for number, verb in enumerate(("arm", "stop", "reset", "acquire", "arm")):
+            peer.publish(REQUEST, b"", encode(Request(id=number, verb=verb)))
+        go_on.set()
+        assert until(lambda: len(asked) == 4)
+        assert b'"stop"' in asked[0].payload
