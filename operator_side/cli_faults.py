@@ -39,7 +39,9 @@ def faults(
     listing: Annotated[bool, typer.Option("--list", help="Name the rows and what each demands; run nothing.")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write the report, or with --only its rows into one; its worst goes into safety.md."),
+        typer.Option(
+            metavar="FILE", help="Write the report (with --only, its rows into it); worst values go to safety.md."
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> int:

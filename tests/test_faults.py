@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from operator_side import cli_faults
 from operator_side.faults import camera
 from operator_side.faults.attacks import ATTACKS, MALFORMED, OVERSIZED
-from operator_side.faults.bench import run_row
+from operator_side.faults.bench import run_row, watched_us
 from operator_side.faults.judge import (
     Blind,
     Motors,
     Sent,
+    at_most,
     last_valid_us,
     measure_stop,
     most_gain_mps2,
@@ -145,6 +146,11 @@ def test_a_picture_under_way_when_pictures_are_cut_off_may_still_be_answered():
     assert moved_on_old_sight(rows, sent, Blind(1_000_000, by_frame=True)) == 0
     assert last_valid_us(sent, Blind(1_000_000, by_frame=True)) == 1_090_000
     assert last_valid_us(sent, Blind(1_000_000)) <= 1_000_000
+
+
+def test_where_something_failed_the_whole_run_must_have_been_undisturbed():
+    good, bad = at_most("zero", 1.0, "ms", 2.0), at_most("zero", 3.0, "ms", 2.0)
+    assert watched_us([good, bad]) > 60_000_000 > watched_us([good])
 
 
 def test_without_any_command_no_motion_is_allowed():
