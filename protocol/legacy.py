@@ -119,7 +119,8 @@ def detections_of(boxes: Sequence[Box], size: JpegSize) -> Detections:
 def _parse_box(text: bytes) -> Box:
     try:
         if plain := _BOX.fullmatch(text):
-            return Box(*(float(number) for number in plain.groups()))
+            y_min, x_min, y_max, x_max = (float(number) for number in plain.groups())
+            return Box(y_min, x_min, y_max, x_max)
         if classed := _CLASSED_BOX.fullmatch(text):
             x_min, y_min, x_max, y_max = (float(number) for number in classed.groups()[1:])
             return Box(y_min, x_min, y_max, x_max, classed[1].decode("ascii"))
