@@ -119,7 +119,7 @@ def vision(
     if camera_sets and camera is None:
         raise ConfigError("--camera-set is for the camera of --camera; name one, e.g. --camera v4l2")
     if robot is not None and "://" in robot:  # the address of a robot that has one endpoint and no other name
-        robot, connect = None, [*(connect or ()), robot]
+        connect, robot = [*(connect or ()), robot], None
     options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure,
                "detector.kind": detector}
     loaded = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)

@@ -1,0 +1,300 @@
+"""The kit at a robot: who it hears (`Robot`) and who it plays (`Sender`). Pure.
+
+Headers towards the robot are made of plain dicts, so that a case can also send what no model would let it say.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+from protocol.channels import ACK, CAMERA, FRAME, REPLY, REQUEST, STATUS, TWIST
+from protocol.conformance.bench import Bench, Heard
+from protocol.conformance.case import ConformanceError
+from protocol.messages import CameraModel, FrameHeader, Reply, Stamp, State, Status
+from protocol.refusals import CLAMPED, Refusal
+
+GOOD: Final = "GOOD"
+"""The verdict on a command that the robot judged good: obeyed, or counted as DISARMED."""
+CRAWL: Final = b"0.1000|0.0000"
+"""What the kit drives with where the speed does not matter."""
+ANSWER_US: Final = 1_000_000
+"""Until the effect of a command is in a `status` (10 Hz) that has been heard, with room for a slow machine."""
+FRAME_US: Final = 1_500_000
+"""Until a frame comes to a peer that answers; without an answer credit comes back within 500 ms."""
+REPLY_US: Final = 1_000_000
+"""After which a peer may ask again."""
+_SENT_AGAIN: Final = 2
+_SETTLES_US: Final = 6_000_000
+
+
+class Robot:
+    """What is heard from the robot under test."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
+
+    def status(self) -> Status:
+        """The newest status that can be read. Raises ConformanceError after two seconds without one."""
+        self.bench.expect_within(lambda: self._newest_status() is not None, 2_000_000, "no readable status came")
+        status = self._newest_status()
+        assert status is not None
+        return status
+
+    def _newest_status(self) -> Status | None:
+        readable = (one.payload(Status) for one in reversed(self.bench.heard(STATUS)))
+        return next((status for status in readable if status is not None), None)
+
+    def next_status(self, count: int = 1) -> Status:
+        """The newest status once `count` more have come: what happened before the call is in it."""
+        mark = self.bench.mark()
+        came = self.bench.wait(lambda: len(self.bench.heard(STATUS, mark)) >= count, 1_000_000 * count)
+        self.bench.expect(came, f"no {count} status within {count} s")
+        return self.status()
+
+    def reaches(self, holds: Callable[[Status], object], within_us: int) -> bool:
+        """Whether a status for which `holds` comes within `within_us` from now."""
+        looked_at = [self.bench.mark()]
+
+        def seen() -> bool:
+            newest = self.bench.newest(STATUS)
+            if newest is None or newest.number <= looked_at[0]:
+                return False
+            looked_at[0] = newest.number
+            status = newest.payload(Status)
+            return status is not None and bool(holds(status))
+
+        return self.bench.wait(seen, within_us)
+
+    def stamp(self) -> Stamp:
+        """The header of the newest status that can be read. Raises ConformanceError as `status` does."""
+        self.status()
+        stamps = (one.header(Stamp) for one in reversed(self.bench.heard(STATUS)))
+        stamp = next((stamp for stamp in stamps if stamp is not None), None)
+        self.bench.expect(stamp is not None, "no status has a header that can be read")
+        assert stamp is not None
+        return stamp
+
+    def frame(self, within_us: int = FRAME_US) -> FrameHeader:
+        """The header of the next frame. Raises NotApplicableError when none comes."""
+        mark = self.bench.mark()
+        self.bench.wait(lambda: self.frames(mark), within_us)
+        frames = self.frames(mark)
+        self.bench.need(frames, f"no frame within {within_us / 1e6:g} s")
+        return frames[0][1]
+
+    def frames(self, since: int = 0) -> list[tuple[Heard, FrameHeader]]:
+        """Frames since a mark, with headers that can be read."""
+        return [
+            (one, header) for one in self.bench.heard(FRAME, since) if (header := one.header(FrameHeader)) is not None
+        ]
+
+    def each_frame(self, react: Callable[[FrameHeader], None]) -> None:
+        """From now on call `react` for every frame whose header can be read."""
+
+        def read(heard: Heard) -> None:
+            header = heard.header(FrameHeader)
+            if header is not None:
+                react(header)
+
+        self.bench.on(FRAME, read)
+
+    def camera(self) -> CameraModel | None:
+        """The newest camera model."""
+        heard = self.bench.newest(CAMERA)
+        return heard.payload(CameraModel) if heard else None
+
+
+class Sender:
+    """A peer of the robot that the kit plays: one source and session, counting its own messages."""
+
+    def __init__(self, robot: Robot, source: str = "vision", *, acks: bool = True) -> None:
+        """`acks`: acknowledge every frame at once that is not answered by a twist, so that frames flow."""
+        self.robot, self.bench, self.source = robot, robot.bench, source
+        # A robot remembers sessions of earlier runs of the kit, so theirs must differ: by the kit's clock.
+        draw = (self.bench.now_us + 7919 * self.bench.number() + id_of(source)) * 2_654_435_761
+        self.session = f"{draw & 0xFFFFFFFF:08x}"
+        self.seq = 0
+        self.ack_seq = 0
+        self.request_id = 0
+        self.acks = acks
+        self.driving: bytes | None = None
+        self.delay_us = self.compute_us = 0
+        robot.each_frame(self._on_frame)
+
+    # --- headers -------------------------------------------------------------------------------------------------
+
+    def header(self, frame: FrameHeader, **changes: Any) -> dict[str, Any]:
+        """An answer's header for `frame`; `changes` replace fields, `echo_...` those of the echo, None removes one."""
+        echo = {"channel": "frame", "session": frame.session, "seq": frame.seq, "t_us": frame.t_us}
+        echo.update({name[5:]: changes.pop(name) for name in list(changes) if name.startswith("echo_")})
+        fields = {"v": 1, "source": self.source, "session": self.session, "seq": self.seq, "echo": echo}
+        fields.update(compute_us=self.compute_us, **changes)
+        return {name: value for name, value in fields.items() if value is not None}
+
+    # --- twists and acks -----------------------------------------------------------------------------------------
+
+    def twist(self, frame: FrameHeader, text: bytes = CRAWL, **changes: Any) -> None:
+        """Send a twist that cites `frame`; its `seq` is the next unless `changes` say otherwise."""
+        self.seq += 1
+        self.bench.publish(TWIST, as_json(self.header(frame, **changes)), text, self.source)
+
+    def ack(self, frame: FrameHeader, **changes: Any) -> None:
+        """Acknowledge `frame`."""
+        self.ack_seq += 1
+        fields = {"seq": self.ack_seq, **changes}
+        self.bench.publish(ACK, as_json(self.header(frame, **fields)), b"", self.source)
+
+    def drive(self, text: bytes | None = CRAWL) -> None:
+        """From now on answer every frame with this twist; None: go back to acknowledging."""
+        self.driving = text
+
+    def fall_silent(self) -> None:
+        """Answer nothing any more."""
+        self.driving, self.acks = None, False
+
+    def _on_frame(self, frame: FrameHeader) -> None:
+        if not (self.acks or self.driving):
+            return
+        if self.delay_us:
+            self.bench.after(self.delay_us, lambda: self._answer(frame))
+        else:
+            self._answer(frame)
+
+    def _answer(self, frame: FrameHeader) -> None:
+        if self.driving is not None:
+            self.twist(frame, self.driving)
+        elif self.acks:
+            self.ack(frame)
+
+    def verdict(self, send: Callable[[], None]) -> str:
+        """What became of the one command that `send` sends: GOOD, a refusal's reason, or "" when it was not counted."""
+        before = self.robot.status()
+        send()
+        self.robot.reaches(lambda status: _counts(status) != _counts(before), ANSWER_US)
+        after = self.robot.status()
+        news = _counts(after) - _counts(before)
+        del news[CLAMPED]
+        names = [GOOD if name in (Refusal.DISARMED, GOOD) else name for name in news]
+        return "+".join(sorted(names))
+
+    def judged(self, text: bytes = CRAWL, **changes: Any) -> str:
+        """The verdict on a twist that answers the next frame."""
+        return self.verdict_on_next(lambda frame: self.twist(frame, text, **changes))
+
+    def verdict_on_next(self, send: Callable[[FrameHeader], None]) -> str:
+        """The verdict on what `send` sends about the next frame; sent once more if it was lost, as messages may be."""
+        verdict = ""
+        for _ in range(_SENT_AGAIN):
+            self.robot.status()  # whatever has to be waited for comes before the frame
+            verdict = self.verdict(partial(send, self._frame_to_answer()))
+            if verdict:
+                break
+        return verdict
+
+    def _frame_to_answer(self) -> FrameHeader:
+        """The next frame, not acknowledged beside the answer that it is about to get."""
+        acks, self.acks = self.acks, False
+        try:
+            return self.robot.frame()
+        finally:
+            self.acks = acks
+
+    def need_good(self) -> None:
+        """Leave the case unless an ordinary twist is judged good: R-CAUS-01 says so."""
+        verdict = self.judged()
+        self.bench.need(verdict == GOOD, f"an ordinary twist is not judged good here, but {verdict or 'not counted'}")
+
+    def need_unknown(self) -> None:
+        """Leave the case unless a twist on a frame never issued is refused so: R-CAUS-02 says so."""
+        self.robot.status()
+        frame = self.robot.frame()
+        verdict = self.verdict(lambda: self.twist(frame, echo_seq=frame.seq + 5000))
+        self.bench.need(verdict == "UNKNOWN_FRAME", f"an unknown frame is {verdict or 'not counted'} (R-CAUS-02)")
+
+    # --- requests ------------------------------------------------------------------------------------------------
+
+    def ask(self, verb: str, *, cite: Stamp | bool = True, **changes: Any) -> Reply | None:
+        """Send a request and return the next reply, whomever it names; None when none comes within a second.
+
+        `cite` is the status to cite: True the newest, False none. `changes` replace fields of the header.
+        """
+        mark = self.bench.mark()
+        self.request(verb, cite=cite, **changes)
+        self.bench.wait(lambda: self.bench.heard(REPLY, mark), REPLY_US)
+        replies = [reply for one in self.bench.heard(REPLY, mark) if (reply := one.payload(Reply)) is not None]
+        return replies[0] if replies else None
+
+    def request(self, verb: str, *, cite: Stamp | bool = True, **changes: Any) -> None:
+        """Send a request and wait for nothing."""
+        self.request_id += 1
+        stamp = self.robot.stamp() if cite is True else cite
+        fields: dict[str, Any] = {"v": 1, "source": self.source, "session": self.session, "seq": self.request_id}
+        if isinstance(stamp, Stamp):
+            fields["echo"] = {"channel": "status", "session": stamp.session, "seq": stamp.seq, "t_us": stamp.t_us}
+        payload = {"id": changes.pop("id", self.request_id), "verb": verb, **changes.pop("extra", {})}
+        self.bench.publish(REQUEST, as_json({**fields, **changes}), as_json(payload), self.source)
+
+    def granted(self, verb: str, **changes: Any) -> bool:
+        """Ask, and whether it was done."""
+        reply = self.ask(verb, **changes)
+        return reply is not None and reply.ok
+
+
+def _counts(status: Status) -> Counter[str]:
+    return Counter({**status.refused, GOOD: status.accepted})
+
+
+def id_of(name: str) -> int:
+    """A number for a name, the same on every run."""
+    return int.from_bytes(name.encode()[:8])
+
+
+def as_json(fields: dict[str, Any]) -> bytes:
+    """Compact JSON."""
+    return json.dumps(fields, separators=(",", ":")).encode()
+
+
+def armed(bench: Bench, source: str = "vision", text: bytes = CRAWL) -> tuple[Robot, Sender]:
+    """A robot that obeys a driver of ours, driving with `text`; R-ARM-03 says that this can be had."""
+    robot = Robot(bench)
+    driver = Sender(robot, source)
+    driver.drive(text)
+    if not bench.wait(lambda: driver.seq >= 8, 3_000_000):
+        bench.need(False, "too few frames to arm with")
+    arm(driver)
+    return robot, driver
+
+
+def arm(driver: Sender) -> None:
+    """Arm the robot that `driver` is driving; not applicable where it will not."""
+    bench = driver.bench
+    for _ in range(5):
+        if driver.granted("arm"):
+            break
+        bench.rest(200_000)
+    reached = driver.robot.reaches(lambda status: status.state in (State.ACTIVE, State.DEGRADED), 1_500_000)
+    bench.need(reached, "the robot could not be armed and driven (R-ARM-03)")
+
+
+def prepare(bench: Bench) -> None:
+    """Bring the robot to where a case begins: DISARMED, nobody drives, wheels at zero. Raises ConformanceError."""
+    robot = Robot(bench)
+    robot.status()
+    operator = Sender(robot, "operator", acks=False)
+    robot.next_status()
+    for _ in range(3):
+        if robot.status().state in (State.STOPPED, State.FAULT):
+            operator.ask("reset")
+        elif robot.status().state is not State.DISARMED:
+            operator.ask("disarm")
+        if robot.reaches(_is_at_rest, _SETTLES_US // 3):
+            break
+    else:
+        raise ConformanceError("before the case the robot could not be brought to DISARMED, without holder, at zero")
+    bench.forget()
+
+
+def _is_at_rest(status: Status) -> bool:
+    return status.state is State.DISARMED and status.holder is None and status.applied == (0.0, 0.0)

@@ -1,0 +1,44 @@
+"""Every case for a vision, in the order of the report, and how each begins. Shell (some cases have sockets)."""
+
+from typing import Final
+
+from protocol.conformance import (
+    vision_answers,
+    vision_causality,
+    vision_flow,
+    vision_hostile,
+    vision_limits,
+    vision_reconnect,
+    vision_sockets,
+    vision_steering,
+)
+from protocol.conformance.bench import Bench
+from protocol.conformance.case import Case
+from protocol.conformance.vision_robot import RobotPlayed
+
+_FIRST_US: Final = 10_000_000
+"""A vision may still be starting."""
+_AGAIN_US: Final = 3_000_000
+"""One that lost its robot in the last case tries again every second."""
+_EVERY_US: Final = 100_000
+_PARTS: Final = (
+    vision_answers, vision_causality, vision_flow, vision_limits, vision_hostile, vision_reconnect, vision_steering,
+    vision_sockets,
+)
+
+CASES: Final[tuple[Case, ...]] = tuple(case for part in _PARTS for case in part.SUITE.cases)
+
+
+def prepare(bench: Bench) -> None:
+    """Wait until the vision hears the kit's robot: some answer, even one that this end turns away.
+
+    The robot names no camera: a case is about what happens then.
+    """
+    robot = RobotPlayed(bench, camera=None)
+    before = bench.dropped_here.total()
+    deadline_us = bench.now_us + (_AGAIN_US if bench.mark() else _FIRST_US)
+    while bench.now_us < deadline_us:
+        robot.frame("absent")
+        if bench.wait(lambda: robot.answers() or bench.dropped_here.total() > before, _EVERY_US):
+            break
+    robot.stop()

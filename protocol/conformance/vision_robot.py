@@ -1,0 +1,245 @@
+"""The robot that the kit plays for a vision, and what the vision answered, read leniently. Pure.
+
+    robot = RobotPlayed(bench).met()
+    sent = robot.frame("left")
+    answer = robot.answer_to(sent)
+
+An answer belongs to a frame if its echo has that frame's `seq` or its `t_us`: so one wrong field fails the case about
+that field, and no other. What the kit's own link had to turn away is known only by its count; a case that misses such
+an answer is not applicable, since another one names what was wrong with it.
+"""
+
+import itertools
+import json
+import zlib
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+from protocol.channels import ACK, CAMERA, FRAME, STATUS, TWIST, Channel
+from protocol.codec import encode
+from protocol.conformance.bench import Bench, Heard
+from protocol.conformance.vision_pictures import CAMERA as LENS
+from protocol.conformance.vision_pictures import picture
+from protocol.messages import CameraModel, FrameHeader, Stamp, State, Status
+
+ANSWER_US: Final = 500_000
+"""Credit that is not returned times out within this: later is as good as never."""
+FRAME_US: Final = 33_333
+_CAMERA_US: Final = 500_000
+_STATUS_US: Final = 100_000
+_FIRST_T_US: Final = 7_000_000_123
+"""A robot's clock is no clock of the kit's: each start has its own."""
+_SEQ_APART: Final = 10_000
+_MEETING_FRAMES: Final = 30
+ARMED: Final = Status(state=State.ACTIVE, reason="driving")
+_STARTS = itertools.count(1)
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """A frame as it went out, on the robot's clock and on the kit's."""
+
+    session: str
+    seq: int
+    t_us: int
+    at_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A twist or an ack. `fields` is its header as JSON, empty if it is none."""
+
+    heard: Heard
+    fields: dict[str, Any]
+
+    @property
+    def is_twist(self) -> bool:
+        """Whether it drives."""
+        return self.heard.message.channel is TWIST
+
+    @property
+    def echo(self) -> dict[str, Any]:
+        """What it cites; empty for nothing."""
+        echo = self.fields.get("echo")
+        return echo if isinstance(echo, dict) else {}
+
+    @property
+    def text(self) -> bytes:
+        """The payload."""
+        return self.heard.message.payload
+
+    @property
+    def speeds(self) -> tuple[float, float]:
+        """(linear_mps, angular_rad_s), however they are written; zeros for what cannot be read."""
+        try:
+            linear, angular = (float(part) for part in self.text.split(b"|"))
+        except ValueError:
+            return 0.0, 0.0
+        return linear, angular
+
+    def cites(self, sent: Sent) -> bool:
+        """Whether it means `sent`, one wrong field forgiven."""
+        return self.echo.get("seq") == sent.seq or self.echo.get("t_us") == sent.t_us
+
+    def words(self) -> str:
+        """For a person."""
+        return f"a {self.heard.message.channel.name} that cites {json.dumps(self.echo)[:160]}"
+
+
+def read_answer(heard: Heard) -> Answer:
+    """`heard` with its header read as any JSON object."""
+    try:
+        fields = json.loads(heard.message.header)
+    except (ValueError, RecursionError):
+        fields = {}
+    return Answer(heard, fields if isinstance(fields, dict) else {})
+
+
+class RobotPlayed:
+    """One start of a robot: a session, a clock, a count. It announces itself until the next case, or `stop`."""
+
+    def __init__(
+        self, bench: Bench, *, camera: CameraModel | None = LENS, status: Status | bytes | None = ARMED,
+        first_seq: int | None = None, first_t_us: int | None = None,
+    ) -> None:
+        """`camera` and `status` are announced at their rates; None: not at all.
+
+        The first `seq` and `t_us` differ from those of every other start unless given.
+        """
+        self.bench, self.camera, self.status = bench, camera, status
+        start = next(_STARTS)
+        self.session = f"{zlib.crc32(f'{start} {bench.robot} {bench.now_us}'.encode()):08x}"
+        first_seq = start * _SEQ_APART if first_seq is None else first_seq
+        first_t_us = start * _FIRST_T_US if first_t_us is None else first_t_us
+        self._began_us, self._mark, self._dropped = bench.now_us, bench.mark(), bench.dropped_here.total()
+        self._first_t_us, self._last_t_us, self._next_seq = first_t_us, first_t_us - 1, first_seq
+        self._stamps, self._stopped = itertools.count(1), False
+        self._read: dict[int, Answer] = {}
+        self._announce_camera()
+        self._announce_status()
+
+    # --- what it says ------------------------------------------------------------------------------------------------
+
+    def stop(self) -> None:
+        """Fall silent for good."""
+        self._stopped = True
+
+    def stamp(self) -> Stamp:
+        """The header of anything but a frame."""
+        return Stamp(session=self.session, seq=next(self._stamps), t_us=self._clock_us())
+
+    def show(self, camera: CameraModel | None) -> None:
+        """Have another camera from now on."""
+        self.camera = camera
+        if camera is not None:
+            self.bench.publish(CAMERA, self.stamp(), camera)
+
+    def say(self, channel: Channel, payload: bytes, header: bytes | None = None) -> None:
+        """Any bytes on a channel of the robot's, with a good header unless told otherwise."""
+        self.bench.publish(channel, encode(self.stamp()) if header is None else header, payload)
+
+    def frame(self, name: str = "centre", *, jpeg: bytes | None = None, header: bytes | None = None,
+              **fields: Any) -> Sent:
+        """Send a picture at once; `fields` replace those of its header, `header` all of it."""
+        t_us = max(self._clock_us(), self._last_t_us + 1)
+        known = FrameHeader(session=self.session, seq=self._next_seq, t_us=t_us).model_copy(update=fields)
+        if not fields.keys() & {"seq", "t_us", "session"}:
+            self._next_seq, self._last_t_us = known.seq + 1, known.t_us
+        at_us = self.bench.now_us  # before it leaves: sending takes time, and a quick peer answers meanwhile
+        self.bench.publish(FRAME, encode(known) if header is None else header, picture(name) if jpeg is None else jpeg)
+        return Sent(known.session, known.seq, known.t_us, at_us)
+
+    def next_fields(self) -> dict[str, Any]:
+        """The fields of the frame that comes next, as a dictionary; the frame itself does not come."""
+        self._last_t_us = max(self._clock_us(), self._last_t_us + 1)
+        self._next_seq += 1
+        known = FrameHeader(session=self.session, seq=self._next_seq - 1, t_us=self._last_t_us)
+        return known.model_dump(mode="json", exclude_none=True)
+
+    def film(self, name: str, frames: int, every_us: int = FRAME_US) -> list[Sent]:
+        """So many pictures at a steady rate."""
+        sent = []
+        for _ in range(frames):
+            sent.append(self.frame(name))
+            self.bench.rest(every_us)
+        return sent
+
+    def _clock_us(self) -> int:
+        return self.bench.now_us - self._began_us + self._first_t_us
+
+    def _announce_camera(self) -> None:
+        if not self._stopped:
+            if self.camera is not None:
+                self.bench.publish(CAMERA, self.stamp(), self.camera)
+            self.bench.after(_CAMERA_US, self._announce_camera)
+
+    def _announce_status(self) -> None:
+        if not self._stopped:
+            if self.status is not None:
+                self.bench.publish(STATUS, self.stamp(), self.status)
+            self.bench.after(_STATUS_US, self._announce_status)
+
+    # --- what it hears -----------------------------------------------------------------------------------------------
+
+    def answers(self, since: int | None = None) -> list[Answer]:
+        """Twists and acks since this robot began, or since a mark, in the order of their arrival."""
+        since = self._mark if since is None else since
+        heard = [*self.bench.heard(TWIST, since), *self.bench.heard(ACK, since)]
+        for one in heard:
+            if one.number not in self._read:
+                self._read[one.number] = read_answer(one)
+        return [self._read[number] for number in sorted(one.number for one in heard)]
+
+    def twists(self, since: int | None = None) -> list[Answer]:
+        """Only what drives."""
+        return [one for one in self.answers(since) if one.is_twist]
+
+    def answers_to(self, sent: Sent) -> list[Answer]:
+        """Whatever cites `sent`."""
+        return [one for one in self.answers() if one.cites(sent)]
+
+    def is_answered(self, sent: Sent, within_us: int = ANSWER_US) -> bool:
+        """Whether an answer to `sent` comes in time."""
+        return self.bench.wait(lambda: self.answers_to(sent), within_us)
+
+    def answer_to(self, sent: Sent, within_us: int = ANSWER_US) -> Answer:
+        """The answer to `sent`; the case fails if none comes in time."""
+        if not self.is_answered(sent, within_us):
+            self.need_nothing_dropped()
+            self.bench.expect(False, f"no answer to frame {sent.seq} within {within_us / 1e6:g} s")
+        return self.answers_to(sent)[0]
+
+    def need_nothing_dropped(self) -> None:
+        """Leave the case if this end's link turned something away: another case says what."""
+        dropped = self.bench.dropped_here
+        self.bench.need(dropped.total() == self._dropped, f"answers came that break the rules of keys or sizes: "
+                        f"{', '.join(sorted(dropped))}")
+
+    def met(self) -> Self:
+        """Go on once the vision drives by these pictures; a case that builds on that is not applicable otherwise."""
+        for _ in range(_MEETING_FRAMES):
+            sent = self.frame()
+            if self.is_answered(sent) and self._drives(sent):
+                return self
+        self.bench.need(False, "it does not answer plain frames with twists")
+        return self
+
+    def _drives(self, sent: Sent) -> bool:
+        """Whether a twist came; after an ack, it is not yet time for the next frame."""
+        if any(one.is_twist for one in self.answers_to(sent)):
+            return True
+        self.bench.rest(FRAME_US)
+        return False
+
+    def expect_driven(self, after: str) -> Answer:
+        """One of three plain frames is answered by a twist; the case fails otherwise."""
+        for _ in range(3):
+            sent = self.frame()
+            self.is_answered(sent)
+            twists = [one for one in self.answers_to(sent) if one.is_twist]
+            if twists:
+                return twists[0]
+            self.bench.rest(FRAME_US)
+        self.need_nothing_dropped()
+        self.bench.expect(False, f"after {after}, plain frames get no twist any more")
+        raise AssertionError("unreachable: expect raised")

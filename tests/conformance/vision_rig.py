@@ -1,0 +1,82 @@
+"""The reference vision in virtual time: the service's own logic, answering over a network in memory. Pure.
+
+What a picture holds is computed once per picture and process: the pictures of the kit are few, the runs are many.
+"""
+
+from functools import cache
+
+from protocol.conformance.bench import Bench
+from protocol.conformance.virtual import TO_ROBOT, VirtualBench
+from protocol.errors import WireError
+from protocol.messages import CameraModel, FrameHeader
+from protocol.transports.memory import MemoryLink, MemoryNetwork
+from vision_side.config import VisionConfig
+from vision_side.decode import Decoder
+from vision_side.detect.hsv import HsvDetector
+from vision_side.pipeline import Answer, Pipeline
+from vision_side.service import Service
+
+COMPUTE_US = 2_000
+"""What it says a frame took; virtual answers take a step of 5 ms."""
+CONFIG = VisionConfig()
+
+
+@cache
+def _looked_at(width_px, height_px, jpeg):
+    """The detections in a picture, or why it is none."""
+    try:
+        picture = Decoder(width_px, height_px, CONFIG.max_pixels).decode(jpeg)
+    except WireError as error:
+        return error
+    return HsvDetector(CONFIG.hsv).detect(picture)
+
+
+class RememberingDecoder:
+    """Hands on the detections as if they were the picture."""
+
+    def __init__(self, camera: CameraModel) -> None:
+        self._size = camera.width_px, camera.height_px
+
+    def decode(self, jpeg):
+        found = _looked_at(*self._size, jpeg)
+        if isinstance(found, WireError):
+            raise WireError(found.reason, found.detail)
+        return found
+
+
+class RememberingDetector:
+    """What the decoder has handed on."""
+
+    def detect(self, picture):
+        return picture
+
+
+class VirtualVision(Service):
+    """The reference. `tick` is its turn; broken ones override a step of it."""
+
+    def __init__(self, network: MemoryNetwork, robot: str = "r1") -> None:
+        self.network = network
+        self.link: MemoryLink = network.link(robot, role="vision")
+        self.now_us = 0
+        super().__init__(CONFIG, self.link, lambda line: None)
+
+    def tick(self, now_us: int) -> None:
+        self.now_us = now_us
+        self.turn(0.0)
+
+    def _use(self, camera: CameraModel) -> None:
+        self._camera, self._pipeline = camera, self.pipeline(camera)
+
+    def pipeline(self, camera: CameraModel) -> Pipeline:
+        made = Pipeline(CONFIG, camera, RememberingDetector())  # a detector of its own would build its colour table
+        made._decoder = RememberingDecoder(camera)
+        return made
+
+    def _publish(self, header: FrameHeader, answer: Answer, compute_us: int) -> None:
+        super()._publish(header, answer, COMPUTE_US)
+
+
+def virtual_bench(vision=VirtualVision) -> Bench:
+    """A bench of its own with one vision."""
+    network = MemoryNetwork()
+    return VirtualBench(network, [vision(network)], TO_ROBOT)

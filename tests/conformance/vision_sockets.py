@@ -1,0 +1,121 @@
+"""Visions over the library `websockets`: a good one, and one broken in each way that a socket can be. Shell.
+
+They look at nothing: every frame is answered by a twist of zeros. `SOCKETS` maps a case's id to what is wrong.
+"""
+
+import contextlib
+import json
+import threading
+
+from websockets.exceptions import ConnectionClosedError, WebSocketException
+from websockets.frames import Opcode
+from websockets.sync.client import connect
+
+SOCKETS = {
+    "V-SOCK-01": "offers a sub-protocol of its own",
+    "V-SOCK-02": "means every robot",
+    "V-SOCK-03": "wants the camera only",
+    "V-SOCK-04": "has no role",
+    "V-SOCK-05": "follows whoever says hello",
+    "V-SOCK-06": "answers in a text",
+    "V-SOCK-07": "takes the first fragment for all",
+    "V-SOCK-08": "is deaf to pings",
+    "V-SOCK-09": "never pings",
+    "V-SOCK-10": "reads on after a broken block",
+    "V-SOCK-11": "takes any size",
+    "V-SOCK-12": "needs no hello",
+    "V-SOCK-13": "gives up after a reset",
+}
+
+
+class SocketVision:
+    """Use it in a `with`: it connects to `endpoint` again and again. `broken` is a case's id, or empty."""
+
+    def __init__(self, endpoint, broken=""):
+        self.endpoint, self.broken = endpoint, broken
+        self.ending = threading.Event()
+        self.seq, self.greeted = 0, False
+        self.thread = threading.Thread(target=self.run, daemon=True)
+
+    def __enter__(self):
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self.ending.set()
+        self.thread.join(5)
+
+    def run(self):
+        while not self.ending.is_set():
+            try:
+                self.connected()
+            except ConnectionClosedError as error:
+                if self.broken == "V-SOCK-13" and self.greeted and error.rcvd is None and error.sent is None:
+                    return
+            except (OSError, WebSocketException, EOFError):
+                pass
+            self.ending.wait(0.1)
+
+    def connected(self):
+        protocols = ["sightline.v9"] if self.broken == "V-SOCK-01" else ["sightline.v1"]
+        pings = None if self.broken == "V-SOCK-09" else 1
+        with connect(self.endpoint, subprotocols=protocols, compression=None, open_timeout=1, close_timeout=0.5,
+                     ping_interval=pings, ping_timeout=1,
+                     max_size=None if self.broken == "V-SOCK-11" else 1_100_000) as link:
+            if self.broken == "V-SOCK-08":
+                send = link.protocol.send_frame
+                link.protocol.send_frame = lambda frame: None if frame.opcode is Opcode.PONG else send(frame)
+            self.speak(link)
+
+    def speak(self, link):
+        robot = "every" if self.broken == "V-SOCK-02" else "r1"
+        hello = {"v": 1, "robot": robot, "role": "vision", "session": "4e5f6071", "wants": ["frame", "camera"]}
+        if self.broken == "V-SOCK-03":
+            hello["wants"] = ["camera"]
+        if self.broken == "V-SOCK-04":
+            del hello["role"]
+        link.send(json.dumps(hello))
+        first = link.recv(timeout=2)
+        self.greeted = isinstance(first, str) and json.loads(first)["session"] == "5ca1ab1e"  # not the kit's link
+        if not isinstance(first, str) and self.broken != "V-SOCK-12":
+            link.close(1003, "no hello")
+            return
+        if isinstance(first, str) and json.loads(first)["robot"] != "r1" and self.broken != "V-SOCK-05":
+            link.close(1008, "another robot")
+            return
+        while not self.ending.is_set():
+            with contextlib.suppress(TimeoutError):
+                self.hear(link, self.received(link))
+
+    def received(self, link):
+        if self.broken == "V-SOCK-07":
+            fragments = list(link.recv_streaming())
+            return fragments[0] if len(fragments) == 1 else ""
+        return link.recv(timeout=0.1)
+
+    def hear(self, link, message):
+        if isinstance(message, str):
+            return
+        size = int.from_bytes(message[:2])
+        if len(message) < 2 + size:
+            if self.broken != "V-SOCK-10":
+                link.close(1007, "header block past the end")
+                self.ending.wait(0.05)
+                raise EOFError
+            return
+        try:
+            header = json.loads(message[2 : 2 + size])
+        except ValueError:
+            return
+        if header.get("channel") == "frame":
+            self.answer(link, header)
+
+    def answer(self, link, frame):
+        self.seq += 1
+        echo = {"channel": "frame", **{name: frame[name] for name in ("session", "seq", "t_us")}}
+        header = {"channel": "twist", "v": 1, "source": "vision", "session": "4e5f6071", "seq": self.seq, "echo": echo}
+        block = json.dumps(header).encode()
+        if self.broken == "V-SOCK-06":
+            del header["channel"]
+            block = json.dumps(header).encode()
+        link.send(len(block).to_bytes(2) + block + b"0.0000|0.0000")

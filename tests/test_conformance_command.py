@@ -1,0 +1,159 @@
+"""`sightline conform` as a person and as a CI use it: against a real robot process, over WebSocket and Zenoh."""
+
+import json
+import xml.etree.ElementTree as ET
+
+import pytest
+
+from operator_side import cli
+from protocol.conformance.case import Case, Level
+from protocol.conformance.html_report import to_html
+from protocol.conformance.report import summary, to_dict, to_junit, to_page
+from protocol.conformance.robot import CASES
+from protocol.conformance.runner import Outcome, Result
+from tests.conformance.small_server import SmallServer
+from tests.link_rigs import free_endpoint, until
+from tests.robot_process import RobotProcess
+
+QUICK = ("R-CAUS-02", "R-HEAD-17", "R-REQ-01", "R-STOP-03", "R-HOST-04")
+
+
+def run(capsys, *arguments):
+    code = cli.run(("conform", *map(str, arguments)))
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def only(*cases):
+    return [part for case in cases for part in ("--only", case)]
+
+
+# --- at real robots --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["tcp/", "ws://"])
+def test_a_real_robot_conforms(capsys, tmp_path, scheme):
+    endpoint = free_endpoint().replace("tcp/", scheme)
+    with RobotProcess(tmp_path, endpoint=endpoint, safety={}) as robot:
+        assert until(lambda: f"on {endpoint}" in robot.output(), 20.0), robot.output()
+        code, out, _err = run(capsys, "robot", endpoint, *only(*QUICK), "--json", "--html", tmp_path / "r.html")
+    report = json.loads(out)
+    assert code == 0, [check["reason"] for check in report["checks"]]
+    assert report["ok"] and report["side"] == "robot" and report["peer"] == endpoint
+    assert {check["name"] for check in report["checks"]} == set(QUICK)
+    assert "R-CAUS-02" in (tmp_path / "r.html").read_text()
+
+
+@pytest.mark.slow
+def test_a_broken_robot_does_not_and_every_report_says_why(capsys, tmp_path):
+    files = {name: tmp_path / f"r.{name}" for name in ("junit", "html", "save")}
+    with SmallServer({"compresses"}) as server:
+        options = [part for name, path in files.items() for part in (f"--{name}", path)]
+        code, out, err = run(capsys, "robot", server.endpoint, *only("R-SOCK-01", "R-SOCK-03"), *options)
+    assert code == 5
+    assert "does NOT conform: 1 passed, 1 failed, of 2 cases" in out
+    assert "R-SOCK-03" in err and "permessage-deflate" in err
+    assert "permessage-deflate" in files["html"].read_text()
+    assert ET.parse(files["junit"]).getroot().get("failures") == "1"
+    assert json.loads(files["save"].read_text())["ok"] is False
+
+
+# --- mistakes --------------------------------------------------------------------------------------------------------
+
+
+def test_nobody_there_is_exit_code_4(capsys):
+    code, out, err = run(capsys, "robot", free_endpoint().replace("tcp/", "ws://"), "--only", "R-CAUS-02")
+    assert (code, out) == (4, "")
+    assert err.startswith("error: nobody answers at ws://127.0.0.1:") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["robot", "ws://127.0.0.1:1", "--only", "R-NONE"], "no case begins so"),
+        (["robot", "ws://127.0.0.1:1", "--group", "leases"], "no such group"),
+        (["robot", "http://127.0.0.1:1"], "write ws://"),
+        (["robot", "ws://127.0.0.1:1", "--html", "/nowhere/r.html"], "there is no folder /nowhere"),
+        (["page", "/nowhere/r.json"], "not a run of this kit"),
+        (["robot"], "ENDPOINT"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_mistake_is_one_line_and_exit_code_2(capsys, arguments, says):
+    code, out, err = run(capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert says in err and err.count("\n") == 1
+
+
+def test_cases_are_listed_without_a_peer(capsys):
+    code, out, _err = run(capsys, "robot", "ws://127.0.0.1:1", "--list", "--group", "stop")
+    assert code == 0
+    stops = [case for case in CASES if case.group == "stop"]
+    assert [line.split()[0] for line in out.splitlines()] == [case.id for case in stops]
+    assert all(case.title in out and case.clause in out for case in stops)
+
+
+# --- reports ---------------------------------------------------------------------------------------------------------
+
+
+def result(number, outcome=Outcome.PASSED, reason="", level=Level.MUST):
+    case = Case(f"R-LEASE-{number:02}", level, "Lease, arming, STOP", f"Point | {number}.", lambda bench: None)
+    return Result(case, outcome, reason, 1_500_000)
+
+
+NASTY = "<script>&\x00\x1b|\ud800"
+RUN = [
+    result(1),
+    result(2, Outcome.FAILED, NASTY),
+    result(3, Outcome.SKIPPED, "no guests"),
+    result(4, Outcome.FAILED, "slow", Level.SHOULD),
+]
+
+
+def test_the_summary_counts_each_kind():
+    assert summary(RUN) == "does NOT conform: 1 passed, 1 failed, 1 SHOULD failed, 1 not applicable, of 4 cases"
+    assert summary(RUN[:1]) == "conforms: 1 passed, of 1 cases"
+    assert summary([]) == "does NOT conform: 0 passed, of 0 cases"
+
+
+def test_the_json_has_the_shape_of_all_that_judge():
+    report = to_dict(RUN, "robot", "x")
+    assert report["ok"] is False
+    assert [(check["name"], check["value"], check["ok"]) for check in report["checks"]] == [
+        ("R-LEASE-01", "passed", True),
+        ("R-LEASE-02", "failed", False),
+        ("R-LEASE-03", "not applicable", True),
+        ("R-LEASE-04", "failed", True),
+    ]
+    assert set(report["checks"][0]) >= {"name", "value", "unit", "bound", "ok"}
+    assert report["ok"] == all(check["ok"] for check in report["checks"])
+
+
+def test_junit_can_be_read_whatever_a_peer_said():
+    suite = ET.fromstring(to_junit(RUN, "robot", NASTY))
+    assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("4", "1", "2")
+    failure = suite.find(".//failure")
+    assert failure.get("message") == "<script>&??|?" and failure.get("type") == "MUST"
+    assert [case.get("classname") for case in suite] == ["robot.lease"] * 4
+
+
+def test_html_escapes_what_a_peer_said_and_needs_nothing_else():
+    page = to_html(RUN, "robot", NASTY)
+    assert "<script>" not in page and "&lt;script&gt;" in page
+    assert "http" not in page and "src=" not in page
+    page.encode("utf-8")
+    assert all(f"R-LEASE-0{number}" in page for number in (1, 2, 3, 4))
+
+
+def test_the_page_of_several_runs_has_a_column_each(capsys, tmp_path):
+    other = [result(1), result(2)]
+    for name, results in (("a", RUN), ("b", other)):
+        (tmp_path / name).write_text(json.dumps(to_dict(results, "robot", name)))
+    assert run(capsys, "page", tmp_path / "a", tmp_path / "b", "--out", tmp_path / "page.md")[0] == 0
+    page = (tmp_path / "page.md").read_text()
+    assert "| a | robot | no | 1 | 1 | 1 | 1 | 4 |" in page
+    assert "| b | robot | yes | 2 | 0 | 0 | 0 | 2 |" in page
+    assert "| R-LEASE-02 | MUST | Lease, arming, STOP | Point \\| 2. | FAIL | ok |" in page
+    assert "| R-LEASE-03 | MUST | Lease, arming, STOP | Point \\| 3. | n/a |  |" in page
+    assert to_page([]).startswith("# Conformance")
