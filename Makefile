@@ -5,13 +5,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test mutation lint lock clean
+.PHONY: demo test kit mutation lint lock clean
 
 demo: $(READY)
 	$(BIN)/sightline demo $(ARGS)
 
 test: $(READY)
 	$(BIN)/python -m pytest $(ARGS)
+
+kit: $(READY)  ## the conformance kit against every broken peer
+	$(BIN)/python -m pytest -m kit $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -65,7 +65,7 @@ def test_each_case_finds_its_broken_robot(case):
     assert result_of(case, BROKEN[case.id]).outcome is Outcome.FAILED
 
 
-@pytest.mark.slow
+@pytest.mark.kit
 @pytest.mark.parametrize("broken_id", BROKEN, ids=lambda name: f"{name} {BROKEN[name].__name__}")
 def test_a_broken_robot_fails_exactly_its_case(matrix, broken_id):
     assert set(matrix[broken_id]) == {broken_id}, matrix[broken_id]
@@ -166,6 +166,15 @@ def test_a_case_may_be_tried_again_and_says_so():
     assert twice[0].reason == "at a second try; at first lost"
     always = Case("R-CAUS-98", Level.MUST, "Headers", "A title.", lambda bench: bench.expect(False, "never"))
     assert run_cases([always], bench, tries=3)[0].reason == "never"
+    runs.clear()
+
+    def fails_then_lacks(bench):
+        runs.append(bench.now_us)
+        bench.expect(len(runs) > 1, "lost")
+        bench.need(False, "gone")
+
+    lacking = Case("R-CAUS-97", Level.MUST, "Headers", "A title.", fails_then_lacks)
+    assert run_cases([lacking], bench, tries=2)[0].outcome is Outcome.FAILED
 
 
 def test_a_peer_conforms_if_no_must_failed_and_something_was_tested():

@@ -156,4 +156,10 @@ def test_the_page_of_several_runs_has_a_column_each(capsys, tmp_path):
     assert "| b | robot | yes | 2 | 0 | 0 | 0 | 2 |" in page
     assert "| R-LEASE-02 | MUST | Lease, arming, STOP | Point \\| 2. | FAIL | ok |" in page
     assert "| R-LEASE-03 | MUST | Lease, arming, STOP | Point \\| 3. | n/a |  |" in page
+    assert "| R-LEASE-03 | not applicable | no guests |" in page
     assert to_page([]).startswith("# Conformance")
+
+
+def test_cases_that_lack_the_same_share_a_line():
+    alike = [result(number, Outcome.SKIPPED, "no guests") for number in (1, 2)]
+    assert "| R-LEASE-01, R-LEASE-02 | not applicable | no guests |" in to_page([to_dict(alike, "robot", "x")])

@@ -50,19 +50,19 @@ def test_every_case_has_its_defect():
     assert len(set(DEFECTS.values())) == len(DEFECTS)
 
 
-@pytest.mark.slow
+@pytest.mark.kit
 def test_a_small_server_without_defect_passes():
     assert failures_at("") == {}
 
 
-@pytest.mark.slow
+@pytest.mark.kit
 def test_our_own_robot_passes(tmp_path):
     ends = [free_endpoint().replace("tcp/", scheme) for scheme in ("ws://", "ws-legacy://")]
     with RobotProcess(tmp_path, listen=ends, safety={"guests": True}):
         assert bad(run_at(*ends)) == {}
 
 
-@pytest.mark.slow
+@pytest.mark.kit
 @pytest.mark.parametrize("case_id", DEFECTS, ids=lambda name: f"{name} {DEFECTS[name]}")
 def test_a_defect_fails_exactly_its_case(matrix, case_id):
     assert set(matrix[case_id]) == {case_id}, matrix[case_id]

@@ -75,7 +75,7 @@ def test_a_broken_vision_fails_its_case(name):
     assert failed_of(name, [case for case in REAL if case.id == name]) == {name}
 
 
-@pytest.mark.slow
+@pytest.mark.kit
 @pytest.mark.parametrize("name", sorted(SOCKETS))
 def test_a_broken_vision_fails_no_other_case(name):
     assert failed_of(name, REAL) == {name}

@@ -74,9 +74,9 @@ def run_cases(
 
 
 def _after(first: Result, second: Result) -> Result:
-    """What to keep of two runs of a case, of which the first failed."""
-    if second.outcome is Outcome.FAILED:
-        return second
+    """What to keep of two runs of a case, of which the first failed: only passing makes up for it."""
+    if second.outcome is not Outcome.PASSED:
+        return second if second.outcome is Outcome.FAILED else first
     return Result(second.case, second.outcome, f"at a second try; at first {first.reason}", second.took_us)
 
 

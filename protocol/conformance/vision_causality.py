@@ -53,7 +53,7 @@ def echo_time(bench: Bench) -> None:
     _echoes(bench, "t_us", lambda sent: sent.t_us)
 
 
-@SUITE.must("V-CAUS-05", "4.4 Echo")
+@SUITE.must("V-CAUS-05", "4.5 Echo")
 def nothing_before_a_frame(bench: Bench) -> None:
     """Before a frame came there is nothing to answer: camera and status alone drive nothing."""
     robot = RobotPlayed(bench)
