@@ -17,7 +17,7 @@ def register(app: typer.Typer) -> None:
 
 
 def install(
-    service: Annotated[str, typer.Argument(metavar="robot|vision")],
+    service: Annotated[str, typer.Argument(metavar="robot|vision", help="Which service.")],
     config: Annotated[
         Path | None,
         typer.Option("--config", metavar="FILE", help="Its configuration [default: /etc/sightline/SERVICE.toml]."),
