@@ -55,7 +55,9 @@ class Machines:
     def _once(self, command):
         done = subprocess.run(command, cwd=self._folder, env=self._env, capture_output=True, text=True, timeout=40,
                               check=False)
-        assert done.returncode == 0, (command, done.stdout, done.stderr)
+        judged = 5 if "doctor" in command else 0  # the doctor also judges this machine, as it is; the way must be good
+        assert done.returncode in (0, judged), (command, done.stdout, done.stderr)
+        assert judged == 0 or "ok   frames" in done.stdout, done.stdout
         return done.stdout
 
     @contextmanager
