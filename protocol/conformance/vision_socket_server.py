@@ -7,6 +7,7 @@ import base64
 import contextlib
 import hashlib
 import re
+import secrets
 import socket
 import struct
 import time
@@ -16,6 +17,8 @@ from typing import Final, Self
 from protocol.errors import LinkError
 
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
+SESSION_BEGINS: Final = "5ca1"
+"""So the tests' broken visions tell this server from the kit's own link."""
 _GUID: Final = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 _SEND_S: Final = 2.0
 _MAX_REQUEST_BYTES: Final = 16_384
@@ -71,12 +74,16 @@ class RawServer:
 
 
 class RawClient:
-    """One connection. `offered` are the sub-protocols that the client offered."""
+    """One connection. `offered` are the sub-protocols that the client offered; `session` is of the robot played on it.
+
+    Each connection is to a robot started anew: a vision may take an earlier session for over.
+    """
 
     def __init__(self, connection: socket.socket) -> None:
         """Do the opening handshake. Raises OSError or GoneError for a client that does not."""
         self._socket = connection
         self._buffer = b""
+        self.session = SESSION_BEGINS + secrets.token_hex(2)
         self.pings = 0
         connection.settimeout(_SEND_S)
         while b"\r\n\r\n" not in self._buffer:

@@ -24,7 +24,6 @@ _BACK_S: Final = 5.0
 _HELLO_S: Final = 2.0
 _END_S: Final = 3.0
 _ANSWER_S: Final = 1.0
-_SESSION: Final = "5ca1ab1e"
 _TOO_LARGE_BYTES: Final = 3_000_000
 """Above what any peer can want: a frame has at most a million."""
 
@@ -66,7 +65,7 @@ def _fields(text: bytes) -> dict[str, Any]:
 
 
 def _greet(client: RawClient, robot: str) -> None:
-    hello = {"v": 1, "robot": robot, "role": "robot", "session": _SESSION, "wants": ["twist", "ack"]}
+    hello = {"v": 1, "robot": robot, "role": "robot", "session": client.session, "wants": ["twist", "ack"]}
     client.send(TEXT, json.dumps(hello).encode())
 
 
@@ -74,8 +73,8 @@ def _message(channel: Channel, header: Stamp, payload: bytes) -> bytes:
     return pack(channel, "", "robot", encode(header), payload)
 
 
-def _frame(seq: int) -> bytes:
-    return _message(FRAME, FrameHeader(session=_SESSION, seq=seq, t_us=seq * 40_000), picture("left"))
+def _frame(client: RawClient, seq: int) -> bytes:
+    return _message(FRAME, FrameHeader(session=client.session, seq=seq, t_us=seq * 40_000), picture("left"))
 
 
 def _met(bench: Bench, server: RawServer) -> RawClient:
@@ -83,7 +82,7 @@ def _met(bench: Bench, server: RawServer) -> RawClient:
     client = _client(bench, server)
     _hello(client)
     _greet(client, bench.robot)
-    client.send(BINARY, _message(CAMERA, Stamp(session=_SESSION, seq=1, t_us=1), encode(LENS)))
+    client.send(BINARY, _message(CAMERA, Stamp(session=client.session, seq=1, t_us=1), encode(LENS)))
     return client
 
 
@@ -159,8 +158,8 @@ def leaves_another_robot(bench: Bench) -> None:
         client = _client(bench, server)
         _hello(client)
         _greet(client, "another")
-        client.send(BINARY, _message(CAMERA, Stamp(session=_SESSION, seq=1, t_us=1), encode(LENS)))
-        client.send(BINARY, _frame(1))
+        client.send(BINARY, _message(CAMERA, Stamp(session=client.session, seq=1, t_us=1), encode(LENS)))
+        client.send(BINARY, _frame(client, 1))
         bench.expect(_answer(client) is None, "it answered another robot's frame")
         bench.expect(_ends(client), "it stayed with another robot")
 
@@ -173,7 +172,7 @@ def answers_in_binary(bench: Bench) -> None:
     """Its answer is one binary message whose header block names its channel."""
     with _server(bench) as server:
         client = _met(bench, server)
-        client.send(BINARY, _frame(1))
+        client.send(BINARY, _frame(client, 1))
         data = _answer(client)
         bench.need(data is not None, "it answers nothing")
         assert data is not None
@@ -187,7 +186,7 @@ def reads_fragments(bench: Bench) -> None:
     """A frame in fragments, with a ping between them, is read."""
     with _server(bench) as server:
         client = _met(bench, server)
-        whole = _frame(1)
+        whole = _frame(client, 1)
         client.send(BINARY, whole[:100], last=False)
         client.send(PING, b"between")
         client.send(0, whole[100:2_000], last=False)
@@ -254,7 +253,7 @@ def no_hello(bench: Bench) -> None:
     with _server(bench) as server:
         client = _client(bench, server)
         _hello(client)
-        client.send(BINARY, _frame(1))
+        client.send(BINARY, _frame(client, 1))
         bench.expect(_ends(client), "it stayed with a robot that said no hello")
 
 
