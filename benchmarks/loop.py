@@ -5,8 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from benchmarks.interrupted import terminated_like_interrupted
 from benchmarks.loop_course import Sample
-from benchmarks.loop_crew import terminated_like_interrupted
 from benchmarks.loop_figures import Figures, LoopCheck, figures_of, judge
 from benchmarks.loop_ours import endpoint_of
 from benchmarks.loop_overload import overloaded

@@ -15,7 +15,8 @@ from typing import Final, Protocol
 import cv2
 import numpy as np
 
-from benchmarks.loop_crew import Crew, terminated_like_interrupted
+from benchmarks.interrupted import terminated_like_interrupted
+from benchmarks.loop_crew import Crew
 from benchmarks.loop_figures import LoopCheck
 from benchmarks.loop_ours import ROBOT
 from benchmarks.loop_pictures import write_pictures

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from benchmarks.interrupted import terminated_like_interrupted
 from benchmarks.loop_course import Course
-from benchmarks.loop_crew import Crew, terminated_like_interrupted
+from benchmarks.loop_crew import Crew
 from benchmarks.loop_figures import ANSWERED_PERCENT, LoopCheck, at_most, percentile
 from benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
 from benchmarks.loop_ours import Ours, running_services

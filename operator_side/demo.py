@@ -4,7 +4,6 @@ The three run what `sightline sim`, `robot` and `vision` run by hand; their conf
 """
 
 import os
-import signal
 import socket
 import tempfile
 import time
@@ -13,9 +12,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final
 
+from benchmarks.interrupted import terminated_like_interrupted
 from operator_side.live_block import Display, display
 from operator_side.processes import Processes
 from operator_side.recording import Recorder
@@ -82,7 +81,7 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
     scenario = load_scenario(options.scenario)
     run = DemoRun(options, scenario, _run_folder(options, scenario))
     with ExitStack() as ending:
-        ending.enter_context(_terminated_like_interrupted())
+        ending.enter_context(terminated_like_interrupted())
         sockets = ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
         processes = ending.enter_context(Processes(run.folder))
         try:
@@ -219,16 +218,3 @@ def _truth(sockets: str) -> Iterator[TruthReader]:
     finally:
         reader.close()
 
-
-@contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM ends a run as Ctrl-C does."""
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

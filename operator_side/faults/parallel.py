@@ -1,17 +1,16 @@
 """Runs rows side by side, each in a process of its own, and says how long the rest will take. Shell (processes)."""
 
 import multiprocessing
-import signal
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import FrameType
 from typing import Final, NamedTuple
 
+from benchmarks.interrupted import terminated_like_interrupted
 from operator_side.faults.bench import run_row
 from operator_side.faults.row import Outcome, Row
 
@@ -52,7 +51,7 @@ def run_rows(
     turns = [_Turn(index, row, number) for index, row in enumerate(rows) for number in range(1, repeat + 1)]
     turns.sort(key=lambda turn: turn.row.alone)  # stable: otherwise in the report's order
     began_s, done, total = time.monotonic(), 0, len(turns)
-    with _terminated_like_interrupted(), closing(_outcomes(turns, folder, jobs, results)) as outcomes:
+    with terminated_like_interrupted(), closing(_outcomes(turns, folder, jobs, results)) as outcomes:
         for turn, outcome in outcomes:
             results[turn.index].append(outcome)
             done += 1
@@ -101,7 +100,7 @@ def _start(turn: _Turn, folder: Path) -> _Running:
 
 def _run(turn: _Turn, folder: Path, answer: connection.Connection) -> None:
     """In the process of its own; whoever waits is told what became of the row, whatever did."""
-    with suppress(KeyboardInterrupt), _terminated_like_interrupted():
+    with suppress(KeyboardInterrupt), terminated_like_interrupted():
         outcome = run_row(turn.row, folder, turn.number)
         answer.send((outcome.checks, outcome.skipped, outcome.trouble))
 
@@ -117,16 +116,3 @@ def _collect(ended: _Running) -> Outcome:
     ended.process.join()
     return outcome
 
-
-@contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM ends the bench as Ctrl-C does: no process is left behind."""
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
