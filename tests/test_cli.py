@@ -114,6 +114,17 @@ def test_a_mistake_is_one_line_and_its_exit_code(capsys, arguments, code, expect
     assert expected in err
 
 
+def test_a_robot_may_be_given_by_its_address(capsys, monkeypatch):
+    """As in `vision --robot ws-legacy://HOST:9091`: an older robot has an address and no id."""
+    seen = []
+    monkeypatch.setattr("vision_side.service.run", lambda config: seen.append(config) or 0)
+    assert run(capsys, "vision", "--robot", "ws-legacy://127.0.0.1:9091")[0] == 0
+    assert run(capsys, "vision", "--robot", "r7", "--connect", "ws://127.0.0.1:9090")[0] == 0
+    assert [(config.robot, config.connect) for config in seen] == [
+        ("r1", ("ws-legacy://127.0.0.1:9091",)), ("r7", ("ws://127.0.0.1:9090",)),
+    ]  # fmt: skip
+
+
 def test_a_misspelt_environment_name_stops_any_service(capsys, monkeypatch):
     monkeypatch.setenv("SIGHTLINE_ROBOT__SAFETY__MAX_LINER_MPS", "0.1")
     for service in ("robot", "vision", "sim"):

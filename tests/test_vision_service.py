@@ -180,3 +180,19 @@ def test_what_was_skipped_is_counted_over_every_camera(bench: Bench) -> None:
     bench.frame(b"junk", 4)
     bench.frame(BALL, 5)  # the last camera's size
     assert bench.service.skipped == {"MALFORMED": 5}
+
+
+def test_frames_of_a_session_that_is_over_are_left_out_and_said_once(bench):
+    """A late frame of before a restart, or two robots of one id: it steers for the newer one alone."""
+    bench.camera()
+    for seq in range(1, 4):
+        bench.frame(BALL, seq)
+    bench.frame(BALL, 1, session="0000beef")
+    answered = bench.service.answered
+    for seq in range(4, 8):
+        bench.frame(BALL, seq)
+    assert bench.service.answered == answered == 4
+    assert bench.service.skipped["OTHER_SESSION"] == 4
+    assert sum("frames of session 0000abcd are left out" in line for line in bench.said) == 1
+    bench.frame(BALL, 2, session="0000beef")
+    assert bench.service.answered == 5

@@ -143,6 +143,8 @@ class Service:
             return
         if self._is_over(header.session):
             self.skipped["OTHER_SESSION"] += 1
+            self._tell("other", f"frames of session {header.session} are left out: a newer one began; two robots "
+                                f"with the id {self._config.robot}? give each its own with --robot")
             return
         self._heard_s = time.monotonic()
         if header.session != self._robot_session:
