@@ -9,6 +9,7 @@ import select
 import signal
 import struct
 import time
+from collections import Counter
 from contextlib import ExitStack, suppress
 from types import FrameType
 
@@ -85,6 +86,7 @@ class Driver:
         self._obeyed = False
         self._verdicts: list[ipc.Judged] = []
         self._refusals = RefusalLog()
+        self._counted: Counter[str] = Counter()
         self.child = NetworkChild(config, self._driving.session, self.scribe.say)
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, self._on_signal)
@@ -201,16 +203,17 @@ class Driver:
         elif kind is ipc.Kind.REFUSED:
             self._on_turned_away(ipc.unpack_refused(packet))
         elif kind is ipc.Kind.READY:
+            self._counted.clear()
             self.child.on_ready()
         return False
 
     def _on_turned_away(self, counts: dict[str, int]) -> None:
-        """Counts of one network process; those of an earlier one are lost with it."""
-        before, self._driving.turned_away = self._driving.turned_away, counts
-        for reason, count in counts.items():
-            if count > before.get(reason, 0):
-                refusal = LastRefusal(source="the network", reason=reason, detail="turned away by the transport")
-                self._tell(refusal, count - before.get(reason, 0))
+        """Counts of this network process, which begins at zero; ours go on over its restarts."""
+        more, self._counted = Counter(counts) - self._counted, Counter(counts)
+        self._driving.turned_away += more
+        for reason, count in more.items():
+            refusal = LastRefusal(source="the network", reason=reason, detail="turned away by the transport")
+            self._tell(refusal, count)
 
     def _on_raw(self, packet: bytes) -> bool:
         message, refused_before = ipc.unpack_message(packet), self._driving.gate.last_refusal

@@ -63,7 +63,7 @@ class Driving:
         self.stream = StreamStatus()
         self.tick_late_max_us = 0
         self.network_restarts = 0
-        self.turned_away: dict[str, int] = {}
+        self.turned_away: Counter[str] = Counter()
         """By the transport, before the gate could judge it: how often, by reason."""
         self._seqs: dict[str, int] = {}
         self._due_us: dict[str, int] = {}
@@ -151,7 +151,7 @@ class Driving:
             frame_age_us=gate.frame_age_us(now_us),
             latency_us=gate.latency_us,
             accepted=gate.accepted,
-            refused=dict(gate.counters + Counter(self.turned_away)),
+            refused=dict(gate.counters + self.turned_away),
             last_refusal=gate.last_refusal,
             stream=self.stream,
             auto_arm=gate.arms_itself,

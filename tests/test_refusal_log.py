@@ -72,3 +72,20 @@ def test_what_the_transport_turned_away_is_readable_in_the_status_and_told(tmp_p
             assert until(lambda: vision.status().refused.get("OVERSIZE") == 1, 5)
         assert until(lambda: vision.status().refused.get("MALFORMED", 0) == 1, 5)
         assert until(lambda: "refused OVERSIZE from the network: turned away by the transport" in robot.output(), 2)
+
+
+def test_what_an_earlier_network_process_counted_stays_in_the_status(tmp_path):
+    def refused():
+        try:
+            return vision.status().refused.get("OVERSIZE", 0)
+        except AttributeError:  # no status while the network process is away
+            return -1
+
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
+        for count in (1, 2):
+            with open_session((), [robot.endpoint], 10.0) as stranger:
+                stranger.put(key_for("r1", TWIST, "vision"), b"0" * 300)
+                assert until(lambda count=count: refused() == count, 8)
+            if count == 1:
+                robot.kill_network()
+                assert until(lambda: len(vision.headers) and refused() == 1, 10), "the old count, from the new process"
