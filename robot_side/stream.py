@@ -135,17 +135,23 @@ class Stream:
     def on_holder(self, holder: Holder | None, now_us: int) -> None:
         """The lease changed hands: credit goes to who drives."""
         if holder is not None and holder != self._owner:
-            self._owner = holder
+            self._hand_over(holder)
             self._owner_until_us = now_us + self._config.owner_life_ms * 1000
             self._in_flight.clear()
 
     def _owns(self, who: Holder, now_us: int) -> bool:
-        if self._owner is None or now_us >= self._owner_until_us:
-            self._owner = who
+        if who != self._owner and (self._owner is None or now_us >= self._owner_until_us):
+            self._hand_over(who)
         if who != self._owner:
             return False
         self._owner_until_us = now_us + self._config.owner_life_ms * 1000
         return True
+
+    def _hand_over(self, owner: Holder) -> None:
+        """A slow successor must not be held to a quick one's times, nor to what the way to that one carried."""
+        self._owner = owner
+        self._answer_us, self._spread_us, self._overdue = None, 0.0, 0
+        self._window = Window(self._interval_us, self._config.max_window)
 
     def _measure(self, sent: _Sent, passed: list[_Sent], compute_us: int, now_us: int) -> None:
         answer_us = now_us - sent.at_us

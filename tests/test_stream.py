@@ -126,3 +126,20 @@ def test_whatever_happens_a_picture_is_taken_again(seed):
             stream.on_holder(chance.choice((VISION, VIEWER, None)), now)
     until = now + 3_000_000
     assert any(stream.may_capture(later, listening=True) for later in range(now, until, 10_000)), "it is stuck"
+
+
+def test_a_slow_successor_is_not_held_to_a_quick_ones_times():
+    stream, sent, due, in_flight = Stream(StreamConfig()), 0, [], []
+    for now in range(0, 6_000_000, 1000):
+        who, takes_us = (VIEWER, 5_000) if now < 3_000_000 else (VISION, 300_000)
+        if now == 3_000_000:
+            stream.on_holder(VISION, now)
+        while due and due[0][0] <= now:
+            stream.on_answer(who, due.pop(0)[1], takes_us, now)
+        if stream.may_capture(now, listening=True):
+            stream.on_sent(sent, now, now)
+            due.append((now + takes_us, sent))
+            sent += 1
+        if now >= 3_000_000:
+            in_flight.append(len(due))
+    assert max(in_flight) <= 4, "three until the first answer is measured, and what the quick one left"
