@@ -4,15 +4,19 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 from benchmarks.interrupted import terminated_like_interrupted
-from benchmarks.loop_course import Sample
+from benchmarks.loop_course import Sample, joined
 from benchmarks.loop_figures import Figures, LoopCheck, figures_of, judge
 from benchmarks.loop_ours import endpoint_of
 from benchmarks.loop_overload import overloaded
 from benchmarks.loop_pictures import write_pictures
 from benchmarks.loop_sample import take_sample
-from benchmarks.loop_setting import LoopSetting
+from benchmarks.loop_setting import FLOOR, OURS, LoopSetting
+
+_TURNS: Final = 3
+_LEAST_TURN_S: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +43,19 @@ def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
         ready = replace(setting, pictures=pictures)
         if setting.overload:
             ready = overloaded(ready, say)
-        samples = {one: take_sample(one, ready, Path(name), say) for one in setting.contestants}
+        samples = _samples(ready, Path(name), say)
     figures = {one: figures_of(sample) for one, sample in samples.items()}
     return Race(ready, jpeg_bytes, samples, figures, judge(figures, ready))
+
+
+def _samples(setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> dict[str, Sample]:
+    """One of each contestant.
+
+    Floor and Sightline take turns, since what is judged is their difference and a shared machine's clock changes from
+    minute to minute; under load there is one turn, for age is to be watched over the whole time.
+    """
+    turns = 1 if setting.is_loaded else max(1, min(_TURNS, int(setting.seconds // _LEAST_TURN_S)))
+    part = replace(setting, seconds=setting.seconds / turns)
+    judged = [[take_sample(one, part, folder / f"turn-{turn}", say) for one in (FLOOR, OURS)] for turn in range(turns)]
+    samples = {FLOOR: joined([pair[0] for pair in judged]), OURS: joined([pair[1] for pair in judged])}
+    return samples | {one: take_sample(one, setting, folder, say) for one in setting.contestants if one not in samples}

@@ -2,7 +2,7 @@
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 
 Header = tuple[int, int, int | None]
@@ -37,6 +37,24 @@ class Sample:
     taken_percent: float
     hot_us: float | None = None
     tries: int = 1
+
+
+def joined(samples: Sequence[Sample]) -> Sample:
+    """What was measured of one contestant in several turns, as one sample; memory and disturbance are the worst."""
+    first, courses = samples[0], [sample.course for sample in samples]
+    captured = sum(course.captured for course in courses)
+    answered = sum(course.captured * course.answered_percent for course in courses) / max(1, captured)
+    carried = [sample.carried_bytes for sample in samples]
+    return replace(
+        first,
+        course=Course(captured, answered, tuple(age for course in courses for age in course.ages_us)),
+        seconds=sum(sample.seconds for sample in samples),
+        cpu_s={name: sum(sample.cpu_s[name] for sample in samples) for name in first.cpu_s},
+        memory_mb={name: max(sample.memory_mb[name] for sample in samples) for name in first.memory_mb},
+        carried_bytes=None if None in carried else sum(one or 0 for one in carried),
+        taken_percent=max(sample.taken_percent for sample in samples),
+        tries=sum(sample.tries for sample in samples),
+    )
 
 
 def course_of_tally(

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.loop import run_race
-from benchmarks.loop_course import Course, Sample, course_of_headers, course_of_tally
+from benchmarks.loop_course import Course, Sample, course_of_headers, course_of_tally, joined
 from benchmarks.loop_figures import figures_of, judge, percentile
 from benchmarks.loop_machine import Reading, taken_percent
 from benchmarks.loop_overload import overloaded, with_overload
@@ -116,6 +116,24 @@ def test_the_bounds_are_held_against_the_floor_of_the_same_run():
     assert not judged(**{FLOOR: floor, OURS: sample(OURS, [2.0] * 94 + [6.1] * 6)})["p95 over floor"]
     assert not judged(**{FLOOR: floor, OURS: sample(OURS, [2.0] * 100, cpu_s=0.17)})["vision CPU over floor"]
     assert not judged(**{FLOOR: floor, OURS: sample(OURS, [2.0] * 100, answered_percent=98.9)})["not accepted"]
+
+
+@given(st.lists(st.lists(st.integers(1, 90), min_size=1, max_size=9), min_size=1, max_size=4), st.data())
+def test_turns_joined_are_as_one_sample_of_all_their_pictures(turns, data):
+    parts = [replace(sample(OURS, ages_ms, data.draw(st.floats(0, 9)), data.draw(st.floats(0, 100)), at), tries=at + 1)
+             for at, ages_ms in enumerate(turns)]
+    whole = joined(parts)
+    assert [age_us // MS for _, age_us in whole.course.ages_us] == [age for ages_ms in turns for age in ages_ms]
+    answered = sum(len(ages) * part.course.answered_percent for ages, part in zip(turns, parts, strict=True))
+    assert whole.course.answered_percent == pytest.approx(answered / whole.course.captured)
+    assert whole.cpu_s["vision"] == pytest.approx(sum(part.cpu_s["vision"] for part in parts))
+    assert (whole.seconds, whole.carried_bytes) == (10.0 * len(parts), 1000 * len(parts))
+    assert whole.taken_percent == len(parts) - 1  # a turn that was disturbed is not hidden by the others
+    assert whole.tries == sum(part.tries for part in parts)
+
+
+def test_what_one_turn_could_not_count_is_not_made_up():
+    assert joined([sample(OURS, [1]), replace(sample(OURS, [1]), carried_bytes=None)]).carried_bytes is None
 
 
 def test_with_a_slow_detector_age_has_bounds_of_its_own_and_must_not_grow():
