@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from operator_side.cli_judge import Json
+from operator_side.cli_robot_tools import drive
 from operator_side.cli_services import Connect, RobotName
 from operator_side.extras import needs
 from protocol.errors import ConfigError
@@ -39,6 +40,7 @@ def register(app: typer.Typer) -> None:
     group = typer.Typer(help="Measure what a robot is made of.", rich_markup_mode=None)
     group.callback()(_calibrate)
     group.command(epilog="Example: sightline calibrate camera --camera v4l2 --board 9x6 --square-m 0.025")(camera)
+    group.command(epilog="Example: sightline calibrate drive --config raspberry-car.toml")(drive)
     app.add_typer(group, name="calibrate")
 
 

@@ -70,6 +70,14 @@ class RobotConfig(Config):
         return tuple(with_allowed(endpoint, self.legacy.allow_from) for endpoint in self.listen)
 
     @property
+    def motors(self) -> PluginChoice:
+        """The drive in use; `gpio`, whose calibration is in metres, is told the radius of the wheels."""
+        if self.drive.kind != "gpio":
+            return self.drive
+        options = {"wheel_radius_m": self.wheels.wheel_radius_m, **self.drive.options}
+        return PluginChoice(kind=self.drive.kind, options=options)
+
+    @property
     def ranging(self) -> PluginChoice | None:
         """The range sensor in use."""
         if self.range_sensor is None and self.drive.kind == "sim":

@@ -45,7 +45,7 @@ def run(config: RobotConfig) -> int:
     """
     check_robot_id(config.robot)
     with ExitStack() as ending:
-        drive: Drive = build("drives", config.drive)
+        drive: Drive = build("drives", config.motors)
         ending.callback(drive.close)
         ranges: RangeSensor | None = build("range_sensors", config.ranging) if config.ranging else None
         if ranges is not None:
@@ -64,9 +64,11 @@ def _zero(drive: Drive) -> None:
 
 def zero_motors(config: RobotConfig) -> int:
     """Tell the motors to stand still, without gate or network: for whoever cleans up after a dead driver."""
-    drive: Drive = build("drives", config.drive)
-    drive.set(0.0, 0.0)
-    drive.close()
+    drive: Drive = build("drives", config.motors)
+    try:
+        drive.set(0.0, 0.0)
+    finally:
+        drive.close()
     return 0
 
 

@@ -40,7 +40,8 @@ def _problem(config: type[BaseModel], error: ValidationError) -> str:
     where = ".".join(str(part) for part in problems[0]["loc"])
     if problems[0]["type"] == "extra_forbidden":
         return f"unknown option {where!r}; it takes {', '.join(config.model_fields)}"
-    return f"option {where!r}: {'is missing' if problems[0]['type'] == 'missing' else problems[0]['msg']}"
+    said = "is missing" if problems[0]["type"] == "missing" else problems[0]["msg"].removeprefix("Value error, ")
+    return f"option {where!r}: {said}" if where else said
 
 
 def _load(group: str, kind: str) -> Any:

@@ -1,0 +1,210 @@
+"""Two motors on an H-bridge (L298N) at a Raspberry Pi's pins: duty by a calibration table, no encoders. Shell.
+
+One pin of a motor is low before the other is driven; every end and every failure leaves all of them low.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from protocol.errors import ConfigError, HardwareError
+from robot_side.hardware.gpio_pins import Pins, open_pins
+from robot_side.hardware.gpio_table import DutyTable, TableConfig, table_of
+from robot_side.ports import WheelAngles
+
+BcmPin = Annotated[int, Field(ge=2, le=27)]
+"""Broadcom's number, not the position on the header. 0 and 1 belong to the memory of add-on boards."""
+_REVERSAL_PERIODS = 2
+"""Of the PWM: a new duty begins with the next period, so both pins are low for two before the other one is driven."""
+
+
+class GpioDriveConfig(TableConfig):
+    """The pins are BCM numbers; the defaults are the older write-up's car, its PWM of 2 kHz too."""
+
+    left_forward_pin: BcmPin = 10
+    left_backward_pin: BcmPin = 9
+    right_forward_pin: BcmPin = 8
+    right_backward_pin: BcmPin = 7
+    enable_pins: Annotated[tuple[BcmPin, ...], Field(max_length=2)] = ()
+    """ENA and ENB of the bridge, on one pin or two: high from the first motion until a failure or the end."""
+    pwm_hz: Annotated[int, Field(ge=400, le=10_000)] = 2_000
+    left_reversed: bool = False
+    right_reversed: bool = False
+    swapped: bool = False
+    """The motor on the left pins is the right one."""
+    trim: Annotated[float, Field(ge=-0.3, le=0.3)] = 0.0
+    """Share by which the left wheel is slowed (negative: the right one), for a car that bends to the right (left)."""
+    table_file: Path | None = None
+    """As `sightline calibrate drive` writes it, in place of `table`."""
+    odometry: Literal["table", "none"] = "table"
+    """Without encoders: how far the wheels should have turned by the table, or nothing at all."""
+    wheel_radius_m: Annotated[float, Field(gt=0.005, lt=1.0)]
+    """Comes from the robot's own `wheels.wheel_radius_m`."""
+
+    @property
+    def pins(self) -> tuple[int, int, int, int]:
+        """Those of the motors: left forward and backward, right forward and backward."""
+        return self.left_forward_pin, self.left_backward_pin, self.right_forward_pin, self.right_backward_pin
+
+    @model_validator(mode="after")
+    def _are_distinct(self) -> Self:
+        numbers = [*self.pins, *self.enable_pins]
+        twice = sorted({number for number in numbers if numbers.count(number) > 1})
+        if twice:
+            raise ValueError(f"pin {twice[0]} is named twice; each wire has its own")
+        if self.table_file is not None and "table" in self.model_fields_set:
+            raise ValueError("table and table_file are both set; keep one")
+        return self
+
+
+class GpioDrive:
+    """`opening` and `pause` are seams for tests; the pins are low when it is constructed and when it is closed."""
+
+    Config = GpioDriveConfig
+
+    def __init__(
+        self,
+        config: GpioDriveConfig,
+        opening: Callable[[GpioDriveConfig], Pins] = open_pins,
+        pause: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._config = config
+        self.table = DutyTable(_rows(config))
+        self._pins: Pins | None = opening(config)
+        left, right = _Motor(config.pins[:2], config.left_reversed), _Motor(config.pins[2:], config.right_reversed)
+        self._motors = (right, left) if config.swapped else (left, right)
+        self._pause = pause
+        self._enabled = self._failed = False
+        self._expected_mps = (0.0, 0.0)
+        self._angles = WheelAngles(0.0, 0.0, _now_us())
+
+    def set(self, left_rad_s: float, right_rad_s: float) -> None:
+        """Give wheel speeds; takes two PWM periods where a wheel reverses, else no time."""
+        if not (math.isfinite(left_rad_s) and math.isfinite(right_rad_s)):
+            self._all_low()
+            raise HardwareError(f"wheel speeds ({left_rad_s}, {right_rad_s}) are no numbers; the pins are low")
+        radius_m, (left, right) = self._config.wheel_radius_m, self._shares
+        duties = self.table.duty(left_rad_s * radius_m * left), self.table.duty(right_rad_s * radius_m * right)
+        self.set_duty(*duties)
+
+    def set_duty(self, left: float, right: float) -> None:
+        """Give duties, -1..1, forward positive. Raises HardwareError, with the pins low, when a pin fails."""
+        self._angles = self._expected()
+        pins, moves = self._opened(), bool(left or right)
+        if self._failed and moves:  # a gate that ramps down must not bring the wheels up again
+            raise HardwareError("GPIO has failed; its pins stay low until it is told zero")
+        try:
+            wanted = list(zip(self._motors, (left, right), strict=True))
+            reversing = [motor.let_go(pins, duty) for motor, duty in wanted]
+            if any(reversing):
+                self._pause(_REVERSAL_PERIODS / self._config.pwm_hz)
+            self._enable(moves or self._enabled)
+            for motor, duty in wanted:
+                motor.drive(pins, duty)
+        except Exception as error:
+            self._failed = True
+            self._all_low()
+            raise HardwareError(f"GPIO: {error}; the pins are low, look at the wiring") from None
+        self._failed = False
+        self._expected_mps = self._speeds(left, right)
+
+    def wheels(self) -> WheelAngles | None:
+        """How far the wheels should have turned, by the table: an expectation. None if the configuration wants none."""
+        return self._expected() if self._config.odometry == "table" else None
+
+    def close(self) -> None:
+        """All pins low, then given back; idempotent."""
+        if self._pins is not None:
+            self._all_low()
+            self._pins.close()
+            self._pins = None
+
+    @property
+    def _shares(self) -> tuple[float, float]:
+        trim = self._config.trim
+        return 1 - max(0.0, trim), 1 - max(0.0, -trim)
+
+    def _speeds(self, left: float, right: float) -> tuple[float, float]:
+        """At the rims. A wheel that is trimmed is the quicker one: it turns as fast as the other with less."""
+        shares = self._shares
+        return self.table.speed(left) / shares[0], self.table.speed(right) / shares[1]
+
+    def _expected(self) -> WheelAngles:
+        now_us = _now_us()
+        seconds, radius_m = (now_us - self._angles.t_us) / 1e6, self._config.wheel_radius_m
+        left, right = (speed / radius_m * seconds for speed in self._expected_mps)
+        return WheelAngles(self._angles.left_rad + left, self._angles.right_rad + right, now_us)
+
+    def _opened(self) -> Pins:
+        if self._pins is None:
+            raise HardwareError("the GPIO drive is closed")
+        return self._pins
+
+    def _enable(self, wanted: bool) -> None:
+        if wanted != self._enabled:
+            self._opened().enable(wanted)
+            self._enabled = wanted
+
+    def _all_low(self) -> None:
+        """Each pin by itself: one that fails must not keep the others up."""
+        self._angles, self._expected_mps = self._expected(), (0.0, 0.0)
+        with suppress(Exception):
+            self._enable(False)
+        for motor in self._motors:
+            motor.low(self._pins)
+
+
+class _Motor:
+    """One motor's two pins, and what they were last told."""
+
+    def __init__(self, pins: tuple[int, ...], is_reversed: bool) -> None:
+        self._pins = (pins[1], pins[0]) if is_reversed else (pins[0], pins[1])
+        self._told = dict.fromkeys(pins, 0.0)
+
+    def let_go(self, pins: Pins, duty: float) -> bool:
+        """Put low what `duty` does not drive; whether a pin that was driven has to make way for the other one."""
+        idle = [self._pins[duty > 0]] if duty else [*self._pins]
+        was_driven = [self._write(pins, number, 0.0) for number in idle]
+        return any(was_driven) and duty != 0
+
+    def drive(self, pins: Pins, duty: float) -> None:
+        """Drive the pin of that direction; the other is low."""
+        if duty:
+            self._write(pins, self._pins[duty < 0], min(1.0, abs(duty)))
+
+    def low(self, pins: Pins | None) -> None:
+        """Both, whatever happens."""
+        for number in self._pins:
+            try:
+                if pins is not None:
+                    pins.write(number, 0.0)
+            except Exception:  # the others still have to go down
+                continue
+            self._told[number] = 0.0
+
+    def _write(self, pins: Pins, number: int, duty: float) -> bool:
+        if self._told[number] == duty:
+            return False
+        pins.write(number, duty)
+        self._told[number] = duty
+        return True
+
+
+def _rows(config: GpioDriveConfig) -> tuple[tuple[float, float], ...]:
+    path = config.table_file
+    if path is None:
+        return config.table
+    try:
+        return table_of(path.expanduser().read_text("utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        said = error.strerror if isinstance(error, OSError) else "is no text"
+        raise ConfigError(f"{path}: cannot be read: {said}; `sightline calibrate drive` writes one") from None
+
+
+def _now_us() -> int:
+    return time.monotonic_ns() // 1000

@@ -1,0 +1,80 @@
+"""Pins driven low and left so, by lgpio alone: for the end of a drive, and for after a driver that was killed. Shell.
+
+    python -m robot_side.hardware.gpio_low 10 9 8 7
+
+Needs neither gpiozero nor a configuration. The internal pull-down (about 50 kilohms) stays when the program has gone,
+where the kernel makes an input of a pin that nobody holds.
+"""
+
+import importlib
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+_CHIPS: Final = (0, 4)
+"""A Raspberry Pi 5 with an early kernel has its header on the chip 4, every other on 0."""
+_HEADER_LABEL: Final = "pinctrl-"
+
+
+def import_lgpio() -> Any:
+    """lgpio makes a pipe in the folder it is imported in, and fails where it may not: it gets a folder of its own."""
+    if "lgpio" in sys.modules or "LG_WD" in os.environ:
+        return importlib.import_module("lgpio")
+    here = Path.cwd()  # lgpio leaves it, and what is relative must stay so
+    with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
+        os.environ["LG_WD"] = folder
+        try:
+            return importlib.import_module("lgpio")
+        finally:
+            del os.environ["LG_WD"]
+            os.chdir(here)
+
+
+def leave_low(numbers: Sequence[int], chip: int | None = None) -> None:
+    """Make outputs of the pins, low and with a pull-down. Raises whatever lgpio raises; every pin is tried first."""
+    lgpio = import_lgpio()
+    handle = lgpio.gpiochip_open(chip) if chip is not None else _header(lgpio)
+    troubles: list[Exception] = []
+    try:
+        for number in numbers:
+            try:
+                lgpio.gpio_claim_output(handle, number, 0, lgpio.SET_PULL_DOWN)
+            except Exception as error:
+                troubles.append(error)
+    finally:
+        lgpio.gpiochip_close(handle)
+    if troubles:
+        raise troubles[0]
+
+
+def _header(lgpio: Any) -> Any:
+    """The chip that the pins of the header belong to."""
+    for chip in _CHIPS:
+        try:
+            handle = lgpio.gpiochip_open(chip)
+        except Exception:  # not there
+            continue
+        if str(lgpio.gpio_get_chip_info(handle)[3]).startswith(_HEADER_LABEL):
+            return handle
+        lgpio.gpiochip_close(handle)
+    raise RuntimeError("no GPIO here: this needs a Raspberry Pi and a user in the group gpio")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Exit 0, or 3 with one line."""
+    if not arguments or not all(text.isascii() and text.isdigit() and int(text) <= 27 for text in arguments):
+        print("error: name the BCM numbers of the pins, e.g. 10 9 8 7", file=sys.stderr)
+        return 2
+    try:
+        leave_low([int(text) for text in arguments])
+    except Exception as error:
+        print(f"error: pins {', '.join(arguments)}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 3
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
