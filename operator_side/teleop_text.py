@@ -1,0 +1,49 @@
+"""What `sightline teleop` shows: the keys once, and one line that follows the robot. Pure."""
+
+from typing import Final
+
+from operator_side.status_text import millis, twist_text
+from operator_side.teleop import Mode, Teleop
+from protocol.messages import Status
+
+KEYS: Final = """\
+      forward            hold a key to drive, let go to stop
+   u     i     o
+ turn j  k  l turn       k or space   stop
+   m     ,     .         q z  both speeds 10 % up, down
+       back              w x  linear only    e c  turning only
+                         a    hand over to vision; any of u i o j l m , . takes back
+Ctrl-C ends it. The first press arms the robot: make sure that it may move.
+"""
+
+
+def live_line(robot: str, teleop: Teleop, width: int) -> str:
+    """State, reason, who drives, speeds; cut to the terminal's width, so that it stays one line."""
+    if teleop.report is None:
+        text = f"{robot}: nothing heard yet"
+    else:
+        text = " | ".join(part for part in _parts(robot, teleop, teleop.report.status) if part)
+    return text if len(text) <= width else text[: max(0, width - 1)] + "…"
+
+
+def _parts(robot: str, teleop: Teleop, status: Status) -> list[str]:
+    """What matters most comes first: narrow terminals cut the rest."""
+    speeds = teleop.speeds
+    return [
+        f"{robot} {status.state}: {status.reason}",
+        "" if teleop.sees else "no picture yet, and a command must cite one: is its camera running?",
+        teleop.note,
+        _driver(teleop, status),
+        twist_text(status.applied),
+        f"up to {speeds.linear_mps:.2f} m/s {speeds.angular_rad_s:.2f} rad/s",
+        f"frame {millis(status.frame_age_us)}",
+    ]
+
+
+def _driver(teleop: Teleop, status: Status) -> str:
+    holder = status.holder
+    if holder is None:
+        return "nobody drives" if teleop.mode is not Mode.HANDING_OVER else Mode.HANDING_OVER.value
+    if holder.session == teleop.session:
+        return "you drive"
+    return f"{holder.source} drives"

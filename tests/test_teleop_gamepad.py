@@ -1,0 +1,81 @@
+"""The gamepad's shell: which device it takes, what it reads, and what is said when it is not there or goes."""
+
+import errno
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from operator_side.teleop_evdev import Gamepad
+from operator_side.teleop_pad import ABS_X, ABS_Y, BTN_EAST, BTN_SOUTH, BTN_TL, EV_ABS, EV_KEY, PadKey
+from protocol.errors import ConfigError, HardwareError
+
+
+class Device:
+    """As much of `evdev.InputDevice` as is used; `events` are given once, then it has gone."""
+
+    def __init__(self, path, keys=(BTN_SOUTH, BTN_TL), axes=(ABS_X, ABS_Y)):
+        self.path, self.name, self.fd = path, f"pad {path}", 7
+        self.closed, self.events = False, []
+        self._keys, self._axes = list(keys), [(code, SimpleNamespace(min=0, max=255)) for code in axes]
+
+    def capabilities(self, absinfo=False):
+        return {EV_KEY: self._keys, EV_ABS: self._axes if absinfo else [code for code, _ in self._axes]}
+
+    def read(self):
+        if self.events is None:
+            raise OSError(errno.ENODEV, "No such device")
+        if not self.events:
+            raise BlockingIOError
+        events, self.events = self.events, None
+        return [SimpleNamespace(type=kind, code=code, value=value) for kind, code, value in events]
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def plugged(monkeypatch):
+    """Plug devices in by path."""
+    devices = {}
+
+    def opened(path):
+        if path not in devices:
+            raise OSError(errno.EACCES, "Permission denied")
+        return devices[path]
+
+    monkeypatch.setitem(sys.modules, "evdev", SimpleNamespace(InputDevice=opened, list_devices=lambda: list(devices)))
+    return devices
+
+
+def test_auto_takes_the_first_that_is_a_gamepad_and_lets_go_of_the_others(plugged):
+    plugged["/dev/input/event1"] = mouse = Device("/dev/input/event1", keys=(), axes=())
+    plugged["/dev/input/event2"] = Device("/dev/input/event2")
+    assert Gamepad("auto").name == "pad /dev/input/event2"
+    assert mouse.closed
+
+
+def test_what_it_reads_is_the_pads_own_and_its_end_is_an_error(plugged):
+    plugged["a"] = device = Device("a")
+    gamepad = Gamepad("a")
+    assert gamepad.read() == [] and gamepad.fileno() == 7
+    device.events = [(EV_KEY, BTN_TL, 1), (EV_ABS, ABS_Y, 0), (EV_KEY, BTN_EAST, 0), (EV_KEY, BTN_EAST, 1)]
+    assert gamepad.read() == [PadKey.STOP] and gamepad.pad.shares is None
+    with pytest.raises(HardwareError, match="gamepad pad a: No such device; the robot was told to stand still"):
+        gamepad.read()
+
+
+@pytest.mark.parametrize(("path", "says"), [
+    ("auto", "no gamepad is found"), ("/dev/input/event9", "Permission denied; its user must be in the group input"),
+    ("keys", "has no stick; is it a gamepad?"),
+])  # fmt: skip
+def test_without_a_gamepad_it_is_one_line(plugged, path, says):
+    plugged["keys"] = Device("keys", keys=(), axes=(ABS_X,))
+    with pytest.raises(HardwareError, match=says):
+        Gamepad(path)
+
+
+def test_without_evdev_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "evdev", None)
+    with pytest.raises(ConfigError, match=r"evdev is not installed: pip install 'sightline\[gamepad\]'"):
+        Gamepad("auto")
