@@ -1,16 +1,21 @@
-"""Odometry against the simulated world's truth: straight, turning, and with unequal wheels. Shell (PyBullet)."""
+"""Odometry against the simulated world's truth: straight, turning, and with unequal wheels. Shell (PyBullet).
+
+Each robot drives at two thirds of its motors' speed, as its own robot.toml would count its wheels.
+"""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from protocol.messages import Twist
 from robot_side.kinematics import DiffDriveConfig, Odometer, wheel_speeds
-from sim.robot_model import RobotModel, load_robot
+from sim.robot_model import RobotModel, load_robot, robot_names
 from sim.scenario import Start, load_scenario
 from sim.world import STEP_US, World
 
 _TICK_STEPS = 5  # 50 Hz, as the driver reads its encoders
-DRIVE = DiffDriveConfig()
+_SHARE = 2 / 3
+_WAY_M, _TURNS = 10.0, 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,36 +27,52 @@ class OdometryError:
     bound_percent: float
 
 
-def measure_odometry() -> list[OdometryError]:
-    """Ten metres straight, ten turns in place, and the heading error of a 2 % mismatch over ten metres."""
-    way_m, miss_m, _, _ = _drive(load_robot("raspberry"), Twist(linear_mps=0.35, angular_rad_s=0.0), 10 / 0.35)
-    turn = Twist(linear_mps=0.0, angular_rad_s=2.0)
-    _, _, turned_rad, wrong_rad = _drive(load_robot("raspberry"), turn, 10 * math.tau / 2.0)
+def measure_odometry(robots: Sequence[str] = ()) -> list[OdometryError]:
+    """Ten metres straight, ten turns in place, and the heading error of a 2 % mismatch over ten metres, of each robot.
+
+    `robots` are names or .toml files; none: all that come with Sightline.
+    """
+    return [error for name in robots or robot_names() for error in _errors(load_robot(name))]
+
+
+def _errors(robot: RobotModel) -> list[OdometryError]:
+    rim_mps = _SHARE * robot.wheels.max_rad_s * robot.wheels.radius_m
+    ahead = Twist(linear_mps=rim_mps, angular_rad_s=0.0)
+    turn = Twist(linear_mps=0.0, angular_rad_s=2 * rim_mps / robot.wheels.track_m)
+    way_m, miss_m, _, _ = _drive(robot, ahead, _WAY_M / rim_mps)
+    _, _, turned_rad, wrong_rad = _drive(robot, turn, _TURNS * math.tau / turn.angular_rad_s)
     mismatch = 0.02
-    ahead = Twist(linear_mps=0.35, angular_rad_s=0.0)
-    way, _, _, bent_rad = _drive(_with_mismatch(mismatch), ahead, 10 / 0.35)
+    way, _, _, bent_rad = _drive(_with_mismatch(robot, mismatch), ahead, _WAY_M / rim_mps)
     # The left wheel drives mismatch x way further than the right one, across the track width.
-    predicted_rad = mismatch * way / DRIVE.track_width_m
+    predicted_rad = mismatch * way / robot.wheels.track_m
     return [
-        OdometryError("10 m straight", 100 * miss_m / way_m, 0.1),
-        OdometryError("ten turns in place", 100 * wrong_rad / turned_rad, 0.2),
-        OdometryError("2 % mismatch, off the prediction", 100 * abs(bent_rad / predicted_rad - 1), 1.0),
+        OdometryError(f"{robot.name}: 10 m straight", 100 * miss_m / way_m, 0.1),
+        OdometryError(f"{robot.name}: ten turns in place", 100 * wrong_rad / turned_rad, 0.2),
+        OdometryError(f"{robot.name}: 2 % mismatch, off the prediction", 100 * abs(bent_rad / predicted_rad - 1), 1.0),
     ]
 
 
-def _with_mismatch(mismatch: float) -> RobotModel:
-    robot = load_robot("raspberry")
+def _with_mismatch(robot: RobotModel, mismatch: float) -> RobotModel:
     return robot.model_copy(update={"wheels": robot.wheels.model_copy(update={"mismatch": mismatch})})
+
+
+def _wheels_of(robot: RobotModel) -> DiffDriveConfig:
+    """As its robot.toml has them, with all of its motors' speed."""
+    wheels = robot.wheels
+    return DiffDriveConfig(
+        wheel_radius_m=wheels.radius_m, track_width_m=wheels.track_m, max_wheel_rad_s=wheels.max_rad_s
+    )
 
 
 def _drive(robot: RobotModel, twist: Twist, seconds: float) -> tuple[float, float, float, float]:
     """(way, error of position, angle turned, error of heading): metres and radians, of truth."""
     far = Start(distance_m=(50.0, 50.0), bearing_deg=(180.0, 180.0), approach_deg=(0.0, 0.0))
     scenario = load_scenario("static").model_copy(update={"start": far})
-    odometer, way_m, turned_rad = Odometer(DRIVE), 0.0, 0.0
+    drive = _wheels_of(robot)
+    odometer, way_m, turned_rad = Odometer(drive), 0.0, 0.0
     with World(scenario, robot, 1) as world:
         begin = before = world.truth()
-        world.set_wheels(*wheel_speeds(DRIVE, twist))
+        world.set_wheels(*wheel_speeds(drive, twist))
         for _ in range(round(seconds * 1e6 / STEP_US / _TICK_STEPS)):
             odometer.update(world.wheel_angles())
             for _ in range(_TICK_STEPS):

@@ -63,13 +63,19 @@ def pipeline(*, as_json: Json = False) -> int:
     return _print_checks(checks, as_json)
 
 
-def odometry(*, as_json: Json = False) -> int:
-    """Dead reckoning against the simulated world's truth."""
+def odometry(
+    *,
+    robot_model: Annotated[
+        list[str] | None, typer.Option(help="Only this robot, a name or a .toml; may be given again [default: all].")
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Dead reckoning against the simulated world's truth, of every simulated robot."""
     with needs("sim"):
         from benchmarks.odometry import measure_odometry
     from operator_side.score import Check
 
-    errors = measure_odometry()
+    errors = measure_odometry(robot_model or ())
     checks = [Check(one.name, one.percent, "%", one.bound_percent, one.percent <= one.bound_percent) for one in errors]
     return _print_checks(checks, as_json)
 

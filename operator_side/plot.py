@@ -1,4 +1,4 @@
-"""trajectory.png: where robot and target went, and how bearing and distance kept. Shell (writes a file)."""
+"""trajectory.png: where robot and target went, and what the scenario is about over time. Shell (writes a file)."""
 
 import math
 from collections.abc import Sequence
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from operator_side.extras import needs
 from sim.scenario import Scenario, Wall
+from sim.things import Static
 from sim.truth import Truth
 
 if TYPE_CHECKING:
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.patches import Circle
 
 ROBOT_COLOUR, TARGET_COLOUR, WALL_COLOUR = "tab:blue", "goldenrod", "0.55"
+LIGHT_DRAWN_M = 0.06
 
 
 def plot_run(path: Path, samples: Sequence[Truth], scenario: Scenario, title: str) -> None:
@@ -26,8 +28,13 @@ def plot_run(path: Path, samples: Sequence[Truth], scenario: Scenario, title: st
     grid = figure.add_gridspec(2, 2, width_ratios=(1.1, 1))
     _plot_ways(figure.add_subplot(grid[:, 0]), samples, scenario)
     times_s = [(truth.t_us - samples[0].t_us) / 1e6 for truth in samples]
-    _plot_bearing(figure.add_subplot(grid[0, 1]), times_s, samples)
-    _plot_distance(figure.add_subplot(grid[1, 1]), times_s, samples, scenario.stand_off_m)
+    upper, lower = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
+    if scenario.goals_m or scenario.light:
+        _plot_speed(upper, times_s, samples)
+        (_plot_line if scenario.light else _plot_clearance)(lower, times_s, samples)
+    else:
+        _plot_bearing(upper, times_s, samples)
+        _plot_distance(lower, times_s, samples, scenario.stand_off_m)
     figure.suptitle(title)
     canvas.print_png(path)  # type: ignore[no-untyped-call]
 
@@ -46,6 +53,7 @@ def wall_corners(wall: Wall) -> list[tuple[float, float]]:
 def _plot_ways(axes: "Axes", samples: Sequence[Truth], scenario: Scenario) -> None:
     for wall in scenario.walls:
         axes.fill(*zip(*wall_corners(wall), strict=True), color=WALL_COLOUR)
+    _plot_things(axes, scenario)
     axes.plot([t.target_x_m for t in samples], [t.target_y_m for t in samples], color=TARGET_COLOUR, label="target")
     axes.plot([t.x_m for t in samples], [t.y_m for t in samples], color=ROBOT_COLOUR, label="robot")
     start, end = samples[0], samples[-1]
@@ -54,17 +62,30 @@ def _plot_ways(axes: "Axes", samples: Sequence[Truth], scenario: Scenario) -> No
         "", (end.x_m + 0.15 * math.cos(end.yaw_rad), end.y_m + 0.15 * math.sin(end.yaw_rad)), (end.x_m, end.y_m),
         arrowprops={"arrowstyle": "-|>", "color": ROBOT_COLOUR},
     )
-    radius_m = scenario.target.radius_m
-    axes.add_patch(_circle((end.target_x_m, end.target_y_m), radius_m))
+    if scenario.target.shape != "place":
+        axes.add_patch(_circle((end.target_x_m, end.target_y_m), scenario.target.reach_m, TARGET_COLOUR))
     axes.set(xlabel="x (m)", ylabel="y (m)", title="from above")
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(loc="best")
 
 
-def _circle(centre: tuple[float, float], radius_m: float) -> "Circle":
+def _plot_things(axes: "Axes", scenario: Scenario) -> None:
+    """What stands about, but for what the seed moved it by; waypoints; the light and its line."""
+    for thing in scenario.things:
+        if isinstance(thing, Static):
+            axes.add_patch(_circle(thing.at_m, thing.reach_m, WALL_COLOUR))
+    for x_m, y_m in scenario.goals_m:
+        axes.plot(x_m, y_m, "x", color=TARGET_COLOUR, markersize=12)
+    if scenario.light:
+        axes.add_patch(_circle(scenario.light.at_m, LIGHT_DRAWN_M, "black"))
+        line_x_m, line_y_m = scenario.light.ahead(scenario.light.line_m)
+        axes.plot([line_x_m, line_x_m], [line_y_m - 0.1, line_y_m + 0.9], color="black")
+
+
+def _circle(centre: tuple[float, float], radius_m: float, colour: str) -> "Circle":
     from matplotlib.patches import Circle
 
-    return Circle(centre, radius_m, color=TARGET_COLOUR)
+    return Circle(centre, radius_m, color=colour)
 
 
 def _plot_bearing(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
@@ -78,3 +99,26 @@ def _plot_distance(axes: "Axes", times_s: list[float], samples: Sequence[Truth],
     axes.plot(times_s, [truth.distance_m for truth in samples], color=ROBOT_COLOUR)
     axes.set(xlabel="time (s)", ylabel="distance (m)", title="distance, lens to the target's centre")
     axes.legend(loc="best")
+
+
+def _plot_speed(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
+    axes.plot(times_s, [truth.linear_mps for truth in samples], color=ROBOT_COLOUR)
+    axes.set(ylabel="speed (m/s)", title="speed")
+
+
+def _plot_clearance(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
+    axes.axhline(0.10, color="0.7", linewidth=1, label="demanded")
+    axes.plot(times_s, [truth.clearance_m or 0.0 for truth in samples], color=ROBOT_COLOUR)
+    axes.set(xlabel="time (s)", ylabel="clearance (m)", title="clearance, body to the nearest obstacle")
+    axes.legend(loc="best")
+
+
+def _plot_line(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
+    """How far the front is beyond the line, on the colour that is lit."""
+    axes.axhline(0.0, color="black", linewidth=1)
+    ways_m = [truth.past_line_m or 0.0 for truth in samples]
+    for colour, shown in (("red", "tab:red"), ("yellow", "gold"), ("green", "tab:green")):
+        lit = [truth.light == colour for truth in samples]
+        axes.fill_between(times_s, min(ways_m), max(ways_m), where=lit, color=shown, alpha=0.25, linewidth=0)
+    axes.plot(times_s, ways_m, color=ROBOT_COLOUR)
+    axes.set(xlabel="time (s)", ylabel="beyond the line (m)", title="the robot's front and the stop line")

@@ -2,8 +2,8 @@
 
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from statistics import median
 
 from sim.truth import Truth
@@ -26,15 +26,26 @@ class Score:
     lost_percent: float | None
     """Share of the time since acquisition in which the target was out of view."""
     wall_contacts: int
-    """Physics steps in contact with a wall, over the whole run."""
+    """Physics steps in contact with a wall or another thing in the way, over the whole run."""
     travelled_m: float
     """Way of the axle's midpoint, over the whole run."""
     seconds: float
+    unseen_percent: float = 0.0
+    """Share of the whole run in which the target was out of view."""
+    target_contacts: int = 0
+    """Physics steps in which the robot drove into the target, over the whole run."""
+    figures: Mapping[str, float | None] = field(default_factory=dict)
+    """What else this scenario is judged by; see `score_course.py`."""
+
+    def figure(self, name: str) -> float | None:
+        """One figure by its name, whichever kind it is."""
+        value: float | None = self.figures[name] if name in self.figures else getattr(self, name, None)
+        return value
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One demanded figure."""
+    """One demanded figure: at most `bound`, or at least, where the name begins so."""
 
     name: str
     value: float | None
@@ -43,7 +54,9 @@ class Check:
     ok: bool
 
 
-def score(samples: Sequence[Truth], stand_off_m: float) -> Score:
+def score(
+    samples: Sequence[Truth], stand_off_m: float, figures: Mapping[str, float | None] | None = None
+) -> Score:
     """Score evenly spaced samples. Raises ValueError for none at all."""
     if not samples:
         raise ValueError("a run without samples has no score")
@@ -60,6 +73,9 @@ def score(samples: Sequence[Truth], stand_off_m: float) -> Score:
         wall_contacts=samples[-1].wall_contacts - samples[0].wall_contacts,
         travelled_m=sum(math.dist((a.x_m, a.y_m), (b.x_m, b.y_m)) for a, b in itertools.pairwise(samples)),
         seconds=(samples[-1].t_us - start_us) / 1e6,
+        unseen_percent=100 * sum(not truth.visible for truth in samples) / len(samples),
+        target_contacts=samples[-1].target_contacts_by_robot - samples[0].target_contacts_by_robot,
+        figures=figures or {},
     )
 
 
@@ -76,45 +92,14 @@ def _rms(values: Sequence[float]) -> float | None:
     return math.sqrt(sum(value * value for value in values) / len(values)) if values else None
 
 
-# --- what is demanded --------------------------------------------------------------------------------------------
-
-UNITS = {
-    "acquired_s": "s", "found_s": "s", "bearing_rms_deg": "deg", "distance_rms_m": "m", "lost_percent": "%",
-    "wall_contacts": "steps", "travelled_m": "m",
-}
-STANDS_STILL_FROM_MS = 350
-"""With so much added latency no frame is young enough any more: the robot is to stand still, and that is judged."""
-BOUNDS: dict[str, dict[str, float]] = {
-    "static": {"acquired_s": 1.5, "bearing_rms_deg": 0.5, "distance_rms_m": 0.03},
-    "circle": {"bearing_rms_deg": 1.0, "distance_rms_m": 0.05},
-    "eight": {"bearing_rms_deg": 3.0, "lost_percent": 0.0},
-    "pushed": {"lost_percent": 0.0},
-    "behind": {"found_s": 5.0},
-    "walls": {},
-}
-"""For 0 to 200 ms added latency and 10 % loss on each leg. No contact with walls is demanded everywhere."""
-_EXACT = ("lost_percent", "wall_contacts")
-
-
-def judge(scenario: str, result: Score, latency_ms: float = 0.0, factor: float = 1.0) -> list[Check]:
-    """Hold `result` against the bounds of `scenario`, each times `factor` but for counts that must be zero."""
-    if latency_ms >= STANDS_STILL_FROM_MS:
-        return [_check("travelled_m", result, 0.05), _check("wall_contacts", result, 0.0)]
-    bounds = {**BOUNDS.get(scenario, {}), "wall_contacts": 0.0}
-    checks = [_check(name, result, bound if name in _EXACT else bound * factor) for name, bound in bounds.items()]
-    if not any(name.startswith(("found", "acquired")) for name in bounds):
-        checks.insert(0, Check("acquired_s", result.acquired_s, "s", result.seconds, result.acquired_s is not None))
-    return checks
-
-
-def _check(name: str, result: Score, bound: float) -> Check:
-    value: float | None = getattr(result, name)
-    return Check(name, value, UNITS[name], bound, value is not None and value <= bound)
-
-
 def median_and_worst(results: Sequence[Score], name: str) -> tuple[float | None, float | None]:
     """Median and worst of one figure over runs; None where a run has none, for then it is worst of all."""
-    values: list[float | None] = [getattr(result, name) for result in results]
+    values = [result.figure(name) for result in results]
     numbers = [value for value in values if value is not None]
-    worst = max(numbers) if numbers and len(numbers) == len(values) else None
-    return (median(numbers) if numbers else None), worst
+    worst = min if name.startswith(AT_LEAST) else max
+    whole = worst(numbers) if numbers and len(numbers) == len(values) else None
+    return (median(numbers) if numbers else None), whole
+
+
+AT_LEAST = "least_"
+"""A figure whose name begins so must not fall below its bound."""

@@ -10,11 +10,15 @@ from dataclasses import asdict, dataclass
 from itertools import groupby, product
 from typing import Any
 
-from operator_side.lockstep import Conditions, run_lockstep
-from operator_side.score import Check, Score, judge, median_and_worst, score
+from operator_side.lockstep import Conditions, Run, run_lockstep
+from operator_side.scenario_settings import robot_of, vision_config
+from operator_side.score import Check, Score, median_and_worst, score
+from operator_side.score_bounds import judge
+from operator_side.score_course import figures_of
 from protocol.errors import ConfigError
-from sim.robot_model import load_robot
-from sim.scenario import load_scenario
+from sim.look import look_named
+from sim.scenario import Scenario, load_scenario
+from vision_side.missions.choice import configured
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,11 +30,16 @@ class Case:
     loss: float
     seed: int
     seconds: float | None
+    mission: str | None = None
+    """In place of the scenario's own, as the robot is; and the look."""
+    robot: str | None = None
+    look: str | None = None
 
     @property
     def group(self) -> str:
         """What it shares with the runs of other seeds."""
-        return f"{self.scenario} +{self.latency_ms:g} ms {self.loss:.0%} loss"
+        others = "".join(f" {one}" for one in (self.mission, self.robot, self.look) if one)
+        return f"{self.scenario}{others} +{self.latency_ms:g} ms {self.loss:.0%} loss"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,27 +82,37 @@ class ScoreReport:
 
 def cases(
     scenarios: Sequence[str], seeds: Sequence[int], latencies_ms: Sequence[float], losses: Sequence[float],
-    seconds: float | None,
+    seconds: float | None, *, mission: str | None = None, robot: str | None = None, look: str | None = None,
 ) -> list[Case]:
-    """Every combination, those of one group together. Raises ConfigError for a scenario or number that is none."""
+    """Every combination, those of one group together. Raises ConfigError for a name or number that is none."""
     for name in scenarios:
-        load_scenario(name)
+        scenario = load_scenario(name)
+        configured(vision_config(scenario, robot_of(scenario, robot), 0, mission))
+    if look is not None:
+        look_named(look)
     if not seeds or any(not 0 <= seed < 2**32 for seed in seeds):
         raise ConfigError("--seeds needs whole numbers from 0, e.g. --seeds 101,102,103")
     if any(not 0 <= one <= 10_000 for one in latencies_ms) or any(not 0 <= one < 1 for one in losses):
         raise ConfigError("--latency-ms is 0 to 10000 and --loss 0 to below 1, e.g. --latency-ms 0,50 --loss 0.1")
     return [
-        Case(name, latency_ms, loss, seed, seconds)
+        Case(name, latency_ms, loss, seed, seconds, mission, robot, look)
         for name, latency_ms, loss, seed in product(scenarios, latencies_ms, losses, seeds)
     ]
 
 
 def run_case(case: Case) -> Score:
     """One run in lockstep, scored."""
+    scenario, run = run_of(case)
+    return score(run.samples, scenario.stand_off_m, figures_of(scenario, run.samples, run.said))
+
+
+def run_of(case: Case) -> tuple[Scenario, Run]:
+    """The run itself, and the scenario as it was run."""
     scenario = load_scenario(case.scenario)
-    conditions = Conditions(case.latency_ms, case.loss)
-    run = run_lockstep(scenario, load_robot("raspberry"), case.seed, conditions, case.seconds)
-    return score(run.samples, scenario.stand_off_m)
+    if case.look is not None:
+        scenario = scenario.model_copy(update={"look": look_named(case.look)})
+    model, conditions = robot_of(scenario, case.robot), Conditions(case.latency_ms, case.loss)
+    return scenario, run_lockstep(scenario, model, case.seed, conditions, case.seconds, mission=case.mission)
 
 
 def run_cases(wanted: Sequence[Case], jobs: int, on_done: Callable[[Case], None]) -> ScoreReport:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from operator_side.plot import wall_corners
 from sim.scenario import Scenario
+from sim.things import Static
 from sim.truth import Truth
 
 Image = NDArray[np.uint8]
@@ -25,7 +26,7 @@ class TopView:
 
     def __init__(self, samples: Sequence[Truth], scenario: Scenario, size_px: int) -> None:
         """Raises ValueError for no samples."""
-        self._samples, self._radius_m, self._size_px = samples, scenario.target.radius_m, size_px
+        self._samples, self._radius_m, self._size_px = samples, scenario.target.reach_m, size_px
         corners = [corner for wall in scenario.walls for corner in wall_corners(wall)]
         xs = [x for t in samples for x in (t.x_m, t.target_x_m)] + [x for x, _ in corners]
         ys = [y for t in samples for y in (t.y_m, t.target_y_m)] + [y for _, y in corners]
@@ -37,6 +38,9 @@ class TopView:
         for wall in scenario.walls:
             outline = np.array([self._at(*corner) for corner in wall_corners(wall)], np.int32)
             cv2.fillPoly(self._paper, [outline], _WALL, cv2.LINE_AA, _SHIFT)
+        for thing in scenario.things:
+            if isinstance(thing, Static):
+                self._disc(self._paper, thing.at_m, thing.reach_m, _WALL)
 
     def draw(self, index: int) -> Image:
         """The picture at sample `index`, which never goes back."""

@@ -1,16 +1,57 @@
-"""The robot's body as URDF text. Pure.
+"""The robot's body as URDF text: written from its TOML, or its own file's. Pure.
 
-The root link is the axle's midpoint on the floor, so that its pose is the robot's pose. Wheels whose radii differ are
-hung so that both touch the floor and the plate stays level.
+The root link of a written one is the axle's midpoint on the floor, so that its pose is the robot's pose. Wheels whose
+radii differ are hung so that both touch the floor and the plate stays level.
 """
 
-from sim.robot_model import RobotModel
+from dataclasses import dataclass
+from pathlib import Path
 
-LEFT_JOINT, RIGHT_JOINT, CASTER_JOINT = 0, 1, 2
+from sim.frames import Frame
+from sim.robot_model import Caster, Chassis, RobotModel
+from sim.urdf import Outline, Urdf
+from sim.xacro import urdf_text
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """What PyBullet is to load, and what it must know of it."""
+
+    text: str
+    joints: tuple[str, str] = ("left", "right")
+    signs: tuple[float, float] = (1.0, 1.0)
+    """-1 where the joint's positive turn rolls the wheel backwards."""
+    foot: Frame | None = None
+    """The axle's midpoint on the floor, seen from the root link; None where it is the root link."""
+
+
+def body_of(robot: RobotModel) -> Body:
+    """The body of `robot`. Raises ConfigError for a URDF that has gone or changed since."""
+    if not robot.urdf:
+        return Body(urdf(robot))
+    file, wheels = Urdf(urdf_text(Path(robot.urdf)), robot.urdf), robot.wheels
+    left, right = file.wheels(wheels.left_joint, wheels.right_joint, robot.front)
+    return Body(
+        file.text(left.joint, right.joint, wheels.mismatch), (left.joint, right.joint), (left.sign, right.sign),
+        file.foot(left.joint, right.joint, robot.front),
+    )
+
+
+def outline(robot: RobotModel) -> Outline:
+    """How far `robot` reaches over the floor, from its axle's midpoint."""
+    wheels = robot.wheels
+    if robot.urdf:
+        file = Urdf(urdf_text(Path(robot.urdf)), robot.urdf)
+        return file.outline(file.foot(wheels.left_joint, wheels.right_joint, robot.front))
+    plate = _plate(robot)
+    return Outline(
+        max(plate.x_m + plate.length_m / 2, wheels.radius_m), max(plate.length_m / 2 - plate.x_m, wheels.radius_m),
+        max(plate.width_m / 2, wheels.track_m / 2 + wheels.width_m / 2),
+    )
 
 
 def urdf(robot: RobotModel) -> str:
-    """The body; links in the order of the joint numbers above."""
+    """The body written from its TOML."""
     wheels = robot.wheels
     left_m = wheels.radius_m * (1 + wheels.mismatch / 2)
     right_m = wheels.radius_m * (1 - wheels.mismatch / 2)
@@ -25,7 +66,7 @@ def urdf(robot: RobotModel) -> str:
 
 
 def _chassis(robot: RobotModel) -> str:
-    plate = robot.chassis
+    plate = _plate(robot)
     moments = _box_moments(plate.mass_kg, plate.length_m, plate.width_m, 2 * plate.mass_z_m)
     shape = (
         f'<origin xyz="{plate.x_m} 0 {plate.z_m}"/>'
@@ -52,13 +93,24 @@ def _wheel(name: str, radius_m: float, y_m: float, robot: RobotModel) -> str:
 
 
 def _caster(robot: RobotModel) -> str:
-    radius_m = robot.caster.radius_m
+    caster = _ball(robot)
+    radius_m = caster.radius_m
     shape = f'<geometry><sphere radius="{radius_m}"/></geometry>'
     inertial = _inertial(0.01, (1e-6, 1e-6, 1e-6), "0 0 0")
     return (
         f'<link name="caster">{inertial}<visual>{shape}</visual><collision>{shape}</collision></link>'
-        + _joint("caster", "fixed", f"{robot.caster.x_m} 0 {radius_m}")
+        + _joint("caster", "fixed", f"{caster.x_m} 0 {radius_m}")
     )
+
+
+def _plate(robot: RobotModel) -> Chassis:
+    assert robot.chassis is not None, "a robot without a urdf has a chassis: its model sees to that"
+    return robot.chassis
+
+
+def _ball(robot: RobotModel) -> Caster:
+    assert robot.caster is not None, "a robot without a urdf has a caster: its model sees to that"
+    return robot.caster
 
 
 def _joint(child: str, kind: str, place: str) -> str:

@@ -116,6 +116,12 @@ def _projection(model: CameraModel) -> list[float]:
     return matrix
 
 
+def _fading(saturation: float) -> Matrix:
+    """What brings red, green and blue nearer to their brightness, or further from it."""
+    weights = np.array([0.299, 0.587, 0.114])  # of brightness, as JPEG has them
+    return np.asarray(saturation * np.eye(3) + (1 - saturation) * weights)
+
+
 class Defects:
     """Exposure, white balance, blur, noise, JPEG: what stands between a scene and what arrives."""
 
@@ -125,6 +131,7 @@ class Defects:
         self._size = (height_px, width_px)
         steps = np.arange(256)[:, None] * look.exposure * np.array(look.white_balance)
         self._table = np.clip(np.rint(steps), 0, 255).astype(np.uint8).reshape(1, 256, 3)
+        self._fade = _fading(look.saturation) if look.saturation != 1.0 else None
         self._is_neutral = look.exposure == 1.0 and look.white_balance == (1.0, 1.0, 1.0)
         pool = (height_px + NOISE_MARGIN_PX, width_px + NOISE_MARGIN_PX, 3)
         self._pool = np.rint(self._draw.normal(0.0, look.noise, pool)).astype(np.int16) if look.noise else None
@@ -132,6 +139,8 @@ class Defects:
     def jpeg(self, picture: Picture, quality_percent: int = 100, scale_percent: int = 100) -> bytes:
         """`picture` (RGB, changed in place) as the JPEG that the camera gives."""
         look = self._look
+        if self._fade is not None:
+            cv2.transform(picture, self._fade, picture)
         if not self._is_neutral:
             cv2.LUT(picture, self._table, picture)
         if look.blur_px:

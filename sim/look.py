@@ -20,6 +20,8 @@ class Look(Config):
 
     exposure: Gain = 1.0
     """Brightness factor; above 1 the bright parts burn out."""
+    saturation: Annotated[float, Field(ge=0, le=2)] = 1.0
+    """Colourfulness: 0 is a grey picture."""
     white_balance: tuple[Gain, Gain, Gain] = (1.0, 1.0, 1.0)
     """Factors on red, green, blue."""
     blur_px: Annotated[float, Field(ge=0, le=10)] = 0.0

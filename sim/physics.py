@@ -9,10 +9,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from sim.body import CASTER_JOINT, LEFT_JOINT, RIGHT_JOINT, urdf
+from protocol.errors import ConfigError
+from sim.body import Body, body_of
 from sim.engine import pybullet
+from sim.frames import Frame
+from sim.path import Place
 from sim.robot_model import RobotModel
-from sim.scenario import Ball, Pushed, Wall
+from sim.scenario import Wall
 
 FLOOR, ROBOT, TARGET, WALL = 1, 2, 4, 8
 """Collision groups; rays choose by them what they may hit."""
@@ -45,7 +48,7 @@ def add_floor(client: int) -> int:
     shape = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
     floor = int(pybullet.createMultiBody(0, shape, _unseen(client), physicsClientId=client))
     pybullet.changeDynamics(floor, -1, lateralFriction=1.0, restitution=0.0, physicsClientId=client)
-    _group(client, floor, FLOOR, ROBOT | TARGET)
+    group(client, floor, FLOOR, ROBOT | TARGET)
     return floor
 
 
@@ -58,96 +61,98 @@ def add_wall(client: int, wall: Wall) -> int:
     middle = [(x0 + x1) / 2, (y0 + y1) / 2, half[2]]
     body = int(pybullet.createMultiBody(0, shape, _unseen(client), middle, turn, physicsClientId=client))
     # FLOOR too, though the two never meet: PyBullet gives every ray group 1, and a body must admit that to be hit.
-    _group(client, body, WALL, FLOOR | ROBOT | TARGET)
+    group(client, body, WALL, FLOOR | ROBOT | TARGET)
     return body
 
 
-def add_ball(client: int, ball: Ball, place: Vector) -> int:
-    """The target; only a pushed one has a mass."""
-    shape = pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=ball.radius_m, physicsClientId=client)
-    normals, triangles = round_mesh()
-    visual = pybullet.createVisualShape(
-        pybullet.GEOM_MESH, vertices=normals, indices=triangles, normals=normals, meshScale=[ball.radius_m] * 3,
-        rgbaColor=[*ball.colour, 1], specularColor=[0, 0, 0], physicsClientId=client,
-    )
-    mass_kg = ball.mass_kg if isinstance(ball, Pushed) else 0.0
-    body = int(pybullet.createMultiBody(mass_kg, shape, visual, place, physicsClientId=client))
-    drag = ball.drag if isinstance(ball, Pushed) else 0.0
-    pybullet.changeDynamics(
-        body, -1, lateralFriction=0.8, restitution=0.0, linearDamping=drag, angularDamping=drag, physicsClientId=client
-    )
-    _group(client, body, TARGET, FLOOR | ROBOT | WALL)
-    return body
-
-
-def round_mesh(rings: int = 24, sides: int = 48) -> tuple[list[Vector], list[int]]:
-    """A unit ball's points and triangles; PyBullet's own is so coarse that it looks 2.5 % too small."""
-    points: list[Vector] = []
-    triangles: list[int] = []
-    for ring in range(rings + 1):
-        polar_rad = math.pi * ring / rings
-        for side in range(sides):
-            around_rad = math.tau * side / sides
-            across = math.sin(polar_rad)
-            points.append((across * math.cos(around_rad), across * math.sin(around_rad), math.cos(polar_rad)))
-            here, beside = ring * sides + side, ring * sides + (side + 1) % sides
-            if ring < rings:
-                triangles += [here, here + sides, beside, beside, here + sides, beside + sides]
-    return points, triangles
-
-
-def add_robot(client: int, robot: RobotModel, place: Vector, yaw_rad: float) -> int:
-    """The robot with its axle's midpoint at `place`, motors off."""
-    with tempfile.NamedTemporaryFile("w", suffix=".urdf", delete=False) as file:
-        file.write(urdf(robot))
-    try:
-        body = int(pybullet.loadURDF(
-            file.name, place, pybullet.getQuaternionFromEuler([0, 0, yaw_rad]),
-            flags=pybullet.URDF_USE_IMPLICIT_CYLINDER | pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client,
-        ))
-    finally:
-        Path(file.name).unlink()
-    for link in (-1, LEFT_JOINT, RIGHT_JOINT, CASTER_JOINT):
-        friction = robot.wheels.friction if link in (LEFT_JOINT, RIGHT_JOINT) else 0.0
+def add_robot(client: int, robot: RobotModel, at: Place) -> "RobotBody":
+    """The robot with its axle's midpoint at `at`, motors off. Raises ConfigError for a URDF that PyBullet refuses."""
+    body = body_of(robot)
+    loaded = _load(client, robot, body, at)
+    moving = {
+        str(pybullet.getJointInfo(loaded, joint, physicsClientId=client)[1], "utf-8"): joint
+        for joint in range(pybullet.getNumJoints(loaded, physicsClientId=client))
+    }
+    wheels = [moving[name] for name in body.joints]
+    for link in (-1, *moving.values()):
+        friction = robot.wheels.friction if link in wheels else 0.0
         pybullet.changeDynamics(
-            body, link, lateralFriction=friction, spinningFriction=0, rollingFriction=0, restitution=0,
+            loaded, link, lateralFriction=friction, spinningFriction=0, rollingFriction=0, restitution=0,
             linearDamping=0, angularDamping=0, jointDamping=0, physicsClientId=client,
         )
-    _group(client, body, ROBOT, FLOOR | TARGET | WALL)
-    return body
+    if robot.urdf:
+        _loosen(client, loaded, [joint for joint in moving.values() if joint not in wheels])
+    group(client, loaded, ROBOT, FLOOR | TARGET | WALL)
+    return RobotBody(client, loaded, wheels, body, robot.wheels.max_torque_nm)
 
 
-def _group(client: int, body: int, group: int, meets: int) -> None:
+def _load(client: int, robot: RobotModel, body: Body, at: Place) -> int:
+    """PyBullet reads files only."""
+    place, turn = (at.x_m, at.y_m, 0.0), pybullet.getQuaternionFromEuler([0, 0, at.heading_rad])
+    if body.foot is not None:
+        place, turn = pybullet.multiplyTransforms(place, turn, *_as_bullet(body.foot.inverse()))
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf", delete=False) as file:
+        file.write(body.text)
+    try:
+        return int(pybullet.loadURDF(
+            file.name, place, turn,
+            flags=pybullet.URDF_USE_IMPLICIT_CYLINDER | pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client,
+        ))
+    except pybullet.error:
+        raise ConfigError(f"{robot.urdf}: PyBullet cannot load it; check its links with `check_urdf`") from None
+    finally:
+        Path(file.name).unlink()
+
+
+def _loosen(client: int, body: int, joints: list[int]) -> None:
+    """A user's casters and levers: PyBullet brakes every joint until it is told not to. And none of it is drawn."""
+    for joint in joints:
+        pybullet.setJointMotorControl2(body, joint, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=client)
+    for link in range(-1, pybullet.getNumJoints(body, physicsClientId=client)):
+        pybullet.changeVisualShape(body, link, rgbaColor=[0, 0, 0, 0], physicsClientId=client)
+
+
+def _as_bullet(frame: Frame) -> tuple[Vector, tuple[float, float, float, float]]:
+    """A level frame as position and quaternion."""
+    return frame.at, pybullet.getQuaternionFromEuler([0, 0, frame.yaw_rad])
+
+
+def group(client: int, body: int, own: int, meets: int) -> None:
+    """Put a body, all its links, into a collision group."""
     links = pybullet.getNumJoints(body, physicsClientId=client)
     for link in range(-1, links):
-        pybullet.setCollisionFilterGroupMask(body, link, group, meets, physicsClientId=client)
+        pybullet.setCollisionFilterGroupMask(body, link, own, meets, physicsClientId=client)
 
 
 class RobotBody:
     """The robot's pose, speed and wheels in one client."""
 
-    def __init__(self, client: int, body: int, max_torque_nm: float) -> None:
+    def __init__(self, client: int, body: int, wheels: list[int], drawn: Body, max_torque_nm: float) -> None:
         self.body = body
         self._client = client
+        self._wheels, self._signs = wheels, drawn.signs
         self._torques = [max_torque_nm, max_torque_nm]
         self._driven: tuple[float, float] | None = None
         info = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)
         self._from_mass = pybullet.invertTransform(info[3], info[4])
+        if drawn.foot is not None:
+            self._from_mass = pybullet.multiplyTransforms(*self._from_mass, *_as_bullet(drawn.foot))
 
     def drive(self, left_rad_s: float, right_rad_s: float) -> None:
         """Let the wheels' motors strive for these speeds."""
         if self._driven == (left_rad_s, right_rad_s):
             return
         self._driven = (left_rad_s, right_rad_s)
+        speeds = [speed * sign for speed, sign in zip(self._driven, self._signs, strict=True)]
         pybullet.setJointMotorControlArray(
-            self.body, [LEFT_JOINT, RIGHT_JOINT], pybullet.VELOCITY_CONTROL, targetVelocities=self._driven,
-            forces=self._torques, physicsClientId=self._client,
+            self.body, self._wheels, pybullet.VELOCITY_CONTROL, targetVelocities=speeds, forces=self._torques,
+            physicsClientId=self._client,
         )
 
     def wheel_angles(self) -> tuple[float, float]:
         """How far each wheel has rolled, rad."""
-        left, right = pybullet.getJointStates(self.body, [LEFT_JOINT, RIGHT_JOINT], physicsClientId=self._client)
-        return float(left[0]), float(right[0])
+        left, right = pybullet.getJointStates(self.body, self._wheels, physicsClientId=self._client)
+        return float(left[0]) * self._signs[0], float(right[0]) * self._signs[1]
 
     def pose(self) -> tuple[Vector, Any]:
         """Axle midpoint on the floor and orientation (quaternion x, y, z, w)."""

@@ -1,23 +1,29 @@
 """What a simulated robot is made of: the models behind `robots/*.toml`. Pure.
 
-Lengths are metres from the axle's midpoint on the floor: x forward, y left, z up.
+Lengths are metres from the axle's midpoint on the floor: x forward, y left, z up. The body is either written in the
+TOML (`chassis`, `caster`) or drawn in a URDF that it names, whose wheels and sensors it then only names too.
 """
 
 import math
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
 from protocol.config import Config
+from protocol.errors import ConfigError
 from protocol.messages import CameraModel
+from sim.frames import Frame
 from sim.toml_file import check, find, names_in, read_table
+from sim.urdf import Front, Urdf
+from sim.xacro import urdf_text
 
 ROBOTS = Path(__file__).parent / "robots"
 
 Length = Annotated[float, Field(gt=0, le=2)]
 Place = Annotated[float, Field(ge=-2, le=2)]
 Mass = Annotated[float, Field(gt=0, le=100)]
+Degrees = Annotated[float, Field(ge=-360, le=360)]
 
 
 class Wheels(Config):
@@ -26,9 +32,9 @@ class Wheels(Config):
     radius_m: Length
     track_m: Length
     """Distance between the two wheels' points of contact."""
-    width_m: Length
-    mass_kg: Mass
-    friction: Annotated[float, Field(ge=0, le=5)]
+    width_m: Length = 0.005
+    mass_kg: Mass = 0.05
+    friction: Annotated[float, Field(ge=0, le=5)] = 1.0
     max_rad_s: Annotated[float, Field(gt=0, le=200)]
     max_accel_mps2: Annotated[float, Field(gt=0, le=100)]
     """At the rim."""
@@ -41,6 +47,9 @@ class Wheels(Config):
     """Left radius less right radius, as a fraction of `radius_m`."""
     slip: Annotated[float, Field(ge=0, le=0.4)] = 0.0
     """Mean fraction of a wheel's turning that does not become motion; drawn every 0.1 s between 0 and twice this."""
+    left_joint: str = ""
+    right_joint: str = ""
+    """The wheels' joints, where the body is a URDF's; radius and track are then measured in it."""
 
 
 class Chassis(Config):
@@ -68,6 +77,8 @@ class Caster(Config):
 class Eye(Config):
     """The camera: where the lens is, what it sees. Straight ahead, no distortion."""
 
+    link: str = ""
+    """Of a URDF: where the lens is, in place of `x_m` and `z_m`."""
     x_m: Place
     z_m: Length
     hfov_deg: Annotated[float, Field(ge=20, le=150)]
@@ -84,35 +95,75 @@ class Eye(Config):
         )
 
 
-class LidarModel(Config):
-    """A lidar that looks all around, first ray straight back, counter-clockwise."""
+class RangeEye(Config):
+    """One of several small range sensors whose echoes are merged into one scan."""
 
+    link: str = ""
+    x_m: Place
+    y_m: Place
+    facing_deg: Degrees
+    span_deg: Annotated[float, Field(gt=0, le=360)]
+    rays: Annotated[int, Field(ge=1, le=3600)]
+    reach_m: Annotated[float, Field(gt=0, le=100)]
+
+
+class LidarModel(Config):
+    """The range sensor: a lidar over an arc, or several small sensors (`eyes`) merged into one scan.
+
+    Rays are evenly spaced from `first_deg` to `last_deg`, counter-clockwise, both ends included; a whole turn leaves
+    out its last, which is its first. With `eyes`, each echo is put where it is seen from (`x_m`, 0) and the nearest in
+    each ray's place counts; what no eye sees is inf, as free space is.
+    """
+
+    link: str = ""
     x_m: Place
     z_m: Length
-    rays: Annotated[int, Field(ge=4, le=3600)]
+    first_deg: Degrees = -180.0
+    last_deg: Degrees = 180.0
+    rays: Annotated[int, Field(ge=2, le=3600)]
     range_min_m: Length
     range_max_m: Annotated[float, Field(gt=0, le=100)]
     rate_hz: Annotated[float, Field(gt=0, le=50)]
     noise_m: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Standard deviation of each range."""
+    eyes: Annotated[tuple[RangeEye, ...], Field(max_length=16)] = ()
 
     @model_validator(mode="after")
     def _sees_something(self) -> Self:
         if self.range_min_m >= self.range_max_m:
             raise ValueError("range_min_m must be below range_max_m")
+        if not 0 < self.last_deg - self.first_deg <= 360:
+            raise ValueError("first_deg must be below last_deg, by at most 360")
         return self
+
+    @property
+    def increment_rad(self) -> float:
+        """From one ray to the next."""
+        span_rad = math.radians(self.last_deg - self.first_deg)
+        return span_rad / (self.rays if self.last_deg - self.first_deg == 360 else self.rays - 1)
 
 
 class RobotModel(Config):
-    """One robot."""
+    """One robot. `settings` is what a person would write into this robot's robot.toml."""
 
     name: str
     summary: str = ""
+    urdf: str = ""
+    """A URDF or xacro file beside the TOML, in place of `chassis` and `caster`."""
+    front: Front = "+x"
+    """Which way the URDF's root link drives."""
     wheels: Wheels
-    chassis: Chassis
-    caster: Caster
+    chassis: Chassis | None = None
+    caster: Caster | None = None
     camera: Eye
     lidar: LidarModel
+    settings: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _has_one_body(self) -> Self:
+        if bool(self.urdf) == bool(self.chassis and self.caster) or (self.urdf and (self.chassis or self.caster)):
+            raise ValueError("a body is either a urdf, or a chassis and a caster")
+        return self
 
 
 def robot_names() -> list[str]:
@@ -123,4 +174,43 @@ def robot_names() -> list[str]:
 def load_robot(name: str) -> RobotModel:
     """A robot by its name, or by the path of a `.toml` file. Raises ConfigError with the nearest name."""
     path = find("robot", name, ROBOTS)
-    return check(RobotModel, {"name": path.stem, **read_table(path)}, path)
+    table = {"name": path.stem, **read_table(path, ROBOTS)}
+    if table.get("urdf"):
+        _measure(table, path)
+    return check(RobotModel, table, path)
+
+
+def _measure(table: dict[str, Any], path: Path) -> None:
+    """Fill in what the URDF says of wheels and sensors. Raises ConfigError."""
+    file = path.parent / str(table["urdf"])
+    table["urdf"] = str(file)
+    wheels = _table(table, "wheels", path)
+    joints = [wheels.get(name) for name in ("left_joint", "right_joint")]
+    if not all(isinstance(joint, str) and joint for joint in joints):
+        raise ConfigError(f"{path}: a robot with a urdf names its wheels: [wheels] left_joint and right_joint")
+    front: Front = "-x" if table.get("front") == "-x" else "+x"
+    body = Urdf(urdf_text(file), str(file))
+    left, right = body.wheels(str(joints[0]), str(joints[1]), front)
+    wheels |= {"radius_m": left.radius_m, "track_m": left.place[1] - right.place[1]}
+    foot = body.foot(str(joints[0]), str(joints[1]), front)
+    lidar = _table(table, "lidar", path)
+    eyes = lidar.get("eyes", [])
+    for sensor in (_table(table, "camera", path), lidar, *(one for one in eyes if isinstance(one, dict))):
+        if sensor.get("link"):
+            _mount(sensor, body.place(str(sensor["link"]), foot), sensor in eyes)
+
+
+def _table(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
+    found = table.get(name)
+    if not isinstance(found, dict):
+        raise ConfigError(f"{path}: has no table [{name}]; see sim/robots/raspberry.toml for what it holds")
+    return found
+
+
+def _mount(sensor: dict[str, Any], where: Frame, is_eye: bool) -> None:
+    """Put a sensor where its link is; an eye, which lies in the scan's plane, faces as its link does."""
+    sensor["x_m"] = where.at[0]
+    if is_eye:
+        sensor |= {"y_m": where.at[1], "facing_deg": math.degrees(where.yaw_rad)}
+    else:
+        sensor["z_m"] = where.at[2]

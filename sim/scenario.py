@@ -2,97 +2,42 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from protocol.config import Config
+from sim.light import Light
 from sim.look import Look, look_named
-from sim.path import ClosedPath, Leg, Place
+from sim.things import Amounts, Colour, Forced, Moving, OnPath, Point, Pushed, Span, Standing, Static
 from sim.toml_file import check, find, names_in, read_table
+
+__all__ = ["Forced", "OnPath", "Pushed", "Scenario", "Start", "Static", "Wall", "load_scenario", "scenario_names"]
 
 SCENARIOS = Path(__file__).parent / "scenarios"
 
-Metres = Annotated[float, Field(ge=-100, le=100)]
-Degrees = Annotated[float, Field(ge=-360, le=360)]
-Unit = Annotated[float, Field(ge=0, le=1)]
-Colour = tuple[Unit, Unit, Unit]
-"""Red, green, blue."""
-Point = tuple[Metres, Metres]
+class Start(Config):
+    """Where the robot begins, the seed draws within each span: seen from its lens and from the target, or on the map.
+    """
 
-
-def _ordered(span: tuple[float, float]) -> tuple[float, float]:
-    if span[0] > span[1]:
-        raise ValueError(f"lowest first: [{span[1]}, {span[0]}]")
-    return span
-
-
-Span = Annotated[tuple[Degrees, Degrees], AfterValidator(_ordered)]
-"""(lowest, highest); the seed draws between them."""
-Amount = Annotated[float, Field(ge=0, le=100)]
-Amounts = Annotated[tuple[Amount, Amount], AfterValidator(_ordered)]
-"""A span of what cannot be negative."""
-
-
-class Ball(Config):
-    """What every target is: a ball on the floor."""
-
-    radius_m: Annotated[float, Field(gt=0, le=1)] = 0.10
-    colour: Colour = (0.95, 0.78, 0.05)
-
-
-class Static(Ball):
-    """Does not move; nothing can move it."""
-
-    kind: Literal["static"]
-    at_m: Point = (0.0, 0.0)
-
-
-class OnPath(Ball):
-    """Moves along a closed path at constant speed; nothing can stop it."""
-
-    kind: Literal["path"]
-    start_m: Point = (0.0, 0.0)
-    heading_deg: Degrees = 0.0
-    path: Annotated[tuple[Leg, ...], Field(min_length=1, max_length=64)]
-    speed_mps: Annotated[float, Field(ge=0, le=5)]
-    phase: Amounts = (0.0, 1.0)
-    """Where on the path it begins, as a fraction of a lap."""
+    distance_m: Amounts = (0.0, 0.0)
+    """Lens to the target's middle."""
+    bearing_deg: Span = (0.0, 0.0)
+    """Of the target, left positive; beyond 90 it is behind the robot."""
+    approach_deg: Span = (180.0, 180.0)
+    """Direction from the target to the lens, from the target's heading; 180 = the robot follows it."""
+    at_m: Point | None = None
+    """On the map: where the axle's midpoint begins; then only this and the two below count."""
+    heading_deg: Span = (0.0, 0.0)
+    jitter_m: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """By how much the seed moves `at_m` along each axis."""
 
     @model_validator(mode="after")
-    def _closes(self) -> Self:
-        self.closed_path()
+    def _says_where(self) -> Self:
+        seen_from = {"distance_m", "bearing_deg", "approach_deg"}
+        if self.at_m is None and not seen_from <= self.model_fields_set:
+            raise ValueError("a start is either at_m, or distance_m, bearing_deg and approach_deg")
         return self
-
-    def closed_path(self) -> ClosedPath:
-        """The path itself."""
-        return ClosedPath(Place(*self.start_m, math.radians(self.heading_deg)), self.path)
-
-
-class Pushed(Ball):
-    """A real ball that rolls where seeded pushes send it, and can be bumped."""
-
-    kind: Literal["pushed"]
-    at_m: Point = (0.0, 0.0)
-    mass_kg: Annotated[float, Field(gt=0, le=100)] = 0.3
-    drag: Annotated[float, Field(ge=0, le=1)] = 0.3
-    """Fraction of its speed that rolling loses each second."""
-    push_every_s: Amounts = (2.0, 4.0)
-    push_mps: Amounts = (0.15, 0.3)
-    """Speed that a push gives a resting ball."""
-    arena_m: Annotated[float, Field(gt=0, le=100)] = 1.5
-    """Pushes aim at random points within this radius of `at_m`, so that it stays about."""
-
-
-class Start(Config):
-    """Where the robot begins, seen from its lens and from the target; the seed draws within each span."""
-
-    distance_m: Amounts
-    """Lens to the ball's centre."""
-    bearing_deg: Span
-    """Of the ball, left positive; beyond 90 it is behind the robot."""
-    approach_deg: Span
-    """Direction from the ball to the lens, from the ball's heading; 180 = the robot follows it."""
 
 
 class Wall(Config):
@@ -112,16 +57,30 @@ class Wall(Config):
 
 
 class Scenario(Config):
-    """One scenario. `stand_off_m` is what both the steering and the score go by: lens to the ball's centre."""
+    """One scenario. `stand_off_m` is what both the steering and the score go by: lens to the target's middle.
+
+    `robot`, `mission` and `vision` (keys of vision.toml) are what a person would choose for it.
+    """
 
     name: str
     summary: str = ""
     seconds: Annotated[float, Field(gt=0, le=3600)] = 20.0
     stand_off_m: Annotated[float, Field(gt=0, le=20)] = 0.8
+    robot: Annotated[str, Field(min_length=1)] = "raspberry"
+    mission: Annotated[str, Field(min_length=1)] = "follow"
+    vision: dict[str, Any] = Field(default_factory=dict)
     look: Look
-    target: Annotated[Static | OnPath | Pushed, Field(discriminator="kind")]
+    target: Moving
     start: Start
     walls: Annotated[tuple[Wall, ...], Field(max_length=64)] = ()
+    things: Annotated[tuple[Standing, ...], Field(max_length=64)] = ()
+    light: Light | None = None
+    goals_m: Annotated[tuple[Point, ...], Field(max_length=64)] = ()
+    """Waypoints on the map, in order, for a robot that is sent to them."""
+    reachable: bool = True
+    """Whether there is a way to the last of them."""
+    labels: Literal["", "legs"] = ""
+    """What the simulation itself labels in each picture, for a vision whose detector is `boxes`."""
 
 
 def scenario_names() -> list[str]:
@@ -132,7 +91,7 @@ def scenario_names() -> list[str]:
 def load_scenario(name: str) -> Scenario:
     """A scenario by its name, or by the path of a `.toml` file. Raises ConfigError with the nearest name."""
     path = find("scenario", name, SCENARIOS)
-    table = read_table(path)
+    table = read_table(path, SCENARIOS)
     look = table.get("look", "plain")
     if isinstance(look, str):
         table["look"] = look_named(look)

@@ -18,6 +18,8 @@ from pydantic import Field
 from protocol.codec import encode
 from protocol.errors import ConfigError
 from sim.bus import CAMERA, MOTION, MOTION_ANGLES, PICTURE_HEAD, RANGE, RANGE_HEAD, TRUTH, SimSocketConfig, Simulated
+from sim.cadence import Cadence
+from sim.label_bus import to_json
 from sim.motor_port import MotorPort
 from sim.robot_model import load_robot
 from sim.scenario import load_scenario
@@ -36,27 +38,13 @@ class SimConfig(SimSocketConfig):
 
     scenario: Annotated[str, Field(min_length=1)] = "circle"
     """A name (`sim/scenarios/`) or the path of a `.toml` file."""
-    robot: Annotated[str, Field(min_length=1)] = "raspberry"
-    """A name (`sim/robots/`) or the path of a `.toml` file."""
+    robot: str = ""
+    """A name (`sim/robots/`) or the path of a `.toml` file; empty for the one that the scenario names."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     motor_log: str | None = None
     """CSV of every motor command, stamped on receipt."""
     seconds: Annotated[float, Field(gt=0)] | None = None
     """End by itself after this long."""
-
-
-class Cadence:
-    """Says when something periodic is due, on average exactly at its rate."""
-
-    def __init__(self, period_us: float) -> None:
-        self._period_us = period_us
-        self._count = 0
-
-    def due(self, now_us: int) -> bool:
-        """Whether it is due at `now_us`; each period answers once."""
-        count = int(now_us / self._period_us)
-        is_due, self._count = count > self._count, count
-        return is_due
 
 
 class Simulation:
@@ -76,7 +64,8 @@ class Simulation:
 
     def _hellos(self) -> dict[str, bytes]:
         config = self._config
-        about = Simulated(scenario=config.scenario, robot=config.robot, seed=config.seed, pid=os.getpid())
+        robot = config.robot or self._world.scenario.robot
+        about = Simulated(scenario=config.scenario, robot=robot, seed=config.seed, pid=os.getpid())
         return {CAMERA: encode(self._world.camera_model), TRUTH: about.model_dump_json().encode()}
 
     def run(self) -> None:
@@ -111,13 +100,20 @@ class Simulation:
             angles = self._world.wheel_angles()
             self._clients.send(MOTION, MOTION_ANGLES.pack(angles.left_rad, angles.right_rad, t_us))
         if self._frames.due(now_us):
-            for wanted in self._clients.wanted_pictures():  # one, unless cameras differ in what they ask
-                self._clients.send_picture(wanted, PICTURE_HEAD.pack(t_us, wanted[1]) + self._world.render(*wanted))
+            self._draw(t_us)
         if self._scans.due(now_us) and self._clients.has(RANGE):
             self._clients.send(RANGE, self._scan(t_us))
         if self._truth.due(now_us) and self._clients.has(TRUTH):
             truth = replace(self._world.truth(), t_us=t_us, lag_us=self._lag_us)
             self._clients.send(TRUTH, truth.to_json())
+
+    def _draw(self, t_us: int) -> None:
+        """A picture for each way in which one is wanted: one, unless cameras differ in what they ask."""
+        asked = self._clients.wanted_pictures()
+        if asked and self._world.scenario.labels and self._clients.has(TRUTH):
+            self._clients.send(TRUTH, to_json(self._world.labels(), t_us))
+        for wanted in asked:
+            self._clients.send_picture(wanted, PICTURE_HEAD.pack(t_us, wanted[1]) + self._world.render(*wanted))
 
     def _scan(self, t_us: int) -> bytes:
         scan = self._world.scan()
@@ -136,23 +132,24 @@ def run(config: SimConfig) -> int:
     Prints one line that begins with `simulation ready` once everything accepts. Raises ConfigError for an unknown
     scenario or robot, a `socket_dir` in use, a missing extra.
     """
-    scenario, robot = load_scenario(config.scenario), load_robot(config.robot)
+    scenario = load_scenario(config.scenario)
+    robot = load_robot(config.robot or scenario.robot)
     folder = Folder(config.socket_dir)
     try:
         with _world_class()(scenario, robot, config.seed) as world:
-            _simulate(Simulation(config, world, folder), config)
+            _simulate(Simulation(config, world, folder), config, robot.name)
     finally:
         folder.close()
     return 0
 
 
-def _simulate(simulation: Simulation, config: SimConfig) -> None:
+def _simulate(simulation: Simulation, config: SimConfig, robot: str) -> None:
     def stop(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  the signature is Python's
         simulation.stopping = True
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        print(f"simulation ready: {config.scenario}, {config.robot}, seed {config.seed}, in {config.socket_dir}",
+        print(f"simulation ready: {config.scenario}, {robot}, seed {config.seed}, in {config.socket_dir}",
               flush=True)
         simulation.run()
     finally:

@@ -1,4 +1,4 @@
-"""What moves the ball: nothing, a path, or pushes. Shell (PyBullet); reads no clock."""
+"""What moves a thing: nothing, a path, pushes, or one constant force. Shell (PyBullet); reads no clock."""
 
 import math
 from typing import Protocol
@@ -8,43 +8,46 @@ import numpy as np
 from sim.engine import pybullet
 from sim.path import Place
 from sim.physics import Vector
-from sim.scenario import OnPath, Pushed, Static
+from sim.start import target_phase, thing_phase, thing_place
+from sim.thing_bodies import ThingBodies
+from sim.things import Forced, OnPath, Pushed, Static
 
 PUSH_S = 0.4
 SOLID_BALL = 1.4  # a rolling solid ball resists a push at its centre as 7/5 of its mass would
 
 
 class Mover(Protocol):
-    """Moves the ball before each physics step."""
+    """Moves a thing before each physics step."""
 
-    def move(self, body: int, now_us: int) -> None: ...
+    def move(self, bodies: ThingBodies, now_us: int) -> None: ...
 
 
 class Still:
     """Leaves it where it is."""
 
-    def move(self, body: int, now_us: int) -> None:
+    def move(self, bodies: ThingBodies, now_us: int) -> None:
         """Nothing."""
 
 
 class PathMover:
-    """Carries the ball along its path."""
+    """Carries it along its path."""
 
-    def __init__(self, client: int, target: OnPath, phase: float) -> None:
-        self._client, self._target = client, target
-        self._path = target.closed_path()
+    def __init__(self, thing: OnPath, phase: float) -> None:
+        self._thing = thing
+        self._path = thing.closed_path()
         self._begin_m = phase * self._path.length_m
 
-    def place(self, now_us: int) -> Place:
-        """Where the ball is at `now_us`."""
-        return self._path.at(self._begin_m + self._target.speed_mps * now_us / 1e6)
+    def way_m(self, now_us: int) -> float:
+        """How far along its path it is at `now_us`."""
+        return self._begin_m + self._thing.speed_mps * now_us / 1e6
 
-    def move(self, body: int, now_us: int) -> None:
+    def place(self, now_us: int) -> Place:
+        """Where it is at `now_us`."""
+        return self._path.at(self.way_m(now_us))
+
+    def move(self, bodies: ThingBodies, now_us: int) -> None:
         """Put it there."""
-        place = self.place(now_us)
-        pybullet.resetBasePositionAndOrientation(
-            body, (place.x_m, place.y_m, self._target.radius_m), (0, 0, 0, 1), physicsClientId=self._client
-        )
+        bodies.put(self.place(now_us), self.way_m(now_us))
 
 
 class Pusher:
@@ -56,14 +59,14 @@ class Pusher:
         self._begin_us = round(self._draw.uniform(0.5, 1.5) * 1e6)
         self._force: Vector | None = None
 
-    def move(self, body: int, now_us: int) -> None:
+    def move(self, bodies: ThingBodies, now_us: int) -> None:
         """Push while a push lasts."""
         if now_us < self._begin_us:
             return
-        place, _ = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+        place = bodies.middle
         if self._force is None:
             self._force = self._force_from(place)
-        pybullet.applyExternalForce(body, -1, self._force, place, pybullet.WORLD_FRAME, physicsClientId=self._client)
+        _push(self._client, bodies, self._force)
         if now_us >= self._begin_us + PUSH_S * 1e6:
             self._begin_us = now_us + round(self._draw.uniform(*self._target.push_every_s) * 1e6)
             self._force = None
@@ -78,12 +81,44 @@ class Pusher:
         return (force_n * aim_x / far_m, force_n * aim_y / far_m, 0.0)
 
 
-def begin(client: int, target: Static | OnPath | Pushed, seed: int) -> tuple[Mover, Place]:
-    """What moves `target`, and where it begins."""
+class Force:
+    """Pushes the ball the same way for ever."""
+
+    def __init__(self, client: int, target: Forced) -> None:
+        self._client, self._from_us = client, target.from_s * 1e6
+        heading_rad = math.radians(target.heading_deg)
+        self._force: Vector = (target.force_n * math.cos(heading_rad), target.force_n * math.sin(heading_rad), 0.0)
+
+    def move(self, bodies: ThingBodies, now_us: int) -> None:
+        """Push."""
+        if now_us >= self._from_us:
+            _push(self._client, bodies, self._force)
+
+
+def _push(client: int, bodies: ThingBodies, force: Vector) -> None:
+    pybullet.applyExternalForce(
+        bodies.bodies[0], -1, force, bodies.middle, pybullet.WORLD_FRAME, physicsClientId=client
+    )
+
+
+def begin(client: int, target: Static | OnPath | Pushed | Forced, seed: int) -> tuple[Mover, Place, float]:
+    """What moves the target, where it begins, and how far it has come on its path by then."""
     if isinstance(target, OnPath):
-        phase = float(np.random.default_rng([seed, 1]).uniform(*target.phase))
-        mover = PathMover(client, target, phase)
-        return mover, mover.place(0)
+        return _on_path(target, target_phase(target, seed))
     if isinstance(target, Pushed):
-        return Pusher(client, target, seed), Place(*target.at_m, 0.0)
-    return Still(), Place(*target.at_m, 0.0)
+        return Pusher(client, target, seed), Place(*target.at_m, 0.0), 0.0
+    if isinstance(target, Forced):
+        return Force(client, target), Place(*target.at_m, math.radians(target.heading_deg)), 0.0
+    return Still(), thing_place(target, 0, seed), 0.0
+
+
+def begin_thing(thing: Static | OnPath, number: int, seed: int) -> tuple[Mover, Place, float]:
+    """The same for whatever else there is."""
+    if isinstance(thing, OnPath):
+        return _on_path(thing, thing_phase(thing, number, seed))
+    return Still(), thing_place(thing, number, seed), 0.0
+
+
+def _on_path(thing: OnPath, phase: float) -> tuple[Mover, Place, float]:
+    mover = PathMover(thing, phase)
+    return mover, mover.place(0), mover.way_m(0)

@@ -35,12 +35,41 @@ def _nearest(name: str, folder: Path) -> str:
     return f", did you mean {near[0]!r}?" if near else ""
 
 
-def read_table(path: Path) -> dict[str, Any]:
-    """The file as a table. Raises ConfigError naming the file and the line that is no TOML."""
+def read_table(path: Path, folder: Path | None = None) -> dict[str, Any]:
+    """The file as a table, laid over the one of `folder` that it `extends`, if it says so.
+
+    Raises ConfigError naming the file and the line that is no TOML.
+    """
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        table = tomllib.loads(path.read_text("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise ConfigError(f"{path}: cannot be read as TOML: {error}") from None
+    return _extended(table, path, folder) if folder and "extends" in table else table
+
+
+def _extended(table: dict[str, Any], path: Path, folder: Path) -> dict[str, Any]:
+    """Only a file that comes with Sightline is extended, and it extends none itself: two files to read, no more."""
+    name = str(table.pop("extends"))
+    if name not in names_in(folder) or name == path.stem:
+        raise ConfigError(f"{path}: extends: nothing is called {name!r}{_nearest(name, folder)}")
+    under = read_table(folder / f"{name}.toml")
+    if "extends" in under:
+        raise ConfigError(f"{path}: extends {name!r}, which extends another; extend {under['extends']!r} itself")
+    return laid_over(under, table)
+
+
+def laid_over(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """`over` on `under`: tables of one kind are merged, anything else is replaced, and `{}` takes a table away."""
+    merged = dict(under)
+    for name, value in over.items():
+        merged[name] = laid_over(under[name], value) if _is_more_of(under.get(name), value) else value
+    return merged
+
+
+def _is_more_of(under: Any, over: Any) -> bool:
+    """Whether a table adds to another; with another `kind` it means another thing, of which nothing is kept."""
+    both = isinstance(under, dict) and isinstance(over, dict) and bool(over)
+    return both and over.get("kind", under.get("kind")) == under.get("kind")
 
 
 def check(model: type[Model], table: dict[str, Any], path: Path) -> Model:

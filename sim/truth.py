@@ -21,17 +21,23 @@ class Truth:
     target_y_m: float
     target_z_m: float
     bearing_rad: float
-    """Of the ball's centre from the camera's axis, left positive."""
+    """Of the target's middle from the camera's axis, left positive."""
     distance_m: float
-    """Lens to the ball's centre, in the horizontal plane."""
+    """Lens to the target's middle, in the horizontal plane."""
     visible: bool
-    """The ball's centre is within the camera's width and no wall hides it."""
+    """The target's middle is within the camera's width and no wall hides it."""
     wall_contacts: int
-    """Physics steps so far in which the robot touched a wall."""
+    """Physics steps so far in which the robot touched a wall or another thing in its way."""
     target_contacts: int
-    """Physics steps so far in which the robot touched the ball."""
+    """Physics steps so far in which the robot touched the target."""
     target_contacts_by_robot: int
-    """Those of them in which the robot moved towards the ball faster than the ball towards it."""
+    """Those of them in which the robot moved towards the target faster than the target towards it."""
+    clearance_m: float | None = None
+    """From the robot's body to the nearest obstacle, at most 1; only where it is sent to waypoints."""
+    light: str = ""
+    """What the traffic light shows, if there is one."""
+    past_line_m: float | None = None
+    """How far the robot's front is beyond the light's stop line, negative before it."""
     lag_us: int = 0
     """How far the simulation is behind the clock; 0 in lockstep."""
 

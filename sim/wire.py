@@ -60,6 +60,7 @@ class Counts:
 
     taken: int = 0
     delivered: int = 0
+    delivered_bytes: int = 0
     delayed: int = 0
     lost: int = 0
     cut: int = 0
@@ -144,6 +145,7 @@ class Leg:
                 self.counts.cut += 1
             else:
                 self.counts.delivered += 1
+                self.counts.delivered_bytes += len(packet)
                 yield packet
 
     @property

@@ -56,6 +56,12 @@ def namespaces(*names: str) -> Iterator[None]:
             _ip("netns", "del", name)
 
 
+def move_address(namespace: str, old: str, new: str) -> None:
+    """Another address for this end of the wire, as a router gives one after a while."""
+    _ip("-n", namespace, "addr", "del", f"{old}/24", "dev", DEVICE)
+    _ip("-n", namespace, "addr", "add", f"{new}/24", "dev", DEVICE)
+
+
 def _ip(*arguments: str) -> None:
     done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
     if done.returncode:

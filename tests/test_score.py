@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from operator_side.score import judge, median_and_worst, score
+from operator_side.score import median_and_worst, score
+from operator_side.score_bounds import judge
 from sim.truth import Truth
 
 

@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import ConfigError
+from sim.cadence import Cadence
 from sim.look import look_named
 from sim.motors import Motor
 from sim.path import ClosedPath, Leg, Place
 from sim.robot_model import load_robot, robot_names
 from sim.scenario import OnPath, load_scenario, scenario_names
-from sim.service import Cadence
 
 STEP_S = 0.004
 

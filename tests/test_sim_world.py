@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("pybullet")
 
+from sim.robot_model import load_robot
 from sim.scenario import Start, Wall, load_scenario, scenario_names
 from sim.world import STEP_US, World
 from tests.sim_rig import RADIUS_M, TRACK_M, DeadReckoning, empty, robot_with, seen_at
@@ -111,11 +112,32 @@ def test_a_stop_from_half_a_metre_per_second_takes_what_the_limits_say():
         assert abs(after.linear_mps) < 0.001
 
 
-@pytest.mark.parametrize("name", scenario_names())
+SEEN = [name for name in scenario_names() if load_scenario(name).start.at_m is None]
+ON_THE_MAP = [name for name in scenario_names() if name not in SEEN]
+
+
+@pytest.mark.parametrize("name", ON_THE_MAP)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_run_begins_where_the_map_says_and_rests(name, seed):
+    scenario = load_scenario(name)
+    start = scenario.start
+    with World(scenario, load_robot(scenario.robot), seed) as world:
+        truth = world.truth()
+        assert max(abs(truth.x_m - start.at_m[0]), abs(truth.y_m - start.at_m[1])) <= start.jitter_m + 1e-6
+        low, high = start.heading_deg
+        assert low - 1e-6 <= math.degrees(truth.yaw_rad) <= high + 1e-6
+        for _ in range(250):
+            world.step()
+        after = world.truth()
+        assert math.hypot(after.x_m - truth.x_m, after.y_m - truth.y_m) < 1e-3
+        assert after.contacts == 0
+
+
+@pytest.mark.parametrize("name", SEEN)
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_run_begins_as_the_scenario_says_and_rests(name, seed):
     scenario = load_scenario(name)
-    with World(scenario, robot_with(), seed) as world:
+    with World(scenario, load_robot(scenario.robot), seed) as world:
         truth = world.truth()
         low, high = scenario.start.distance_m
         assert low - 1e-6 <= truth.distance_m <= high + 1e-6

@@ -1,0 +1,74 @@
+"""Publishes the simulation's labels as boxes of a robot's frames, as a detector elsewhere would. Shell.
+
+It looks at no picture: the simulation says what is in each, by the time it was captured at.
+"""
+
+import secrets
+from collections.abc import Callable
+
+from operator_side.labels import SOURCE, boxes_message
+from protocol.channels import CAMERA, DETECTIONS, FRAME
+from protocol.codec import decode
+from protocol.errors import WireError
+from protocol.messages import CameraModel, FrameHeader
+from protocol.transports.link import LatestSlot, Link, Message
+from protocol.transports.opening import open_link
+from sim.label_bus import LabelReader
+
+_WAIT_S = 0.03
+"""For a frame; then it takes in what the simulation said meanwhile."""
+
+
+def run(robot: str, connect: list[str], secure: str, socket_dir: str, say: Callable[[str], None]) -> int:
+    """Publish until interrupted. Raises HardwareError when the simulation is gone, LinkError as `open_link` does."""
+    labels = LabelReader(socket_dir)
+    with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
+        publisher = LabelPublisher(link, labels)
+        say(f"labels: boxes of robot {robot}'s frames go to detections/{SOURCE}")
+        try:
+            while True:
+                publisher.step()
+        except KeyboardInterrupt:
+            return 0
+        finally:
+            labels.close()
+
+
+class LabelPublisher:
+    """One robot's frames in, their boxes out: the newest frame only."""
+
+    def __init__(self, link: Link, labels: LabelReader) -> None:
+        self._link, self._labels = link, labels
+        self._frames: LatestSlot[Message] = link.latest(FRAME)
+        self._cameras: LatestSlot[Message] = link.latest(CAMERA)
+        self._camera: CameraModel | None = None
+        self._session = secrets.token_hex(4)
+        self._seq = 0
+
+    def step(self) -> None:
+        """The next frame's boxes, if one comes soon."""
+        frame = self._frames.take(_WAIT_S)
+        self._labels.drain()
+        camera = self._cameras.take()
+        if camera is not None:
+            self._camera = self._decoded_camera(camera) or self._camera
+        if frame is not None and self._camera is not None:
+            self._publish(frame, self._camera)
+
+    def _publish(self, frame: Message, camera: CameraModel) -> None:
+        try:
+            header = decode(FrameHeader, frame.header)
+        except WireError:
+            return
+        boxes = self._labels.of(header.t_us)
+        if boxes is not None:
+            stamp, payload = boxes_message(header, boxes, camera, self._session, self._seq)
+            self._link.publish(DETECTIONS, stamp, payload)
+            self._seq += 1
+
+    @staticmethod
+    def _decoded_camera(message: Message) -> CameraModel | None:
+        try:
+            return decode(CameraModel, message.payload, CAMERA.max_payload_bytes)
+        except WireError:
+            return None

@@ -1,0 +1,63 @@
+"""Where the robot and whatever else may vary begin: drawn from the seed. Pure (NumPy's seeded generators)."""
+
+import math
+
+import numpy as np
+
+from sim.light import Light
+from sim.path import Place
+from sim.scenario import Scenario, Start
+from sim.things import OnPath, Static
+
+# Each draw has a stream of its own, so that one more thing in a scenario moves nothing else.
+_PATH, _START, _THING_PATH, _JITTER, _LIGHT = 1, 2, 7, 8, 9
+
+
+def target_phase(target: OnPath, seed: int) -> float:
+    """Where on its path the target begins, as a fraction."""
+    return float(np.random.default_rng([seed, _PATH]).uniform(*target.phase))
+
+
+def thing_phase(thing: OnPath, number: int, seed: int) -> float:
+    """The same for the thing of that number."""
+    return float(np.random.default_rng([seed, _THING_PATH, number]).uniform(*thing.phase))
+
+
+def thing_place(thing: Static, number: int, seed: int) -> Place:
+    """Where a thing that does not move stands."""
+    x_m, y_m = thing.at_m
+    if thing.jitter_m:
+        moved = np.random.default_rng([seed, _JITTER, number]).uniform(-thing.jitter_m, thing.jitter_m, 2)
+        x_m, y_m = x_m + float(moved[0]), y_m + float(moved[1])
+    return Place(x_m, y_m, math.radians(thing.heading_deg))
+
+
+def light_begin(light: Light, seed: int) -> float:
+    """Where in its cycle the light begins, as a fraction."""
+    return float(np.random.default_rng([seed, _LIGHT]).uniform(*light.begin))
+
+
+def robot_start(start: Start, target: Place, lens_x_m: float, seed: int) -> Place:
+    """Where the axle's midpoint begins: on the map, or so that the lens sees the target as `start` says."""
+    draw = np.random.default_rng([seed, _START])
+    if start.at_m is not None:
+        moved = draw.uniform(-start.jitter_m, start.jitter_m, 2)
+        heading_rad = math.radians(draw.uniform(*start.heading_deg))
+        return Place(start.at_m[0] + float(moved[0]), start.at_m[1] + float(moved[1]), heading_rad)
+    distance_m = float(draw.uniform(*start.distance_m))
+    bearing_rad = math.radians(draw.uniform(*start.bearing_deg))
+    from_ball_rad = target.heading_rad + math.radians(draw.uniform(*start.approach_deg))
+    yaw_rad = math.remainder(from_ball_rad + math.pi - bearing_rad, math.tau)
+    return Place(
+        target.x_m + distance_m * math.cos(from_ball_rad) - lens_x_m * math.cos(yaw_rad),
+        target.y_m + distance_m * math.sin(from_ball_rad) - lens_x_m * math.sin(yaw_rad),
+        yaw_rad,
+    )
+
+
+def goals_seen(scenario: Scenario, seed: int) -> list[tuple[float, float]]:
+    """The scenario's waypoints as the robot counts, from where it starts: x ahead, y left."""
+    at = robot_start(scenario.start, Place(0.0, 0.0, 0.0), 0.0, seed)
+    cos, sin = math.cos(at.heading_rad), math.sin(at.heading_rad)
+    aways = [(x_m - at.x_m, y_m - at.y_m) for x_m, y_m in scenario.goals_m]
+    return [(x_m * cos + y_m * sin, y_m * cos - x_m * sin) for x_m, y_m in aways]

@@ -1,0 +1,298 @@
+"""A robot's URDF, read and checked: where wheels and sensors are, how far the body reaches. Pure.
+
+Everything is told about the axle's midpoint on the floor, x forward, whatever frame the file was drawn in. A file that
+cannot be a two-wheeled robot is refused with one line that names the link or joint and the fix.
+"""
+
+import difflib
+import math
+from collections.abc import Iterable, Iterator
+from copy import deepcopy
+from itertools import product
+from typing import Literal, NamedTuple
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from protocol.errors import ConfigError
+from sim.frames import Frame, Vector, frame
+
+Front = Literal["+x", "-x"]
+
+_NUMBERS = {
+    "xyz": 3, "rpy": 3, "size": 3, "value": 1, "radius": 1, "length": 1,
+    "ixx": 1, "iyy": 1, "izz": 1, "ixy": 1, "ixz": 1, "iyz": 1,
+}
+_PLACED_WITHIN_M = 0.001
+_ACROSS = 0.999  # cosine: a URDF that writes a quarter turn as 1.57 is meant to be square
+_RIM = 0.03  # of the track width: so narrow a rim turns within 0.1 % of what the joints' distance says
+_REST = 0.97  # of the radius
+_FEATHER = (
+    '<inertial><mass value="0.001"/><inertia ixx="1e-6" iyy="1e-6" izz="1e-6" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+
+
+class Wheel(NamedTuple):
+    """One driven wheel: `sign` is -1 where the joint's positive turn rolls backwards."""
+
+    joint: str
+    place: Vector
+    radius_m: float
+    sign: float
+
+
+class Outline(NamedTuple):
+    """How far the body's collision shapes reach from the axle's midpoint, over the floor."""
+
+    front_m: float
+    rear_m: float
+    half_width_m: float
+
+
+class Urdf:
+    """One file's robot. Raises ConfigError for what cannot be one."""
+
+    def __init__(self, text: str, name: str) -> None:
+        self._name = name
+        self._root = self._parsed(text)
+        self._links = {link.get("name", ""): link for link in self._root.findall("link")}
+        self._joints = {joint.get("name", ""): joint for joint in self._root.findall("joint")}
+        self._check_numbers()
+        self._check_bodies()
+        self._frames = self._link_frames()
+
+    # --- what a robot asks of it -------------------------------------------------------------------------------------
+
+    def foot(self, left_joint: str, right_joint: str, front: Front) -> Frame:
+        """The axle's midpoint on the floor, x forward, seen from the root link."""
+        left, right = self._wheel_place(left_joint), self._wheel_place(right_joint)
+        radius_m = self._wheel_radius(left_joint)
+        middle = ((left[0] + right[0]) / 2, (left[1] + right[1]) / 2, (left[2] + right[2]) / 2 - radius_m)
+        return frame(middle, yaw_rad=math.pi if front == "-x" else 0.0)
+
+    def wheels(self, left_joint: str, right_joint: str, front: Front) -> tuple[Wheel, Wheel]:
+        """Left and right, about the axle's midpoint on the floor."""
+        seen_from = self.foot(left_joint, right_joint, front).inverse()
+        left, right = self._wheel(left_joint, seen_from), self._wheel(right_joint, seen_from)
+        if left.place[1] <= right.place[1]:
+            raise self._wrong(f"{left_joint!r} is not left of {right_joint!r}; swap the two, or turn `front`")
+        uneven_m = max(abs(left.place[0]), abs(left.place[1] + right.place[1]), abs(left.radius_m - right.radius_m))
+        if uneven_m > _PLACED_WITHIN_M:
+            raise self._wrong(
+                f"{left_joint!r} and {right_joint!r} are no pair: give them one radius, one x and opposite y"
+            )
+        return left, right
+
+    def place(self, link: str, foot: Frame) -> Frame:
+        """Where a link is, about the axle's midpoint on the floor."""
+        if link not in self._links:
+            raise self._wrong(f"has no link {link!r}{_nearest(link, self._links)}")
+        return foot.inverse().of(self._frames[link])
+
+    def outline(self, foot: Frame) -> Outline:
+        """Of all collision shapes, wheels included."""
+        back = foot.inverse()
+        corners = [
+            back.of(self._frames[name]).of(_origin(shape)).point(corner)
+            for name, link in self._links.items() for shape in link.iter("collision") for corner in _corners(shape)
+        ]
+        if not corners:
+            raise self._wrong("has no collision shape; give the body a <collision> so that it can touch things")
+        return Outline(
+            max(x for x, _, _ in corners), -min(x for x, _, _ in corners), max(abs(y) for _, y, _ in corners)
+        )
+
+    def text(self, left_joint: str, right_joint: str, mismatch: float) -> str:
+        """The file as PyBullet shall have it: a feather's mass for links without one, radii off by `mismatch`.
+
+        Wheels roll on a narrow rim: a wide one scrubs, and the robot turns 1 % short. Nothing is drawn, since
+        the lens may lie within its housing.
+        """
+        root = ElementTree.fromstring(ElementTree.tostring(self._root))
+        for link in root.findall("link"):
+            for visual in link.findall("visual"):
+                link.remove(visual)
+            if link.find("inertial") is None:
+                link.append(ElementTree.fromstring(_FEATHER))
+        left, right = self._wheel_place(left_joint), self._wheel_place(right_joint)
+        for joint, share in ((left_joint, mismatch / 2), (right_joint, -mismatch / 2)):
+            _grow(root, joint, share)
+            _narrow(_child(root, joint), _RIM * math.dist(left, right))
+        return ElementTree.tostring(root, "unicode")
+
+    # --- reading -----------------------------------------------------------------------------------------------------
+
+    def _parsed(self, text: str) -> Element:
+        try:
+            root = ElementTree.fromstring(text)
+        except ElementTree.ParseError as error:
+            raise self._wrong(f"is no XML: {error}") from None
+        if root.tag != "robot":
+            raise self._wrong(f"is no URDF: its outermost element is <{root.tag}>, not <robot>")
+        return root
+
+    def _check_numbers(self) -> None:
+        for owner in (*self._links.values(), *self._joints.values()):
+            for element in owner.iter():
+                for key, count in _NUMBERS.items():
+                    text = element.get(key)
+                    if text is not None and len(_numbers(text)) != count:
+                        wanted = "a number" if count == 1 else f"{count} numbers"
+                        raise self._wrong(f"{owner.tag} {owner.get('name')!r}: <{element.tag} {key}={text!r}> is not "
+                                          f"{wanted}; write metres, kilograms and radians")
+
+    def _check_bodies(self) -> None:
+        for name, link in self._links.items():
+            mass = link.find("inertial/mass")
+            if mass is not None and _number(mass, "value", 0.0) <= 0:
+                raise self._wrong(f"link {name!r} has a mass of {mass.get('value')} kg; it must be above 0")
+            if link.find("collision/geometry/mesh") is not None:
+                raise self._wrong(f"link {name!r} collides as a mesh; write it as <box>, <cylinder> or <sphere>")
+
+    def _link_frames(self) -> dict[str, Frame]:
+        """Every link, seen from the root, joints at zero."""
+        above: dict[str, Element] = {}
+        for name, joint in self._joints.items():
+            for end in ("parent", "child"):
+                link = _end(joint, end)
+                if link not in self._links:
+                    raise self._wrong(f"joint {name!r}: its {end} {link!r} is no link{_nearest(link, self._links)}")
+            above[_end(joint, "child")] = joint
+        roots = [name for name in self._links if name not in above]
+        if len(roots) != 1:
+            raise self._wrong(f"must have one root link, it has {len(roots)}: {', '.join(roots)[:80]}")
+        return {name: self._chain(name, above) for name in self._links}
+
+    def _chain(self, link: str, above: dict[str, Element]) -> Frame:
+        seen, joints = {link}, []
+        while link in above:
+            joints.append(above[link])
+            link = _end(above[link], "parent")
+            if link in seen:
+                raise self._wrong(f"link {link!r} hangs from itself")
+            seen.add(link)
+        whole = Frame()
+        for joint in reversed(joints):
+            whole = whole.of(_origin(joint))
+        return whole
+
+    # --- wheels ------------------------------------------------------------------------------------------------------
+
+    def _wheel_joint(self, name: str) -> Element:
+        joint = self._joints.get(name)
+        if joint is None:
+            raise self._wrong(f"has no joint {name!r}{_nearest(name, self._joints)}; name the wheels' joints under "
+                              "[wheels] as left_joint and right_joint")
+        if joint.get("type") != "continuous":
+            raise self._wrong(f"joint {name!r} is {joint.get('type')}; a wheel's joint is type=\"continuous\"")
+        return joint
+
+    def _wheel_place(self, joint: str) -> Vector:
+        return self._frames[_end(self._wheel_joint(joint), "child")].at
+
+    def _wheel_radius(self, joint: str) -> float:
+        link = _end(self._wheel_joint(joint), "child")
+        radii = [_number(shape, "radius", 0.0) for shape in _round_shapes(self._links[link])]
+        if not radii or radii[0] <= 0:
+            raise self._wrong(f"link {link!r}, a wheel, has no round <collision>; give it a <cylinder> or a <sphere>")
+        return radii[0]
+
+    def _wheel(self, name: str, seen_from: Frame) -> Wheel:
+        joint = self._wheel_joint(name)
+        here = seen_from.of(self._frames[_end(joint, "child")])
+        axis = joint.find("axis")
+        x, y, z = _numbers(axis.get("xyz", "1 0 0")) if axis is not None else (1.0, 0.0, 0.0)
+        _, across, _ = here.direction((x, y, z))
+        if abs(across) < _ACROSS * math.hypot(x, y, z) or not across:
+            raise self._wrong(f"joint {name!r} does not turn about an axle across the robot; mend its <axis> or rpy")
+        return Wheel(name, here.at, self._wheel_radius(name), math.copysign(1.0, across))
+
+    def _wrong(self, what: str) -> ConfigError:
+        return ConfigError(f"{self._name}: {what}")
+
+
+def _end(joint: Element, name: str) -> str:
+    """The parent or the child of a joint."""
+    found = joint.find(name)
+    return found.get("link", "") if found is not None else ""
+
+
+def _origin(element: Element) -> Frame:
+    origin = element.find("origin")
+    if origin is None:
+        return Frame()
+    x, y, z = _numbers(origin.get("xyz", "0 0 0"))
+    return frame((x, y, z), *_numbers(origin.get("rpy", "0 0 0")))
+
+
+def _numbers(text: str) -> list[float]:
+    """The finite numbers of `text`; none at all if one of them is no such number."""
+    try:
+        values = [float(part) for part in text.split()]
+    except ValueError:
+        return []
+    return values if all(map(math.isfinite, values)) else []
+
+
+def _number(element: Element, key: str, otherwise: float) -> float:
+    text = element.get(key)
+    return otherwise if text is None else _numbers(text)[0]
+
+
+def _round_shapes(link: Element) -> Iterator[Element]:
+    for shape in link.iter("collision"):
+        for kind in ("cylinder", "sphere"):
+            found = shape.find(f"geometry/{kind}")
+            if found is not None:
+                yield found
+
+
+def _corners(shape: Element) -> Iterable[Vector]:
+    """Of the box around a collision shape, in the shape's own frame."""
+    half = (0.0, 0.0, 0.0)
+    for kind in shape.findall("geometry/*"):
+        radius = _number(kind, "radius", 0.0)
+        if kind.tag == "box":
+            x, y, z = _numbers(kind.get("size", "0 0 0"))
+            half = (x / 2, y / 2, z / 2)
+        else:
+            half = (radius, radius, _number(kind, "length", 2 * radius) / 2)
+    return [(x * half[0], y * half[1], z * half[2]) for x, y, z in product((-1, 1), repeat=3)]
+
+
+def _grow(root: Element, joint_name: str, share: float) -> None:
+    """Make one wheel larger by a share, and hang it so that it still touches the floor."""
+    if not share:
+        return
+    joint = next(one for one in root.findall("joint") if one.get("name") == joint_name)
+    for shape in _round_shapes(_child(root, joint_name)):
+        radius_m = _number(shape, "radius", 0.0)
+        shape.set("radius", repr(radius_m * (1 + share)))
+        origin = joint.find("origin")
+        if origin is not None:
+            x, y, z = _numbers(origin.get("xyz", "0 0 0"))
+            origin.set("xyz", f"{x!r} {y!r} {z + radius_m * share!r}")
+
+
+def _child(root: Element, joint_name: str) -> Element:
+    """The link that a joint moves."""
+    joint = next(one for one in root.findall("joint") if one.get("name") == joint_name)
+    return next(one for one in root.findall("link") if one.get("name") == _end(joint, "child"))
+
+
+def _narrow(link: Element, rim_m: float) -> None:
+    """Let a wheel stand on a rim in its middle; the rest of its width, a little smaller, still meets what it meets."""
+    for shape in link.findall("collision"):
+        cylinder = shape.find("geometry/cylinder")
+        if cylinder is None or _number(cylinder, "length", 0.0) <= rim_m:
+            continue
+        rest = deepcopy(shape)
+        inner = rest.find("geometry/cylinder")
+        assert inner is not None, "a copy of what has one"
+        inner.set("radius", repr(_REST * _number(cylinder, "radius", 0.0)))
+        cylinder.set("length", repr(rim_m))
+        link.append(rest)
+
+
+def _nearest(name: str, names: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(names), n=1, cutoff=0.4)
+    return f", did you mean {near[0]!r}?" if near else ""

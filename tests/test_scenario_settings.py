@@ -1,0 +1,79 @@
+"""What a person would configure for each scenario: it loads, it fits the robot, and another mission starts clean."""
+
+import pytest
+
+from operator_side.scenario_settings import robot_config, robot_of, vision_config, vision_table
+from protocol.errors import ConfigError
+from robot_side.config import RobotConfig
+from robot_side.limits import stop_bound
+from sim.body import outline
+from sim.robot_model import load_robot, robot_names
+from sim.scenario import load_scenario, scenario_names
+from vision_side.config import VisionConfig
+from vision_side.missions.choice import configured
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_every_scenario_configures_a_vision_with_its_mission(name):
+    scenario = load_scenario(name)
+    config = vision_config(scenario, robot_of(scenario), 3)
+    assert configured(config).name == scenario.mission
+    assert config.target.stand_off_m == scenario.stand_off_m
+
+
+def test_the_plain_scenarios_are_seen_with_plain_eyes():
+    for name in ("static", "circle", "eight", "pushed", "behind", "walls", "occluder"):
+        config = vision_config(load_scenario(name), load_robot("raspberry"))
+        same = config.model_copy(update={"target": VisionConfig().target})
+        assert same == VisionConfig()
+
+
+def test_the_raspberry_is_the_robot_that_robot_side_is_by_default():
+    assert robot_config(load_robot("raspberry")) == RobotConfig()
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_the_guard_knows_the_robots_outline_and_its_sensors_dead_zone(name):
+    model = load_robot(name)
+    guard, reach = robot_config(model).guard, outline(model)
+    assert guard.front_m >= reach.front_m - 1e-9
+    assert guard.rear_m >= reach.rear_m - 1e-9
+    assert guard.half_width_m >= reach.half_width_m - 1e-9
+    if not model.lidar.eyes:  # what is nearer than a sensor can tell must be nearer than where the robot stands
+        assert guard.stop_m > model.lidar.x_m + model.lidar.range_min_m - guard.front_m + 2 * model.lidar.noise_m
+
+
+def test_a_robot_that_brakes_slowly_is_steered_as_slowly():
+    model = load_robot("chaser")
+    limits, config = robot_config(model).safety, vision_config(load_scenario("chaser"), model)
+    assert limits.max_acceleration_mps2 + limits.max_acceleration_rad_s2 * model.wheels.track_m / 2 <= 0.7 + 1e-9
+    assert stop_bound(limits).zero_us <= 700_000
+    assert config.steer.max_linear_mps == limits.max_linear_mps > load_scenario("chaser-circle").target.speed_mps
+    assert config.latency.angular_acceleration_rad_s2 == limits.max_acceleration_rad_s2
+
+
+def test_another_mission_keeps_the_waypoints_and_none_of_the_options():
+    scenario = load_scenario("thymio")
+    model = load_robot("thymio")
+    own, other = (vision_table(scenario, model, 4, mission)["mission"] for mission in (None, "goto-baseline"))
+    assert own["kind"] == "goto" and set(own["options"]) == {"waypoints", "sensor_x_m", "body"}
+    assert other == {"kind": "goto-baseline", "options": {"waypoints": own["options"]["waypoints"]}}
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), [
+    ("hue_low_deg = 40", "hue_low_deg = 400", "scenario mine: [vision] hsv.ranges.0.hue_low_deg"),
+    ("[[vision.hsv.ranges]]", "[vision.hsw]\n[[vision.hsv.ranges]]", "scenario mine: [vision] hsw"),
+])
+def test_a_scenario_with_a_wrong_setting_is_one_line(tmp_path, old, new, expected):
+    text = (load_scenario.__globals__["SCENARIOS"] / "ball.toml").read_text()
+    (tmp_path / "mine.toml").write_text(text.replace(old, new, 1))
+    with pytest.raises(ConfigError) as caught:
+        vision_config(load_scenario(str(tmp_path / "mine.toml")), load_robot("raspberry"))
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_robot_whose_settings_would_not_stop_in_time_is_refused():
+    model = load_robot("chaser").model_copy(update={"settings": {"safety": {"max_acceleration_mps2": 0.2}}})
+    with pytest.raises(ConfigError, match=r"robot chaser: \[settings\].*allowed are 700 ms"):
+        robot_config(model)

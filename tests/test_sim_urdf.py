@@ -1,0 +1,151 @@
+"""URDF files as robots: what is measured in them, and what is refused in which words."""
+
+import math
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from protocol.errors import ConfigError
+from sim.body import body_of, outline, urdf
+from sim.robot_model import ROBOTS, load_robot, robot_names
+from sim.urdf import Urdf
+
+WHEELS = ("left_wheel_joint", "right_wheel_joint")
+
+
+def test_the_four_robots_are_as_they_were_drawn():
+    measured = {name: load_robot(name).wheels for name in robot_names()}
+    assert {name: (round(one.radius_m, 6), round(one.track_m, 6)) for name, one in measured.items()} == {
+        "raspberry": (0.035, 0.174), "gazebo-raspi": (0.035, 0.174), "thymio": (0.022, 0.112),
+        "chaser": (0.15, 0.5), "chaser-small": (0.15, 0.5),
+    }
+
+
+def test_a_robot_whose_front_is_at_minus_x_has_its_sensors_in_front():
+    chaser = load_robot("chaser")
+    assert (chaser.camera.x_m, chaser.camera.z_m) == pytest.approx((0.6, 0.16))
+    assert chaser.lidar.x_m == pytest.approx(0.485)
+    reach = outline(chaser)
+    assert (reach.front_m, reach.rear_m, reach.half_width_m) == pytest.approx((0.58, 0.175, 0.3))
+
+
+def test_range_sensors_face_as_their_links_do():
+    eyes = load_robot("thymio").lidar.eyes
+    assert [(round(eye.x_m, 4), round(eye.y_m, 4), round(eye.facing_deg, 3)) for eye in eyes] == [
+        (0.077, 0.0, 0.0), (0.065, 0.053, 90.0), (0.065, -0.053, -90.0),
+    ]
+
+
+def test_the_raspberrys_urdf_is_what_its_toml_says():
+    drawn = ElementTree.fromstring((ROBOTS / "raspberry.urdf").read_text())
+    said = ElementTree.fromstring(urdf(load_robot("raspberry")))
+    said.set("name", "raspberry")
+    ElementTree.indent(said)
+    assert ElementTree.tostring(drawn) == ElementTree.tostring(said)
+
+
+def test_a_users_own_urdf_is_a_robot(tmp_path):
+    (tmp_path / "mine.urdf").write_text((ROBOTS / "raspberry.urdf").read_text())
+    toml = (ROBOTS / "raspberry.toml").read_text()
+    wheels = '[wheels]\nleft_joint = "left"\nright_joint = "right"\nmax_rad_s = 25.0\nmax_accel_mps2 = 2.0\n' \
+        "max_torque_nm = 0.25\nlag_s = 0.05\nencoder_steps = 1440\n\n[camera]"
+    (tmp_path / "mine.toml").write_text(
+        'urdf = "mine.urdf"\n' + wheels + toml[toml.index("[camera]") + len("[camera]"):]
+    )
+    mine, own = load_robot(str(tmp_path / "mine.toml")), load_robot("raspberry")
+    assert (mine.wheels.radius_m, mine.wheels.track_m) == pytest.approx((own.wheels.radius_m, own.wheels.track_m))
+    assert outline(mine) == pytest.approx(outline(own))
+
+
+@pytest.mark.parametrize("axis", ["0 1 0", "0 -1 0"])
+def test_a_wheel_that_turns_the_other_way_round_is_driven_the_other_way(axis):
+    text = (ROBOTS / "thymio.urdf").read_text().replace('<axis xyz="0 1 0"/>', f'<axis xyz="{axis}"/>')
+    wheels = Urdf(text, "mine").wheels(*WHEELS, "+x")
+    assert {wheel.sign for wheel in wheels} == {float(axis.split()[1])}
+
+
+def test_unequal_wheels_both_touch_the_floor():
+    thymio = load_robot("thymio")
+    uneven = thymio.model_copy(update={"wheels": thymio.wheels.model_copy(update={"mismatch": 0.02})})
+    text = Urdf(body_of(uneven).text, "uneven")
+    heights = [text.place(link, text.foot(*WHEELS, "+x")).at[2] for link in ("left_wheel", "right_wheel")]
+    assert heights[0] - heights[1] == pytest.approx(0.022 * 0.02)
+
+
+def thymio_with(tmp_path: Path, drawing: tuple[str, str] = ("", ""), words: tuple[str, str] = ("", "")) -> str:
+    """The path of the Thymio with something replaced in its URDF, or in its TOML."""
+    for suffix, (old, new) in ((".urdf", drawing), (".toml", words)):
+        text = (ROBOTS / f"thymio{suffix}").read_text()
+        assert old in text
+        (tmp_path / f"thymio{suffix}").write_text(text.replace(old, new, 1))
+    return str(tmp_path / "thymio.toml")
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), [
+    ('mass value="0.216"', 'mass value="-0.216"', "'main_body' has a mass of -0.216 kg; it must be above 0"),
+    ('mass value="0.216"', 'mass value="0"', "must be above 0"),
+    ('mass value="0.216"', 'mass value="nan"', "is not a number; write metres, kilograms and radians"),
+    ('radius="0.022"', 'radius="inf"', "link 'left_wheel': <cylinder radius='inf'> is not a number"),
+    ('xyz="-0.025 0.056 0.022"', 'xyz="-0.025 0.056"', "is not 3 numbers"),
+    ('type="continuous"', 'type="fixed"', "joint 'left_wheel_joint' is fixed; a wheel's joint is type=\"continuous\""),
+    ('xyz="-0.025 0.056 0.022"', 'xyz="0.025 0.056 0.022"', "are no pair: give them one radius, one x and opposite y"),
+    ('<axis xyz="0 1 0"/>', '<axis xyz="1 0 0"/>', "does not turn about an axle across the robot"),
+    ('<cylinder radius="0.022" length="0.015"/>', '<box size="0.1 0.1 0.1"/>', "has no round <collision>"),
+    ('<box size="0.11 0.112 0.045"/>', '<mesh filename="body.stl"/>', "collides as a mesh"),
+    ('<parent link="main_body"/>', '<parent link="main_bdy"/>', "is no link, did you mean 'main_body'?"),
+    ('<robot name="thymio">', '<robot name="thymio"', "is no XML"),
+    ('<link name="sensor_front"/>', '<link name="sensor_front"/><link name="loose"/>', "must have one root link"),
+])
+def test_a_urdf_that_is_no_robot_is_one_line_with_the_fix(tmp_path, old, new, expected):
+    with pytest.raises(ConfigError) as caught:
+        load_robot(thymio_with(tmp_path, drawing=(old, new)))
+    assert expected in str(caught.value)
+    assert str(caught.value).startswith(str(tmp_path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), [
+    ('left_joint = "left_wheel_joint"', 'left_joint = "left_weel_joint"', "did you mean 'left_wheel_joint'?"),
+    ('left_joint = "left_wheel_joint"\n', "", "names its wheels: [wheels] left_joint and right_joint"),
+    ('left_joint = "left_wheel_joint"', 'left_joint = "right_wheel_joint"', "is not left of"),
+    ('link = "sensor_left"', 'link = "sensor_lft"', "has no link 'sensor_lft', did you mean 'sensor_left'?"),
+    ('urdf = "thymio.urdf"', 'urdf = "thymo.urdf"', "no such file; `urdf` names a file beside the robot's .toml"),
+    ('urdf = "thymio.urdf"', 'front = "-x"\nurdf = "thymio.urdf"', "is not left of 'right_wheel_joint'; swap the two"),
+    ('urdf = "thymio.urdf"', 'urdf = "thymio.urdf"\nchassis = {}', "chassis"),
+    ("max_torque_nm = 0.05", "max_torque_nm = nan", "wheels.max_torque_nm"),
+])
+def test_a_toml_that_does_not_fit_its_urdf_is_one_line_too(tmp_path, old, new, expected):
+    with pytest.raises(ConfigError) as caught:
+        load_robot(thymio_with(tmp_path, words=(old, new)))
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_its_extra_a_xacro_file_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "xacrodoc", None)
+    (tmp_path / "mine.urdf.xacro").write_text("<robot/>")
+    path = thymio_with(tmp_path, words=('urdf = "thymio.urdf"', 'urdf = "mine.urdf.xacro"'))
+    with pytest.raises(ConfigError, match=r"pip install 'sightline\[xacro\]'"):
+        load_robot(path)
+
+
+def test_a_joint_that_lies_by_a_quarter_turn_is_measured_where_it_is():
+    chaser = Urdf((ROBOTS / "chaser.urdf").read_text(), "chaser")
+    left, right = chaser.wheels("wheel_left_joint", "wheel_right_joint", "-x")
+    assert left.place == pytest.approx((0.0, 0.25, 0.15), abs=1e-9)
+    assert right.place == pytest.approx((0.0, -0.25, 0.15), abs=1e-9)
+    lens = chaser.place("camera", chaser.foot("wheel_left_joint", "wheel_right_joint", "-x"))
+    assert math.degrees(lens.yaw_rad) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_xacro_file_is_expanded(tmp_path):
+    pytest.importorskip("xacrodoc")
+    text = (ROBOTS / "thymio.urdf").read_text().replace('radius="0.022"', 'radius="${wheel}"')
+    head = '<robot name="mine" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:property name="wheel" value="0.03"/>'
+    path = thymio_with(tmp_path, words=('urdf = "thymio.urdf"', 'urdf = "mine.urdf.xacro"'))
+    (tmp_path / "mine.urdf.xacro").write_text(text.replace('<robot name="thymio">', head))
+    assert load_robot(path).wheels.radius_m == 0.03
+    (tmp_path / "mine.urdf.xacro").write_text(text.replace('<robot name="thymio">', head.replace("wheel", "weel")))
+    with pytest.raises(ConfigError, match="xacro cannot expand it"):
+        load_robot(path)
