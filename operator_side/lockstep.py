@@ -9,7 +9,9 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from protocol.channels import ACK, FRAME, TWIST
+from operator_side.labels import Labels
+from operator_side.scenario_settings import robot_config, vision_config
+from protocol.channels import ACK, FRAME, SCAN, TWIST
 from protocol.codec import decode, encode
 from protocol.messages import FrameHeader, State
 from protocol.transports.link import LatestSlot, Message
@@ -17,19 +19,20 @@ from protocol.transports.memory import MemoryNetwork
 from protocol.twist_text import format_twist
 from robot_side.config import RobotConfig
 from robot_side.driving import Driving
-from robot_side.limits import TICK_US, SafetyConfig
+from robot_side.limits import TICK_US
 from robot_side.ports import Picture
 from robot_side.sending import Sending
+from sim.cadence import Cadence
 from sim.robot_model import RobotModel
 from sim.scenario import Scenario
 from sim.truth import Truth
 from sim.world import World
 from vision_side.config import VisionConfig
 from vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
+from vision_side.scan import read_scan
 
 COMPUTE_US = 4_000
 """What one frame costs the vision side in virtual time: one step of the world, above what it takes in truth."""
-_SCAN_US = 100_000
 _SAMPLE_US = 20_000
 _ROBOT_SESSION, _VISION_SESSION = "00000001", "00000002"
 
@@ -51,11 +54,8 @@ class Run:
     twists: list[bytes] = field(default_factory=list)
     """Every twist the vision side sent, in order."""
     states: set[State] = field(default_factory=set)
-
-
-def simulation_robot(auto_arm: bool = True) -> RobotConfig:
-    """The robot's configuration in lockstep: its defaults, armed without a person."""
-    return RobotConfig(safety=SafetyConfig(auto_arm=auto_arm))
+    said: list[tuple[int, str, str]] = field(default_factory=list)
+    """Capture time of each frame that was answered, and the mission's phase and note."""
 
 
 class Lockstep:
@@ -82,10 +82,13 @@ class Lockstep:
         self._vision_link = self.network.link(robot.robot, role=SOURCE)
         self._frames: LatestSlot[Message] = self._vision_link.latest(FRAME)
         self._pipeline = Pipeline(vision, world.camera_model)
+        self._scanned = self._vision_link.latest(SCAN) if self._pipeline.mission.wants_scan else None
+        self._labels = Labels(vision.boxes, world.camera_model) if vision.detector.kind == "boxes" else None
         self._computed: deque[tuple[int, Message]] = deque(maxlen=1)
         self._answers = 0
         self._camera_tick = 0
         self._frame_interval_us = 1e6 / world.robot.camera.fps
+        self._scans = Cadence(1e6 / world.robot.lidar.rate_hz)
         self._now_us = 0
 
     def step(self) -> None:
@@ -112,6 +115,8 @@ class Lockstep:
         sent = self._sending.on_camera(Picture(self.world.render(), self._now_us), self._now_us)
         if sent is not None:
             header, message = sent
+            if self._labels is not None:
+                self._labels.label(header, self.world.labels())
             self.driving.on_issued(header.seq, header.t_us, zlib.crc32(message.payload))
             self._robot_link.publish(message.channel, message.header, message.payload)
 
@@ -122,10 +127,19 @@ class Lockstep:
         self._tick()
 
     def _tick(self) -> None:
-        scan = self.world.scan() if self._now_us % _SCAN_US == 0 else None
+        scan = self.world.scan() if self._scans.due(self._now_us) else None
         self.world.set_wheels(*self.driving.tick(self._now_us, self.world.wheel_angles(), scan))
         self._sending.motion = self.driving.motion()
+        self._publish_scans()
         self.run.states.add(self.driving.gate.state)
+
+    def _publish_scans(self) -> None:
+        """For a mission that goes by them; of all that the driver publishes, nothing else is listened to here."""
+        if self._scanned is None:
+            return
+        for message in self.driving.messages(self._now_us):
+            if message.channel is SCAN:
+                self._robot_link.publish(SCAN, message.header, message.payload)
 
     # --- vision --------------------------------------------------------------------------------------------------
 
@@ -142,8 +156,14 @@ class Lockstep:
 
     def _answer(self, message: Message) -> Message:
         frame = Frame(decode(FrameHeader, message.header), message.payload)
-        answer = self._pipeline.step(frame)
-        header = encode(answer_header(frame.header, _VISION_SESSION, self._answers, COMPUTE_US))
+        scan = self._scanned.take() if self._scanned else None
+        if scan is not None:
+            self._pipeline.see_scan(*read_scan(scan.header, scan.payload))
+        answer = self._pipeline.step(frame) if self._labels is None else self._pipeline.follow(
+            *self._labels.of(frame.header)
+        )
+        self.run.said.append((frame.header.t_us, answer.seen.phase, answer.seen.note))
+        header = encode(answer_header(frame.header, _VISION_SESSION, self._answers, COMPUTE_US, answer))
         self._answers += 1
         if answer.twist is None:
             return Message(ACK, SOURCE, header, b"")
@@ -160,23 +180,19 @@ def run_lockstep(
     seconds: float | None = None,
     *,
     vision: VisionConfig | None = None,
+    mission: str | None = None,
     on_progress: Callable[[int], None] = lambda _now_us: None,
 ) -> Run:
-    """One run of `scenario` for `seconds` (its own length if None). `on_progress` is told the time each second."""
+    """One run of `scenario` for `seconds` (its own length if None). `on_progress` is told the time each second.
+
+    `vision` and `mission` stand in for what the scenario names.
+    """
+    vision = vision or vision_config(scenario, model, seed, mission)
     with World(scenario, model, seed) as world:
-        lockstep = Lockstep(world, simulation_robot(), vision or vision_for(scenario), conditions, seed)
+        lockstep = Lockstep(world, robot_config(model, auto_arm=True), vision, conditions, seed)
         end_us = round((seconds or scenario.seconds) * 1e6)
         while world.now_us < end_us:
             lockstep.step()
             if world.now_us % 1_000_000 == 0:
                 on_progress(world.now_us)
         return lockstep.run
-
-
-def vision_for(scenario: Scenario, base: VisionConfig | None = None) -> VisionConfig:
-    """`base` told what a person would tell it of this scenario: the ball's size and the distance to keep."""
-    base = base or VisionConfig()
-    target = base.target.model_copy(
-        update={"radius_m": scenario.target.radius_m, "stand_off_m": scenario.stand_off_m}
-    )
-    return base.model_copy(update={"target": target})

@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final, Self
 
 from operator_side.extras import needs
-from protocol.channels import ACK, CAMERA, CHANNELS, FRAME, STATUS, TWIST, Channel
+from protocol.channels import ACK, CAMERA, CHANNELS, DETECTIONS, FRAME, MISSION, REPORT, SCAN, STATUS, TWIST, Channel
 from protocol.errors import ConfigError
 from protocol.transports.link import Link, Message
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 ENCODING: Final = "sightline.v1"
 METADATA: Final = "sightline"
-RECORDED: Final = (FRAME, TWIST, ACK, STATUS, CAMERA)
+RECORDED: Final = (FRAME, TWIST, ACK, STATUS, CAMERA, SCAN, MISSION, REPORT, DETECTIONS)
 MAX_WAITING: Final = 256
 """Messages that wait for the disk; while it is slower than that, new ones are dropped and counted."""
 CHUNK_BYTES: Final = 256 * 1024  # a kill loses at most one chunk

@@ -1,6 +1,7 @@
-"""A recording through a fresh pipeline: the same frames must give the same twists, byte for byte. Shell.
+"""A recording through a fresh pipeline: what went in must give the same twists again, byte for byte. Shell.
 
-Frames that were answered go in again in the order they were answered, one pipeline per vision session and camera model.
+Frames that were answered go in again in the order they were answered, one pipeline per vision session; with each go the
+scan and the mission that its answer cites.
 """
 
 from collections.abc import Iterator
@@ -8,14 +9,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from operator_side.recording import read_about, read_recording
-from protocol.channels import ACK, CAMERA, FRAME, TWIST
+from protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MISSION, SCAN, TWIST
 from protocol.codec import decode
 from protocol.errors import ConfigError, WireError
-from protocol.messages import AnswerHeader, CameraModel, FrameHeader
+from protocol.messages import AnswerHeader, Asked, CameraModel, DetectionsHeader, FrameHeader, RequestHeader, Stamp
+from protocol.mission_messages import MissionRequest
 from protocol.transports.link import Message
 from protocol.twist_text import format_twist
 from vision_side.config import VisionConfig
+from vision_side.detect.boxes import BoxReader
+from vision_side.missions.choice import requested
 from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline
+from vision_side.scan import read_scan
 
 VISION_CONFIG = "vision_config"
 """Key of the recording's metadata that holds the configuration of vision, as JSON."""
@@ -39,13 +44,13 @@ class Step:
 
 @dataclass(slots=True)
 class Replayed:
-    """What a replay found. With answers lost on the way (`gaps`) or frames not recorded, later twists may differ."""
+    """What a replay found. With answers lost on the way or frames not recorded, later twists may differ."""
 
     total: int = 0
     equal: int = 0
     missing_frames: int = 0
     gaps: int = 0
-    """Answers that vision numbered and nobody recorded."""
+    """Answers that vision numbered, and scans and missions that they cite, which nobody recorded."""
     first_difference: str = ""
 
     @property
@@ -56,16 +61,21 @@ class Replayed:
 
 @dataclass(slots=True)
 class _Answers:
-    """Answers of the recording, by the frame they cite."""
+    """Answers of the recording, by the frame they cite; and what else they cite: scans, missions."""
 
     by_frame: dict[_FrameId, list[tuple[AnswerHeader, bytes | None]]] = field(default_factory=dict)
     gaps: int = 0
+    scans: dict[_FrameId, Message] = field(default_factory=dict)
+    missions: dict[Asked, MissionRequest] = field(default_factory=dict)
+    boxes: dict[_FrameId, Message] = field(default_factory=dict)
+    """What somebody else found in each frame, for a vision without eyes of its own."""
 
 
 def replay(path: Path) -> Replayed:
     """Replay the recording at `path`. Raises ConfigError if it is none."""
     answers = _answers(path)
-    result = Replayed(gaps=answers.gaps)
+    missing = _gather_cited(path, answers)
+    result = Replayed(gaps=answers.gaps + missing)
     for step in _steps(path, answers):
         result.total += 1
         result.equal += step.sent == step.now
@@ -77,7 +87,9 @@ def replay(path: Path) -> Replayed:
 
 def replay_steps(path: Path) -> Iterator[Step]:
     """Every answered frame with its answer, in order. Raises ConfigError if `path` is no recording."""
-    return _steps(path, _answers(path))
+    answers = _answers(path)
+    _gather_cited(path, answers)
+    return _steps(path, answers)
 
 
 def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
@@ -91,15 +103,65 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
             model = decode(CameraModel, message.payload, CAMERA.max_payload_bytes)
             if model != camera:
                 camera = model
-                pipelines.clear()
+                pipelines = {session: one.with_camera(model) for session, one in pipelines.items()}
         if message.channel is not FRAME:
             continue
         frame = Frame(decode(FrameHeader, message.header), message.payload)
         for header, sent in answers.by_frame.pop((frame.header.session, frame.header.seq), ()):
             if sent is None and header.session not in pipelines:
                 continue  # before its first twist vision may not have had the camera's model: it only acknowledged
-            pipeline = pipelines.setdefault(header.session, Pipeline(config, camera))
-            yield Step(frame, sent, pipeline.step(frame))
+            if header.session not in pipelines:
+                pipelines[header.session] = Pipeline(config, camera)
+            pipeline = pipelines[header.session]
+            _give(pipeline, header, answers, config)
+            if config.detector.kind == "boxes":
+                found = answers.boxes.get((frame.header.session, frame.header.seq))
+                if sent is not None and found is not None:  # what only acknowledges tells that the frame arrived
+                    yield Step(frame, sent, _by_boxes(pipeline, frame, found, camera, config))
+            else:
+                yield Step(frame, sent, pipeline.step(frame))
+
+
+def _by_boxes(
+    pipeline: Pipeline, frame: Frame, found: Message, camera: CameraModel, config: VisionConfig
+) -> Answer:
+    """What the pipeline answers to what somebody else found in `frame`."""
+    reader = BoxReader(config.boxes)
+    reader.remember(frame.header)
+    return pipeline.follow(*reader.read(found.header, found.payload, camera))
+
+
+def _give(pipeline: Pipeline, header: AnswerHeader, answers: _Answers, config: VisionConfig) -> None:
+    """What the answer of `header` went by besides its frame, if that is in the recording."""
+    scan = answers.scans.get((header.echo.session, header.scan)) if header.scan is not None else None
+    if scan is not None:
+        pipeline.see_scan(*read_scan(scan.header, scan.payload))
+    pipeline.meet(header.echo.session)  # so that its first frame does not end what was asked for it
+    request = answers.missions.get(header.mission) if header.mission else None
+    if header.mission and request and header.mission != pipeline.asked:
+        pipeline.switch(requested(request, config), header.mission)
+
+
+def _gather_cited(path: Path, answers: _Answers) -> int:
+    """Fill in the scans and missions that answers cite; returns how many are not in the recording."""
+    headers = [header for some in answers.by_frame.values() for header, _ in some]
+    scans = {(one.echo.session, one.scan) for one in headers if one.scan is not None}
+    missions = {one.mission for one in headers if one.mission is not None}
+    for recorded in read_recording(path):
+        message = recorded.message
+        if message.channel is DETECTIONS:
+            echo = decode(DetectionsHeader, message.header).echo
+            if echo is not None:
+                answers.boxes[echo.session, echo.seq] = message
+        if message.channel is SCAN:
+            stamp = decode(Stamp, message.header)
+            if (stamp.session, stamp.seq) in scans:
+                answers.scans[stamp.session, stamp.seq] = message
+        elif message.channel is MISSION:
+            request = decode(MissionRequest, message.payload, MISSION.max_payload_bytes)
+            asked = Asked(session=decode(RequestHeader, message.header).session, id=request.id)
+            answers.missions.setdefault(asked, request)
+    return len(scans - set(answers.scans)) + len(missions - set(answers.missions))
 
 
 def _answers(path: Path) -> _Answers:

@@ -3,7 +3,7 @@
 from typing import Any, Final
 
 from protocol import VERSION
-from protocol.channels import CHANNELS, DETECTIONS, KEY_PREFIX, MAX_HEADER_BYTES, REPLY, REQUEST, Channel, Direction
+from protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REPLY, REQUEST, Channel, Direction
 from protocol.legacy import MAX_BOXES_BYTES
 from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
 from protocol.twist_text import MAX_TWIST_BYTES
@@ -97,7 +97,7 @@ def _operations() -> Node:
     operations = {}
     for one in CHANNELS.values():
         actions = ["send"] if one.direction is Direction.FROM_ROBOT else ["receive"]
-        for action in [*actions, *(["send"] if one is DETECTIONS else [])]:
+        for action in [*actions, *(["send"] if one.passed_on else [])]:
             operations[f"{action}_{one.name}"] = _operation(action, one.name, one.name)
     operations[f"receive_{REQUEST.name}"]["reply"] = {
         "channel": _reference("channels", REPLY.name),

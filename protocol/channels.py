@@ -6,6 +6,7 @@ Everything towards the robot names its source in the key (`twist/vision`), so th
 import re
 from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 
 from protocol.errors import ConfigError
 from protocol.messages import (
@@ -23,6 +24,7 @@ from protocol.messages import (
     Status,
     Wire,
 )
+from protocol.mission_messages import MissionReport, MissionRequest
 from protocol.twist_text import MAX_TWIST_BYTES
 
 MAX_HEADER_BYTES = 512
@@ -60,6 +62,10 @@ class Channel:
     purpose: str
     when_full: str = "a newer one takes its place"
     """What becomes of a message that cannot leave at once."""
+    passed_on: bool = False
+    """Whether the robot hands it, as it came, to every other peer that wants it."""
+    said_by: tuple[str, ...] = ()
+    """Who may say it where links have keys; empty for every source."""
 
     @property
     def has_source(self) -> bool:
@@ -88,11 +94,18 @@ SCAN = Channel("scan", _OUT, ScanHeader, None, "application/octet-stream", Prior
 CAMERA = Channel("camera", _OUT, Stamp, CameraModel, _JSON, Priority.INTERACTIVE_HIGH, "2 Hz", 1024,
                  "the camera's model and mounting")
 DETECTIONS = Channel("detections", _IN, DetectionsHeader, Detections, _JSON, Priority.INTERACTIVE_HIGH,
-                     "one per picture looked at", 32_768, "boxes that somebody found; the robot passes them on")
+                     "one per picture looked at", 32_768, "boxes that somebody found; the robot passes them on",
+                     passed_on=True)
+MISSION = Channel("mission", _IN, RequestHeader, MissionRequest, _JSON, Priority.INTERACTIVE_HIGH, "as a person asks",
+                  4096, "what vision is to do; the robot passes it on", passed_on=True,
+                  said_by=("operator", "teleop"))
+REPORT = Channel("report", _IN, DetectionsHeader, MissionReport, _JSON, Priority.INTERACTIVE_HIGH,
+                 "2 Hz and on a change", 2048, "what vision does; the robot passes it on", passed_on=True,
+                 said_by=("vision",))
 
 CHANNELS: dict[str, Channel] = {
     channel.name: channel
-    for channel in (FRAME, TWIST, ACK, REQUEST, REPLY, STATUS, ODOMETRY, SCAN, CAMERA, DETECTIONS)
+    for channel in (FRAME, TWIST, ACK, REQUEST, REPLY, STATUS, ODOMETRY, SCAN, CAMERA, DETECTIONS, MISSION, REPORT)
 }
 
 _ROBOT_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
@@ -109,6 +122,7 @@ def check_robot_id(robot: str) -> str:
     return robot
 
 
+@lru_cache(maxsize=1024)  # asked for each message, and after an idle camera period a pattern costs 50 us
 def key_for(robot: str, channel: Channel, source: str = "") -> str:
     """The exact key of `channel` for `robot`; `source` is required towards the robot and forbidden from it."""
     if channel.has_source != bool(source) or (source and not _SOURCE.fullmatch(source)):
@@ -123,6 +137,7 @@ def pattern_for(robot: str, channel: Channel) -> str:
     return f"{KEY_PREFIX}/{check_robot_id(robot)}/{channel.name}{tail}"
 
 
+@lru_cache(maxsize=1024)
 def parse_key(key: str) -> tuple[str, Channel, str] | None:
     """Split an exact key into (robot, channel, source); None for anything else, wildcards included."""
     parts = key.split("/")

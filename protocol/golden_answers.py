@@ -1,6 +1,6 @@
 """Golden cases of twists and acknowledgements. Pure."""
 
-from protocol.golden_case import ANSWER, ECHO, INEXACT, MALFORMED, NOT_FINITE, Case, case, echoing, without
+from protocol.golden_case import ANSWER, ECHO, INEXACT, MALFORMED, NOT_FINITE, PEER, Case, case, echoing, without
 
 _TWISTS_GOOD = {
     "zero": b"0|0",
@@ -57,6 +57,10 @@ def answers() -> list[Case]:
         case("twist", "guest", "a guest needs no header", header=b"", key=guest),
         case("twist", "no_header", "any other role needs one", MALFORMED, header=b""),
         case("twist", "no_compute", "compute_us may be left out", header=without(ANSWER, "compute_us")),
+        case("twist", "with_scan_and_mission", "what else it went by",
+             header=ANSWER | {"scan": 12, "mission": {"session": PEER, "id": 5}}),
+        case("twist", "scan_negative", "integers are bounded below", MALFORMED, header=ANSWER | {"scan": -1}),
+        case("twist", "mission_no_id", "named in full", MALFORMED, header=ANSWER | {"mission": {"session": PEER}}),
         case("twist", "no_echo", "a twist must cite what it answers", MALFORMED, header=without(ANSWER, "echo")),
         case("twist", "echo_of_scan", "no scan is cited", MALFORMED, header=echoing(ECHO | {"channel": "scan"})),
         case("twist", "echo_no_time", "an echo is complete", MALFORMED, header=echoing(without(ECHO, "t_us"))),

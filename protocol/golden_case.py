@@ -34,6 +34,9 @@ CAMERA = {"width_px": 640, "height_px": 480, "fx_px": 381.4, "fy_px": 381.4, "cx
 BOX = {"label": "person", "score": 0.91, "x1_px": 280.0, "y1_px": 120.5, "x2_px": 360.0, "y2_px": 330.0}
 DETECTIONS: dict[str, Any] = {"width_px": 640, "height_px": 480, "boxes": [BOX]}
 REPLY = {"to": PEER, "id": 3, "ok": True, "state": "HOLD", "detail": "armed"}
+MISSION: dict[str, Any] = {"id": 5, "name": "goto", "waypoints": [[1.5, 1.5], [0.0, -2.0]]}
+REPORT: dict[str, Any] = {"mission": "goto", "phase": "driving", "note": "to waypoint 1 of 2",
+                          "asked": {"session": PEER, "id": 5}, "detector": "hsv", "device": "cpu"}
 
 
 def packed(value: dict[str, Any]) -> bytes:
@@ -98,4 +101,6 @@ USUAL: dict[str, tuple[str, dict[str, Any], dict[str, Any] | bytes]] = {
     "scan": ("", SCAN_HEADER, struct.pack("<4f", 0.5, 1.25, float("inf"), 8.0)),
     "camera": ("", STAMP, CAMERA),
     "detections": ("guest", ANSWER | {"source": "guest"}, DETECTIONS),
+    "mission": ("operator", ASK | {"source": "operator"}, MISSION),
+    "report": ("vision", ANSWER, REPORT),
 }

@@ -6,7 +6,7 @@ from protocol.channels import CHANNELS
 from protocol.golden_answers import answers, twists
 from protocol.golden_case import MALFORMED, USUAL, VERSION, Case, case, packed, without
 from protocol.golden_frames import frames, pictures
-from protocol.golden_payloads import detections, payloads
+from protocol.golden_payloads import detections, missions, payloads, reports
 
 
 def _usual() -> list[Case]:
@@ -34,6 +34,7 @@ def _header_cases(channel: str, header: dict[str, Any]) -> list[Case]:
 
 
 CASES: tuple[Case, ...] = (
-    *_usual(), *_stamps(), *frames(), *pictures(), *twists(), *answers(), *payloads(), *detections(),
+    *_usual(), *_stamps(), *frames(), *pictures(), *twists(), *answers(), *payloads(), *detections(), *missions(),
+    *reports(),
 )
 """Every case; the first of a channel is its example in the specification."""

@@ -10,10 +10,12 @@ from protocol.golden_case import (
     CAMERA,
     DETECTIONS,
     MALFORMED,
+    MISSION,
     MOVED,
     NOT_FINITE,
     PEER,
     REPLY,
+    REPORT,
     Case,
     case,
     packed,
@@ -86,4 +88,54 @@ def detections() -> list[Case]:
         case(name, "no_size", "the picture's size is needed", MALFORMED, payload=without(DETECTIONS, "width_px")),
         case(name, "payload_32769", "32769 bytes", MALFORMED, payload=packed(DETECTIONS).ljust(32_769)),
         case(name, "payload_32768", "32768 bytes", payload=packed(DETECTIONS).ljust(32_768)),
+    ]
+
+
+def missions() -> list[Case]:
+    """What vision is asked to do."""
+    name, most = "mission", {"options": {f"option_{number}": 1 for number in range(16)}}
+    return [
+        case(name, "name_alone", "what a mission needs is its own default", payload={"id": 1, "name": "follow"}),
+        case(name, "of_teleop", "another role", header=ASK, key="sightline/r1/mission/teleop"),
+        case(name, "options", "of every kind", payload=MISSION | {"options": {"a": True, "b.c": 0.5, "d": "left"}}),
+        case(name, "option_number_1", "a number, not a truth", payload=MISSION | {"options": {"confirm": 1}}),
+        case(name, "options_16", "as many as may be", payload=MISSION | most),
+        case(name, "options_17", "one too many", MALFORMED,
+             payload=MISSION | {"options": most["options"] | {"more": 1}}),
+        case(name, "option_list", "no list", MALFORMED, payload=MISSION | {"options": {"a": [1]}}),
+        case(name, "option_null", "nor nothing", MALFORMED, payload=MISSION | {"options": {"a": None}}),
+        case(name, "option_nan", "NaN is no number", MALFORMED, payload=MISSION | {"options": {"a": float("nan")}}),
+        case(name, "option_text_65", "65 characters", MALFORMED, payload=MISSION | {"options": {"a": "x" * 65}}),
+        case(name, "option_name_upper", "names are lower-case", MALFORMED, payload=MISSION | {"options": {"A": 1}}),
+        case(name, "path_to_code", "a name, never a path to code", MALFORMED, payload=MISSION | {"name": "os:system"}),
+        case(name, "name_33", "33 letters", MALFORMED, payload=MISSION | {"name": "a" * 33}),
+        case(name, "no_name", "a mission has a name", MALFORMED, payload=without(MISSION, "name")),
+        case(name, "waypoints_64", "as many as may be", payload=MISSION | {"waypoints": [[1.0, -1.0]] * 64}),
+        case(name, "waypoints_65", "one too many", MALFORMED, payload=MISSION | {"waypoints": [[1.0, -1.0]] * 65}),
+        case(name, "waypoint_far", "within 100 m", MALFORMED, payload=MISSION | {"waypoints": [[100.1, 0.0]]}),
+        case(name, "waypoint_at_100_m", "100 m", payload=MISSION | {"waypoints": [[100, -100]]}),
+        case(name, "waypoint_of_three", "two numbers", MALFORMED, payload=MISSION | {"waypoints": [[1.0, 2.0, 3.0]]}),
+        case(name, "waypoint_text", "no type is converted", MALFORMED, payload=MISSION | {"waypoints": [["1", 2.0]]}),
+        case(name, "payload_4097", "4097 bytes", MALFORMED, payload=packed(MISSION).ljust(4097)),
+    ]
+
+
+def reports() -> list[Case]:
+    """What vision does."""
+    name = "report"
+    return [
+        case(name, "without_echo", "before the first frame", header=without(ANSWER, "echo")),
+        case(name, "name_and_phase", "all that is needed", payload={"mission": "follow", "phase": "tracking"}),
+        case(name, "refused", "why a mission was not taken up",
+             payload=REPORT | {"refused": "no mission called 'gota'; did you mean 'goto'?"}),
+        case(name, "done", "it is over", payload=REPORT | {"done": True, "note": "reached 2 of 2"}),
+        case(name, "measured", "with the model and its time",
+             payload=REPORT | {"device": "cuda", "model": "9f86d081884c7d65", "inference_us": 1060}),
+        case(name, "of_a_path", "a mission of one's own", payload=REPORT | {"mission": "my_missions:Circle"}),
+        case(name, "no_phase", "a phase is needed", MALFORMED, payload=without(REPORT, "phase")),
+        case(name, "note_201", "at most 200 characters", MALFORMED, payload=REPORT | {"note": "x" * 201}),
+        case(name, "asked_no_id", "an id is needed", MALFORMED, payload=REPORT | {"asked": {"session": PEER}}),
+        case(name, "done_as_1", "1 is not true", MALFORMED, payload=REPORT | {"done": 1}),
+        case(name, "time_negative", "not below 0", MALFORMED, payload=REPORT | {"inference_us": -1}),
+        case(name, "payload_2049", "2049 bytes", MALFORMED, payload=packed(REPORT).ljust(2049)),
     ]

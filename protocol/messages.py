@@ -92,8 +92,18 @@ class Echo(Wire):
     t_us: Microseconds
 
 
+class Asked(Wire):
+    """Names a mission that somebody asked for: the asker's session, and the id in the payload."""
+
+    session: SessionId
+    id: Counter
+
+
 class AnswerHeader(Wire):
-    """Header of a twist and of an ack: who answers, which frame, and how long the computing took."""
+    """Header of a twist and of an ack: who answers, which frame, and how long the computing took.
+
+    `scan` and `mission` name what else it went by, so that a recording can be answered again, byte for byte.
+    """
 
     v: Version = VERSION
     source: Source
@@ -101,10 +111,12 @@ class AnswerHeader(Wire):
     seq: Counter
     echo: Echo
     compute_us: Microseconds = 0
+    scan: Counter | None = None
+    mission: Asked | None = None
 
 
 class RequestHeader(Wire):
-    """Header of a request. `echo` names the newest `status` seen; only stop, disarm and release may lack it."""
+    """Header of a request or mission. `echo` names the newest `status` seen; only stop, disarm, release may lack it."""
 
     v: Version = VERSION
     source: Source
@@ -114,8 +126,7 @@ class RequestHeader(Wire):
 
 
 class DetectionsHeader(Wire):
-    """Header of detections: who looked and, where known, at which frame; without `echo` they may be shown, not obeyed.
-    """
+    """Header of detections and reports: who looked, at which frame; without `echo` they may be shown, not obeyed."""
 
     v: Version = VERSION
     source: Source

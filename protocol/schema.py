@@ -109,7 +109,9 @@ def _type_of(schema: Schema) -> str:
     if schema.get("type") == "array":
         return _array(schema)
     if schema.get("type") == "object":
-        return f"object of {_type_of(schema['additionalProperties'])}"
+        values = schema.get("additionalProperties") or next(iter(schema["patternProperties"].values()))
+        most = f" (at most {schema['maxProperties']})" if "maxProperties" in schema else ""
+        return f"object of {_type_of(values)}{most}"
     return " ".join([schema["type"], *_bounds(schema)])
 
 

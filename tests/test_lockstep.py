@@ -3,7 +3,8 @@
 import pytest
 
 from operator_side.lockstep import Conditions, run_lockstep
-from operator_side.score import judge, score
+from operator_side.score import score
+from operator_side.score_bounds import judge
 from protocol.messages import State
 from sim.robot_model import load_robot
 from sim.scenario import load_scenario

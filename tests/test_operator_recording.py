@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from operator_side.lockstep import Conditions, Lockstep, simulation_robot, vision_for
+from operator_side.lockstep import Conditions, Lockstep
+from operator_side.scenario_settings import robot_config, vision_config
 from operator_side.recording import CHUNK_BYTES, MAX_WAITING, Recorder, read_about, read_recording
 from operator_side.replay import VISION_CONFIG, replay, replay_steps
 from protocol.channels import CAMERA, CHANNELS, FRAME, STATUS, TWIST
@@ -102,9 +103,10 @@ def recorded(tmp_path_factory) -> Path:
     """Three seconds of the real line in virtual time, recorded from its network."""
     path = tmp_path_factory.mktemp("replay") / "run.mcap"
     scenario = load_scenario("circle")
-    config = vision_for(scenario)
+    model = load_robot("raspberry")
+    config = vision_config(scenario, model)
     with World(scenario, load_robot("raspberry"), 7) as world:
-        lockstep = Lockstep(world, simulation_robot(), config, Conditions(latency_ms=20), 7)
+        lockstep = Lockstep(world, robot_config(model, auto_arm=True), config, Conditions(latency_ms=20), 7)
         link, camera = lockstep.network.link("r1"), lockstep.network.link("r1")
         with Recorder(link, path, {VISION_CONFIG: config.model_dump_json()}):
             stamp = Stamp(session="00000001", seq=0, t_us=0)

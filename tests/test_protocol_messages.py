@@ -22,7 +22,7 @@ from protocol.channels import (
 from protocol.codec import check_sizes, decode, decode_ranges, encode, encode_ranges
 from protocol.errors import ConfigError, WireError
 from protocol.golden_cases import CASES
-from protocol.messages import MAX_INTEGER, AnswerHeader, Echo, FrameHeader, RequestHeader, ScanHeader, Stamp
+from protocol.messages import MAX_INTEGER, AnswerHeader, Asked, Echo, FrameHeader, RequestHeader, ScanHeader, Stamp
 from protocol.refusals import Refusal
 
 MODELS = sorted(
@@ -54,7 +54,8 @@ headers = st.one_of(
         range_min_m=numbers,
         range_max_m=numbers,
     ),
-    st.builds(AnswerHeader, source=sources, session=sessions, seq=integers, echo=echoes, compute_us=integers),
+    st.builds(AnswerHeader, source=sources, session=sessions, seq=integers, echo=echoes, compute_us=integers,
+              scan=st.none() | integers, mission=st.none() | st.builds(Asked, session=sessions, id=integers)),
     st.builds(RequestHeader, source=sources, session=sessions, seq=integers, echo=st.none() | echoes),
 )
 

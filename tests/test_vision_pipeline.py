@@ -8,12 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vision_side
+from protocol.channels import MAX_HEADER_BYTES
 from protocol.codec import decode, encode
-from protocol.messages import STILL, AnswerHeader, FrameHeader
+from protocol.messages import STILL, AnswerHeader, Asked, FrameHeader
 from protocol.twist_text import format_twist
 from tests.vision_rig import Rig, camera, eight, jpeg_of, scene
 from vision_side.config import VisionConfig
-from vision_side.pipeline import Answer, Frame, Pipeline, answer_header, encode_answer
+from vision_side.pipeline import Answer, Frame, Pipeline, Seen, answer_header, encode_answer
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -132,7 +133,12 @@ COUNTS = st.integers(0, 2**53 - 1)
 SESSIONS = st.from_regex(r"[0-9a-f]{8}", fullmatch=True)
 
 
-@given(SESSIONS, SESSIONS, COUNTS, COUNTS, COUNTS, COUNTS)
-def test_the_quick_answer_header_is_that_of_the_model(robot, vision, frame_seq, t_us, seq, compute_us) -> None:
-    frame = FrameHeader(session=robot, seq=frame_seq, t_us=t_us)
-    assert encode_answer(frame, vision, seq, compute_us) == encode(answer_header(frame, vision, seq, compute_us))
+ANSWERS = st.none() | st.builds(Answer, twist=st.none(), seen=st.just(Seen("tracking")), scan=st.none() | COUNTS,
+                                mission=st.none() | st.builds(Asked, session=SESSIONS, id=COUNTS))
+
+
+@given(SESSIONS, SESSIONS, st.tuples(COUNTS, COUNTS, COUNTS, COUNTS), ANSWERS)
+def test_the_quick_answer_header_is_that_of_the_model(robot, vision, counts, answer) -> None:
+    frame = FrameHeader(session=robot, seq=counts[0], t_us=counts[1])
+    quick = encode_answer(frame, vision, *counts[2:], answer)
+    assert quick == encode(answer_header(frame, vision, *counts[2:], answer)) and len(quick) <= MAX_HEADER_BYTES

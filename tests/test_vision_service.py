@@ -193,6 +193,25 @@ def test_frames_of_a_session_that_is_over_are_left_out_and_said_once(bench):
         bench.frame(BALL, seq)
     assert bench.service.answered == answered == 4
     assert bench.service.skipped["OTHER_SESSION"] == 4
-    assert sum("frames of session 0000abcd are left out" in line for line in bench.said) == 1
+    refused = "frames of session 0000abcd are refused: robot r1 is steered in session 0000beef"
+    assert sum(refused in line for line in bench.said) == 1
     bench.frame(BALL, 2, session="0000beef")
     assert bench.service.answered == 5
+
+
+def test_of_two_robots_with_one_id_the_second_is_refused_and_that_is_said(bench, monkeypatch):
+    """Where they cannot meet, nobody but vision can see that they are two."""
+    monkeypatch.setattr("vision_side.service.time.monotonic_ns", lambda: 1_000 * bench.now_us)
+    bench.camera()
+    answers = {"0000abcd": 0, "0000beef": 0}
+    for seq in range(1, 10):
+        bench.frame(BALL, seq)
+    for seq in range(10, 100):
+        for session in answers:
+            before = bench.service.answered
+            bench.frame(BALL, seq, session=session)
+            answers[session] += bench.service.answered - before
+    assert answers["0000abcd"] > 75 and answers["0000beef"] < 12
+    refused = [line for line in bench.said if "are refused" in line]
+    assert len(refused) == 2, refused  # first the old one, for a moment, then the second robot
+    assert "frames of session 0000beef are refused: robot r1 is steered in session 0000abcd" in refused[-1]

@@ -215,8 +215,10 @@ def test_a_token_opens_the_door_and_nothing_else_does(keys, capfd):
 
 
 def test_a_role_may_publish_what_the_table_of_channels_gives_it():
-    assert grant_of("vision") == {("twist", "vision"), ("ack", "vision"), ("detections", "vision")}
-    assert {("twist", "teleop"), ("request", "operator"), ("request", "teleop")} < grant_of("operator")
+    assert grant_of("vision") == {(name, "vision") for name in ("twist", "ack", "detections", "report")}
+    said = {("twist", "teleop"), ("request", "operator"), ("request", "teleop"), ("mission", "operator")}
+    assert said < grant_of("operator")
+    assert ("report", "operator") not in grant_of("operator")
     assert grant_of("viewer") == frozenset()
     assert {("frame",), ("status",)} < grant_of("robot")
 

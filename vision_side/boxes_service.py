@@ -18,6 +18,7 @@ from vision_side.pipeline import Answer, Seen
 from vision_side.service import Say, Service
 
 _BOXES_SILENCE_S = 2.0
+_NO_BOXES = Seen("no boxes")
 
 
 class Inbox(LatestSlot[Message]):
@@ -76,6 +77,7 @@ class BoxesService(Service):
         if self._pipeline is None:
             self._wait_for_camera()
         elif time.monotonic() - self._boxes_heard_s > _BOXES_SILENCE_S:
+            self._dispatch.after(time.monotonic(), self._pipeline, header, _NO_BOXES)
             self._tell("boxes", f"frames come, but no boxes from {self._config.boxes.source}; does its detector run?")
 
     def _boxes(self, message: Message, started_ns: int) -> None:
@@ -90,12 +92,14 @@ class BoxesService(Service):
             self._tell("boxes", f"boxes are refused: {error.detail}", f"refused {error.reason}")
             return
         self._tell("boxes", f"boxes from {self._config.boxes.source}")
+        self._dispatch.before(self._pipeline, frame)
         answer = self._pipeline.follow(frame, found)
         if answer.twist is None:
             self.skipped["OUT_OF_ORDER"] += 1
             return
         self._publish(frame, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._tell_phase(answer)
+        self._dispatch.after(time.monotonic(), self._pipeline, frame, answer.seen)
 
     def _remember_frames(self) -> None:
         """Also those that newer ones replaced before they were taken up."""

@@ -30,6 +30,8 @@ class HsvConfig(Config):
     ranges: Annotated[tuple[HsvRange, ...], Field(min_length=1, max_length=8)] = (
         HsvRange(hue_low_deg=36, hue_high_deg=68, saturation_low=0.5),
     )
+    shape: Literal["disc", "any"] = "disc"
+    """`any`: whatever has the colour, e.g. a box; its range then follows from `boxes.height_m` or `boxes.width_m`."""
     min_radius_px: Annotated[float, Field(gt=1, le=200)] = 3.0
     max_contours: Annotated[int, Field(ge=1, le=256)] = 16
     """Security limit: no more blobs than this are measured in one picture, the longest outlines first."""
@@ -46,7 +48,10 @@ class DetectorConfig(Config):
 
 
 class BoxesConfig(Config):
-    """What is steered by when the detector is `boxes`. Without a size the robot only turns towards the box."""
+    """What is steered by when the detector is `boxes`. Without a size the robot only turns towards the box.
+
+    The sizes are also those of what the colour detector finds with `hsv.shape` `any`.
+    """
 
     source: Source = "guest"
     """Whose boxes."""
@@ -57,6 +62,13 @@ class BoxesConfig(Config):
     """How tall the thing is; its range follows from it while top and bottom are in view."""
     width_m: Annotated[float | None, Field(gt=0.01, le=10)] = None
     """How wide it is, for when the height is not given or not in view."""
+
+
+class MissionConfig(Config):
+    """What to do with what is seen: a mission's name or `package.module:Name`; `options` are for its own `Config`."""
+
+    kind: Annotated[str, Field(min_length=1, max_length=64)] = "follow"
+    options: dict[str, Any] = Field(default_factory=dict)
 
 
 class TargetConfig(Config):
@@ -152,6 +164,9 @@ class VisionConfig(Config):
     detector: DetectorConfig = DetectorConfig()
     hsv: HsvConfig = HsvConfig()
     boxes: BoxesConfig = BoxesConfig()
+    mission: MissionConfig = MissionConfig()
+    missions: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """Options by the name of the mission, for those that may be asked for while vision runs, e.g. missions.goto."""
     target: TargetConfig = TargetConfig()
     track: TrackConfig = TrackConfig()
     steer: SteerConfig = SteerConfig()

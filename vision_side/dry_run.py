@@ -12,6 +12,7 @@ from protocol.errors import HardwareError
 from protocol.messages import CameraModel, FrameHeader
 from protocol.transports.link import Link
 from vision_side.config import VisionConfig
+from vision_side.dispatch import Dispatch
 from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, Seen
 from vision_side.service import Service
 
@@ -80,11 +81,24 @@ class AckingService(Service):
 
     def __init__(self, config: VisionConfig, link: Link, say: Say) -> None:
         super().__init__(config, link, say)
+        self._dispatch = OnlyScans(config, link, self._tell, self._refuse)
         self._telling = Telling(say)
 
     def _publish(self, header: FrameHeader, answer: Answer, compute_us: int) -> None:
         super()._publish(header, Answer(None, answer.seen), compute_us)
         self._telling.step(answer, time.monotonic())
+
+
+class OnlyScans(Dispatch):
+    """Takes no missions and reports nothing: what the robot does is not this one's doing."""
+
+    def before(self, pipeline: Pipeline, frame: FrameHeader) -> None:  # noqa: ARG002
+        """Give `pipeline` the newest scan."""
+        if pipeline.mission.wants_scan:
+            self._look(pipeline)
+
+    def after(self, now_s: float, pipeline: Pipeline | None, frame: FrameHeader | None, seen: Seen) -> None:
+        """Say nothing."""
 
 
 class Watching:

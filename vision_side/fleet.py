@@ -13,6 +13,7 @@ from typing import Protocol, Self
 from protocol.channels import Channel
 from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.config import VisionConfig
+from vision_side.counts import Counts
 from vision_side.service import Say, Service, open_service
 
 _LONGEST_WAIT_S = 0.2
@@ -89,6 +90,10 @@ class Fleet:
         for robot, service in self.services.items():
             skipped = dict(service.skipped) or "none"
             self._say(f"vision: {robot}: ended after {service.answered} frames; skipped: {skipped}")
+
+    def counts(self) -> list[Counts]:
+        """What is done so far for each robot; from any thread."""
+        return [service.counts() for service in list(self.services.values())]
 
     def turn(self) -> None:
         """Answer at most one frame of each robot: whatever came meanwhile waits one round, whoever sends more."""

@@ -25,25 +25,43 @@ class Motion:
     angular_rad_s: float
 
 
-class Foretelling:
-    """Keeps the latency and the commands sent."""
+class Latency:
+    """How late a command acts, smoothed."""
 
     def __init__(self, config: LatencyConfig) -> None:
         self._config = config
-        self._measured_s = config.first_guess_s
-        self._sent: deque[tuple[int, float, float]] = deque(maxlen=_REMEMBERED)
+        self.measured_s = config.first_guess_s
+        """From capture to accepted command."""
 
     @property
-    def latency_s(self) -> float:
+    def total_s(self) -> float:
         """From capture to wheels that follow."""
-        return min(self._measured_s, self._config.max_s) + self._config.actuation_s
+        return min(self.measured_s, self._config.max_s) + self._config.actuation_s
 
     def measure(self, latency_us: int | None, dt_s: float) -> None:
         """Take in what the robot measured from capture to accepted command; None changes nothing."""
         if latency_us is None:
             return
         share = min(1.0, dt_s / self._config.smoothing_s)
-        self._measured_s += share * (min(latency_us / 1e6, self._config.max_s) - self._measured_s)
+        self.measured_s += share * (min(latency_us / 1e6, self._config.max_s) - self.measured_s)
+
+
+class Foretelling:
+    """Keeps the latency and the commands sent."""
+
+    def __init__(self, config: LatencyConfig) -> None:
+        self._config = config
+        self._latency = Latency(config)
+        self._sent: deque[tuple[int, float, float]] = deque(maxlen=_REMEMBERED)
+
+    @property
+    def latency_s(self) -> float:
+        """From capture to wheels that follow."""
+        return self._latency.total_s
+
+    def measure(self, latency_us: int | None, dt_s: float) -> None:
+        """As `Latency.measure`."""
+        self._latency.measure(latency_us, dt_s)
 
     def sent(self, t_us: int, twist: Twist) -> None:
         """Note the command that answers the frame captured at `t_us`."""
@@ -52,7 +70,7 @@ class Foretelling:
     def expected(self, t_us: int) -> tuple[float, float] | None:
         """The twist that should have been in force at `t_us`; None before the first."""
         for sent_us, linear, angular in reversed(self._sent):
-            if sent_us + self._measured_s * 1e6 <= t_us:
+            if sent_us + self._latency.measured_s * 1e6 <= t_us:
                 return linear, angular
         return None
 

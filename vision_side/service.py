@@ -7,7 +7,7 @@ import secrets
 import signal
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -21,45 +21,60 @@ from protocol.refusals import Refusal
 from protocol.transports.link import LatestSlot, Link, Message
 from protocol.twist_text import format_twist
 from vision_side.config import VisionConfig
+from vision_side.counts import Counts, Observe
+from vision_side.dispatch import NO_FRAMES, Dispatch
+from vision_side.missions.choice import configured
 from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, Seen, encode_answer
+from vision_side.sessions import Sessions
 
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 _SILENCE_S = 3.0
+_NO_FRAMES_S = 1.0  # twice what the slowest stream takes between two frames
 _CAMERA_PATIENCE_S = 1.5
-_SESSIONS_KEPT = 8
 _TOLD_COUNTS = tuple(10**power for power in range(10))  # a camera gone bad is told at 1, 10, 100 ... pictures
+_TOLD_PHASES = {"searching": "target not in sight, searching", "lost": "target lost"}
 Say = Callable[[str], None]
 Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
 
 
-def run(config: VisionConfig) -> int:
-    """Serve until SIGTERM or SIGINT; returns the exit code 0.
+def run(config: VisionConfig, observe: Observe | None = None) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code 0. `observe` is told how to look at what is done.
 
-    Raises ConfigError for an endpoint that is none, LinkError if the link cannot be opened.
+    Raises ConfigError for an endpoint or a mission that is none, LinkError if the link cannot be opened.
     """
+    from protocol.transports.zenoh_log import refusals_told
+
+    configured(config)  # a mission that there is not is said before anything is opened
+    ending = threading.Event()
+    with refusals_told(config.listen, config.secure, lambda line: _say(f"vision: {line}")):
+        return (_run_fleet if set("*?") & set(config.robot) else _run_one)(config, ending, observe)
+
+
+def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | None) -> int:
     from protocol.transports.opening import open_link
 
-    ending = threading.Event()
-    if set("*?") & set(config.robot):
-        return _run_fleet(config, ending)
     opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                         max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     # Signals are caught only from here on: until the link is open, they end the process by themselves.
     with opened as link, _ends_on_signal(ending):
         _say(f"vision: looking for robot {config.robot} at {_endpoints(config)}")
-        serve(config, link, ending, _say)
+        serve(config, link, ending, _say, observe)
     return 0
 
 
-def serve(config: VisionConfig, link: Link, ending: threading.Event, say: Say) -> None:
+def serve(
+    config: VisionConfig, link: Link, ending: threading.Event, say: Say, observe: Observe | None = None
+) -> None:
     """Answer frames that come over `link` until `ending` is set."""
     service = open_service(config, link, say)
+    if observe is not None:
+        observe(lambda: [service.counts()])
     while not ending.is_set():
         service.turn(_WAIT_S)
     say(f"vision: ended after {service.answered} frames; skipped: {dict(service.skipped) or 'none'}")
 
 
-def _run_fleet(config: VisionConfig, ending: threading.Event) -> int:
+def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe | None) -> int:
     from protocol.transports.zenoh_site import open_site
     from vision_side.fleet import Fleet
 
@@ -67,7 +82,10 @@ def _run_fleet(config: VisionConfig, ending: threading.Event) -> int:
                        max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     with opened as site, _ends_on_signal(ending):
         _say(f"vision: looking for robots {config.robot} at {_endpoints(config)}")
-        Fleet(config, site, _say).serve(ending)
+        fleet = Fleet(config, site, _say)
+        if observe is not None:
+            observe(fleet.counts)
+        fleet.serve(ending)
     return 0
 
 
@@ -91,15 +109,17 @@ class Service:
         self._pipeline: Pipeline | None = None
         self._session = secrets.token_hex(4)
         self._robot_session = ""
-        self._sessions: deque[str] = deque(maxlen=_SESSIONS_KEPT)
+        self._sessions = Sessions()
         self._said: dict[str, str] = {}
         self._counted: Counter[str] = Counter()
         if config.camera is not None:
             self._use(config.camera)
         self._heard_s = time.monotonic()
         self._blind_since_s = 0.0
-        self.answered = 0
+        self._newest: tuple[int, int | None] = (0, None)
+        self.answered = self.steered = 0
         self.skipped: Counter[str] = Counter()
+        self._dispatch = Dispatch(config, link, self._tell, self._refuse)
 
     def _arrivals(self, link: Link) -> LatestSlot[Message]:
         """Where what is to be answered arrives."""
@@ -116,10 +136,22 @@ class Service:
         self._look_at_camera()
         if message is not None:
             self._frame(message, started_ns)
-        elif time.monotonic() - self._heard_s > _SILENCE_S:
+        else:
+            self._note_silence(time.monotonic())
+
+    def _note_silence(self, now_s: float) -> None:
+        if now_s - self._heard_s > _NO_FRAMES_S:
+            self._dispatch.after(now_s, self._pipeline, None, NO_FRAMES)
+        if now_s - self._heard_s > _SILENCE_S:
             self._robot_session = ""
             self._tell("link", f"no frames from robot {self._config.robot} at {_endpoints(self._config)}; is "
                                "`sightline robot` running there, with this robot id?")
+
+    def counts(self) -> Counts:
+        """What is done so far; from any thread."""
+        heard, (compute_us, latency_us) = time.monotonic() - self._heard_s <= _SILENCE_S, self._newest
+        return Counts(self._config.robot, heard and self.answered > 0, self.answered, self.steered,
+                      dict(self.skipped.copy()), self._frames.dropped, compute_us, latency_us)
 
     def _look_at_camera(self) -> None:
         """Take in the camera's model; a new one needs a new pipeline."""
@@ -132,7 +164,8 @@ class Service:
 
     def _use(self, camera: CameraModel) -> None:
         self._camera = camera
-        self._pipeline = Pipeline(self._config, camera)
+        before = self._pipeline
+        self._pipeline = before.with_camera(camera) if before else Pipeline(self._config, camera)
         self._counted.clear()
         lens = "calibrated" if camera.calibrated else "not calibrated"
         self._tell("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")
@@ -141,10 +174,11 @@ class Service:
         header = self._decoded(FrameHeader, message.header, MAX_HEADER_BYTES)
         if header is None:
             return
-        if self._is_over(header.session):
+        if not self._sessions.admits(header.session, header.t_us, time.monotonic_ns() // 1000):
             self.skipped["OTHER_SESSION"] += 1
-            self._tell("other", f"frames of session {header.session} are left out: a newer one began; two robots "
-                                f"with the id {self._config.robot}? give each its own with --robot")
+            self._tell("other", f"frames of session {header.session} are refused: robot {self._config.robot} is "
+                                f"steered in session {self._sessions.current}; two robots with this id? give each its "
+                                "own with --robot")
             return
         self._heard_s = time.monotonic()
         if header.session != self._robot_session:
@@ -154,17 +188,13 @@ class Service:
             self._wait_for_camera()
             self._publish(header, Answer(None, Seen("no picture", note="no camera model yet")), 0)
             return
+        self._dispatch.before(self._pipeline, header)
         answer = self._pipeline.step(Frame(header, message.payload))
         if answer.twist is None:
             self._count_skipped(self._pipeline.skipped)
         self._publish(header, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._tell_phase(answer)
-
-    def _is_over(self, session: str) -> bool:
-        """Whether the robot has started again since: who sends frames of `session` now is late, or repeats them."""
-        if session not in self._sessions:
-            self._sessions.append(session)
-        return session != self._sessions[-1]
+        self._dispatch.after(time.monotonic(), self._pipeline, header, answer.seen)
 
     def _count_skipped(self, skipped: Counter[str]) -> None:
         """Add what this pipeline has skipped since the last time to what earlier ones did."""
@@ -179,7 +209,9 @@ class Service:
 
     def _publish(self, header: FrameHeader, answer: Answer, compute_us: int) -> None:
         self.answered += 1
-        stamp = encode_answer(header, self._session, self.answered, compute_us)
+        self.steered += answer.twist is not None
+        self._newest = (compute_us, header.latency_us)
+        stamp = encode_answer(header, self._session, self.answered, compute_us, answer)
         if answer.twist is None:
             self._link.publish(ACK, stamp, b"")
         else:
@@ -189,10 +221,13 @@ class Service:
         try:
             return decode(model, data, max_bytes)
         except WireError as error:
-            self.skipped[error.reason] += 1
-            if error.reason is Refusal.UNSUPPORTED_VERSION:
-                self._tell("version", error.detail)
+            self._refuse(error)
             return None
+
+    def _refuse(self, error: WireError) -> None:
+        self.skipped[error.reason] += 1
+        if error.reason is Refusal.UNSUPPORTED_VERSION:
+            self._tell("version", error.detail)
 
     def _tell_phase(self, answer: Answer) -> None:
         seen = answer.seen
@@ -200,10 +235,12 @@ class Service:
             count = self.skipped.total()
             if count in _TOLD_COUNTS:
                 self._say(f"vision: pictures skipped so far: {count}; this one: {seen.note}")
-        elif seen.distance_m is None:
-            self._tell("phase", "target not in sight, searching" if seen.phase == "searching" else "target lost")
-        elif seen.phase == "tracking":
+        elif seen.phase in _TOLD_PHASES:
+            self._tell("phase", _TOLD_PHASES[seen.phase])
+        elif seen.phase == "tracking" and seen.distance_m is not None:
             self._tell("phase", f"target seen at {seen.distance_m:.2f} m", "seen")
+        elif seen.phase != "coasting":
+            self._tell("phase", ": ".join(filter(None, (seen.phase, seen.note))), seen.phase)
 
     def _tell(self, about: str, line: str, state: str = "") -> None:
         """Print `line` if what it is about changed since it was last told."""

@@ -1,4 +1,4 @@
-"""Detector of round things of one colour: colour mask, outlines, sharp edge, circle fit. Pure."""
+"""Detector of things of one colour, round ones unless told otherwise: mask, outlines, sharp edge, circle fit. Pure."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ _EDGE_PX = 0.45  # the true edge lies this far outside the centre of an outermos
 
 
 class HsvDetector:
-    """Finds discs of the configured colours."""
+    """Finds discs of the configured colours, or anything that has them."""
 
     def __init__(self, config: HsvConfig, label: str = "target") -> None:
         self._config = config
@@ -27,14 +27,26 @@ class HsvDetector:
         self._mask = ColourMask(config.ranges)
 
     def detect(self, picture: Picture) -> tuple[Detection, ...]:
-        """Discs of the colour, largest first."""
+        """What has the colour, and the shape if one is asked for, largest first."""
         region = self._mask.region(picture.bgr)
         if region is None:
             return ()
         outlines, _ = cv2.findContours(region.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         longest = sorted(outlines, key=len, reverse=True)[: self._config.max_contours]
-        found = [self._disc(picture, region, outline) for outline in longest]
-        return tuple(sorted((disc for disc in found if disc), key=_radius, reverse=True))
+        look = self._disc if self._config.shape == "disc" else self._thing
+        found = [look(picture, region, outline) for outline in longest]
+        return tuple(sorted((one for one in found if one), key=_radius, reverse=True))
+
+    def _thing(self, picture: Picture, region: Region, outline: Pixels) -> Detection | None:
+        """The box around whatever it is; None if it is too small."""
+        box = cv2.boundingRect(outline)
+        if min(box[2], box[3]) < 2 * self._config.min_radius_px:
+            return None
+        sharp = sharp_outline(region.bgr, region.mask, box)
+        x, y, width, height = box if sharp is None else cv2.boundingRect(sharp)
+        left, top, scale = region.origin_px[0] + x, region.origin_px[1] + y, picture.scale
+        right, bottom = left + width, top + height
+        return Detection(left * scale, top * scale, right * scale, bottom * scale, 1.0, self._label)
 
     def _disc(self, picture: Picture, region: Region, outline: Pixels) -> Detection | None:
         """The disc that `outline` encloses, or None if it is too small or not round."""
@@ -78,4 +90,5 @@ def _own_edge(pixels: Pixels, box: Box, origin_px: tuple[int, int], shape: tuple
 
 
 def _radius(detection: Detection) -> float:
-    return detection.circle.radius_px if detection.circle else 0.0
+    """Of its circle; of what has none, half its height."""
+    return detection.circle.radius_px if detection.circle else (detection.y2_px - detection.y1_px) / 2

@@ -1,0 +1,81 @@
+"""What people write to send a robot somewhere, and what they are told of it."""
+
+import pytest
+
+from operator_side.cli_mission import options_of
+from operator_side.mission_asking import request_of
+from operator_side.mission_text import cannot, mission_line, mission_lines
+from operator_side.waypoints import waypoints_of, waypoints_of_file
+from protocol.errors import ConfigError
+from protocol.mission_messages import MissionReport
+
+
+def test_waypoints_are_pairs_of_metres():
+    assert waypoints_of(["1.5", "-2", "+.5", "1e1"]) == ((1.5, -2.0), (0.5, 10.0))
+    assert waypoints_of(["100", "-100"]) == ((100.0, -100.0),)
+    text = "# out\n1.5 1.5\n\n 0,-2.25   # and back\n-1 , 3\n"
+    assert waypoints_of_file(text, "way.txt") == ((1.5, 1.5), (0.0, -2.25), (-1.0, 3.0))
+
+
+@pytest.mark.parametrize(("texts", "words"), [
+    (["1", "2", "abc", "4"], "waypoint 2: 'abc' is no number"),
+    (["1", "nan"], "waypoint 1: 'nan' is no number"),
+    (["inf", "1"], "waypoint 1: 'inf' is no number"),
+    (["1_0", "1"], "waypoint 1: '1_0' is no number"),
+    (["٣", "1"], "is no number"),
+    (["1", "2", "--wiat"], "waypoint 2: '--wiat' is no number"),
+    (["1", "2", "3"], "waypoint 2: has an X and no Y"),
+    (["1", "100.5"], "waypoint 1: 100.5 m is out of the world; -100 to 100 m"),
+    (["1e999", "1"], "out of the world"),
+    ([], "0 waypoints; give 1 to 64"),
+    (["1", "1"] * 65, "65 waypoints; give 1 to 64"),
+])
+def test_a_waypoint_that_is_none_is_named(texts, words):
+    with pytest.raises(ConfigError) as error:
+        waypoints_of(texts)
+    assert words in str(error.value) and len(str(error.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("1 2\n1 2 3\n", "way.txt:2: has 3 numbers"),
+    ("1 2\n1 b\n", "way.txt:2: 'b' is no number"),
+    ("# nothing\n", "0 waypoints"),
+    ("1 500\n", "way.txt:1: 500 m is out of the world"),
+])
+def test_a_file_of_waypoints_names_its_line(text, words):
+    with pytest.raises(ConfigError, match=words.replace("(", r"\(")):
+        waypoints_of_file(text, "way.txt")
+
+
+def test_options_are_read_as_they_are_meant():
+    assert options_of(["a=1", "b.c=0.5", "d=true", "e=left", 'f="2"', "g="]) == {
+        "a": 1, "b.c": 0.5, "d": True, "e": "left", "f": "2", "g": ""}
+    for wrong in ("a", "=1"):
+        with pytest.raises(ConfigError, match="is no setting"):
+            options_of([wrong])
+
+
+@pytest.mark.parametrize(("name", "options", "words"), [
+    ("my_missions:Circle", {}, "is no mission's name"),
+    ("Follow", {}, "is no mission's name"),
+    ("band", {"a": [1]}, "option 'a'"),
+    ("band", {"a": float("nan")}, "option 'a'"),
+    ("band", {"A": 1}, "option"),
+    ("band", {f"o{at}": 1 for at in range(17)}, "at most 16 options"),
+])
+def test_what_the_wire_has_no_room_for_is_said_before_it_is_sent(name, options, words):
+    with pytest.raises(ConfigError, match=words):
+        request_of(1, name, (), options)
+
+
+def test_a_report_in_words():
+    report = MissionReport(mission="goto", phase="driving", note="reached 1 of 2", detector="hsv", device="cpu")
+    assert mission_line(report) == "goto: driving; reached 1 of 2" and not cannot(report)
+    over = report.model_copy(update={"phase": "cannot reach", "done": True, "refused": "no mission called 'x'",
+                                     "inference_us": 1060})
+    assert list(mission_lines(over)) == [
+        "mission   goto: cannot reach; reached 1 of 2 (over)",
+        "          the last that was asked for is not taken up: no mission called 'x'",
+        "detector  hsv, on cpu, 1.1 ms a picture",
+    ]
+    assert cannot(over) and not cannot(over.model_copy(update={"phase": "arrived"}))

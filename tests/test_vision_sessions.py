@@ -1,0 +1,129 @@
+"""Whose frames count when several sessions claim one robot: restarts, late frames, forgeries, two robots of one id."""
+
+import random
+
+import pytest
+
+from vision_side.sessions import GOES_ON_US, KEPT, SILENT_US, Sessions
+
+A, B, C = "0000aaaa", "0000bbbb", "0000cccc"
+FRAME_US = 33_333
+
+
+class Watch:
+    """Plays frames of several robots, each with its own clock, at one `Sessions`."""
+
+    def __init__(self):
+        self.sessions = Sessions()
+        self.now_us = 50_000_000
+
+    def frame(self, session, late_us=0):
+        return self.sessions.admits(session, self.now_us - late_us + int(session, 16), self.now_us)
+
+    def film(self, *playing, seconds=1.0, every_us=FRAME_US):
+        """Frames of all that play, side by side; the share of each that was admitted."""
+        rounds, admitted = round(seconds * 1e6 / every_us), dict.fromkeys(playing, 0)
+        for _ in range(rounds):
+            self.now_us += every_us
+            for session in playing:
+                admitted[session] += self.frame(session)
+        return [admitted[session] / rounds for session in playing]
+
+
+@pytest.fixture
+def watch():
+    return Watch()
+
+
+def test_a_robot_that_starts_anew_is_met_at_once(watch):
+    assert watch.film(A) == [1.0]
+    assert watch.film(B) == [1.0]
+    assert watch.film(C) == [1.0]
+
+
+def test_late_frames_of_before_a_restart_are_left_out(watch):
+    watch.film(A)
+    watch.film(B, seconds=0.1)
+    for held_back_us in range(0, 500_000, 20_000):  # half a second of frames that the network held back, in one burst
+        watch.now_us += 1_000
+        assert not watch.frame(A, late_us=500_000 - held_back_us)
+    assert watch.frame(B)
+
+
+def test_late_frames_that_come_slowly_are_left_out_as_long_as_they_show_little_time(watch):
+    watch.film(A)
+    watch.film(B, seconds=0.1)
+    for _ in range(20):
+        watch.now_us += 50_000
+        assert not watch.frame(A, late_us=watch.now_us - 50_000_000)  # all captured at one moment
+    assert watch.frame(B)
+
+
+@pytest.mark.parametrize("every_us", [FRAME_US, 120_000, 250_000, 499_000])
+def test_one_forged_frame_costs_a_moment(watch, every_us):
+    """A robot whose frames are not answered sends few of them; it is taken back all the same."""
+    watch.film(A)
+    assert watch.frame(B)
+    lost = 0
+    while not watch.frame(A):
+        watch.now_us += every_us
+        lost += 1
+        assert lost < 20
+    assert lost * every_us <= GOES_ON_US + every_us
+    assert watch.film(A) == [1.0]
+
+
+@pytest.mark.parametrize("per_frame", [1, 3, 40])
+def test_forged_frames_of_ever_new_sessions_cost_no_more_than_one(watch, per_frame):
+    watch.film(A)
+    forged, lost, obeyed = random.Random(7), 0, 0
+    for _ in range(300):
+        for _ in range(per_frame):
+            watch.now_us += FRAME_US // per_frame
+            obeyed += watch.frame(f"{forged.getrandbits(32):08x}")
+        lost += not watch.frame(A)
+    assert lost <= GOES_ON_US / FRAME_US + 2
+    assert per_frame > KEPT or obeyed <= per_frame * (GOES_ON_US / FRAME_US + 2)
+
+
+def test_forged_frames_of_two_sessions_in_turn_do_not_keep_the_robot_out(watch):
+    watch.film(A)
+    watch.film(B, C, A, seconds=0.5)
+    assert watch.film(A, B, C) == [1.0, 0.0, 0.0]
+
+
+def test_of_two_robots_with_one_id_the_first_is_steered_and_never_both(watch):
+    watch.film(A)
+    share_a, share_b = watch.film(A, B, seconds=10)
+    assert share_a > 0.95 and share_b < 0.05
+    assert watch.film(A, B, seconds=10) == [1.0, 0.0]
+
+
+@pytest.mark.parametrize("share", [1, 2])
+def test_when_the_first_of_two_ends_the_second_is_steered(watch, share):
+    watch.film(A)
+    watch.film(A, B, seconds=2)
+    later = watch.film(B, seconds=4.0)[0]
+    assert 1 - later <= (SILENT_US + GOES_ON_US + 2 * FRAME_US) / 4e6
+    assert watch.film(B, seconds=share) == [1.0]
+
+
+def test_a_robot_that_starts_anew_after_a_dispute_waits_for_the_silence(watch):
+    watch.film(A)
+    watch.film(A, B, seconds=2)
+    assert not watch.frame(C)
+    watch.now_us += SILENT_US + 1
+    assert watch.frame(C)
+    assert watch.film(C) == [1.0]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_whatever_comes_one_session_at_most_is_admitted_within_the_time_to_change(watch, seed):
+    draw, last = random.Random(seed), (0, "")
+    for _ in range(2_000):
+        watch.now_us += draw.choice([1_000, FRAME_US, 400_000])
+        session = draw.choice([A, A, B, C, f"{draw.getrandbits(32):08x}"])
+        if watch.frame(session):
+            assert watch.sessions.current == session
+            last = (watch.now_us, session)
+    assert watch.sessions.current == last[1]

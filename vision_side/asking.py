@@ -1,0 +1,69 @@
+"""Missions that people ask for: who may, whether it was asked just now, and why one is not taken up. Pure.
+
+Times are the robot's: what was asked must cite a status not much older than the frame at hand, so that a message that
+a network kept back does not start anything.
+"""
+
+from typing import Final
+
+from protocol.channels import MISSION
+from protocol.codec import decode
+from protocol.errors import ConfigError, WireError
+from protocol.messages import Asked, FrameHeader, RequestHeader
+from protocol.mission_messages import MissionRequest
+from protocol.refusals import Refusal
+from protocol.transports.link import Message
+from vision_side.config import VisionConfig
+from vision_side.missions.choice import Chosen, requested
+
+MAX_AGE_US: Final = 2_000_000
+"""As old as the status that a request to a robot may cite."""
+_LONGEST: Final = 200
+
+
+class Desk:
+    """Takes up what is asked for, each once. `asked` is the newest, `refused` why it was not taken up."""
+
+    def __init__(self, config: VisionConfig) -> None:
+        self._config = config
+        self.asked: Asked | None = None
+        self.refused = ""
+
+    def take(self, message: Message, frame: FrameHeader) -> Chosen | None:
+        """What to do from `frame` on; None for what was said before and for what is refused.
+
+        Raises WireError for what is no message of this channel; `refused` then says it too.
+        """
+        try:
+            header = decode(RequestHeader, message.header)
+            request = decode(MissionRequest, message.payload, MISSION.max_payload_bytes)
+        except WireError as error:
+            self.refused = str(error)[:_LONGEST]
+            raise
+        asked = Asked(session=header.session, id=request.id)
+        if asked == self.asked:
+            return None
+        self.asked, self.refused = asked, ""
+        try:
+            _check(header, message.source, frame)
+            return requested(request, self._config)
+        except (WireError, ConfigError) as error:
+            self.refused = " ".join(str(error).split())[:_LONGEST]
+            return None
+
+
+def _check(header: RequestHeader, source: str, frame: FrameHeader) -> None:
+    """Raise WireError unless it is said by who may, of this session of the robot, and just now."""
+    if header.source != source:
+        raise WireError(Refusal.UNKNOWN_SOURCE, "key and header disagree on the source")
+    if source not in MISSION.said_by:
+        raise WireError(Refusal.UNKNOWN_SOURCE, f"{source} chooses no mission; {' and '.join(MISSION.said_by)} do")
+    echo = header.echo
+    if echo is None or echo.channel != "status":
+        raise WireError(Refusal.NOT_ALLOWED, "a mission cites the newest status of the robot")
+    if echo.session != frame.session:
+        raise WireError(Refusal.OTHER_SESSION, f"it was asked of session {echo.session}, the robot is in "
+                                               f"{frame.session}: say it again")
+    age_us = frame.t_us - echo.t_us
+    if age_us > MAX_AGE_US:
+        raise WireError(Refusal.STALE, f"it was asked {age_us / 1e6:.1f} s ago: say it again")

@@ -1,0 +1,89 @@
+"""What vision hears and says about missions on a link: requests, scans, reports. Shell (slots; the clock is given)."""
+
+import secrets
+from collections.abc import Callable
+
+from protocol.channels import MISSION, REPORT, SCAN
+from protocol.codec import encode
+from protocol.errors import WireError
+from protocol.messages import DetectionsHeader, Echo, FrameHeader
+from protocol.transports.link import LatestSlot, Link, Message
+from vision_side.asking import Desk
+from vision_side.config import VisionConfig
+from vision_side.missions.choice import configured
+from vision_side.pipeline import SOURCE, Pipeline, Seen
+from vision_side.reporting import Reporter
+from vision_side.scan import read_scan
+
+NO_FRAMES = Seen("no frames")
+_ENDED = "the robot started anew, which ended it: say it again"
+
+
+class Dispatch:
+    """One robot's missions. Scans are subscribed to only once a mission goes by them."""
+
+    def __init__(
+        self, config: VisionConfig, link: Link, tell: Callable[[str, str], None], refuse: Callable[[WireError], None]
+    ) -> None:
+        """`tell` prints a line (about what, the line) if it changed; `refuse` counts.
+
+        Raises ConfigError for a configured mission that there is not.
+        """
+        self._link, self._tell, self._refuse = link, tell, refuse
+        self._mission = configured(config).name
+        self._missions: LatestSlot[Message] = link.latest(MISSION)
+        self._scans: LatestSlot[Message] | None = None
+        self._desk = Desk(config)
+        self._reporter = Reporter(config.detector)
+        self._session = secrets.token_hex(4)
+        self._reports = 0
+
+    def before(self, pipeline: Pipeline, frame: FrameHeader) -> None:
+        """Give `pipeline` what it has to know before it answers `frame`."""
+        message = self._missions.take()
+        if message is not None:
+            self._choose(message, pipeline, frame)
+        if pipeline.mission.wants_scan:
+            self._look(pipeline)
+
+    def after(self, now_s: float, pipeline: Pipeline | None, frame: FrameHeader | None, seen: Seen) -> None:
+        """Say what was done, if it is time; without a frame, that none comes."""
+        if pipeline is not None:
+            self._mission = pipeline.mission.name
+        asked, refused = self._desk.asked, self._desk.refused
+        if pipeline is not None and asked is not None and pipeline.asked != asked:
+            refused = refused or _ENDED
+        report = self._reporter.due(now_s, self._mission, seen, asked, refused)
+        if report is None:
+            return
+        self._reports += 1
+        echo = None
+        if frame is not None:
+            echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
+        header = DetectionsHeader(source=SOURCE, session=self._session, seq=self._reports, echo=echo)
+        self._link.publish(REPORT, encode(header), encode(report), SOURCE)
+
+    def _choose(self, message: Message, pipeline: Pipeline, frame: FrameHeader) -> None:
+        try:
+            chosen = self._desk.take(message, frame)
+        except WireError as error:
+            self._refuse(error)
+            return
+        if chosen is not None and self._desk.asked is not None:
+            pipeline.meet(frame.session)
+            pipeline.switch(chosen, self._desk.asked)
+            self._tell("mission", f"mission {chosen.name}, asked for by {message.source}")
+        elif self._desk.refused:
+            self._tell("mission", f"a mission of {message.source} is refused: {self._desk.refused}")
+
+    def _look(self, pipeline: Pipeline) -> None:
+        if self._scans is None:
+            self._scans = self._link.latest(SCAN)
+        message = self._scans.take()
+        if message is None:
+            return
+        try:
+            pipeline.see_scan(*read_scan(message.header, message.payload))
+        except WireError as error:
+            self._refuse(error)
+            self._tell("scan", f"scans are refused: {error.detail}")

@@ -1,0 +1,1 @@
+"""Missions: what to do with what is seen."""

@@ -1,0 +1,159 @@
+"""Finds a mission by its name and builds it with its own `Config`. Shell (imports plug-ins).
+
+Names are those below, those of the entry points `sightline.missions`, or, from a configuration or a command line only,
+`package.module:Name`. A mission whose `Config` has a section of vision's configuration by name and type (`target`,
+`track`, `steer`, `latency`, `search`, `boxes`) begins with that section; its options lie over it.
+"""
+
+import difflib
+import importlib
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import BaseModel, ValidationError
+
+from protocol.errors import ConfigError
+from protocol.messages import CameraModel
+from protocol.mission_messages import MissionRequest
+from vision_side.config import VisionConfig
+from vision_side.missions.port import Mission
+
+BUILT_IN: Final = {
+    "follow": "vision_side.missions.follow:Follow",
+    "band": "vision_side.missions.band:Band",
+    "pixel-pi": "vision_side.missions.pixel_pi:PixelPi",
+    "pixel-p": "vision_side.missions.pixel_p:PixelP",
+    "legs": "vision_side.missions.legs:Legs",
+    "legs-baseline": "vision_side.missions.legs_baseline:LegsBaseline",
+    "traffic-light": "vision_side.missions.traffic_light:TrafficLight",
+    "traffic-light-boxes": "vision_side.missions.traffic_light:TrafficLightBoxes",
+    "goto": "vision_side.missions.goto:Goto",
+    "goto-baseline": "vision_side.missions.goto_baseline:GotoBaseline",
+}
+"""Here and not as entry points, so that a checkout that nobody installed has them too."""
+GROUP: Final = "sightline.missions"
+_LONGEST_DETAIL: Final = 160
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """A mission that can be built, as often as is needed: for each session of the robot anew."""
+
+    name: str
+    plugin: Any
+    config: Any
+
+    @property
+    def wants_scan(self) -> bool:
+        """Whether it goes by range scans."""
+        return bool(getattr(self.plugin, "wants_scan", False))
+
+    @property
+    def needs_camera(self) -> bool:
+        """Whether another camera model means to begin anew."""
+        return bool(getattr(self.plugin, "needs_camera", True))
+
+    def build(self, camera: CameraModel) -> Mission:
+        """A new one, that knows nothing yet."""
+        mission: Mission = self.plugin(self.config, camera)
+        return mission
+
+
+def configured(config: VisionConfig) -> Chosen:
+    """The mission of `config.mission`. Raises ConfigError as `choose` does."""
+    return choose(config.mission.kind, _own_options(config.mission.kind, config), config)
+
+
+def _own_options(kind: str, config: VisionConfig) -> dict[str, Any]:
+    """What `config` has for this mission."""
+    own = config.mission.options if kind == config.mission.kind else {}
+    return {**config.missions.get(kind, {}), **own}
+
+
+def requested(request: MissionRequest, config: VisionConfig) -> Chosen:
+    """The mission that somebody asked for: its options over those that `config` has for the same one.
+
+    Raises ConfigError for an unknown one or a wrong option.
+    """
+    if ":" in request.name:  # the wire's model has no such name; should it ever, code is still not named by a message
+        raise ConfigError(f"no mission called {request.name!r}")
+    options = _own_options(request.name, config)
+    for name, value in request.options.items():
+        _lay(options, name.split("."), value)
+    if request.waypoints:
+        options["waypoints"] = request.waypoints
+    return choose(request.name, options, config)
+
+
+def _lay(options: dict[str, Any], path: list[str], value: Any) -> None:
+    """Put `value` at `path`, leaving what is beside it and the given tables themselves as they are."""
+    for name in path[:-1]:
+        inner = options.get(name)
+        options[name] = options = dict(inner) if isinstance(inner, Mapping) else {}
+    options[path[-1]] = value
+
+
+def choose(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Chosen:
+    """The mission called `kind` with its checked configuration.
+
+    Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option.
+    """
+    plugin = _load(kind)
+    settings = getattr(plugin, "Config", None)
+    if not (isinstance(settings, type) and issubclass(settings, BaseModel)):
+        raise ConfigError(f"mission {kind!r}: {plugin!r} has no pydantic model called Config; see docs/missions.md")
+    try:
+        return Chosen(kind, plugin, settings.model_validate(_merged(settings, options, config)))
+    except ValidationError as error:
+        raise ConfigError(f"mission {kind!r}: {_problem(settings, error)}"[:_LONGEST_DETAIL]) from None
+
+
+def _merged(settings: type[BaseModel], options: Mapping[str, Any], config: VisionConfig) -> dict[str, Any]:
+    """The sections of vision's configuration that the mission shares, with its options laid over them."""
+    merged: dict[str, Any] = dict(options)
+    for name, field in settings.model_fields.items():
+        section = getattr(config, name, None)
+        if not isinstance(section, BaseModel) or field.annotation is not type(section):
+            continue
+        given = options.get(name, {})
+        merged[name] = section.model_dump() | dict(given) if isinstance(given, Mapping) else given
+    return merged
+
+
+def _problem(settings: type[BaseModel], error: ValidationError) -> str:
+    """A misspelt option before a missing one: it is usually both."""
+    problems = sorted(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden")
+    first = problems[0]
+    where = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"unknown option {where!r}; it takes {', '.join(settings.model_fields) or 'none'}"
+    if first["type"] == "missing":
+        return f"option {where!r} is missing"
+    return f"option {where!r}: {first['msg']}"
+
+
+def _load(kind: str) -> Any:
+    where = BUILT_IN.get(kind)
+    others = {} if where else {entry.name: entry for entry in entry_points(group=GROUP)}
+    try:
+        if kind in others:
+            return others[kind].load()
+        if where is not None or ":" in kind:
+            return _imported(where or kind)
+    except Exception as error:  # whatever a plug-in's own import raises
+        raise ConfigError(f"mission {kind!r} cannot be loaded: {error}"[:_LONGEST_DETAIL]) from None
+    names = sorted({*BUILT_IN, *others})
+    nearest = difflib.get_close_matches(kind, names, n=1)
+    hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+    raise ConfigError(f"no mission called {kind!r}{hint}; there are {', '.join(names)}, or package.module:Name")
+
+
+def _imported(path: str) -> Any:
+    if str(Path.cwd()) not in sys.path:  # a class of one's own lies where vision is started
+        sys.path.insert(0, str(Path.cwd()))
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)

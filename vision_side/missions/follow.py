@@ -1,0 +1,124 @@
+"""The default mission: turn towards one target and keep a distance to it; when it is lost, look around. Pure.
+
+Track, foretell, steer, search: each is a file of its own. What a detector found is located as a sphere of known size;
+boxes that somebody else found are located by their height or width.
+"""
+
+import math
+
+from protocol.config import Config as Settings
+from protocol.messages import STILL, CameraModel, FrameHeader, Pose, Twist
+from vision_side.config import BoxesConfig, LatencyConfig, SearchConfig, SteerConfig, TargetConfig, TrackConfig
+from vision_side.detect.boxes import locate_box
+from vision_side.detect.port import Detection
+from vision_side.foretell import Foretelling, Motion
+from vision_side.missions.port import Plan, View
+from vision_side.search import Search
+from vision_side.sphere import Sighting, locate
+from vision_side.steer import Aim, Steer
+from vision_side.track import Target, Track, from_odometry
+
+
+class Follow:
+    """Follows one target. `phase` is tracking, coasting, searching or lost.
+
+    Bearing and distance are the track's at the time of capture, over the floor from the lens.
+    """
+
+    class Config(Settings):
+        """The sections of vision's configuration of the same names."""
+
+        target: TargetConfig = TargetConfig()
+        track: TrackConfig = TrackConfig()
+        steer: SteerConfig = SteerConfig()
+        latency: LatencyConfig = LatencyConfig()
+        search: SearchConfig = SearchConfig()
+        boxes: BoxesConfig = BoxesConfig()
+
+    def __init__(self, config: Config, camera: CameraModel) -> None:
+        self._config = config
+        self._camera = camera
+        self._track = Track(config.track)
+        self._steer = Steer(config.steer, config.target.stand_off_m)
+        self._search = Search(config.search)
+        self._foretelling = Foretelling(config.latency)
+
+    def step(self, view: View) -> Plan:
+        """The plan for one frame."""
+        places = self._places(view)
+        self._hear(view)
+        seen = self._track.step(view.dt_s, view.header.pose, self._sightings(places))
+        plan = self._act(view, seen)
+        self._foretelling.sent(view.header.t_us, plan.twist)
+        return plan
+
+    def _hear(self, view: View) -> None:
+        """Let the delay estimate and the integrals know what the robot did."""
+        header, dt_s = view.header, view.dt_s
+        self._foretelling.measure(header.latency_us, dt_s)
+        asked = self._foretelling.expected(header.t_us)
+        if asked is not None and header.applied == (0.0, 0.0):
+            self._steer.unmet(dt_s, -asked[0], -asked[1])
+
+    def _places(self, view: View) -> list[Sighting | None]:
+        """Where each detection is: a sphere, or a box that somebody else found or whose size is given."""
+        otherwise_m, sizes = self._expected_m(view.header.pose), self._config.boxes
+        return [
+            locate_box(one, self._camera, sizes, otherwise_m) if self._is_box(one, view)
+            else locate(one, self._camera, self._config.target.radius_m)
+            for one in view.detections
+        ]
+
+    def _is_box(self, one: Detection, view: View) -> bool:
+        """Without a picture here all are somebody else's boxes; with one, what has no outline where a size is given."""
+        sizes = self._config.boxes
+        sized = sizes.height_m is not None or sizes.width_m is not None
+        return view.picture is None or (sized and one.outline_px is None)
+
+    def _sightings(self, places: list[Sighting | None]) -> list[Sighting]:
+        target = self._config.target
+        return [one for one in places if one and one.x_m**2 + one.y_m**2 <= target.max_range_m**2]
+
+    def _expected_m(self, pose: Pose) -> float:
+        """How far from the lens a thing is whose box does not tell: where it was last, or where the robot may stay."""
+        target, boxes = self._track.target, self._config.boxes
+        if target is None or (boxes.height_m is None and boxes.width_m is None):
+            return self._config.target.stand_off_m
+        x, y = from_odometry(pose, target.x_m, target.y_m)
+        return math.hypot(x - self._camera.x_m, y - self._camera.y_m)
+
+    def _act(self, view: View, seen: Sighting | None) -> Plan:
+        target = self._track.target
+        if target is None:
+            return self._look_around(view)
+        header = view.header
+        x, y = from_odometry(header.pose, target.x_m, target.y_m)
+        x, y = x - self._camera.x_m, y - self._camera.y_m
+        bearing_rad = math.atan2(y, x)
+        self._search.reset(bearing_rad)
+        twist = self._steer_to(target, header, view.dt_s)
+        phase = "tracking" if seen else "coasting"
+        box = seen.detection if seen else None
+        return Plan(twist, phase, target=box, bearing_rad=bearing_rad, distance_m=math.hypot(x, y))
+
+    def _steer_to(self, target: Target, header: FrameHeader, dt_s: float) -> Twist:
+        latency_s = self._foretelling.latency_s
+        then = self._foretelling.motion(header.t_us, header.pose, header.moving, header.applied)
+        aim = aim_at(target, then, self._camera, latency_s)
+        return self._steer.step(dt_s, aim, latency_s, self._may_drive(target))
+
+    def _may_drive(self, target: Target) -> bool:
+        config = self._config.track
+        return target.sightings >= config.confirm and target.unseen_us <= config.coast_s * 1e6
+
+    def _look_around(self, view: View) -> Plan:
+        self._steer.reset()
+        twist = self._search.step(view.dt_s, view.header.pose, view.header.applied)
+        return Plan(STILL, "lost") if twist is None else Plan(twist, "searching")
+
+
+def aim_at(target: Target, robot: Motion, camera: CameraModel, ahead_s: float) -> Aim:
+    """`target`, `ahead_s` from now, about the lens of `robot`."""
+    x, y = from_odometry(robot.pose, target.x_m + target.vx_mps * ahead_s, target.y_m + target.vy_mps * ahead_s)
+    vx, vy = from_odometry((0.0, 0.0, robot.pose[2]), target.vx_mps, target.vy_mps)
+    return Aim(x - camera.x_m, y - camera.y_m, vx, vy, camera.x_m)

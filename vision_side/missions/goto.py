@@ -1,0 +1,228 @@
+"""Mission `goto`: drive to waypoints, round what short-sighted range sensors find on the way, or say it cannot. Pure.
+
+Straight to the goal while nothing known is in between; else along the wall, at a clearance, the way that is shortest
+by all that was seen so far. Speed is bound by sight: whatever stands just beyond the sensors' reach must still leave
+the clearance. Waypoints are in the odometry frame, in metres.
+"""
+
+import math
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from protocol.config import Config
+from protocol.messages import STILL, CameraModel, Pose, Twist
+from vision_side.config import LatencyConfig
+from vision_side.foretell import Foretelling, Motion
+from vision_side.missions.body import Body, braking_mps, clear_of
+from vision_side.missions.giving_up import Patience, PatienceConfig
+from vision_side.missions.ground import CELL_M, Ground
+from vision_side.missions.port import Plan, RangeScan, View
+from vision_side.missions.ranging import PoseMemory, about_robot, echoes, in_odometry
+from vision_side.missions.route import Point, Route
+from vision_side.track import to_odometry
+
+Metres = Annotated[float, Field(ge=-100, le=100)]
+
+_NEAR_M = 0.8  # points further off than this are none of the brakes' business
+_BRAKE_SLACK_M = 0.015  # what steering and cells of 0.03 m may be off, and so much that it can turn where it stopped
+_ROOMY_M = 0.03  # more than needed, where that is no long way round: so that the brakes need not act beside a wall
+_OUTSIDE_M = 1.2 * CELL_M  # no free cell nearer than this: the robot is where it should not be
+_SHY_RAD_S = 0.4
+_TURN_RAD = math.radians(25)  # a turn by more than this brings the robot's corners to the front
+_CORNER_SLACK_M = 0.002
+_SIDE_RAD, _SIDE_M = math.radians(45), 0.15  # to the other side of what is in the way only for this much shorter a way
+
+
+class GotoConfig(Config):
+    """Where to, what with, and how far from everything."""
+
+    waypoints: Annotated[tuple[tuple[Metres, Metres], ...], Field(min_length=1, max_length=64)]
+    """(x, y) in the odometry frame, one after the other."""
+    body: Body = Body()
+    sensor_x_m: Annotated[float, Field(ge=-2, le=2)] = 0.0
+    """Where the scan's rays start, forward of the axle."""
+    sight_m: Annotated[float, Field(gt=0, le=50)] = 0.2
+    """How far beyond the robot's front its range sensors see; what bounds the speed into the unknown."""
+    clearance_m: Annotated[float, Field(ge=0.01, le=2)] = 0.112
+    """Between the robot's outline and anything seen."""
+    tolerance_m: Annotated[float, Field(ge=0.01, le=1)] = 0.05
+    max_linear_mps: Annotated[float, Field(gt=0, le=2)] = 0.5
+    max_angular_rad_s: Annotated[float, Field(gt=0, le=6)] = 2.5
+    bearing_kp: Annotated[float, Field(gt=0, le=20)] = 5.0
+    """Per second; times latency it never exceeds 0.9, as for following."""
+    drive_within_rad: Annotated[float, Field(gt=0, le=1.5)] = 0.7
+    """Forward speed fades to zero as the bearing of the way grows to this."""
+    brake_mps2: Annotated[float, Field(gt=0, le=10)] = 0.8
+    """What stopping counts on; below what the robot can."""
+    creep_mps: Annotated[float, Field(gt=0, le=1)] = 0.1
+    """For backing out, and where the delay leaves no faster."""
+    max_scan_age_s: Annotated[float, Field(gt=0, le=2)] = 0.4
+    patience: PatienceConfig = PatienceConfig()
+    latency: LatencyConfig = LatencyConfig()
+
+
+class Goto:
+    """To each waypoint in turn."""
+
+    Config = GotoConfig
+    wants_scan: ClassVar[bool] = True
+    needs_camera: ClassVar[bool] = False
+
+    def __init__(self, config: GotoConfig, camera: CameraModel) -> None:  # noqa: ARG002  every mission is given it
+        self._config = config
+        self._keep_m = config.body.radius_m + config.clearance_m
+        self._ground = Ground()
+        self._poses = PoseMemory()
+        self._foretelling = Foretelling(config.latency)
+        self._patience = Patience(config.patience)
+        self._reached = 0
+        self._route: Route | None = None
+        self._planned = -1
+        self._scan: RangeScan | None = None
+        self._carrot: Point | None = None
+        self._ended: Plan | None = None
+
+    def step(self, view: View) -> Plan:
+        """The twist towards the next waypoint."""
+        self._poses.add(view.header)
+        self._foretelling.measure(view.header.latency_us, view.dt_s)
+        self._look(view)
+        plan = self._ended or self._next(view)
+        if plan.done:
+            self._ended = plan
+        self._foretelling.sent(view.header.t_us, plan.twist)
+        return plan
+
+    def _look(self, view: View) -> None:
+        """Take in a scan that is new."""
+        scan = view.scan
+        if scan is None or (self._scan is not None and scan.t_us <= self._scan.t_us):
+            return
+        self._scan = scan
+        pose, sensor_x_m = self._poses.at(scan.t_us), self._config.sensor_x_m
+        self._ground.see(to_odometry(pose, sensor_x_m, 0.0), in_odometry(echoes(scan, sensor_x_m), pose))
+
+    def _next(self, view: View) -> Plan:
+        if self._scan is None or view.header.t_us - self._scan.t_us > self._config.max_scan_age_s * 1e6:
+            return Plan(STILL, "no ranges", "the range sensors are silent; without them nothing moves")
+        while math.dist(view.header.pose[:2], self._goal()) <= self._config.tolerance_m:
+            self._reached += 1
+            self._route = self._carrot = None
+            self._patience.start_again()
+            if self._reached == len(self._config.waypoints):
+                return Plan(STILL, "arrived", self._score(), done=True)
+        return self._towards(view)
+
+    def _goal(self) -> Point:
+        return self._config.waypoints[min(self._reached, len(self._config.waypoints) - 1)]
+
+    def _score(self) -> str:
+        return f"reached {self._reached} of {len(self._config.waypoints)}"
+
+    def _towards(self, view: View) -> Plan:
+        robot = (view.header.pose[0], view.header.pose[1])
+        route = self._plan(robot)
+        entry = route.entry(robot, self._config.clearance_m + 2 * CELL_M)
+        left_m = route.left_m(entry) if entry else None
+        reason = self._patience.step(view, left_m, self._ground.discoveries)
+        if reason:
+            return Plan(STILL, "cannot reach", f"{self._score()}: cannot reach waypoint {self._reached + 1}: {reason}",
+                        done=True)
+        if entry is None:
+            return Plan(STILL, "closed in", self._score())
+        out = route.middle(entry)
+        if math.dist(out, robot) > _OUTSIDE_M:
+            return self._leave(view, out)
+        self._carrot = self._chosen(route, robot, route.carrot(robot, entry), route.left_m(entry))
+        return self._drive(view, route, self._carrot)
+
+    def _leave(self, view: View, out: Point) -> Plan:
+        """Too near to something: straight out forwards or backwards, and turn only afterwards, where there is room."""
+        then = self._then(view)
+        bearing_rad = _bearing(then.pose, self._room(then.pose) or out)
+        backs = abs(bearing_rad) > math.pi / 2
+        turn_rad = math.remainder(bearing_rad + math.pi, math.tau) if backs else bearing_rad
+        creep = self._config.creep_mps * max(0.0, math.cos(1.3 * turn_rad))
+        twist = self._braked(then.pose, -creep if backs else creep, max(-_SHY_RAD_S, min(_SHY_RAD_S, 2 * turn_rad)))
+        return Plan(twist, "backing out" if backs else "going out", self._score())
+
+    def _room(self, pose: Pose) -> Point | None:
+        """Where to creep straight to before a turn: away from what the robot's corners would come too near to."""
+        points = about_robot(self._ground.points(), pose)
+        if not len(points):
+            return None
+        away_m = np.hypot(points[:, 0], points[:, 1])
+        x, y = points[int(np.argmin(away_m))].tolist()
+        if away_m.min() >= self._keep_m - _CORNER_SLACK_M or abs(x) < abs(y):
+            return None
+        return to_odometry(pose, -math.copysign(0.1, x), 0.0)
+
+    def _then(self, view: View) -> Motion:
+        """The robot when the command acts."""
+        header = view.header
+        return self._foretelling.motion(header.t_us, header.pose, header.moving, header.applied)
+
+    def _chosen(self, route: Route, robot: Point, carrot: Point, left_m: float) -> Point:
+        """`carrot`, or the one before it where the way over that, on the other side, is hardly longer."""
+        old = self._carrot
+        if old is None or math.dist(robot, old) < self._config.clearance_m or not route.sees(robot, old):
+            return carrot
+        aside_rad = _bearing((*robot, 0.0), carrot) - _bearing((*robot, 0.0), old)
+        if abs(math.remainder(aside_rad, math.tau)) < _SIDE_RAD:
+            return carrot
+        return old if math.dist(robot, old) + route.left_from(old) < left_m + _SIDE_M else carrot
+
+    def _plan(self, robot: Point) -> Route:
+        route = self._route
+        if route is None or self._planned != self._ground.version or not route.covers(robot):
+            route = self._route = Route(self._ground.cells(), robot, self._goal(), self._keep_m,
+                                        self._keep_m + _ROOMY_M)
+            self._planned = self._ground.version
+        return route
+
+    def _drive(self, view: View, route: Route, carrot: Point) -> Plan:
+        header, config, then = view.header, self._config, self._then(view)
+        bearing_rad = _bearing(then.pose, carrot)
+        room = self._room(then.pose) if abs(bearing_rad) > _TURN_RAD else None
+        if room is not None:
+            return self._leave(view, room)
+        goal_m = math.dist(header.pose[:2], route.goal)
+        linear = self._speed(math.dist(then.pose[:2], route.goal), bearing_rad, self._sight_mps(then))
+        kp = min(config.bearing_kp, 0.9 / max(self._foretelling.latency_s, 1e-3))
+        angular = max(-config.max_angular_rad_s, min(config.max_angular_rad_s, kp * bearing_rad))
+        phase = "to goal" if carrot == route.goal else "along wall"
+        note = f"{self._score()}, {goal_m:.2f} m to waypoint {self._reached + 1}"
+        return Plan(self._braked(then.pose, linear, angular), phase, note,
+                    bearing_rad=_bearing(header.pose, route.goal), distance_m=goal_m)
+
+    def _speed(self, goal_m: float, bearing_rad: float, sight_mps: float) -> float:
+        """By what is left, by how far off the heading is, and by sight."""
+        config = self._config
+        fade = max(0.0, 1.0 - (bearing_rad / config.drive_within_rad) ** 2)
+        arriving = max(0.03, min(braking_mps(goal_m, 0.1, config.brake_mps2 / 2), 2.0 * goal_m))
+        return min(arriving, fade * config.max_linear_mps, fade * max(sight_mps, config.creep_mps))
+
+    def _sight_mps(self, then: Motion) -> float:
+        """What may stand just beyond the sensors' reach must still be left at the clearance.
+
+        The reach is counted from where the newest scan was taken, so speed gives way when scans are late or lost.
+        """
+        config = self._config
+        seen_from = self._poses.at(self._scan.t_us) if self._scan else then.pose
+        room_m = config.sight_m - config.clearance_m - _BRAKE_SLACK_M - math.dist(seen_from[:2], then.pose[:2])
+        return braking_mps(room_m, 0.0, config.brake_mps2)
+
+    def _braked(self, pose: Pose, linear: float, angular: float) -> Twist:
+        """The twist, slowed down towards what is known to stand near."""
+        points = about_robot(self._ground.points(), pose)
+        near = points[(abs(points) < _NEAR_M).all(axis=1)]
+        keep_m = self._config.clearance_m + _BRAKE_SLACK_M
+        share = clear_of(near, self._config.body, (linear, 0.0), keep_m, self._config.brake_mps2)
+        return Twist(linear_mps=linear * share, angular_rad_s=angular)
+
+
+def _bearing(pose: Pose, point: Point) -> float:
+    """Left positive, within half a turn."""
+    return math.remainder(math.atan2(point[1] - pose[1], point[0] - pose[0]) - pose[2], math.tau)

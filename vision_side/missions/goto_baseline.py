@@ -1,0 +1,165 @@
+"""Mission `goto-baseline`: the write-up's go-to-goal and wall following as they were, for comparison. Pure.
+
+Two PD laws, never both at once, and a machine of three states (to the goal, left contour, right contour) at 10 Hz.
+What is wrong in it stays: differences per step instead of per second, an angle that wraps wrongly near half a turn, a
+turn by the clock, gaps between its conditions, and no memory, so that it can go round for ever.
+"""
+
+import math
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from protocol.config import Config
+from protocol.messages import STILL, CameraModel, FrameHeader, Pose, Twist
+from vision_side.missions.goto import Metres
+from vision_side.missions.port import Plan, RangeScan, View
+
+_STEP_US = 100_000  # it ran at 10 Hz
+_REACH_M = 0.2
+_RAY_RAD = 0.25  # 13 rays over 3 rad
+_FIRST_RAD = {"front": -1.5, "left": 0.0708, "right": -3.0708}
+_SAME_RAY_RAD = 0.2
+
+
+class GotoBaselineConfig(Config):
+    """Its numbers; gains per step of 0.1 s, lengths in metres, speeds in m/s and rad/s."""
+
+    waypoints: Annotated[tuple[tuple[Metres, Metres], ...], Field(min_length=1, max_length=64)]
+    position_kp: float = 0.3
+    position_kd: float = 0.08
+    angle_kp: float = 1.2
+    angle_kd: float = 0.2
+    tolerance_m: Annotated[float, Field(gt=0, le=1)] = 0.05
+    tolerance_rad: Annotated[float, Field(gt=0, le=1)] = 0.05
+    max_linear_mps: Annotated[float, Field(gt=0, le=2)] = 0.5
+    wall_m: float = 0.13
+    """The distance that it keeps from a wall, and at which it turns before one."""
+    too_near_m: float = 0.12
+    off_from_m: float = 0.05
+    off_to_m: float = 0.08
+    """It turns while the distance is off by more than the first and by less than the second."""
+    contour_mps: Annotated[float, Field(gt=0, le=2)] = 0.1
+    contour_rad_s: Annotated[float, Field(gt=0, le=6)] = 1.0
+    turn_us: Annotated[int, Field(ge=0)] = 1_500_000
+
+
+class GotoBaseline:
+    """The three-state machine."""
+
+    Config = GotoBaselineConfig
+    wants_scan: ClassVar[bool] = True
+    needs_camera: ClassVar[bool] = False
+
+    def __init__(self, config: GotoBaselineConfig, camera: CameraModel) -> None:  # noqa: ARG002
+        self._config = config
+        self._reached = 0
+        self._side = 0.0  # 0 to the goal, 1 left contour (the wall on the right), -1 right contour
+        self._turned = False
+        self._error = (10.0, 10.0, 10.0)  # x, y, angle: what it began with
+        self._linear = self._angular = 0.0
+        self._next_us = 0
+        self._rays: dict[str, list[float]] = {}
+
+    def step(self, view: View) -> Plan:
+        """The twist of its last step; a new one every 0.1 s."""
+        if view.scan is None:
+            return Plan(STILL, "no ranges", "the range sensors are silent")
+        if view.header.t_us >= self._next_us:
+            self._next_us = view.header.t_us + _STEP_US
+            self._rays = _three_sensors(view.scan)
+            self._run(view.header)
+        if self._reached == len(self._config.waypoints):
+            return Plan(STILL, "arrived", self._score(), done=True)
+        phase = "to goal" if not self._side else "left contour" if self._side > 0 else "right contour"
+        return Plan(Twist(linear_mps=self._linear, angular_rad_s=self._angular), phase, self._score())
+
+    def _score(self) -> str:
+        return f"reached {self._reached} of {len(self._config.waypoints)}"
+
+    def _run(self, header: FrameHeader) -> None:
+        if self._reached == len(self._config.waypoints):
+            return
+        if self._side:
+            self._contour(header)
+        else:
+            self._navigate(header.pose)
+
+    def _errors(self, pose: Pose) -> tuple[float, float, float]:
+        """x, y and angle, with its way of wrapping."""
+        goal = self._config.waypoints[self._reached]
+        dx, dy = goal[0] - pose[0], goal[1] - pose[1]
+        yaw = abs(pose[2]) if abs(pose[2]) > 3 else pose[2]
+        angle = math.atan2(dy, dx) - yaw
+        if abs(angle) > 3:
+            angle = 3.14 - yaw + angle % 3.14
+        return dx, dy, angle
+
+    def _navigate(self, pose: Pose) -> None:
+        config, before = self._config, self._error
+        dx, dy, angle = self._error = self._errors((pose[0], pose[1], math.remainder(pose[2], math.tau)))
+        away = math.hypot(dx, dy)
+        if away > math.hypot(before[0], before[1]):
+            self._linear = self._angular = 0.0
+        if away <= config.tolerance_m:
+            self._linear = self._angular = 0.0
+            self._reached += 1
+        elif abs(angle) > config.tolerance_rad:
+            self._angular = config.angle_kp * angle + config.angle_kd * (angle - before[2])
+        else:
+            speed = config.position_kp * away + config.position_kd * math.hypot(dx - before[0], dy - before[1])
+            self._linear = min(speed, config.max_linear_mps)
+        self._meet()
+
+    def _meet(self) -> None:
+        """Something ahead: stop, and choose the contour by which of the two middle rays is shorter."""
+        front = self._rays["front"]
+        if min(front[6], front[7]) < _REACH_M:
+            self._linear = self._angular = 0.0
+            self._turned = False
+            self._side = -1.0 if front[6] > front[7] else 1.0
+
+    def _contour(self, header: FrameHeader) -> None:
+        """Approach, turn away by the clock, then keep the wall at its distance until the goal is on the wall's side."""
+        config, front = self._config, self._rays["front"]
+        if self._turned:
+            self._follow_wall()
+            pose = header.pose
+            if self._errors((pose[0], pose[1], math.remainder(pose[2], math.tau)))[2] * self._side > 0:
+                self._side = 0.0
+        elif max(front[6], front[7]) > config.wall_m:
+            self._linear, self._angular = config.contour_mps, 0.0
+        else:
+            self._linear, self._angular = 0.0, self._side * config.contour_rad_s
+            self._next_us = header.t_us + config.turn_us
+            self._turned = True
+
+    def _follow_wall(self) -> None:
+        config, front = self._config, self._rays["front"]
+        wall = self._rays["right" if self._side > 0 else "left"]
+        rear = wall[3] if self._side > 0 else wall[10]
+        beside = wall[7] if self._side > 0 else wall[6]
+        error = (wall[6] + wall[7]) / 2 - config.wall_m
+        self._linear, self._angular = 0.0, 0.0
+        if -config.off_to_m < error < -config.off_from_m or min(front[6], front[7]) < config.too_near_m:
+            self._angular = self._side * config.contour_rad_s
+        elif config.off_from_m < error < config.off_to_m or (rear > _REACH_M and beside > _REACH_M):
+            self._angular = -self._side * config.contour_rad_s
+        else:
+            self._linear = config.contour_mps
+
+
+def _three_sensors(scan: RangeScan) -> dict[str, list[float]]:
+    """Its three sensors of 13 rays, from whatever rays there are; no ray so near to the angle: nothing seen."""
+    angles = scan.angle_min_rad + np.arange(len(scan.ranges_m)) * scan.angle_increment_rad
+    return {name: [_range_at(scan, angles, first + _RAY_RAD * index) for index in range(13)]
+            for name, first in _FIRST_RAD.items()}
+
+
+def _range_at(scan: RangeScan, angles: NDArray[Any], angle_rad: float) -> float:
+    off = np.abs(np.remainder(angles - angle_rad + math.pi, math.tau) - math.pi)
+    near = np.flatnonzero(off <= _SAME_RAY_RAD)
+    seen = [float(scan.ranges_m[one]) for one in near[np.argsort(off[near])] if math.isfinite(scan.ranges_m[one])]
+    return seen[0] if seen and seen[0] <= scan.range_max_m else math.inf

@@ -1,0 +1,136 @@
+"""Mission `legs`: follow a person who walks on two legs, by boxes of legs and a lidar. Pure.
+
+A box, one for both legs, says in which direction; the lidar's echoes within the box's span say how far: the middle
+between the two legs, which stays with the person while the legs swing. Everything after that is as in `follow`.
+"""
+
+import math
+from typing import Annotated, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from protocol.messages import CameraModel
+from vision_side.config import TrackConfig
+from vision_side.detect.port import Detection
+from vision_side.missions.follow import Follow
+from vision_side.missions.port import Plan, View
+from vision_side.missions.ranging import Points, PoseMemory, about_robot, echoes, in_odometry
+from vision_side.sphere import Sighting, points_ahead
+from vision_side.track import from_odometry
+
+_SPAN_MARGIN_RAD = math.radians(1.5)  # a lidar's rays stand 1 degree apart, and the person walks on meanwhile
+_GAP_M = 0.10  # echoes further apart than this, one after the other, are of two legs
+
+
+class LegsTrack(TrackConfig):
+    """A person changes speed quicker than a ball that rolls, and is measured less exactly."""
+
+    acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 0.5
+    range_noise: Annotated[float, Field(gt=0, le=1)] = 0.03
+    gate_m: Annotated[float, Field(gt=0, le=5)] = 0.45
+
+
+class Legs(Follow):
+    """Follows one person. `phase` as in `follow`; without echoes in the box it only turns."""
+
+    class Config(Follow.Config):
+        """Those of `follow`, and what legs and the lidar need."""
+
+        track: LegsTrack = LegsTrack()
+        label: Annotated[str, Field(max_length=64)] = "legs"
+        """Boxes with this label are of legs, both legs in one box; empty for any."""
+        leg_radius_m: Annotated[float, Field(gt=0, le=0.3)] = 0.055
+        """The lidar sees a leg's surface; its middle is this much further."""
+        stride_m: Annotated[float, Field(gt=0, le=2)] = 0.6
+        """The second leg is at most this much further away than the first; what is beyond is something else."""
+        sensor_x_m: Annotated[float, Field(ge=-2, le=2)] = 0.055
+        """Where the lidar is, forward of the axle."""
+        max_scan_age_s: Annotated[float, Field(gt=0, le=2)] = 0.4
+
+    wants_scan: ClassVar[bool] = True
+
+    def __init__(self, config: Config, camera: CameraModel) -> None:
+        super().__init__(config, camera)
+        self._legs = config
+        self._poses = PoseMemory()
+        self._scan_us = -1
+        self._echoes: Points = np.empty((0, 2))
+
+    def step(self, view: View) -> Plan:
+        """The plan for one frame."""
+        self._poses.add(view.header)
+        self._lay_out(view)
+        return super().step(view)
+
+    def _lay_out(self, view: View) -> None:
+        """The newest scan's echoes, in the odometry frame; none when it is too old."""
+        scan = view.scan
+        if scan is None or view.header.t_us - scan.t_us > self._legs.max_scan_age_s * 1e6:
+            self._echoes = np.empty((0, 2))
+        elif scan.t_us != self._scan_us or not len(self._echoes):
+            self._scan_us = scan.t_us
+            self._echoes = in_odometry(echoes(scan, self._legs.sensor_x_m), self._poses.at(scan.t_us))
+
+    def _places(self, view: View) -> list[Sighting | None]:
+        """The middle between the legs of each box."""
+        near = about_robot(self._echoes + self._walked(view), view.header.pose) - (self._camera.x_m, self._camera.y_m)
+        return [self._place(one, near, view) for one in view.detections if self._legs.label in ("", one.label)]
+
+    def _walked(self, view: View) -> tuple[float, float]:
+        """How far the person has walked on since the scan: without it he seems nearer than he is, by up to 7 cm."""
+        target = self._track.target
+        if target is None or view.scan is None:
+            return 0.0, 0.0
+        age_s = max(0.0, (view.header.t_us - view.scan.t_us) / 1e6)
+        return target.vx_mps * age_s, target.vy_mps * age_s
+
+    def _place(self, one: Detection, about_lens: Points, view: View) -> Sighting | None:
+        right_rad, left_rad = _span(one, self._camera)
+        if left_rad <= right_rad:
+            return None
+        bearing_rad = (right_rad + left_rad) / 2
+        range_m = self._range(about_lens, right_rad, left_rad)
+        if range_m is None:
+            range_m = self._remembered_m(view)
+        x_m = self._camera.x_m + range_m * math.cos(bearing_rad)
+        return Sighting(x_m, self._camera.y_m + range_m * math.sin(bearing_rad), one)
+
+    def _range(self, about_lens: Points, right_rad: float, left_rad: float) -> float | None:
+        """From the lens to the middle between the legs; None without an echo in the span."""
+        bearings = np.arctan2(about_lens[:, 1], about_lens[:, 0])
+        inside = (bearings >= right_rad - _SPAN_MARGIN_RAD) & (bearings <= left_rad + _SPAN_MARGIN_RAD)
+        away = np.hypot(about_lens[inside, 0], about_lens[inside, 1])
+        if not len(away):
+            return None
+        legs = nearest_legs(about_lens[inside], away, self._legs.stride_m)
+        return float(np.mean(legs[:2])) + self._legs.leg_radius_m
+
+    def _remembered_m(self, view: View) -> float:
+        """How far the person is as far as is known, for a box without an echo."""
+        target = self._track.target
+        if target is None:
+            return self._config.target.stand_off_m
+        x, y = from_odometry(view.header.pose, target.x_m, target.y_m)
+        return math.hypot(x - self._camera.x_m, y - self._camera.y_m)
+
+
+def nearest_legs(points: Points, away_m: NDArray[np.float64], stride_m: float) -> list[float]:
+    """The range of each leg's nearest echo, nearest leg first, of what is within a stride of the nearest.
+
+    `points` come in the order of the scan; a gap between two of them parts one leg from the next.
+    """
+    parts = np.split(np.arange(len(points)), np.flatnonzero(np.hypot(*np.diff(points, axis=0).T) > _GAP_M) + 1)
+    nearest = sorted(float(away_m[part].min()) for part in parts)
+    return [one for one in nearest if one <= nearest[0] + stride_m]
+
+
+def _span(one: Detection, camera: CameraModel) -> tuple[float, float]:
+    """Bearings of a box's right and left edge at half height, left positive; not limited to a symmetric lens."""
+    middle = (one.y1_px + one.y2_px) / 2
+    rays = points_ahead(np.array([[one.x2_px, middle], [one.x1_px, middle]]), camera)
+    cos, sin = math.cos(camera.pitch_rad), math.sin(camera.pitch_rad)
+    ahead = cos + rays[1] * sin
+    right, left = np.arctan2(-rays[0], ahead)
+    return float(right), float(left)

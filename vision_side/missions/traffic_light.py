@@ -1,0 +1,196 @@
+"""Missions `traffic-light` and `traffic-light-boxes`: drive along a lane of blocks and obey its lights. Pure.
+
+The detector's blocks tell where the lane runs, the picture what the light shows, and the light's own size how far its
+line is. Nothing is driven at: a block is passed at its side, and what lies in a light's box is no block.
+
+`note` begins with what is shown: `light red`, `light yellow`, `light green`, `light unknown`, or `no light`.
+"""
+
+import math
+from typing import Annotated, ClassVar
+
+from pydantic import Field
+
+from protocol.config import Config as Settings
+from protocol.messages import STILL, CameraModel, Pose, Twist
+from vision_side.config import BoxesConfig, LatencyConfig
+from vision_side.detect.boxes import locate_box
+from vision_side.detect.port import Detection
+from vision_side.foretell import Foretelling, Motion
+from vision_side.missions.lamp import UNKNOWN, BoxReader, HousingReader, LampConfig, Light
+from vision_side.missions.lane import Lane, LaneConfig, Line
+from vision_side.missions.port import Plan, View
+from vision_side.missions.stop_line import StopConfig, StopLine
+from vision_side.track import to_odometry
+
+Place = tuple[float, float]
+
+_SAME_M, _SAME_SHARE = 0.3, 0.15  # two sightings are of one light within this, and this part of its distance
+_OUTER_PX = 3.0  # a lamp's edge may lie this far outside the housing's box
+
+
+class TrafficLightConfig(Settings):
+    """The lane, the light, the line, and how to drive."""
+
+    lane: LaneConfig = LaneConfig()
+    lamp: LampConfig = LampConfig()
+    stop: StopConfig = StopConfig()
+    latency: LatencyConfig = LatencyConfig()
+    label: Annotated[str, Field(max_length=64)] = "target"
+    """Detections with this label are the lane's blocks; empty for any."""
+    block_height_m: Annotated[float, Field(gt=0.01, le=5)] = 0.281
+    """How tall a block is: its distance follows from it."""
+    max_range_m: Annotated[float, Field(gt=0.3, le=50)] = 4.0
+    """Blocks and lights further off are measured too badly."""
+    cruise_mps: Annotated[float, Field(gt=0, le=2)] = 0.3
+    look_ahead_m: Annotated[float, Field(gt=0.1, le=5)] = 0.6
+    """It steers for the lane's middle this far ahead."""
+    max_angular_rad_s: Annotated[float, Field(gt=0, le=6)] = 1.5
+
+
+class TrafficLight:
+    """Three lamps in a housing."""
+
+    Config = TrafficLightConfig
+    reader: ClassVar[type[HousingReader] | type[BoxReader]] = HousingReader
+
+    def __init__(self, config: TrafficLightConfig, camera: CameraModel) -> None:
+        self._config, self._camera = config, camera
+        self._reader = self.reader(config.lamp)
+        self._lane = Lane(config.lane)
+        self._foretelling = Foretelling(config.latency)
+        self._light: Place | None = None
+        self._sure = 0.0
+        self._stop = StopLine(config.stop)
+
+    def step(self, view: View) -> Plan:
+        """The twist along the lane."""
+        self._foretelling.measure(view.header.latency_us, view.dt_s)
+        plan = self._plan(view)
+        self._foretelling.sent(view.header.t_us, plan.twist)
+        return plan
+
+    def _plan(self, view: View) -> Plan:
+        if view.picture is None:
+            return Plan(STILL, "no picture", "traffic lights are read in the picture, and there is none")
+        pose = view.header.pose
+        known = [one for one in view.detections if not self._is_light(one, pose)]
+        lights = self._reader.read(view.picture, known)
+        blocks = [one for one in known if not any(_inside(one, light.box) for light in lights)]
+        self._lane.see(pose, self._block_places(blocks, pose))
+        line = self._lane.line
+        if line is None:
+            return Plan(STILL, "no lane", f"{self._shown()}; no block of the lane in view")
+        self._look(lights, line, view)
+        return self._drive(line, view)
+
+    def _shown(self) -> str:
+        return "no light" if self._light is None else f"light {self._stop.colour}"
+
+    def _is_light(self, one: Detection, pose: Pose) -> bool:
+        """Whether a detection lies where the light is known to be."""
+        place = self._place(one, pose, self._config.block_height_m, None) if self._light else None
+        return bool(place and self._light and math.dist(place, self._light) < _SAME_M)
+
+    def _block_places(self, blocks: list[Detection], pose: Pose) -> list[Place]:
+        meant = [one for one in blocks if self._config.label in ("", one.label)]
+        places = [self._place(one, pose, self._config.block_height_m, None) for one in meant]
+        return [one for one in places if one is not None]
+
+    def _place(self, one: Detection, pose: Pose, height_m: float, width_m: float | None) -> Place | None:
+        """Where a thing of that size is, in the odometry frame; None where it is cut off, or too far away."""
+        if self._is_cut(one) and width_m is None:
+            return None
+        sighting = locate_box(one, self._camera, BoxesConfig(height_m=height_m, width_m=width_m), 0.0)
+        if sighting is None or not 0.05 < math.hypot(sighting.x_m, sighting.y_m) <= self._config.max_range_m:
+            return None
+        return to_odometry(pose, sighting.x_m, sighting.y_m)
+
+    def _is_cut(self, one: Detection) -> bool:
+        return one.y1_px < 1 or one.y2_px > self._camera.height_px - 1
+
+    # --- the light -----------------------------------------------------------------------------------------------
+
+    def _look(self, lights: list[Light], line: Line, view: View) -> None:
+        """Which of the lights is the next, what it shows, and where it is."""
+        pose = view.header.pose
+        if self._light and self._left_m(line, self._light, pose) < -self._config.stop.cleared_m:
+            self._light, self._stop = None, StopLine(self._config.stop)
+        next_m, shown = math.inf, UNKNOWN
+        for one in lights:
+            place = self._light_place(one, pose)
+            left_m = self._left_m(line, place, pose) if place else math.inf
+            if place and -self._config.stop.cleared_m <= left_m < next_m:
+                next_m, shown = left_m, one.colour
+                self._meet(place, pose, self._is_cut(one.box))
+        if self._light:
+            self._stop.see(shown, view.dt_s)
+
+    def _light_place(self, one: Light, pose: Pose) -> Place | None:
+        lamp = self._config.lamp
+        if self.reader is BoxReader:
+            return self._place(one.box, pose, lamp.box_height_m, lamp.box_width_m)
+        return self._place(one.box, pose, lamp.housing_height_m, lamp.housing_width_m)
+
+    def _meet(self, place: Place, pose: Pose, is_cut: bool) -> None:
+        """Know better where the light is, near looks most; or that another one comes first."""
+        away_m = math.dist(place, pose[:2])
+        weight = 1.0 / max(away_m, 0.2) ** 4
+        if self._light is None or math.dist(place, self._light) > _SAME_M + _SAME_SHARE * away_m:
+            self._light, self._sure, self._stop = place, weight, StopLine(self._config.stop)
+        elif not is_cut:
+            self._sure += weight
+            share = weight / self._sure
+            old = self._light
+            self._light = old[0] + share * (place[0] - old[0]), old[1] + share * (place[1] - old[1])
+
+    def _left_m(self, line: Line, light: Place, pose: Pose) -> float:
+        """From the robot's front to the light's line."""
+        stop = self._config.stop
+        return line.along_m(*light) - stop.line_m - line.along_m(pose[0], pose[1]) - stop.front_m
+
+    # --- the lane ------------------------------------------------------------------------------------------------
+
+    def _drive(self, line: Line, view: View) -> Plan:
+        header = view.header
+        lane_m = self._lane.left_m(header.pose)
+        if lane_m <= 0:
+            return Plan(STILL, "lane end", f"{self._shown()}; the lane has no more blocks", done=True)
+        then = self._foretelling.motion(header.t_us, header.pose, header.moving, header.applied)
+        cruise = min(self._config.cruise_mps, math.sqrt(2 * self._config.stop.brake_mps2 * lane_m))
+        left_m = self._left_m(line, self._light, then.pose) if self._light else None
+        linear = cruise if left_m is None else self._stop.speed(left_m, then.linear_mps, cruise)
+        note = self._shown() if left_m is None else f"{self._shown()}, line in {left_m:.2f} m"
+        twist = self._steered(line, then, linear)
+        return Plan(twist, self._phase(left_m, linear, cruise), note, distance_m=left_m)
+
+    def _phase(self, left_m: float | None, linear: float, cruise: float) -> str:
+        if left_m is not None and self._stop.clearing:
+            return "clearing line"
+        if linear >= cruise:
+            return "driving"
+        return "waiting" if linear < 0.01 else "stopping"
+
+    def _steered(self, line: Line, then: Motion, linear: float) -> Twist:
+        """Along the arc that meets the lane's middle ahead; on the spot where that lies far to the side."""
+        look_m, limit = self._config.look_ahead_m, self._config.max_angular_rad_s
+        x, y = line.at(line.along_m(then.pose[0], then.pose[1]) + look_m)
+        bearing_rad = math.remainder(math.atan2(y - then.pose[1], x - then.pose[0]) - then.pose[2], math.tau)
+        if abs(bearing_rad) > 1.0:
+            turn = math.copysign(min(limit, 0.8), bearing_rad) if linear else 0.0
+            return Twist(linear_mps=0.0, angular_rad_s=turn)
+        angular = 2.0 * linear * math.sin(bearing_rad) / look_m
+        return Twist(linear_mps=linear, angular_rad_s=max(-limit, min(limit, angular)))
+
+
+class TrafficLightBoxes(TrafficLight):
+    """A whole box that changes its colour. The lane's blocks must have another colour."""
+
+    reader = BoxReader
+
+
+def _inside(one: Detection, box: Detection) -> bool:
+    """Whether the middle of a detection lies in a light's box."""
+    x, y = (one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2
+    return (box.x1_px - _OUTER_PX <= x <= box.x2_px + _OUTER_PX
+            and box.y1_px - _OUTER_PX <= y <= box.y2_px + _OUTER_PX)
