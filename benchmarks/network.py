@@ -6,11 +6,10 @@ The robot plays recorded pictures through a camera that can change their quality
 import json
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import cv2
 import numpy as np
@@ -18,77 +17,63 @@ import numpy as np
 from benchmarks.interrupted import terminated_like_interrupted
 from benchmarks.loop_crew import Crew
 from benchmarks.loop_figures import LoopCheck
-from benchmarks.loop_ours import ROBOT
 from benchmarks.loop_pictures import write_pictures
-from benchmarks.network_figures import NetworkFigures, Stretch, figures_of, judge
+from benchmarks.network_figures import Stretch, figures_of, judge
+from benchmarks.network_fleet import fleet
 from benchmarks.network_rows import Row, spans_s
-from protocol.errors import ConfigError
+from benchmarks.network_stage import (
+    BenchWire,
+    NetworkRun,
+    NetworkSetting,
+    Scene,
+    Stage,
+    Wiring,
+    now_us,
+    start_robot,
+    start_vision,
+)
+from benchmarks.network_takeover import moved, router, standby
+from benchmarks.network_uplink import uplink
+from protocol.errors import ConfigError, HardwareError
 from sim.wire import Shapes
 from sim.wire_tun import ADDRESS_A, why_impossible
 
 WIDTH_PX, HEIGHT_PX, FPS = 640, 480, 30.0
-QUALITY: Final = 80
-PORTS: Final = {"zenoh": "tcp/{}:7447", "websocket": "ws://{}:9090"}
-TOKENED: Final = ("websocket",)
+SCENES: Final[Mapping[str, Scene]] = {
+    "uplink": uplink, "standby": standby, "router": router, "moved": moved, "fleet": fleet,
+}
 _SETTLE_S: Final = 2.0
 
 
-class BenchWire(Protocol):
-    """What shapes the packets between the two namespaces."""
-
-    robot_side: str
-    far_side: str
-
-    def shape(self, shapes: Shapes) -> int:
-        """Put `shapes` in force; returns how many packets were harmed so far."""
-        ...
-
-
-Wiring = Callable[[Path], AbstractContextManager[BenchWire]]
-
-
 @dataclass(frozen=True, slots=True)
-class NetworkSetting:
-    """`seconds` are shared among a row's phases; `seed` draws what the wire loses."""
+class Telling:
+    """Who hears how it goes: that a run begins, and what came of it."""
 
-    transport: str = "zenoh"
-    seconds: float = 20.0
-    seeds: tuple[int, ...] = (1,)
-
-    def __post_init__(self) -> None:
-        """Raise ConfigError for what cannot be run."""
-        if self.transport not in PORTS:
-            raise ConfigError(f"--transport {self.transport!r}: {', '.join(PORTS)}")
-        if not 4 <= self.seconds <= 600:
-            raise ConfigError(f"--seconds {self.seconds:g}: 4 to 600")
-
-
-@dataclass(frozen=True, slots=True)
-class NetworkRun:
-    """One row with one seed; `injected` packets were delayed, lost or cut."""
-
-    row: Row
-    seed: int
-    injected: int
-    figures: tuple[NetworkFigures, ...]
-    checks: tuple[LoopCheck, ...]
+    begins: Callable[[str], None]
+    ended: Callable[[NetworkRun], None]
 
 
 def run_network(
-    rows: Sequence[Row], setting: NetworkSetting, wiring: Wiring, say: Callable[[NetworkRun], None]
+    rows: Sequence[Row], setting: NetworkSetting, wiring: Wiring, telling: Telling, scenes: Mapping[str, Scene]
 ) -> list[NetworkRun]:
-    """Every row with every seed. Raises ConfigError without root, HardwareError for a process that does not run."""
+    """Every row, with every seed where chance has a part in it; `scenes` are added to `SCENES`.
+
+    Raises ConfigError without root; a process that does not run is a check that fails.
+    """
     why = why_impossible()
     if why:
         raise ConfigError(f"bench network {why}: it makes network namespaces; run it as root on Linux")
+    turns = [(row, seed) for row in rows for seed in (setting.seeds if row.draws else setting.seeds[:1])]
     runs: list[NetworkRun] = []
     with terminated_like_interrupted(), tempfile.TemporaryDirectory(prefix="sightline-network-") as name:
         film = write_film(Path(name))
-        for number, (row, seed) in enumerate((row, seed) for row in rows for seed in setting.seeds):
+        for number, (row, seed) in enumerate(turns, start=1):
+            telling.begins(f"{row.name}, seed {seed} ({number} of {len(turns)})")
             folder = Path(name) / str(number)
             folder.mkdir()
-            runs.append(_run_row(row, seed, setting, Stage(film, folder, wiring)))
-            say(runs[-1])
+            stage = Stage(film, film.parent / "pictures", folder, wiring, setting, seed)
+            runs.append(_run(row, stage, {**SCENES, **scenes}))
+            telling.ended(runs[-1])
     return runs
 
 
@@ -104,72 +89,40 @@ def write_film(folder: Path) -> Path:
     return path
 
 
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """Where a row is run: what the camera plays, a folder of its own, what makes the wire."""
+def _run(row: Row, stage: Stage, scenes: Mapping[str, Scene]) -> NetworkRun:
+    try:
+        return scenes[row.scene](row, stage) if row.scene else _course(row, stage)
+    except HardwareError as error:
+        why = f"runs: {error}"[:160]
+        return NetworkRun(row, stage.seed, 0, (), (LoopCheck(why, None, "", 1.0, ok=False),))
 
-    film: Path
-    folder: Path
-    wiring: Wiring
 
-
-def _run_row(row: Row, seed: int, setting: NetworkSetting, stage: Stage) -> NetworkRun:
-    with stage.wiring(stage.folder / "wire.log") as wire, Crew(stage.folder) as crew:
+def _course(row: Row, stage: Stage) -> NetworkRun:
+    """One robot and one vision, the wire shaped phase by phase."""
+    with stage.wire() as wire, stage.crew("crew") as crew:
         # From the first packet on: what TCP learned of a better wire would be what is measured.
-        before = wire.shape(_seeded(row.phases[0].shapes, seed))
-        _start(wire, crew, setting, stage)
+        before = wire.shape(stage.seeded(row.phases[0].shapes))
+        _start(row, wire, crew, stage)
         stretches = []
-        for phase, seconds in zip(row.phases, spans_s(row, setting.seconds), strict=True):
-            wire.shape(_seeded(phase.shapes, seed))
-            begin_us = _now_us()
+        for phase, seconds in zip(row.phases, spans_s(row, stage.setting.seconds), strict=True):
+            wire.shape(stage.seeded(phase.shapes))
+            begin_us = now_us()
             settle_s = phase.settle_s or (0.0 if phase.seconds else _SETTLE_S)
             time.sleep(seconds if phase.seconds else seconds + settle_s)
-            stretches.append(Stretch(begin_us, begin_us + round(settle_s * 1e6), _now_us()))
+            stretches.append(Stretch(begin_us, begin_us + round(settle_s * 1e6), now_us()))
             crew.check()
         injected = wire.shape(Shapes()) - before
         crew.end()
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
     figures = tuple(figures_of(notes, stretch) for stretch in stretches)
-    label = f"{row.name}.{seed}"
-    harmed = LoopCheck(f"{label} injected", float(injected), "", 1.0, injected >= 1)
-    return NetworkRun(row, seed, injected, figures, (harmed, *judge(row, figures, label)))
+    harmed = LoopCheck("injected", float(injected), "", 1.0, injected >= 1)
+    return NetworkRun(row, stage.seed, injected, figures, (harmed, *judge(row, figures)))
 
 
-def _seeded(shapes: Shapes, seed: int) -> Shapes:
-    return shapes.model_copy(update={"seed": seed})
-
-
-def _start(wire: BenchWire, crew: Crew, setting: NetworkSetting, stage: Stage) -> None:
+def _start(row: Row, wire: BenchWire, crew: Crew, stage: Stage) -> None:
     """Robot and watcher on one side, vision on the other, seen driving over the wire as it is."""
-    form = PORTS[setting.transport]
-    config = _robot_toml(form.format("0.0.0.0"), stage)
-    crew.start("robot", "operator_side.cli", "robot", "--config", str(config), namespace=wire.robot_side)
-    crew.wait_line("robot", f"robot {ROBOT}: on")
-    crew.start("watch", "benchmarks.network_watch", form.format("127.0.0.1"), str(stage.folder / "notes.json"),
+    start_robot(stage, crew, wire.robot_side, passes_through=row.passes_through)
+    crew.start("watch", "benchmarks.network_watch", stage.form.format("127.0.0.1"), str(stage.folder / "notes.json"),
                namespace=wire.robot_side)
     crew.wait_line("watch", "watching")
-    crew.start("vision", "operator_side.cli", "vision", "--robot", ROBOT, "--connect", form.format(ADDRESS_A),
-               *(("--secure", str(stage.folder)) if setting.transport in TOKENED else ()), namespace=wire.far_side)
-    crew.wait_line("vision", "target seen")
-
-
-def _robot_toml(endpoint: str, stage: Stage) -> Path:
-    """JSON's strings and numbers are TOML's too."""
-    folder, path = stage.folder, stage.folder / "robot.toml"
-    camera = f"path = {json.dumps(str(stage.film))}, quality = {QUALITY}, hfov_deg = 80.0"
-    secure = ""
-    if endpoint.startswith("ws"):  # beyond loopback it asks for tokens
-        secure = f"secure = {json.dumps(str(folder))}\n"
-        for role in ("vision", "operator"):
-            (folder / f"{role}.token").write_text(f"{role}-of-the-bench", "ascii")
-    path.write_text(
-        f"robot = {json.dumps(ROBOT)}\nlisten = [{json.dumps(endpoint)}]\nstate_dir = {json.dumps(str(folder))}\n"
-        f"{secure}"
-        f'[camera]\nkind = "video"\noptions = {{{camera}}}\n[drive]\nkind = "log"\n[safety]\nauto_arm = true\n',
-        "utf-8",
-    )
-    return path
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000
+    start_vision(stage, crew, wire.far_side, stage.form.format(ADDRESS_A))

@@ -1,7 +1,7 @@
 """What a robot's own notes say of a row of `bench network`, and whether it is enough. Pure."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final
 
@@ -65,6 +65,20 @@ def figures_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: Stretch) -
     )
 
 
+def sent_between(statuses: Sequence[Sequence[Any]], begin_us: int, end_us: int) -> float:
+    """How many frames the robot sent in that time, from counts that come ten times a second."""
+    counts = [(row[NOTED.index("t_us")], row[NOTED.index("sent")]) for row in statuses]
+    return _count_at(counts, end_us) - _count_at(counts, begin_us)
+
+
+def _count_at(counts: Sequence[tuple[int, int]], at_us: int) -> float:
+    """Between two counts it grew evenly."""
+    for (before_us, before), (after_us, after) in pairwise(counts):
+        if before_us <= at_us < after_us:
+            return before + (after - before) * (at_us - before_us) / (after_us - before_us)
+    return float(counts[-1][1] if counts and at_us >= counts[-1][0] else counts[0][1] if counts else 0)
+
+
 def _ages_us(frames: Sequence[Sequence[Any]]) -> Iterator[int]:
     """A header whose latency is the one before it brings no news: nothing was accepted in between."""
     for before, frame in pairwise(frames):
@@ -99,22 +113,42 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else 0.0
 
 
-def judge(row: Row, figures: Sequence[NetworkFigures], label: str) -> Iterator[LoopCheck]:
+def judge(row: Row, figures: Sequence[NetworkFigures]) -> Iterator[LoopCheck]:
     """Hold the last phase of a row against its bounds; `figures` are those of all its phases."""
     last, first = figures[-1], figures[0]
     if row.p50_ms is not None:
-        yield at_most(f"{label} age p50", last.p50_ms, "ms", row.p50_ms)
+        yield at_most("age p50", last.p50_ms, "ms", row.p50_ms)
     if row.over_first_ms is not None:
         over = None if last.p50_ms is None or first.p50_ms is None else last.p50_ms - first.p50_ms
-        yield at_most(f"{label} p50 over loopback", over, "ms", row.over_first_ms)
+        yield at_most("p50 over loopback", over, "ms", row.over_first_ms)
     if row.p95_ms is not None:
-        yield at_most(f"{label} age p95", last.p95_ms, "ms", row.p95_ms)
+        yield at_most("age p95", last.p95_ms, "ms", row.p95_ms)
     if row.least_fps is not None:
-        yield LoopCheck(f"{label} answered", last.fps, "fps", row.least_fps, last.fps >= row.least_fps)
+        yield LoopCheck("answered", last.fps, "fps", row.least_fps, last.fps >= row.least_fps)
     if row.most_holds is not None:
-        yield at_most(f"{label} holds", float(len(last.holds_s)), "", float(row.most_holds))
+        yield at_most("holds", float(len(last.holds_s)), "", float(row.most_holds))
     if row.longest_hold_s is not None:
-        yield at_most(f"{label} longest hold", max(last.holds_s, default=0.0), "s", row.longest_hold_s)
+        yield at_most("longest hold", max(last.holds_s, default=0.0), "s", row.longest_hold_s)
     if row.flows_again_s is not None:
-        yield at_most(f"{label} flows again", last.flows_after_s, "s", row.flows_again_s)
-    yield at_most(f"{label} oldest executed", max(one.executed_ms for one in figures), "ms", HOLD_AGE_MS)
+        yield at_most("flows again", last.flows_after_s, "s", row.flows_again_s)
+    yield at_most("oldest executed", max(one.executed_ms for one in figures), "ms", HOLD_AGE_MS)
+
+
+def worst_of(checks: Iterable[LoopCheck]) -> LoopCheck:
+    """Of one demand in several runs, the run that did worst: the farthest outside its bound, or the nearest inside."""
+    return max(checks, key=_badness)
+
+
+def _badness(check: LoopCheck) -> tuple[bool, float]:
+    away = float("inf") if check.value is None else abs(check.value - check.bound)
+    return (True, away) if not check.ok else (False, -away)
+
+
+def worst_of_seeds(name: str, runs: Sequence[Sequence[LoopCheck]]) -> list[LoopCheck]:
+    """The demands on the row `name`, each as the seed fared that did worst."""
+    label = f"{name}, worst of {len(runs)} seeds" if len(runs) > 1 else name
+    demands: dict[str, list[LoopCheck]] = {}
+    for checks in runs:
+        for check in checks:
+            demands.setdefault(check.name, []).append(check)
+    return [replace(worst_of(checks), name=f"{label}: {what}") for what, checks in demands.items()]

@@ -1,7 +1,10 @@
-"""Notes what a robot says of itself, for `bench network`: `python -m benchmarks.network_watch ENDPOINT FILE`. Shell.
+"""Notes what a robot says of itself, for `bench network`. Shell.
+
+    python -m benchmarks.network_watch ENDPOINT FILE [statuses]
 
 It runs beside the robot, on the near side of the wire, so that watching costs the wire nothing, and acknowledges
-nothing. Written at SIGTERM as JSON: frames (seq, t_us, latency_us, bytes), statuses (t_us and what `NOTED` names).
+nothing. Written at SIGTERM as JSON: frames (seq, t_us, latency_us, bytes), statuses (t_us and what `NOTED` names). With
+`statuses` it takes no frames.
 """
 
 import json
@@ -18,7 +21,8 @@ from protocol.messages import FrameHeader, Stamp, Status
 from protocol.transports.link import Message
 from protocol.transports.opening import open_link
 
-NOTED: Final = ("t_us", "state", "frame_age_us", "accepted", "stale", "window", "timeouts", "speed", "quality", "scale")
+NOTED: Final = ("t_us", "state", "frame_age_us", "accepted", "stale", "window", "timeouts", "speed", "quality", "scale",
+                "sent")
 
 
 class Notes:
@@ -57,18 +61,19 @@ def _status_row(header: bytes, payload: bytes) -> tuple[Any, ...]:
     return (
         decode(Stamp, header).t_us, status.state.value, status.frame_age_us, status.accepted,
         status.refused.get("STALE", 0), stream.window, stream.credit_timeouts, max(map(abs, status.applied)),
-        stream.quality_percent, stream.scale_percent,
+        stream.quality_percent, stream.scale_percent, stream.sent,
     )
 
 
-def main(endpoint: str, path: Path) -> None:
+def main(endpoint: str, path: Path, only: str = "") -> None:
     """Until SIGTERM."""
     ending, notes = threading.Event(), Notes()
     signal.signal(signal.SIGTERM, lambda *_: ending.set())
     secure = str(path.parent) if endpoint.startswith("ws") else ""
     with open_link(ROBOT, connect=[endpoint], role="operator", secure=secure) as link:
         link.subscribe(STATUS, notes.status)
-        link.subscribe(FRAME, notes.frame)
+        if only != "statuses":
+            link.subscribe(FRAME, notes.frame)
         notes.heard.wait()
         print("watching", flush=True)
         while not ending.wait(0.1):
@@ -77,4 +82,4 @@ def main(endpoint: str, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]))
+    main(sys.argv[1], Path(sys.argv[2]), *sys.argv[3:])

@@ -100,6 +100,29 @@ SECTIONS: Final = (
         ("bench", "watchers", "--transport", "websocket", "--viewers", "10", "--seconds", "60"),
     ),
     Section(
+        "network",
+        "Slow, lossy, far and broken networks",
+        "Robot and vision, as two machines would have them, in two network namespaces; every packet goes over a wire "
+        "that delays, loses and slows it. Ages are from capture to the accepted command. Where packets are lost, five "
+        "seeds, each demand as the worst of them fared. A robot stands and turns again in `standby`, `router` and "
+        "`moved`, judged from what its wheels were told. In `fleet` one process plays the twenty robots, with sessions,"
+        " headers and credit of their own: forty robot processes on two cores would measure themselves.",
+        ("bench", "network", "--seeds", "1,2,3,4,5", "--seconds", "60"),
+    ),
+    Section(
+        "network-stop",
+        "STOP through a full medium",
+        "One medium of 1 Mbit/s that both directions share, packet after packet, video offered at 4 Mbit/s, and a "
+        "person beyond it who says STOP, resets and says it again. From the word to the simulated motors' own log.",
+        ("bench", "network", "--only", "medium", "--seconds", "300"),
+    ),
+    Section(
+        "network-websocket",
+        "The same networks over WebSocket",
+        "With `sightline.v1` between robot and vision; rows with a router or a fleet need Zenoh.",
+        ("bench", "network", "--transport", "websocket", "--seeds", "1,2,3,4,5", "--seconds", "60"),
+    ),
+    Section(
         "camera",
         "Camera pass-through",
         "A V4L2 camera's own JPEGs through the plug-in, its thread included, into the network process; the device is a "

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import asdict
-from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -11,14 +10,15 @@ from operator_side.cli_judge import CHECK_FAILED, Json, numbers
 from operator_side.extras import needs
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
-    from benchmarks.network import NetworkRun
+    from benchmarks.loop_figures import LoopCheck
+    from benchmarks.network_stage import NetworkRun
 
 
 def register_network(group: typer.Typer) -> None:
     """Add the command to the `bench` group."""
-    group.command(epilog="Example: sightline bench network --only rtt40 --transport websocket")(network)
+    group.command(epilog="Example: sightline bench network --only radio --seeds 1,2,3,4,5 --seconds 60")(network)
 
 
 def network(
@@ -26,45 +26,70 @@ def network(
     only: Annotated[list[str] | None, typer.Option("--only", metavar="ROW", help="A row; repeatable.")] = None,
     transport: Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")] = "zenoh",
     seconds: Annotated[float, typer.Option(help="Of each row, 4 to 600.")] = 20.0,
-    seeds: Annotated[str, typer.Option(help="Of what the wire loses; separated by commas.")] = "1",
+    seeds: Annotated[str, typer.Option(help="Of what the wire loses, for rows where it loses; by commas.")] = "1",
     as_json: Json = False,
 ) -> int:
-    """Robot and vision in two network namespaces: age, rate and holds over slow, lossy, far and broken wires."""
-    with needs("bench"):
-        from benchmarks.network import NetworkSetting, run_network
+    """Robots, visions and people in two network namespaces: what slow, lossy, far, broken and shared wires cost."""
+    with needs("all"):
+        from benchmarks.network import Telling, run_network
         from benchmarks.network_rows import chosen
+        from benchmarks.network_stage import NetworkSetting
         from operator_side.faults.wires import BenchWire
-    rows = chosen(only or ())
+        from operator_side.network_medium import medium
     setting = NetworkSetting(transport, seconds, tuple(numbers("--seeds", seeds, int)))
-    say = partial(_say, as_json=as_json)
-    runs = run_network(rows, setting, BenchWire, say)
-    result = _result_of(runs, setting.transport)
+    telling = Telling(lambda line: typer.echo(line, err=True), lambda run: _say(run, as_json=as_json))
+    runs = run_network(chosen(only or (), transport), setting, BenchWire, telling, {"medium": medium})
+    result = _result_of(runs, transport)
     if as_json:
         typer.echo(json.dumps(result))
+    elif len(setting.seeds) > 1:
+        _say_worst(runs)
     return 0 if result["ok"] else CHECK_FAILED
 
 
 def _result_of(runs: "Sequence[NetworkRun]", transport: str) -> dict[str, Any]:
-    checks = [asdict(check) for run in runs for check in run.checks]
+    checks = [asdict(check) for check in _worst(runs)]
     rows = [
-        {"row": run.row.name, "seed": run.seed, "injected": run.injected, "phases": [asdict(of) for of in run.figures]}
+        {"row": run.row.name, "seed": run.seed, "injected": run.injected, "facts": run.facts,
+         "checks": [asdict(check) for check in run.checks], "phases": [asdict(of) for of in run.figures]}
         for run in runs
     ]
     return {"ok": bool(checks) and all(one["ok"] for one in checks), "checks": checks, "transport": transport,
             "rows": rows}
 
 
+def _worst(runs: "Sequence[NetworkRun]") -> "Iterator[LoopCheck]":
+    """Of each demand on a row, the seed that did worst."""
+    from benchmarks.network_figures import worst_of_seeds
+
+    for name in dict.fromkeys(run.row.name for run in runs):
+        yield from worst_of_seeds(name, [run.checks for run in runs if run.row.name == name])
+
+
 def _say(run: "NetworkRun", *, as_json: bool) -> None:
-    from operator_side.check_text import check_line, number
+    from operator_side.check_text import number
+
+    typer.echo(f"{run.row.name} ({run.row.what}), seed {run.seed}", err=as_json)
+    for last in run.figures[-1:]:
+        typer.echo(
+            f"  age p50 {number(last.p50_ms)} p95 {number(last.p95_ms)} ms, "
+            f"{last.fps:.1f} fps of {last.bytes_per_frame / 1000:.0f} kB, quality {last.quality_percent:.0f} %, "
+            f"size {last.scale_percent:.0f} %, window up to {last.window}, {last.timeouts} unanswered, "
+            f"holds {', '.join(f'{one:.1f} s' for one in last.holds_s) or 'none'}", err=as_json,
+        )
+    if run.facts:
+        typer.echo("  " + ", ".join(f"{name} {number(fact)}" for name, fact in run.facts.items()), err=as_json)
+    _say_checks(run.checks, as_json=as_json)
+
+
+def _say_worst(runs: "Sequence[NetworkRun]") -> None:
+    typer.echo("worst of all seeds")
+    _say_checks(list(_worst(runs)), as_json=False)
+
+
+def _say_checks(checks: "Sequence[LoopCheck]", *, as_json: bool) -> None:
+    from operator_side.check_text import check_line
     from operator_side.score import Check
 
-    last = run.figures[-1]
-    typer.echo(
-        f"{run.row.name} ({run.row.what}), seed {run.seed}: "
-        f"age p50 {number(last.p50_ms)} p95 {number(last.p95_ms)} ms, "
-        f"{last.fps:.1f} fps of {last.bytes_per_frame / 1000:.0f} kB, quality {last.quality_percent:.0f} %, "
-        f"size {last.scale_percent:.0f} %, window up to {last.window}, {last.timeouts} unanswered, "
-        f"holds {', '.join(f'{one:.1f} s' for one in last.holds_s) or 'none'}", err=as_json,
-    )
-    for check in () if as_json else run.checks:
-        typer.echo("  " + check_line(Check(check.name, check.value, check.unit, check.bound, check.ok)))
+    for check in checks:
+        typer.echo("  " + check_line(Check(check.name, check.value, check.unit, check.bound, check.ok)), err=as_json)

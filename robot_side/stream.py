@@ -42,8 +42,9 @@ class StreamConfig(Config):
 class _Sent:
     at_us: int
     size_bytes: int
-    alone: bool
+    behind: bool
     held_back: bool
+    followed: bool = False
 
 
 class Stream:
@@ -105,8 +106,10 @@ class Stream:
         """A frame captured at `t_us` left. The next is due by capture time: a late send costs no rate."""
         self._in_flight[seq] = now_us + self._timeout_us()
         self._may_probe = False
-        alone = all(now_us - one.at_us > _PENDING_US for one in self._sent_frames.values())
-        self._sent_frames[seq] = _Sent(now_us, size_bytes, alone, self._held_back)
+        pending = [one for one in self._sent_frames.values() if now_us - one.at_us <= _PENDING_US]
+        for one in pending:
+            one.followed = True
+        self._sent_frames[seq] = _Sent(now_us, size_bytes, bool(pending), self._held_back)
         self._held_back = False
         if len(self._sent_frames) > _REMEMBERED:
             self._sent_frames.popitem(last=False)
@@ -162,8 +165,9 @@ class Stream:
         carrying_since_us = max(self._answered_at_us, passed[0].at_us)
         carried = sum(one.size_bytes for one in passed)
         self._answered_at_us = now_us
+        gap_us = now_us - carrying_since_us
         answered = Answered(
-            delay_us, sent.alone, sent.held_back, now_us - carrying_since_us, len(passed), carried, compute_us
+            delay_us, sent.behind, sent.followed, sent.held_back, gap_us, len(passed), carried, compute_us
         )
         full = self._window.on_answer(answered, now_us)
         if full is None:

@@ -2,7 +2,8 @@
 
 A frame sent while nothing is in flight shows the link's own delay. One sent behind another shows the same where the
 link is long, and waits where the link is thin or the peer slow. So the window grows while nobody waits, and what gets
-through while somebody does is what the link carries.
+through while somebody does is what the link carries. Of a link whose rate two tries have shown, no third is made before
+long: a camera's own JPEG of 46 kB takes 184 ms at 2 Mbit/s, and one behind it is twice as old.
 """
 
 from collections import deque
@@ -21,7 +22,18 @@ _FIRST_PAUSE_US: Final = 500_000
 _LONGEST_PAUSE_US: Final = 4_000_000
 """After a window that was too wide: trying it again costs age, so each time in a row it is waited twice as long ..."""
 _HELD_US: Final = 1_000_000
-"""... unless a wider one did well for so long: on a lossy link it is not the width that fails."""
+_HELD_ANSWERS: Final = 12
+"""... unless a wider one did well for so long and so many: on a lossy link it is not the width that fails."""
+_THIN_US: Final = 30_000_000
+"""For so long a measured rate bounds the width: each try beyond it makes a few frames twice as old for nothing ..."""
+_ALIKE: Final = 1.15
+"""... if the try before measured the same, to this factor: what losses make of a rate is seldom the same twice ..."""
+_THINNER: Final = 0.8
+"""... unless a frame by itself takes less than this share of what it did: then the link carries more than it did."""
+_LEAST: Final = 0.6
+"""Of what the rate says that a frame takes, which a few frames show only roughly; in less it cannot be through."""
+_LARGE: Final = 2
+"""Intervals for which a frame occupies the link: of smaller ones the next may wait, its age grows by less than that."""
 _PEER_BOUND_SHARE: Final = 0.7
 """Of the time between answers: a peer that computes for longer than this is what they wait for, not the link."""
 
@@ -31,15 +43,17 @@ _KEEPS_UP: Final = 1.05
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """A frame's answer. `delay_us` is without the peer's computing; `alone`: nothing else was in flight when it left;
-    `held_back`: it was due before there was credit for it.
+    """A frame's answer. `delay_us` is without the peer's computing; `held_back`: it was due before there was credit.
 
+    `behind`: something was in flight when it left. `followed`: something left before its answer came, which waits
+    behind that on a medium that both directions share. Neither: it had the link to itself.
     `gap_us` is from the answer before it, or from when the link began to carry it; `gap_frames` and `gap_bytes` are
     what it carried in that time, frames that a newer one overtook among them.
     """
 
     delay_us: int
-    alone: bool
+    behind: bool
+    followed: bool
     held_back: bool
     gap_us: int
     gap_frames: int
@@ -55,6 +69,19 @@ class Full:
     delay_us: int
 
 
+@dataclass(frozen=True, slots=True)
+class _Thin:
+    """What the link carried when a wider window made frames wait; by itself a frame took `own_us` then."""
+
+    bytes_per_s: float
+    own_us: int
+    until_us: int
+
+    def frame_us(self, frame_bytes: float) -> float:
+        """How long a frame occupies the link."""
+        return frame_bytes * 1e6 / self.bytes_per_s
+
+
 class Window:
     """The number of `frames` that may be in flight, from 1 to `most`; one more for each `interval_us` of delay."""
 
@@ -62,11 +89,14 @@ class Window:
         self._interval_us, self._most = interval_us, most
         self._alone_us: deque[int] = deque(maxlen=_ALONE_KEPT)
         self._behind: deque[Answered] = deque(maxlen=_BEHIND_KEPT)
-        self._since_change = 0
+        self._since_change = self._carried_us = self._carried_bytes = 0
         self._compute_us = 0.0
         self._grow_at_us = self._changed_at_us = 0
         self._pause_us = _FIRST_PAUSE_US
         self._failed = False
+        self._thin: _Thin | None = None
+        self._rate_bytes_per_s = 0.0
+        self._frame_bytes = 0.0
         self.frames = 1
 
     @property
@@ -78,11 +108,16 @@ class Window:
         """Learn from an answer. Returns what the link carries where it falls behind the camera."""
         self._since_change += 1
         self._compute_us += 0.3 * (answered.compute_us - self._compute_us)
-        if answered.alone:
-            self._alone_us.append(answered.delay_us)
-        else:
+        each_bytes = answered.gap_bytes / answered.gap_frames
+        self._frame_bytes = each_bytes if not self._frame_bytes else 0.7 * self._frame_bytes + 0.3 * each_bytes
+        self._carried_us += answered.gap_us
+        self._carried_bytes += answered.gap_bytes
+        if answered.behind or (answered.followed and self._waited(answered.delay_us)):
             self._behind.append(answered)
+        if answered.behind or answered.followed:
             self._lower_own_delay(answered.delay_us)
+        else:
+            self._alone_us.append(answered.delay_us)
         if self._is_queue():
             return self._narrowed(now_us)
         self._widen(now_us)
@@ -91,8 +126,12 @@ class Window:
     def _lower_own_delay(self, delay_us: int) -> None:
         """A frame that was not alone and yet quicker: the link has become shorter."""
         own_us = self.own_delay_us
-        if own_us is None or delay_us < own_us:
+        if own_us is not None and delay_us < own_us:
             self._alone_us.append(delay_us)
+
+    def _waited(self, delay_us: int) -> bool:
+        own_us = self.own_delay_us
+        return own_us is not None and delay_us > own_us + _slack_us(own_us)
 
     def _is_queue(self) -> bool:
         own_us = self.own_delay_us
@@ -107,15 +146,23 @@ class Window:
         return min(one.delay_us for one in self._behind)
 
     def _narrowed(self, now_us: int) -> Full | None:
-        full = self._full()
-        kept = round(self.frames * (self.own_delay_us or 0) / max(1, self._waited_us()))
+        full, own_us = self._full(), self.own_delay_us or 0
+        kept = round(self.frames * own_us / max(1, self._waited_us()))
         if kept < self.frames:
-            held = now_us - self._changed_at_us >= _HELD_US
+            held = now_us - self._changed_at_us >= _HELD_US and self._since_change >= _HELD_ANSWERS
             self._pause_us = _FIRST_PAUSE_US if held else min(2 * self._pause_us, _LONGEST_PAUSE_US)
             self._grow_at_us = now_us + self._pause_us
             self._failed = True
+            self._note_rate(full, own_us, now_us)
             self._set(max(1, kept), now_us)
+        self._behind.clear()  # what waited is told once
         return full
+
+    def _note_rate(self, full: Full | None, own_us: int, now_us: int) -> None:
+        before, now = self._rate_bytes_per_s, self._carried_bytes * 1e6 / max(1, self._carried_us) if full else 0.0
+        if min(now, before) * _ALIKE > max(now, before):
+            self._thin = _Thin(now, own_us, now_us + _THIN_US)
+        self._rate_bytes_per_s = now
 
     def _full(self) -> Full | None:
         gap_us = sum(one.gap_us for one in self._behind)
@@ -132,7 +179,7 @@ class Window:
             return
         if self.frames > 1 and (len(self._behind) < _BEHIND_KEPT or self._waited_us() > own_us + _slack_us(own_us)):
             return
-        useful = min(self._most, self._useful(own_us))
+        useful = min(self._most, self._useful(own_us), self._fitting(own_us, now_us))
         wider = self.frames + 1 if self._failed else 2 * self.frames
         if useful != self.frames:
             self._set(min(useful, wider), now_us)
@@ -147,6 +194,15 @@ class Window:
             return 1 + int(own_us / self._compute_us)
         return 1 + (own_us + self._interval_us // 2) // self._interval_us
 
+    def _fitting(self, own_us: int, now_us: int) -> int:
+        """Frames that the link carries side by side, as far as its rate is known."""
+        thin = self._thin
+        frame_us = thin.frame_us(self._frame_bytes) if thin else 0.0
+        if thin is None or now_us >= thin.until_us or own_us < max(_THINNER * thin.own_us, _LEAST * frame_us):
+            self._thin = None
+            return self._most
+        return self._most if frame_us < _LARGE * self._interval_us else max(1, round(own_us / frame_us))
+
     def on_timeout(self, now_us: int) -> None:
         """An answer is overdue: whatever is under way has to come out first."""
         self._grow_at_us = max(self._grow_at_us, now_us + (self.own_delay_us or 0))
@@ -154,7 +210,7 @@ class Window:
 
     def _set(self, frames: int, now_us: int) -> None:
         self.frames = frames
-        self._since_change = 0
+        self._since_change = self._carried_us = self._carried_bytes = 0
         self._changed_at_us = now_us
         self._behind.clear()
 

@@ -48,6 +48,7 @@ def test_every_packet_is_accounted_for(shape, count, seed):
     out = carry(wire, [PACKET] * count)
     counts = wire.counts
     assert counts.taken == count and counts.delivered == len(out) and wire.next_us is None
+    assert counts.delivered_bytes == sum(map(len, out))
     assert counts.taken + counts.duplicated == counts.delivered + counts.lost + counts.cut + counts.overflow
 
 

@@ -14,7 +14,7 @@ from sim.wire import Shapes
 from sim.wire_tun import namespaces
 
 _END_S: Final = 2.0
-_PLAIN: Final = ("taken", "delivered")
+_PLAIN: Final = ("taken", "delivered", "delivered_bytes")
 
 
 class BenchWire:
@@ -25,6 +25,8 @@ class BenchWire:
         self._log = log
         self._ending = ExitStack()
         self._process: subprocess.Popen[str] | None = None
+        self.carried_bytes = {"ab": 0, "ba": 0}
+        """What came out at the far end of each direction, up to the last `shape`."""
 
     def __enter__(self) -> Self:
         with self._ending:
@@ -52,6 +54,7 @@ class BenchWire:
         stdin.write(shapes.model_dump_json() + "\n")
         stdin.flush()
         counts = json.loads(_file(self._process.stdout).readline())
+        self.carried_bytes = {leg: count["delivered_bytes"] for leg, count in counts.items()}
         return sum(count for leg in counts.values() for name, count in leg.items() if name not in _PLAIN)
 
     @staticmethod

@@ -1,0 +1,63 @@
+"""A row of `bench network`: twenty robots and one vision for all of them. Shell (processes)."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from benchmarks.loop_figures import LoopCheck, at_most, percentile
+from benchmarks.loop_pictures import write_pictures
+from benchmarks.network_robots import Settings
+from benchmarks.network_rows import Row
+from benchmarks.network_stage import EVERYWHERE, NetworkRun, Stage, now_us
+from sim.wire import Shapes
+from sim.wire_tun import ADDRESS_B
+
+ROBOTS: Final = 20
+WIDTH_PX, HEIGHT_PX, FPS = 320, 240, 15.0
+LEAST_FPS: Final = 14.0
+MOST_P95_MS: Final = 80.0
+_SETTLE_S: Final = 3.0
+
+
+def fleet(row: Row, stage: Stage) -> NetworkRun:
+    """All of them for as long as there is time; judged by the robot that fared worst."""
+    pictures = stage.folder / "small"
+    pictures.mkdir()
+    write_pictures(pictures, WIDTH_PX, HEIGHT_PX)
+    settings = Settings(endpoint=f"tcp/{ADDRESS_B}:7447", robots=ROBOTS, fps=FPS, pictures=pictures,
+                        notes=stage.folder / "notes.json", seed=stage.seed)
+    with stage.wire() as wire, stage.crew("crew") as crew:
+        before = wire.shape(stage.seeded(row.phases[0].shapes))
+        crew.start("vision", "operator_side.cli", "vision", "--robot", "r*", "--listen", f"tcp/{EVERYWHERE}:7447",
+                   namespace=wire.far_side)
+        crew.wait_line("vision", "looking for robots")
+        crew.start("robots", "benchmarks.network_robots", settings.model_dump_json(), namespace=wire.robot_side)
+        crew.wait_line("robots", f"playing {ROBOTS} robots")
+        time.sleep(_SETTLE_S)
+        begin_us = now_us()
+        time.sleep(stage.setting.seconds)
+        end_us = now_us()
+        crew.check()
+        injected = wire.shape(Shapes()) - before
+        crew.end()
+    answers = json.loads(settings.notes.read_text("utf-8"))
+    harmed = LoopCheck("injected", float(injected), "", 1.0, injected >= 1)
+    return NetworkRun(row, stage.seed, injected, (), (harmed, *judge_fleet(answers, begin_us, end_us)))
+
+
+def judge_fleet(
+    answers: Mapping[str, Sequence[Sequence[int]]], begin_us: int, end_us: int
+) -> tuple[LoopCheck, LoopCheck, LoopCheck]:
+    """The robot with the fewest answers, and the one with the oldest. `answers`: (captured_us, age_us) of each."""
+    seconds = (end_us - begin_us) / 1e6
+    ages_ms = [[age_us / 1000 for at_us, age_us in seen if begin_us <= at_us < end_us] for seen in answers.values()]
+    least_fps = min((len(one) / seconds for one in ages_ms), default=0.0)
+    p95_ms = [percentile(one, 95) for one in ages_ms]
+    known = [one for one in p95_ms if one is not None]
+    oldest_ms = max(known) if known and len(known) == len(p95_ms) else None
+    return (
+        LoopCheck("robots", float(len(answers)), "", float(ROBOTS), len(answers) >= ROBOTS),
+        LoopCheck("answered, least", least_fps, "fps", LEAST_FPS, least_fps >= LEAST_FPS),
+        at_most("age p95, worst robot", oldest_ms, "ms", MOST_P95_MS),
+    )

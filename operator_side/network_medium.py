@@ -1,0 +1,107 @@
+"""A row of `bench network`: one half-duplex medium, full of video, and a person beyond it who says STOP. Shell.
+
+Judged from the simulated motors' own log, with the fault bench's robot and judge.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+from benchmarks.loop_figures import LoopCheck, at_most, percentile
+from benchmarks.network_rows import Row
+from benchmarks.network_stage import NetworkRun, Stage
+from operator_side.faults.judge import Motors, measure_stop, moved_on_old_sight, wheel_mps
+from operator_side.faults.ledger import TOLD
+from operator_side.faults.rig import ROBOT, Rig, Setup
+from operator_side.network_person import STOPPED
+from protocol.errors import HardwareError, SightlineError
+from sim.wire import Shapes
+
+REACHES_MS: Final = 300.0
+SAID_MS: Final = REACHES_MS + 100.0
+"""By the robot's own status, ten times a second: as frames age, wheels slow down by themselves, before any STOP."""
+ZERO_MS: Final = 700.0
+"""Reached, and then the ramp from 0.5 m/s: as the fault bench demands of every STOP."""
+_READY_S: Final = 30.0
+_BESIDE_S: Final = 60.0
+
+
+def medium(row: Row, stage: Stage) -> NetworkRun:
+    """STOP, reset and so on for as long as there is time. Raises HardwareError if anything does not run."""
+    try:
+        with Rig(stage.folder / "rig", Setup(wired=True, camera="heavy")) as rig:
+            return _run(row, stage, rig)
+    except SightlineError as error:
+        raise HardwareError(str(error)) from None
+
+
+def _run(row: Row, stage: Stage, rig: Rig) -> NetworkRun:
+    assert rig.wire is not None
+    before = rig.wire.shape(stage.seeded(row.phases[0].shapes))
+    ledger = rig.folder / "person.ledger"
+    arguments = [rig.endpoint, ROBOT, str(ledger), str(stage.setting.seconds), str(stage.seed)]
+    rig.fleet.run("person", "operator_side.network_person", arguments, namespace=rig.wire.far_side)
+    rig.fleet.wait_line("person", "person ready", _READY_S)
+    if rig.fleet.exit_code("person", stage.setting.seconds + _BESIDE_S) != 0:
+        raise HardwareError(f"the person gave up: {rig.fleet.log('person').read_text('utf-8').strip()[-200:]}")
+    injected = rig.wire.shape(Shapes()) - before
+    told_us = [one.t_us for one in rig.noted("person", TOLD)]
+    rows = rig.motors()
+    checks = (
+        LoopCheck("injected", float(injected), "", 1.0, injected >= 1),
+        *judge_stops(rows, told_us),
+        judge_said(told_us, [one.frame_us for one in rig.noted("person", STOPPED)]),
+        at_most("moved on frames over 400 ms", moved_on_old_sight(rows, rig.sent(), None), "lines", 0),
+    )
+    return NetworkRun(row, stage.seed, injected, (), checks, {"stops": len(told_us)})
+
+
+def judge_stops(rows: Sequence[Motors], told_us: Sequence[int]) -> tuple[LoopCheck, LoopCheck]:
+    """When each STOP, said at `told_us`, shows in what the motors were told, and when the wheels stood."""
+    ends_us = [*told_us[1:], rows[-1].t_us + 1]
+    windows = [_window(rows, begin_us, end_us) for begin_us, end_us in zip(told_us, ends_us, strict=True)]
+    reached = [reached_ms(window, at_us) for window, at_us in zip(windows, told_us, strict=True)]
+    zero = [measure_stop(rows, at_us, _again_us(window)).zero_ms
+            for window, at_us in zip(windows, told_us, strict=True)]
+    return (
+        at_most(f"STOP reaches the wheels, p99 of {len(reached)}", _p99(reached), "ms", REACHES_MS),
+        at_most(f"wheels at zero, p99 of {len(zero)}", _p99(zero), "ms", ZERO_MS),
+    )
+
+
+def judge_said(told_us: Sequence[int], stopped_us: Sequence[int]) -> LoopCheck:
+    """When the robot itself said, in the status with that stamp, that it was stopped."""
+    said = [(stop_us - at_us) / 1000 for at_us, stop_us in zip(told_us, stopped_us, strict=False)]
+    value = percentile(said, 99) if len(stopped_us) == len(told_us) else None
+    return at_most(f"robot says STOPPED, p99 of {len(said)}", value, "ms", SAID_MS)
+
+
+def _window(rows: Sequence[Motors], begin_us: int, end_us: int) -> list[Motors]:
+    """What they were told when it began, and all up to its end."""
+    before = [row for row in rows if row.t_us <= begin_us]
+    return [*before[-1:], *(row for row in rows if begin_us < row.t_us < end_us)]
+
+
+def reached_ms(window: Sequence[Motors], told_us: int) -> float | None:
+    """From STOP to the first line of the fall that ended at zero; None if the wheels never stood."""
+    zero = next((index for index, row in enumerate(window) if wheel_mps(row) == 0), None)
+    if zero is None:
+        return None
+    first = zero
+    while first > 1 and wheel_mps(window[first - 2]) > wheel_mps(window[first - 1]):
+        first -= 1
+    return max(0, window[first].t_us - told_us) / 1000
+
+
+def _again_us(window: Sequence[Motors]) -> int | None:
+    """Just before the wheels turned again after having stood: the reset."""
+    stood = False
+    for row in window:
+        stood = stood or wheel_mps(row) == 0
+        if stood and wheel_mps(row) > 0:
+            return row.t_us - 1
+    return None
+
+
+def _p99(values: Sequence[float | None]) -> float | None:
+    known = [one for one in values if one is not None]
+    return percentile(known, 99) if len(known) == len(values) else None

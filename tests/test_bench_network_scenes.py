@@ -1,0 +1,121 @@
+"""The rows of `bench network` that are more than one robot and one vision: their judges, and one run for real."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from benchmarks.network_fleet import ROBOTS, judge_fleet
+from benchmarks.network_wheels import moves_again_s, read_told
+from operator_side.faults.judge import Motors
+from operator_side.network_medium import judge_said, judge_stops, reached_ms
+from sim.wire_tun import why_impossible
+
+TICK_US = 20_000
+SECOND_US = 1_000_000
+
+
+def told(*spans):
+    """Lines of the log drive: (speed, seconds) after one another."""
+    speeds = [speed for speed, seconds in spans for _ in range(round(seconds * 50))]
+    return read_told("".join(f"{number * TICK_US},{speed},{speed}\n" for number, speed in enumerate(speeds)))
+
+
+# --- wheels ------------------------------------------------------------------------------------------------------
+
+
+def test_a_line_being_written_is_left_out():
+    assert read_told("1,0.5,0.5\n2,0.0,0.0\n3,0.") == [(1, 0.5, 0.5), (2, 0.0, 0.0)]
+
+
+def test_moving_again_is_the_end_of_the_longest_standstill_after_it():
+    rows = told((0, 1), (3, 2), (0, 0.02), (3, 0.5), (0, 0.7), (3, 2))
+    assert moves_again_s(rows, 3 * SECOND_US, 60 * SECOND_US) == pytest.approx(1.22, abs=0.03)
+    assert moves_again_s(rows, 5 * SECOND_US, 60 * SECOND_US) == 0, "it never stood again"
+
+
+def test_wheels_that_stay_still_do_not_move_again():
+    rows = told((3, 2), (0, 3))
+    assert moves_again_s(rows, 2 * SECOND_US, 60 * SECOND_US) is None
+    assert moves_again_s(told((3, 2), (0, 1), (3, 1)), 1_900_000, 2_500_000) is None, "not by then"
+    assert moves_again_s([], 0, 1) is None
+
+
+# --- STOP --------------------------------------------------------------------------------------------------------
+
+
+def motors(*rad_s):
+    angle, rows = 0.0, []
+    for number, speed in enumerate(rad_s):
+        rows.append(Motors(number * TICK_US, speed, speed, angle, angle))
+        angle += speed * 0.02
+    return rows
+
+
+FALL = (12.0, 9.0, 6.0, 3.0, 0.0, 0.0, 0.0)
+
+
+def test_a_stop_reaches_the_wheels_with_the_first_line_of_the_fall_that_ends_at_zero():
+    rows = motors(*[15.0] * 10, 13.0, 15.0, *FALL)
+    assert reached_ms(rows[6:], 5 * TICK_US) == pytest.approx(20 * (12 - 5))
+    assert reached_ms(motors(*[15.0] * 10), 0) is None, "a STOP that the wheels never heard of"
+
+
+def test_one_stop_in_vain_is_no_p99():
+    heard = motors(*[15.0] * 10, *FALL, *[0.0] * 20, *[15.0] * 20)
+    reached, zero = judge_stops(heard, [5 * TICK_US])
+    assert reached.ok and zero.ok and reached.value == pytest.approx(20 * (10 - 5))
+    reached, zero = judge_stops(heard, [5 * TICK_US, 45 * TICK_US])
+    assert not reached.ok and reached.value is None and not zero.ok
+
+
+def test_a_robot_that_never_says_it_is_stopped_is_not_ok():
+    assert judge_said([1_000_000, 5_000_000], [1_200_000, 5_300_000]).value == pytest.approx(300)
+    assert not judge_said([1_000_000], [1_500_000]).ok
+    assert judge_said([1_000_000, 5_000_000], [1_200_000]).value is None
+
+
+def test_a_late_stop_is_over_its_bound():
+    late = motors(*[15.0] * 25, *FALL, *[0.0] * 20)
+    reached, zero = judge_stops(late, [5 * TICK_US])
+    assert not reached.ok and reached.value == pytest.approx(20 * (25 - 5)) and zero.ok
+
+
+# --- the fleet ---------------------------------------------------------------------------------------------------
+
+
+def answers(fps=15, age_ms=20, seconds=10):
+    return [(round(number * SECOND_US / fps), age_ms * 1000) for number in range(fps * seconds)]
+
+
+def test_a_fleet_is_judged_by_the_robot_that_fares_worst():
+    seen = {f"r{number}": answers() for number in range(ROBOTS)}
+    assert all(check.ok for check in judge_fleet(seen, 0, 10 * SECOND_US))
+    for spoiled, wrong in ((answers(fps=13), "answered, least"), (answers(age_ms=90), "age p95, worst robot")):
+        bad = judge_fleet({**seen, "r3": spoiled}, 0, 10 * SECOND_US)
+        assert [check.name for check in bad if not check.ok] == [wrong]
+    bad = judge_fleet({**seen, "r3": []}, 0, 10 * SECOND_US)
+    assert {check.name: check.value for check in bad if not check.ok} == {
+        "answered, least": 0.0, "age p95, worst robot": None,
+    }
+
+
+def test_a_robot_that_is_missing_is_noticed():
+    few = {f"r{number}": answers() for number in range(ROBOTS - 1)}
+    assert [check.name for check in judge_fleet(few, 0, 10 * SECOND_US) if not check.ok] == ["robots"]
+
+
+# --- for real ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(why_impossible()), reason="needs root and /dev/net/tun")
+def test_a_standby_is_run_for_real():
+    command = [sys.executable, "-m", "operator_side.cli", "bench", "network", "--only", "standby", "--seconds", "4",
+               "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    said = json.loads(done.stdout)
+    taken = next(check for check in said["checks"] if "drives again" in check["name"])
+    assert taken["value"] is not None and 0.2 < taken["value"] < 5, "wheels stood and turned again"
+    assert said["rows"][0]["injected"] >= 1
