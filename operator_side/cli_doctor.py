@@ -1,17 +1,12 @@
 """`sightline doctor`: what is wrong here, or on the way to a robot, and the line that mends it. Shell."""
 
 import json
-import time
 from collections.abc import Iterator
 from typing import Annotated
 
 import typer
 
 from operator_side.doctor.finding import Finding, as_object
-from protocol.errors import SightlineError
-
-_LOOK_S = 3.0
-_ENOUGH = 0.9
 
 
 def register(app: typer.Typer) -> None:
@@ -50,30 +45,11 @@ def doctor(
 
 
 def _findings(robot: str, peer: str | None, camera: str | None, sets: list[str], secure: str) -> Iterator[Finding]:
-    from operator_side.doctor import between, machine
+    from operator_side.doctor import between, cameras, machine
 
     yield from machine.findings(secure)
+    yield from cameras.modes()
     if camera is not None:
-        yield _camera(camera, sets)
+        yield cameras.delivered(camera, sets)
     if peer is not None:
         yield from between.findings(peer, robot, secure)
-
-
-def _camera(kind: str, sets: list[str]) -> Finding:
-    """The rate that a camera really delivers; what it cannot do at all, it says itself."""
-    from operator_side.local_camera import local_camera
-
-    try:
-        with local_camera(kind, sets) as opened:
-            begun_s, stamps_us = time.monotonic(), []
-            while time.monotonic() - begun_s < _LOOK_S:
-                picture = opened.read(0.5)
-                stamps_us += [picture.t_us] if picture else []
-    except SightlineError as error:
-        return Finding(f"camera {kind}", False, str(error))
-    if len(stamps_us) < 2:
-        return Finding(f"camera {kind}", False, "no pictures", "plug it in anew; another program may have it")
-    fps = (len(stamps_us) - 1) / (stamps_us[-1] - stamps_us[0]) * 1e6
-    asked = next((float(one.partition("=")[2]) for one in sets if one.startswith("fps=")), 0.0)
-    fix = "more light (a camera exposes longer in the dark), a smaller size, or another USB port"
-    return Finding(f"camera {kind}", fps >= _ENOUGH * asked, f"{fps:.1f}", fix, "fps", f"{asked:g}")

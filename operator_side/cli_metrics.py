@@ -29,7 +29,8 @@ def metrics(
     """Serve a robot's status to Prometheus at /metrics, and whether it is heard at /health, until Ctrl-C."""
     with needs("metrics"):
         import_module("prometheus_client")
-    from operator_side.metrics import Watched, serving
+    from operator_side.metrics import Watched
+    from operator_side.metrics_server import serving
 
     ending = threading.Event()
     with open_link(robot, connect=connect, role=ROLE, secure=secure) as link, serving(Watched(link), host, port) as at:

@@ -4,23 +4,27 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from operator_side.requests import SOURCE, Operator, read_report
+from operator_side.around import find_around
+from operator_side.mission_asking import MissionDesk
+from operator_side.mission_text import mission_lines
+from operator_side.requests import SOURCE, Operator
 from operator_side.status_text import status_line, status_lines
-from protocol.errors import LinkError, WireError
 from protocol.messages import Reply, Status, Verb
-from protocol.transports.link import Message
 from protocol.transports.opening import open_link
-from protocol.transports.zenoh import list_robots
 from robot_side.config import DEFAULT_ENDPOINT
 
 REFUSED_EXIT = 5
+_REPORT_S = 0.8  # vision reports twice a second; where one drives, that is worth waiting for
 
 Robot = Annotated[str, typer.Argument(metavar="[ROBOT]", help="The robot's id.")]
 Connect = Annotated[list[str], typer.Option("--connect", metavar="ENDPOINT", help="Where the robot or router listens.")]
+MaybeConnect = Annotated[
+    list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Where a robot or router listens.")
+]
 Secure = Annotated[
     str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; endpoints are then tls/...")
 ]
@@ -39,34 +43,21 @@ def register(app: typer.Typer) -> None:
 
 
 def robots(
-    connect: Connect = DEFAULT_CONNECT,
+    connect: MaybeConnect = None,
     secure: Secure = "",
-    seconds: Annotated[float, typer.Option(min=0.2, max=60, help="How long to listen.")] = 1.0,
+    seconds: Annotated[float, typer.Option(min=0.2, max=60, help="How long to listen.")] = 0.8,
     as_json: Json = False,
-) -> None:
-    """List the robots that are heard."""
-    heard = list_robots(connect, seconds, secure)
+) -> int:
+    """List who is there: robots and their state, who sees and steers, versions and round-trip times.
+
+    Without --connect it looks on this machine, then asks the network (multicast).
+    """
+    found = find_around(connect, seconds, secure)
     if as_json:
-        typer.echo(json.dumps({"robots": [_as_object(name, heard[name]) for name in sorted(heard)]}))
-        return
-    for name in sorted(heard):
-        typer.echo(_heard_line(name, heard[name]))
-    if not heard:
-        raise LinkError(f"no robot is heard at {', '.join(connect)} within {seconds:g} s; start one: sightline robot")
-
-
-def _heard_line(name: str, message: Message) -> str:
-    try:
-        return status_line(name, read_report(message).status)
-    except WireError as error:
-        return f"{name}: not understood: {error.detail}"
-
-
-def _as_object(name: str, message: Message) -> dict[str, Any]:
-    try:
-        return {"robot": name, **read_report(message).status.model_dump(mode="json")}
-    except WireError as error:
-        return {"robot": name, "error": error.detail}
+        typer.echo(json.dumps(found.as_object()))
+    else:
+        typer.echo("\n".join(found.lines()))
+    return 0
 
 
 def status(
@@ -76,14 +67,19 @@ def status(
     watch: Annotated[bool, typer.Option("--watch", help="Once a second, until Ctrl-C.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Say what a robot does and why: state, driver, twist, frame age, latency, every refusal."""
-    with _operator(robot, connect, secure) as operator:
+    """Say what a robot does and why: state, driver, twist, frame age, latency, every refusal; its vision's mission."""
+    with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
+        desk = MissionDesk(link)
         while True:
-            report = operator.wait_report()
+            state = desk.operator.wait_report().status
+            seen_to = state.holder is not None and state.holder.source == "vision"
+            mission = desk.newest(_REPORT_S if seen_to else 0.0)
             if as_json:
-                typer.echo(json.dumps({"robot": robot, **report.status.model_dump(mode="json")}))
+                about = mission and mission.model_dump(mode="json")
+                typer.echo(json.dumps({"robot": robot, **state.model_dump(mode="json"), "mission": about}))
             else:
-                typer.echo("\n".join(status_lines(robot, report.status)) + ("\n" if watch else ""))
+                lines = [*status_lines(robot, state), *(mission_lines(mission) if mission else ())]
+                typer.echo("\n".join(lines) + ("\n" if watch else ""))
             if not watch:
                 return
             time.sleep(1.0)

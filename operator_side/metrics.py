@@ -1,29 +1,26 @@
-"""A robot's status for Prometheus, and a health endpoint. Shell (an HTTP server, a link).
-
-`prometheus_client` writes the format: it is the one that Prometheus itself maintains.
-"""
+"""A robot's status for Prometheus. Shell (a link)."""
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Final
 
+from operator_side.metrics_server import counter, gauge
 from operator_side.requests import read_report
 from protocol.channels import STATUS
-from protocol.errors import LinkError, WireError
-from protocol.messages import State, Status
+from protocol.errors import WireError
+from protocol.messages import State, Status, StreamStatus
 from protocol.transports.link import Link, Message
+from protocol.transports.presence import Peer
+from protocol.transports.secured import ROBOT
 
 if TYPE_CHECKING:
-    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+    from operator_side.metrics_server import Family
 
-FRESH_S = 2.0
+FRESH_S: Final = 2.0
 """A robot that was not heard for longer is down."""
-Respond = Callable[[str, list[tuple[str, str]]], Any]
 
 
 class Watched:
@@ -32,29 +29,41 @@ class Watched:
     def __init__(self, link: Link) -> None:
         self._robot = link.robot
         self._newest: tuple[Status, float] | None = None
+        self._entered: Counter[str] = Counter()
+        self._peers: Callable[[], list[Peer]] = getattr(link, "peers", list)
         link.subscribe(STATUS, self._on_status)
 
     def _on_status(self, message: Message) -> None:
         try:
-            self._newest = (read_report(message).status, time.monotonic())
+            status = read_report(message).status
         except WireError:
             return
+        before = self._newest
+        self._entered[status.state.value] += before is not None and before[0].state is not status.state
+        self._newest = (status, time.monotonic())
 
     def fresh(self) -> Status | None:
         """The status, unless it is too old."""
         newest = self._newest
         return newest[0] if newest is not None and time.monotonic() - newest[1] <= FRESH_S else None
 
-    def collect(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
+    def is_heard(self) -> bool:
+        """Whether the robot is heard."""
+        return self.fresh() is not None
+
+    def collect(self) -> Iterator[Family]:
         """All that is known now; only `sightline_up` of a robot that is not heard."""
         status = self.fresh()
         yield self._gauge("up", "whether the robot is heard", float(status is not None))
         if status is not None:
             yield from self._of(status)
+            yield from self._drops(status.stream)
+            yield from self._round_trip()
 
-    def _of(self, status: Status) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
+    def _of(self, status: Status) -> Iterator[Family]:
         stream = status.stream
-        yield self._labelled("state", "1 for the state it is in", {s.value: float(s is status.state) for s in State})
+        yield gauge("state", "1 for the state it is in",
+                    {(self._robot, one.value): float(one is status.state) for one in State}, "robot", "state")
         yield self._gauge("linear_mps", "forward speed applied", status.applied[0])
         yield self._gauge("angular_rad_s", "turning speed applied, left positive", status.applied[1])
         yield from self._times(status)
@@ -63,11 +72,12 @@ class Watched:
         yield self._counter("frames_sent", "frames sent", stream.sent)
         yield self._counter("frames_unanswered", "frames whose answer never came", stream.credit_timeouts)
         yield self._counter("commands_accepted", "commands accepted", status.accepted)
-        yield self._counter("commands_dropped", "commands the driver had no room for", stream.dropped_commands)
+        yield self._by("commands_refused", "commands refused", "reason", status.refused)
         yield self._counter("network_restarts", "restarts of the network process", status.network_restarts)
-        yield self._refused(status.refused)
+        yield self._counter("holds", "times it was seen to begin to hold, at ten looks a second",
+                            self._entered[State.HOLD.value])
 
-    def _times(self, status: Status) -> Iterator[GaugeMetricFamily]:
+    def _times(self, status: Status) -> Iterator[Family]:
         for name, about, value_us in (
             ("frame_age_seconds", "age of the frame behind the applied command", status.frame_age_us),
             ("latency_seconds", "capture to command, as the robot measures it", status.latency_us),
@@ -76,77 +86,27 @@ class Watched:
             if value_us is not None:
                 yield self._gauge(name, about, value_us / 1e6)
 
-    def _gauge(self, name: str, about: str, value: float) -> GaugeMetricFamily:
-        from prometheus_client.core import GaugeMetricFamily
+    def _drops(self, stream: StreamStatus) -> Iterator[Family]:
+        """What was replaced by something newer, slot by slot."""
+        yield self._counter("commands_dropped", "commands the driver had no room for", stream.dropped_commands)
+        yield self._counter("captures_missed", "captures that the stream asked for too late", stream.missed_captures)
+        yield self._counter("frames_overtaken", "frames that a newer one replaced on the way", stream.overtaken)
+        yield self._counter("pictures_refused", "pictures of the camera that were no usable JPEG",
+                            stream.refused_pictures)
+        yield self._by("messages_dropped", "messages replaced on the way out", "channel", stream.dropped)
 
-        family = GaugeMetricFamily(f"sightline_{name}", about, labels=["robot"])
-        family.add_metric([self._robot], value)
-        return family
+    def _round_trip(self) -> Iterator[Family]:
+        """Asked of the robot's network process at every look; nothing where that cannot be asked."""
+        for peer in self._peers():
+            if peer.presence.role == ROBOT and peer.presence.robot == self._robot:
+                yield self._gauge("round_trip_seconds", "there and back on the link", peer.round_trip_us / 1e6)
+                return
 
-    def _labelled(self, name: str, about: str, values: dict[str, float]) -> GaugeMetricFamily:
-        from prometheus_client.core import GaugeMetricFamily
+    def _gauge(self, name: str, about: str, value: float) -> Family:
+        return gauge(name, about, {(self._robot,): value}, "robot")
 
-        family = GaugeMetricFamily(f"sightline_{name}", about, labels=["robot", name])
-        for label, value in values.items():
-            family.add_metric([self._robot, label], value)
-        return family
+    def _counter(self, name: str, about: str, value: float) -> Family:
+        return counter(name, about, {(self._robot,): value}, "robot")
 
-    def _counter(self, name: str, about: str, value: float) -> CounterMetricFamily:
-        from prometheus_client.core import CounterMetricFamily
-
-        family = CounterMetricFamily(f"sightline_{name}", about, labels=["robot"])
-        family.add_metric([self._robot], value)
-        return family
-
-    def _refused(self, refused: dict[str, int]) -> CounterMetricFamily:
-        from prometheus_client.core import CounterMetricFamily
-
-        family = CounterMetricFamily("sightline_commands_refused", "commands refused", labels=["robot", "reason"])
-        for reason, count in refused.items():
-            family.add_metric([self._robot, reason], count)
-        return family
-
-
-@contextmanager
-def serving(watched: Watched, host: str, port: int) -> Iterator[int]:
-    """Serve `/metrics` and `/health` while inside; gives the port. Raises LinkError for a port in use."""
-    from prometheus_client import CollectorRegistry, make_wsgi_app
-
-    registry = CollectorRegistry()
-    registry.register(watched)
-    metrics = make_wsgi_app(registry)
-
-    def answer(environ: dict[str, Any], respond: Respond) -> Iterable[bytes]:
-        if environ["PATH_INFO"] == "/health":
-            heard = watched.fresh() is not None
-            respond("200 OK" if heard else "503 Service Unavailable", [("Content-Type", "text/plain")])
-            return [b"heard\n" if heard else b"not heard\n"]
-        body: Iterable[bytes] = metrics(environ, respond)
-        return body
-
-    server = _listening(host, port, answer)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        yield int(server.server_port)
-    finally:
-        server.shutdown()
-        server.server_close()
-
-
-class _Quiet(WSGIRequestHandler):
-    """One line per change of state, never one per request."""
-
-    def log_message(self, format: str, *arguments: Any) -> None:
-        """Say nothing."""
-
-
-def _listening(host: str, port: int, answer: Callable[..., Iterable[bytes]]) -> WSGIServer:
-    from protocol.transports.port_owner import port_owner
-
-    try:
-        return make_server(host, port, answer, handler_class=_Quiet)
-    except OSError as error:
-        owner = port_owner(port)
-        by = f" by {owner}" if owner else ""
-        cause = f"port {port} is in use{by}; choose another with --port" if owner else error.strerror
-        raise LinkError(f"cannot serve on {host}:{port}: {cause}") from None
+    def _by(self, name: str, about: str, label: str, counts: dict[str, int]) -> Family:
+        return counter(name, about, {(self._robot, key): value for key, value in counts.items()}, "robot", label)

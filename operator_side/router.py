@@ -10,6 +10,7 @@ from contextlib import closing
 
 from protocol.transports.endpoints import check_endpoints
 from protocol.transports.secured import ROBOT, secured_for
+from protocol.transports.zenoh_log import refusals_told
 from protocol.transports.zenoh_session import open_session
 
 _REACH_S = 5.0
@@ -20,11 +21,15 @@ def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
     check_endpoints(listen, connect)
     secured = secured_for(secure, ROBOT)
     ending = threading.Event()
-    with closing(open_session(listen, connect, _REACH_S, secured)):
+    with refusals_told(listen, secure, _say), closing(open_session(listen, connect, _REACH_S, secured)):
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: ending.set())
         rules = f"keys of {secure}, access rules on" if secure else "plain, open to whoever reaches it"
-        print(f"router: on {', '.join(listen)}; {rules}", flush=True)
+        _say(f"on {', '.join(listen)}; {rules}")
         ending.wait()
-    print("router: ended", flush=True)
+    _say("ended")
     return 0
+
+
+def _say(line: str) -> None:
+    print(f"router: {line}", flush=True)

@@ -19,11 +19,12 @@ from operator_side.settings_keys import is_known, known_keys
 from protocol.channels import check_robot_id
 from protocol.config import Config
 from protocol.errors import ConfigError
+from protocol.log_lines import ENV_NAME
 from protocol.transports.opening import check_endpoint
 
 SERVICES: Final = ("robot", "vision", "sim")
 ENV_PREFIX: Final = "SIGHTLINE_"
-OTHER_ENV_NAMES: Final = ("SIGHTLINE_DEBUG",)
+OTHER_ENV_NAMES: Final = ("SIGHTLINE_DEBUG", ENV_NAME)
 PROFILES: Final = Path(__file__).parent / "profiles"
 
 Key = tuple[str, ...]
@@ -97,7 +98,7 @@ def load(
         *_from_options(options or {}),
     ):
         _put(given, one)
-    _check_names(given)
+    _check_names(given, service)
     return Loaded(service, _validated(model, given), given)
 
 
@@ -189,11 +190,13 @@ def _put(given: dict[Key, Given], one: Given) -> None:
     given[key] = one
 
 
-def _check_names(given: Mapping[Key, Given]) -> None:
+def _check_names(given: Mapping[Key, Given], service: str) -> None:
     """Robot id and endpoints are refused here in words, not as a pattern."""
     robot = given.get(("robot",))
     if robot is not None and isinstance(robot.text or robot.value, str):
-        check_robot_id(robot.text or robot.value)
+        robot_id = str(robot.text or robot.value)
+        # A vision may name several by `*` and `?`.
+        check_robot_id(robot_id.replace("*", "x").replace("?", "x") if service == "vision" else robot_id)
     for name in ("listen", "connect"):
         one = given.get((name,))
         for endpoint in _as_list(one.value) if one else ():

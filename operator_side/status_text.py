@@ -33,9 +33,14 @@ def status_lines(robot: str, status: Status) -> Iterator[str]:
     yield f"driver loop late by at most {millis(status.tick_late_max_us)}; network restarts {status.network_restarts}"
 
 
+def stream_is_whole(stream: StreamStatus) -> bool:
+    """Whether pictures are encoded as configured: the link carries what was asked for."""
+    return stream.quality_percent == stream.scale_percent == 100
+
+
 def encoding_text(stream: StreamStatus) -> str:
     """How pictures are encoded to fit the link."""
-    if stream.quality_percent == stream.scale_percent == 100:
+    if stream_is_whole(stream):
         return "as configured"
     return f"made smaller for this link: quality {stream.quality_percent} %, side length {stream.scale_percent} %"
 

@@ -13,11 +13,13 @@ import zlib
 from collections import Counter
 from contextlib import ExitStack, suppress
 
-from protocol.channels import ACK, DETECTIONS, FRAME, REQUEST, TWIST
+from protocol.channels import ACK, CHANNELS, FRAME, REQUEST, TWIST
 from protocol.codec import encode
 from protocol.errors import HardwareError, SightlineError, WireError
+from protocol.log_lines import use_form
 from protocol.transports.link import Link, Message
-from protocol.transports.opening import open_link
+from protocol.transports.opening import open_link, pass_on
+from protocol.transports.zenoh_log import refusals_told
 from robot_side import ipc
 from robot_side.adjusting import Adjusting
 from robot_side.child import Setup
@@ -56,7 +58,9 @@ class Network:
         self._link.subscribe(TWIST, self._driver.forward)
         self._link.subscribe(REQUEST, self._driver.forward)
         self._link.subscribe(ACK, self._on_ack)
-        self._link.subscribe(DETECTIONS, self._pass_on)
+        for channel in CHANNELS.values():
+            if channel.passed_on:
+                pass_on(self._link, channel)
         threading.Thread(target=self._read_driver, daemon=True).start()
         while self.running:
             self._stream_one()
@@ -156,10 +160,6 @@ class Network:
         if refused != self._refused_told and self._driver.tell(ipc.pack_refused(refused)):
             self._refused_told = refused
 
-    def _pass_on(self, message: Message) -> None:
-        """Peers of a WebSocket do not hear one another: what somebody found goes on to whoever wants it."""
-        self._link.publish(DETECTIONS, message.header, message.payload, message.source)
-
     def _on_ack(self, message: Message) -> None:
         try:
             with self._lock:
@@ -174,24 +174,32 @@ def _now_us() -> int:
     return time.monotonic_ns() // 1000
 
 
+def _say(robot: str, line: str) -> None:
+    print(f"robot {robot}: {line}", flush=True)
+
+
 def _run(driver: ParentDriver) -> None:
     setup = Setup.model_validate_json(driver.receive())
     config = setup.config
     with ExitStack() as ending:
         camera: Camera = build("cameras", config.camera)
         ending.callback(camera.close)
+        ending.enter_context(refusals_told(config.doors, config.secure, lambda line: _say(config.robot, line)))
         link = ending.enter_context(
             open_link(
-                config.robot, listen=config.doors, connect=config.connect, role="robot", secure=config.secure
+                config.robot, listen=config.doors, connect=config.connect, role="robot", secure=config.secure,
+                session=setup.session,
             )
         )
-        where = ", ".join(config.listen) or "connected to " + ", ".join(config.connect)
+        where = ", ".join(config.listen) or "no port of its own"
+        where += f", connected to {', '.join(config.connect)}" if config.connect else ""
         print(f"robot {config.robot}: on {where}, camera {config.camera.kind}", flush=True)
         Network(setup, driver, link, camera).run()
 
 
 def main() -> None:
     """Entry of the child process: argv[1] and argv[2] are the sockets' descriptors."""
+    use_form(None, "robot")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the driver ends us, after zero
     driver = ParentDriver(*(socket.socket(fileno=int(number)) for number in sys.argv[1:3]))
     code = 1

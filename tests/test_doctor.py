@@ -1,14 +1,16 @@
 """`sightline doctor`: what it says of this machine, of a real robot, and of a way that leads nowhere."""
 
 import json
+import re
 import socket
 
 import pytest
 
 from operator_side import cli, keys
-from operator_side.doctor import machine
+from operator_side.doctor import between, cameras, machine
 from operator_side.doctor.finding import Finding, as_object, histogram
 from protocol.transports.port_owner import port_owner
+from protocol.transports.zenoh import open_zenoh
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess
 
@@ -30,6 +32,82 @@ def test_what_is_only_said_is_no_failure():
     assert as_object([said, good])["ok"] is True
     assert as_object([said, bad])["ok"] is False
     assert bad.line.endswith("fix: do this") and "fix" not in good.line
+
+
+def test_what_has_a_unit_is_a_number_for_scripts():
+    check = Finding("round trip", True, "12.5", "", "ms", "60").check
+    assert (check["value"], check["bound"]) == (12.5, 60.0)
+    assert Finding("port 1", None, "12").check["value"] == "12"
+    assert Finding("odd", None, "n/a", "", "ms").check == {
+        "name": "odd", "ok": None, "value": "n/a", "fix": "", "unit": "ms", "bound": None,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("stat", "cpu", "ok"), [
+    ("nr_throttled 0\nthrottled_usec 0", "cpu 100 0 100 1000 0 0 0 5 0 0", True),
+    ("nr_throttled 12\nthrottled_usec 34000", "cpu 100 0 100 100 0 0 0 50 0 0", False),
+])  # fmt: skip
+def test_a_processor_that_is_held_back_is_told(monkeypatch, tmp_path, stat, cpu, ok):
+    (tmp_path / "cpu.stat").write_text(stat)
+    (tmp_path / "stat").write_text(f"{cpu}\ncpu0 1")
+    throttle = tmp_path / "cpu0" / "thermal_throttle"
+    throttle.mkdir(parents=True)
+    (throttle / "core_throttle_count").write_text("0" if ok else "3")
+    for name, path in (("CGROUP", tmp_path), ("CPUS", tmp_path), ("PROC_STAT", tmp_path / "stat")):
+        monkeypatch.setattr(machine, name, path)
+    found = {one.name: one for one in machine._slowed_down()}
+    assert {one.ok for one in found.values()} == {ok} and len(found) == 3
+    assert ok or found["throttled by quota"].value == "12 times, 34 ms in all"
+
+
+_ARP = "IP address HW type Flags HW address Mask Device\n192.168.1.7 0x1 {} aa:bb:cc:dd:ee:ff * wlan0\n"
+
+
+@pytest.mark.parametrize(("flags", "host", "words"), [
+    ("0x0", "192.168.1.7", "client isolation"), ("0x2", "192.168.1.7", "it is a firewall"), ("0x2", "192.168.1.8", ""),
+    ("0x0", "no-such-name.invalid", ""),
+])  # fmt: skip
+def test_a_machine_that_is_kept_apart_is_told_from_a_firewall(tmp_path, flags, host, words):
+    (tmp_path / "arp").write_text(_ARP.format(flags))
+    said = between.neighbour(host, tmp_path / "arp")
+    assert words in said and bool(said) is bool(words)
+    assert between.neighbour(host, tmp_path / "absent") == ""
+
+
+@pytest.mark.parametrize(("offered", "ok", "said"), [
+    (["YUYV", "MJPG"], True, "passed through"), (["YUYV"], None, "each picture is encoded here"),
+    (["GREY"], False, "neither MJPG nor YUYV"),
+])  # fmt: skip
+def test_the_modes_of_a_camera_are_told_with_what_they_cost(capsys, monkeypatch, tmp_path, offered, ok, said):
+    (tmp_path / "video3").touch()
+    monkeypatch.setattr(cameras, "DEVICES", tmp_path)
+    assert list(cameras.modes()) == []  # a file that is no camera
+    monkeypatch.setattr(cameras, "formats", lambda device: offered)
+    check = _checks(capsys)["modes video3"]
+    assert check["ok"] is ok and said in check["value"] and (ok or check["fix"])
+
+
+def test_a_camera_that_cannot_be_opened_is_told(monkeypatch, tmp_path):
+    (tmp_path / "video0").mkdir()
+    monkeypatch.setattr(cameras, "DEVICES", tmp_path)
+    found = next(cameras.modes())
+    assert found.ok is False and found.fix
+
+
+def test_a_format_is_read_from_the_kernels_answer():
+    answer = cameras._FORMAT.pack(0, 1, 0, b"Motion-JPEG", int.from_bytes(b"MJPG", "little"), 0)
+    assert len(answer) == 64 and cameras.read_format(answer) == "MJPG"
+
+
+@pytest.mark.parametrize("transport", ["tcp", "udp"])
+def test_the_other_end_is_told_with_its_version_clock_and_round_trip(transport):
+    endpoint = free_endpoint().replace("tcp/", f"{transport}/")
+    with open_zenoh("r1", listen=[endpoint], role="robot"):
+        found = {one.name: one for one in between.findings(endpoint, "r1", "")}
+    assert found["version of robot"].ok and "sightline" in found["version of robot"].value
+    assert int(re.match(r"the robot's clock is (\d+) ms", found["clock skew"].value)[1]) < 100  # one machine, one clock
+    assert found["round trip p50"].ok and "#" in found["jitter"].value
+    assert found["link"].ok is False and "is not heard" in found["link"].value  # it says nothing of its state
 
 
 def test_a_busy_port_is_told_with_its_owner(capsys, monkeypatch):
@@ -87,6 +165,7 @@ def test_a_robot_is_looked_at_and_its_frames_counted(capsys, tmp_path):
     with RobotProcess(tmp_path) as robot:
         assert until(lambda: port_owner(int(robot.endpoint.rpartition(":")[2])))
         checks = _checks(capsys, "--peer", robot.endpoint)
-    assert checks["frames"]["ok"] and checks["round trip p95"]["ok"]
+    assert checks["frames"]["ok"] and checks["round trip p95"]["ok"] and checks["stream"]["ok"]
+    assert checks["version of robot"]["ok"] and "robot's clock is" in checks["clock skew"]["value"]
     assert "r1 is DISARMED" in checks["robot"]["value"]
     assert float(checks["frames"]["value"].split()[0]) > 20

@@ -7,12 +7,15 @@ from itertools import product
 import pytest
 
 from operator_side import keys
-from protocol.channels import ACK, CHANNELS, FRAME, REQUEST, STATUS, TWIST, Direction
+from protocol.channels import ACK, CHANNELS, FRAME, MISSION, REPORT, REQUEST, STATUS, TWIST, Direction
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.secured import ROLES, SOURCES, certificate_role, may_hear, may_publish
 from protocol.transports.websocket_keys import read_tokens
-from protocol.transports.zenoh import list_robots, open_zenoh
+from protocol.transports.zenoh import open_zenoh
+from protocol.transports.zenoh_around import list_robots
 from tests.link_rigs import free_endpoint, until
+
+SAID = (TWIST, ACK, REQUEST, MISSION, REPORT)
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +36,10 @@ def test_only_the_listed_may_publish():
     assert not any("request" in key for key in may_publish("vision"))
     assert {"sightline/*/request/operator", "sightline/*/twist/teleop"} <= set(may_publish("operator"))
     assert not any(key.endswith("/vision") for key in may_publish("operator"))
+    assert {"sightline/*/mission/operator", "sightline/*/mission/teleop"} <= set(may_publish("operator"))
+    assert "sightline/*/report/vision" in may_publish("vision")
+    assert not any("/report/" in key for key in may_publish("operator"))
+    assert not any("/mission/" in key for key in may_publish("vision"))
     assert not any(key.endswith("/guest") for role in ROLES for key in may_publish(role))
     assert {key.split("/")[2] for key in may_publish("robot")} == {
         name for name, channel in CHANNELS.items() if channel.direction is Direction.FROM_ROBOT
@@ -42,6 +49,8 @@ def test_only_the_listed_may_publish():
 def test_what_is_said_towards_the_robot_is_heard_by_the_robot_alone():
     assert all(key.endswith("/*") for key in may_hear("robot"))
     assert not any("twist" in key for role in SOURCES for key in may_hear(role))
+    for passed_on in ("detections", "mission", "report"):
+        assert all(f"sightline/*/{passed_on}/*" in may_hear(role) for role in (*SOURCES, "robot"))
 
 
 def test_a_role_that_is_none_is_a_viewer():
@@ -53,17 +62,17 @@ def test_a_role_that_is_none_is_a_viewer():
 def test_each_role_says_what_it_may_and_nothing_else(folder, endpoint):
     heard = []
     with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)) as robot:
-        for channel in (TWIST, ACK, REQUEST):
+        for channel in SAID:
             robot.subscribe(channel, lambda message: heard.append((message.channel.name, message.source)))
         for role in SOURCES:
             with open_zenoh("r1", connect=[endpoint], role=role, secure=str(folder)) as peer:
                 frames = peer.latest(FRAME)
                 until(lambda: robot.has_listener(FRAME))
-                for channel, source in product((TWIST, ACK, REQUEST), ("vision", "operator", "teleop", "guest")):
+                for channel, source in product(SAID, ("vision", "operator", "teleop", "guest")):
                     peer.publish(channel, b"{}", b"", source)
                 robot.publish(FRAME, b"{}", b"jpeg")
                 assert frames.take(2.0) is not None, f"{role} may watch"
-                allowed = [key for key in may_publish(role) if key.split("/")[2] in ("twist", "ack", "request")]
+                allowed = [key for key in may_publish(role) if CHANNELS[key.split("/")[2]] in SAID]
                 until(lambda allowed=allowed: len(heard) >= len(allowed), 2.0)
             time.sleep(0.1)  # what is denied must have had its chance
             said = {f"sightline/*/{channel}/{source}" for channel, source in heard}

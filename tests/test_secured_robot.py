@@ -4,6 +4,7 @@ import secrets
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -67,3 +68,60 @@ def test_without_keys_nobody_even_watches(robot):
     asked = _sightline("status", "r1", "--connect", robot.endpoint)
     assert asked.returncode == 4
     assert asked.stderr == f"error: refused at {robot.endpoint}: a tls/ endpoint needs keys; give --secure DIR\n"
+
+
+def _with_other_keys(folder, tmp_path):
+    keys.make(tmp_path / "other", [])
+    return tmp_path / "other"
+
+
+def _expired(folder, tmp_path):
+    for file in folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    keys.add(tmp_path, "vision", [], days=-0.5)
+    return tmp_path
+
+
+REFUSALS = {
+    "plain": (None, "it does not speak TLS: connect it to tls/... with --secure DIR"),
+    "other authority": (_with_other_keys, "authority: use keys of one `sightline keys init` on both"),
+    "expired": (_expired, "its certificate has expired: sightline keys add DIR ROLE"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_who_is_refused_is_named_in_the_robots_own_log_within_a_second(robot, name, tmp_path):
+    spoil, words = REFUSALS[name]
+    (tmp_path / "spoilt").mkdir()
+    secure = str(spoil(Path(robot.config["secure"]), tmp_path / "spoilt")) if spoil else ""
+    endpoint = robot.endpoint if secure else robot.endpoint.replace("tls/", "tcp/")
+    with pytest.raises(LinkError):
+        open_zenoh("r1", connect=[endpoint], role="vision", secure=secure, timeout_s=0.3)
+    assert until(lambda: words in robot.output(), 1.0), robot.output()
+    told = [line for line in robot.output().splitlines() if "refused a connection" in line]
+    assert told[0].startswith(f"robot r1: refused a connection from 127.0.0.1 at {robot.endpoint}"), told
+    assert len(told) <= 4, "a peer that tries again does not fill the log"
+
+
+def test_who_asks_for_another_name_refuses_the_robot_and_both_say_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(keys, "LOOPBACK", ("elsewhere.local",))
+    keys.make(tmp_path / "keys", [])
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    with RobotProcess(tmp_path, endpoint=endpoint, secure=str(tmp_path / "keys")) as robot:
+        assert until(lambda: "robot r1: on" in robot.output(), 20)
+        with pytest.raises(LinkError, match="names other addresses"):
+            open_zenoh("r1", connect=[endpoint], role="vision", secure=str(tmp_path / "keys"), timeout_s=0.3)
+        assert until(lambda: "our certificate does not name the address" in robot.output(), 1.0), robot.output()
+
+
+def test_on_a_plain_network_a_rogue_gets_nothing_accepted_while_another_drives_and_that_is_said_at_once(tmp_path):
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as driver:
+        assert until(lambda: "robot r1: on" in robot.output(), 20) and driving(robot)
+        began_s, accepted_of = time.monotonic(), driver.status().holder
+        with Vision(robot.endpoint, twist=b"-0.4000|1.0000") as rogue:
+            assert until(lambda: "refused NOT_HOLDER from vision" in robot.output(), 1.0), robot.output()
+            assert time.monotonic() - began_s < 3.0
+            assert until(lambda: driver.status().refused.get("NOT_HOLDER", 0) > 10)
+            assert driver.status().holder == accepted_of
+            assert rogue.headers, "it could have driven, had it been obeyed"
+        assert all(left >= 0.0 <= right for _, left, right in robot.motor_rows())

@@ -17,7 +17,8 @@ from protocol.messages import FrameHeader
 from protocol.transports.endpoints import check_endpoint, with_send_buffer
 from protocol.transports.link_rules import NOT_A_PUT
 from protocol.transports.port_owner import port_owner
-from protocol.transports.zenoh import list_robots, open_zenoh
+from protocol.transports.zenoh import open_zenoh
+from protocol.transports.zenoh_around import list_robots
 from protocol.transports.zenoh_session import open_session
 from tests.link_rigs import free_endpoint, until
 

@@ -5,20 +5,30 @@ from __future__ import annotations
 import errno
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from statistics import median, quantiles
 
 from operator_side.acknowledge import Viewer
 from operator_side.doctor.finding import Finding, histogram
 from operator_side.requests import Operator
+from operator_side.status_text import encoding_text, stream_is_whole
 from protocol.channels import FRAME
 from protocol.errors import SightlineError
 from protocol.messages import Status
 from protocol.transports import endpoints, websocket_endpoints
 from protocol.transports.link import Link
 from protocol.transports.opening import open_link
+from protocol.transports.presence import ASKS, Peer, quickest
+from protocol.transports.secured import ROBOT
+from protocol.transports.zenoh_discovery import LOOPBACK, find_listeners
+from protocol.transports.zenoh_presence import software
 
 ROLE = "doctor"
+ARP_TABLE = Path("/proc/net/arp")
+_ARP_COMPLETE = 0x2
+_SCOUT_S = 0.5
+_OVER_UDP = ("udp", "quic")
 _KNOCKS = 40
 _PATIENCE_S = 2.0
 _LOOK_S = 3.0
@@ -33,25 +43,70 @@ _UNREACHED = {
 
 def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
     """Everything about the way to `endpoint` and, if it is a robot's, its stream."""
-    host, port = _address(endpoint)
-    knocks_ms, trouble = _knock(host, port)
-    if trouble:
-        yield Finding("reach", False, f"{host}:{port} does not answer", trouble)
-        return
-    yield from _round_trip(knocks_ms)
+    transport, host, port = _address(endpoint)
+    if transport not in _OVER_UDP:
+        knocks_ms, trouble = _knock(host, port)
+        if trouble:
+            yield Finding("reach", False, f"{host}:{port} does not answer", trouble + neighbour(host))
+            return
+        yield from _round_trip(knocks_ms, "handshakes")
+    if not host.startswith(LOOPBACK):
+        yield _found_by_multicast(host)
     try:
         with open_link(robot, connect=[endpoint], role=ROLE, secure=secure) as link:
+            if transport in _OVER_UDP:
+                yield from _round_trip(_asked_ms(link), "questions")
+            yield from _peers(link, robot)
             yield from _robot(link, robot)
     except SightlineError as error:
         yield Finding("link", False, str(error))
 
 
-def _address(endpoint: str) -> tuple[str, int]:
-    """Host and port. Raises ConfigError for an endpoint that is none."""
+def _found_by_multicast(host: str) -> Finding:
+    """Discovery is a comfort: only said."""
+    try:
+        there = socket.gethostbyname(host) in {endpoints.check_endpoint(one)[1] for one in find_listeners(_SCOUT_S)}
+    except OSError:
+        there = False
+    words = "it answers: `sightline robots` finds it" if there else "no answer, as on many networks"
+    return Finding("multicast there", None, words, "" if there else "none needed: name the endpoint with --connect")
+
+
+def _asked_ms(link: Link) -> list[float]:
+    """Round trips of questions on the link itself, for what has no handshake of its own."""
+    rounds = [_peers_of(link) for _ in range(_KNOCKS)]
+    return [min(one.round_trip_us for one in peers) / 1000 for peers in rounds if peers]
+
+
+def _peers_of(link: Link) -> list[Peer]:
+    """Who answers on `link`; nobody on one that cannot be asked."""
+    ask: Callable[[], list[Peer]] = getattr(link, "peers", list)
+    return ask()
+
+
+def _peers(link: Link, robot: str) -> Iterator[Finding]:
+    """Versions at both ends, and how far their clocks are apart; a WebSocket does not tell."""
+    ours = software()
+    for peer in quickest([_peers_of(link) for _ in range(ASKS)]):
+        said = peer.presence
+        if said.role == ROBOT and said.robot != robot:
+            continue
+        same = True if said.software == ours else None
+        fix = f"the same version on both machines; this one has {ours}"
+        yield Finding(f"version of {said.role}", same, f"{said.software} on {said.host}", fix)
+        if said.role == ROBOT:
+            ahead_ms = peer.ahead_us / 1000
+            yield Finding("clock skew", None, f"the robot's clock is {abs(ahead_ms):.0f} ms "
+                          f"{'ahead' if ahead_ms > 0 else 'behind'}; only certificates and logs need it, no frame or "
+                          "command does")
+
+
+def _address(endpoint: str) -> tuple[str, str, int]:
+    """Transport, host and port. Raises ConfigError for an endpoint that is none."""
     if "://" in endpoint:
         web = websocket_endpoints.parse_endpoint(endpoint)
-        return web.host, web.port
-    return endpoints.check_endpoint(endpoint)[1:]
+        return "ws", web.host, web.port
+    return endpoints.check_endpoint(endpoint)
 
 
 def _knock(host: str, port: int) -> tuple[list[float], str]:
@@ -72,13 +127,32 @@ def _knock(host: str, port: int) -> tuple[list[float], str]:
     return times_ms, ""
 
 
-def _round_trip(knocks_ms: list[float]) -> Iterator[Finding]:
+def neighbour(host: str, table: Path = ARP_TABLE) -> str:
+    """What the kernel knows of a machine on the same network that does not answer: whether it is there at all."""
+    try:
+        rows = [line.split() for line in table.read_text().splitlines()[1:]]
+        address = socket.gethostbyname(host)
+    except OSError:
+        return ""
+    flags = {row[0]: int(row[2], 16) for row in rows if len(row) > 3}
+    if address not in flags:
+        return ""
+    if flags[address] & _ARP_COMPLETE:
+        return f"; {address} is there on this network, so it is a firewall: sudo ufw allow 7447/tcp on that machine"
+    return (f"; nobody on this network has {address}: the machine is off, or the access point keeps its clients apart "
+            "(switch off client isolation, or leave the guest network)")
+
+
+def _round_trip(knocks_ms: list[float], what: str) -> Iterator[Finding]:
+    if len(knocks_ms) < 2:
+        yield Finding("round trip p50", None, "cannot be measured: nobody answers questions here")
+        return
     p50, p95 = median(knocks_ms), quantiles(knocks_ms, n=20)[-1]
     fix = "a nearer access point, 5 GHz, Wi-Fi power save off on both ends"
     yield Finding("round trip p50", p50 <= _QUICK_MS, f"{p50:.2f}", fix, "ms", f"{_QUICK_MS:.0f}")
     yield Finding("round trip p95", p95 <= 2 * _QUICK_MS, f"{p95:.2f}", fix, "ms", f"{2 * _QUICK_MS:.0f}")
     lines = "".join(f"\n{'':25}{line}" for line in histogram(knocks_ms))
-    yield Finding("jitter", None, f"{max(knocks_ms) - min(knocks_ms):.2f} ms over {len(knocks_ms)} handshakes{lines}")
+    yield Finding("jitter", None, f"{max(knocks_ms) - min(knocks_ms):.2f} ms over {len(knocks_ms)} {what}{lines}")
 
 
 def _robot(link: Link, robot: str) -> Iterator[Finding]:
@@ -91,6 +165,9 @@ def _robot(link: Link, robot: str) -> Iterator[Finding]:
     fix = "smaller pictures or a lower rate: camera.options.width_px, stream.max_fps in the robot's configuration"
     rate = f"{fps:.1f} per second, {kilobytes:.0f} kB each, {fps * kilobytes / 125:.2f} Mbit/s"
     yield Finding("frames", enough, rate, fix)
+    whole = stream_is_whole(status.stream)
+    yield Finding("stream", whole, encoding_text(status.stream),
+                  "a nearer access point or 5 GHz; or ask for less: --set stream.max_fps=15 on the robot")
 
 
 def _refusals(status: Status) -> Iterator[Finding]:

@@ -26,9 +26,22 @@ class Finding:
         return f"{sign} {self.name:<19} {self.value}{unit}{fix}"
 
 
+    @property
+    def check(self) -> dict[str, Any]:
+        """For scripts: what has a unit is a number."""
+        return {**asdict(self), **{name: _number(getattr(self, name)) for name in ("value", "bound") if self.unit}}
+
+
+def _number(text: str) -> float | str | None:
+    try:
+        return float(text) if text else None
+    except ValueError:
+        return text
+
+
 def as_object(findings: list[Finding]) -> dict[str, Any]:
     """The shape that everything that judges prints with --json."""
-    return {"ok": all(one.ok is not False for one in findings), "checks": [asdict(one) for one in findings]}
+    return {"ok": all(one.ok is not False for one in findings), "checks": [one.check for one in findings]}
 
 
 def histogram(values_ms: list[float], bins: int = 8, width: int = 40) -> list[str]:

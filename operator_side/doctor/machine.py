@@ -17,14 +17,17 @@ from operator_side.doctor.finding import Finding
 from protocol import VERSION
 from protocol.errors import SightlineError
 from protocol.transports.port_owner import port_owner
+from protocol.transports.zenoh_discovery import GROUP
 
 PORTS = {7447: "Zenoh", 9090: "sightline.v1", 9091: "the older dialect"}
 _HOT_C = 80.0
+_STOLEN_PERCENT = 2.0
+CPUS = Path("/sys/devices/system/cpu")
+CGROUP = Path("/sys/fs/cgroup")
+PROC_STAT = Path("/proc/stat")
 _EXPIRES_SOON = datetime.timedelta(days=30)
 _OURS = ("protocol", "robot_side", "vision_side", "sim", "operator_side", "benchmarks")
 _EXTRAS = {"zenoh": "eclipse-zenoh", "websocket": "websockets", "vision": "opencv-python-headless", "sim": "pybullet"}
-_MULTICAST = ("224.0.0.224", 7446)
-"""Where Zenoh's scouting speaks."""
 
 
 def findings(keys_folder: str) -> Iterator[Finding]:
@@ -36,6 +39,7 @@ def findings(keys_folder: str) -> Iterator[Finding]:
     yield _memory_lock()
     yield from _governor()
     yield from _temperature()
+    yield from _slowed_down()
     yield from _power_save()
     yield _multicast()
     yield _clock()
@@ -93,7 +97,7 @@ def _memory_lock() -> Finding:
 
 
 def _governor() -> Iterator[Finding]:
-    found = {_text(file) for file in Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")}
+    found = {_text(file) for file in CPUS.glob("cpu[0-9]*/cpufreq/scaling_governor")}
     if found:
         fix = "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"
         yield Finding("CPU governor", "powersave" not in found, ", ".join(sorted(found)), fix)
@@ -111,6 +115,25 @@ def _temperature() -> Iterator[Finding]:
         yield Finding("throttled", said.endswith("0x0"), said, fix)
 
 
+def _slowed_down() -> Iterator[Finding]:
+    """Time that the processor, or who owns it, has taken from this machine since its start."""
+    counts = [_text(file) for file in CPUS.glob("cpu[0-9]*/thermal_throttle/core_throttle_count")]
+    hot = sum(int(text) for text in counts if text.isdigit())
+    if counts:
+        yield Finding("throttled by heat", hot == 0, f"{hot} times since its start", "a heat sink or a fan")
+    limited = dict(line.split() for line in _text(CGROUP / "cpu.stat").splitlines() if len(line.split()) == 2)
+    if "nr_throttled" in limited:
+        times, ms = int(limited["nr_throttled"]), int(limited.get("throttled_usec", 0)) // 1000
+        fix = "a larger share: docker run --cpus, CPUQuota= in the unit"
+        yield Finding("throttled by quota", times == 0, f"{times} times, {ms} ms in all", fix)
+    ticks = [int(count) for count in _text(PROC_STAT).partition("\n")[0].split()[1:]]
+    if len(ticks) > 7 and sum(ticks) > 0:
+        share = 100 * ticks[7] / sum(ticks)
+        yield Finding("stolen time", share < _STOLEN_PERCENT, f"{share:.1f}",
+                      "a machine of your own: other virtual machines take this one's processor", "%",
+                      f"{_STOLEN_PERCENT:.0f}")
+
+
 def _power_save() -> Iterator[Finding]:
     for device in sorted(Path("/sys/class/net").glob("*/wireless")):
         name = device.parent.name
@@ -125,11 +148,11 @@ def _multicast() -> Finding:
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
             heard.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            heard.bind(("", _MULTICAST[1]))
-            group = socket.inet_aton(_MULTICAST[0]) + socket.inet_aton("0.0.0.0")
+            heard.bind(("", GROUP[1]))
+            group = socket.inet_aton(GROUP[0]) + socket.inet_aton("0.0.0.0")
             heard.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
             heard.settimeout(0.3)
-            heard.sendto(b"sightline doctor", _MULTICAST)
+            heard.sendto(b"sightline doctor", GROUP)
             heard.recv(64)
     except OSError as error:
         fix = "nothing: name the endpoint with --connect, which is surer anyway"

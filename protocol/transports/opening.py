@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from types import TracebackType
 from typing import Any, Self
 
@@ -34,8 +35,10 @@ def open_link(
     timeout_s: float = 5.0,
     max_frame_bytes: int = FRAME.max_payload_bytes,
     secure: str = "",
+    session: str = "",
 ) -> Link:
-    """Open `robot`'s link on every endpoint given; use it in a `with`. `secure` is a folder of `sightline keys`.
+    """Open `robot`'s link on every endpoint given; use it in a `with`. `secure` is a folder of `sightline keys`,
+    `session` what this end calls its start, where it has said so elsewhere.
 
     Raises ConfigError and LinkError as `open_zenoh` and `open_websocket` do; nothing stays open then.
     """
@@ -46,7 +49,7 @@ def open_link(
         if any(zenoh) or not any(web):
             from protocol.transports.zenoh import open_zenoh
 
-            of_zenoh = open_zenoh(robot, listen=zenoh[0], connect=zenoh[1], secure=secure, **options)
+            of_zenoh = open_zenoh(robot, listen=zenoh[0], connect=zenoh[1], secure=secure, session=session, **options)
             links.append(undo.enter_context(of_zenoh))
         if any(web):
             from protocol.transports.websocket import open_websocket
@@ -55,6 +58,21 @@ def open_link(
             links.append(undo.enter_context(of_web))
         undo.pop_all()
     return links[0] if len(links) == 1 else ManyLinks(links)
+
+
+def pass_on(link: Link, channel: Channel) -> None:
+    """What a peer says on `channel` is said to the peers of `link`'s other transports; those of its own have heard it.
+
+    On Zenoh they meet at the router, and who listens on WebSocket passes it on itself.
+    """
+    links = link.links if isinstance(link, ManyLinks) else (link,)
+    for near in links:
+        near.subscribe(channel, partial(_say, [other for other in links if other is not near]))
+
+
+def _say(links: Sequence[Link], message: Message) -> None:
+    for link in links:
+        link.publish(message.channel, message.header, message.payload, message.source)
 
 
 def _of_kind(ends: Sequence[str], is_web: bool) -> list[str]:
@@ -69,16 +87,16 @@ class ManyLinks:
         if len({link.robot for link in links}) != 1:
             raise ConfigError("links of one robot can be joined, and at least one is needed")
         self.robot = links[0].robot
-        self._links = tuple(links)
+        self.links = tuple(links)
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
         """As `Link` says, on all of them; True if any took it."""
-        taken = [link.publish(channel, header, payload, source) for link in self._links]
+        taken = [link.publish(channel, header, payload, source) for link in self.links]
         return any(taken)
 
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
         """As `Link` says, on all of them."""
-        for link in self._links:
+        for link in self.links:
             link.subscribe(channel, callback)
 
     def latest(self, channel: Channel) -> LatestSlot[Message]:
@@ -89,7 +107,7 @@ class ManyLinks:
 
     def has_listener(self, channel: Channel) -> bool:
         """Whether somebody listens on any of them."""
-        return any(link.has_listener(channel) for link in self._links)
+        return any(link.has_listener(channel) for link in self.links)
 
     @property
     def dropped(self) -> Counter[str]:
@@ -102,11 +120,11 @@ class ManyLinks:
         return self._counted("refused")
 
     def _counted(self, name: str) -> Counter[str]:
-        return sum((Counter(dict(getattr(link, name, {}))) for link in self._links), Counter())
+        return sum((Counter(dict(getattr(link, name, {}))) for link in self.links), Counter())
 
     def close(self) -> None:
         """Close all, the last opened first."""
-        for link in reversed(self._links):
+        for link in reversed(self.links):
             link.close()
 
     def __enter__(self) -> Self:

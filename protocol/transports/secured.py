@@ -23,6 +23,8 @@ SOURCES: Final[dict[str, tuple[str, ...]]] = {
 }
 """Role of a certificate -> the sources it may speak as towards a robot. A viewer says nothing, not even `ack`."""
 ROLES: Final = (ROBOT, *SOURCES)
+PRESENCE: Final = "sightline-presence"
+"""Where peers say that they are there (`protocol.transports.presence`): beside `sightline/`, the keys of channels."""
 _TLS: Final = ("tls", "quic")
 
 
@@ -90,8 +92,9 @@ def may_publish(role: str) -> list[str]:
 
 def may_hear(role: str) -> list[str]:
     """Key expressions, for any robot, that a certificate of `role` may subscribe to."""
-    heard = Direction.TO_ROBOT if role == ROBOT else Direction.FROM_ROBOT
-    return [_pattern(channel) for channel in CHANNELS.values() if channel.direction is heard]
+    own = Direction.TO_ROBOT if role == ROBOT else Direction.FROM_ROBOT
+    heard = [one for one in CHANNELS.values() if one.direction is own or (one.passed_on and role != ROBOT)]
+    return [_pattern(channel) for channel in heard]
 
 
 def _published(role: str, channel: Channel) -> list[str]:
@@ -99,7 +102,8 @@ def _published(role: str, channel: Channel) -> list[str]:
         return [_pattern(channel)] if channel.direction is Direction.FROM_ROBOT else []
     if channel.direction is Direction.FROM_ROBOT or (channel is REQUEST and role != "operator"):
         return []
-    return [f"{KEY_PREFIX}/*/{channel.name}/{source}" for source in SOURCES[role]]
+    sources = [source for source in SOURCES[role] if not channel.said_by or source in channel.said_by]
+    return [f"{KEY_PREFIX}/*/{channel.name}/{source}" for source in sources]
 
 
 def _pattern(channel: Channel) -> str:
@@ -111,13 +115,25 @@ def _rules(role: str) -> list[dict[str, Any]]:
     said, heard = may_publish(role), may_hear(role)
     listeners = sorted({_pattern(CHANNELS[key.split("/")[2]]) for key in said})
     rows = [
-        ("says", "ingress", "put", said),
-        ("subscribes", "ingress", "declare_subscriber", heard),
-        ("hears", "egress", "put", heard),
-        ("is heard", "egress", "declare_subscriber", listeners),
+        ("says", "ingress", ["put"], said),
+        ("subscribes", "ingress", ["declare_subscriber"], heard),
+        ("hears", "egress", ["put"], heard),
+        ("is heard", "egress", ["declare_subscriber"], listeners),
+        *_presence_rows(role),
     ]
     return [
-        {"id": f"{role} {what}", "permission": "allow", "flows": [flow], "messages": [message], "key_exprs": keys}
-        for what, flow, message, keys in rows
+        {"id": f"{role} {what}", "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys}
+        for what, flow, messages, keys in rows
         if keys
+    ]
+
+
+def _presence_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
+    """Everybody may ask who is there; each answers as its own role only."""
+    own, all_of_it = [f"{PRESENCE}/{role}/*"], [f"{PRESENCE}/**"]
+    return [
+        ("answers", "ingress", ["declare_queryable", "reply"], own),
+        ("is asked", "egress", ["query"], all_of_it),
+        ("asks", "ingress", ["query"], all_of_it),
+        ("is answered", "egress", ["declare_queryable", "reply"], all_of_it),
     ]

@@ -3,8 +3,8 @@
     with open_websocket("r1", listen="ws://127.0.0.1:9090") as link:
         link.publish(STATUS, header, payload)
 
-Nothing but detections is passed on between peers: who listens speaks with each who connects, and they do not hear one
-another.
+Only what the table of channels calls passed on goes from peer to peer: who listens speaks with each who connects, and
+they do not hear one another.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from functools import partial
 from types import TracebackType
 from typing import Final, Self
 
-from protocol.channels import CHANNELS, DETECTIONS, FRAME, TWIST, Channel, parse_key
+from protocol.channels import CHANNELS, FRAME, TWIST, Channel, parse_key
 from protocol.codec import encode
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.link import LatestSlot, Message
@@ -281,7 +281,7 @@ class WebSocketLink:
         if parsed[1] is TWIST and self._peers[0] is not peer:
             self._put_first(peer)
         callbacks = tuple(self._callbacks.get(parsed[1].name, ()))
-        if parsed[1] is DETECTIONS and self._listeners:
+        if parsed[1].passed_on and self._listeners:
             callbacks = (partial(self._pass_on, peer), *callbacks)
         self._in_callback.now = True
         try:

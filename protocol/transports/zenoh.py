@@ -8,19 +8,21 @@ A session that is not closed keeps the interpreter from exiting, so a link is al
 
 from __future__ import annotations
 
+import secrets
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
-from protocol.channels import FRAME, KEY_PREFIX, STATUS, Channel, parse_key, pattern_for
+from protocol.channels import FRAME, Channel, pattern_for
 from protocol.transports.endpoints import check_endpoints
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.link_rules import NOT_A_PUT, LinkRules
-from protocol.transports.secured import secured_for
+from protocol.transports.presence import Peer
+from protocol.transports.secured import ROBOT, secured_for
+from protocol.transports.zenoh_presence import Here, ask
 from protocol.transports.zenoh_session import open_session
 
 if TYPE_CHECKING:
@@ -30,8 +32,6 @@ CLOSE_S: Final = 1.5
 """A close that takes longer is left to a daemon thread, so that no process hangs on a dead peer."""
 EXPRESS_UP_TO_BYTES: Final = 4096
 """Channels bounded by this are sent at once, never batched."""
-MAX_ROBOTS: Final = 256
-"""`list_robots` remembers no more than this, whatever a network claims."""
 
 
 def open_zenoh(
@@ -43,42 +43,26 @@ def open_zenoh(
     timeout_s: float = 5.0,
     max_frame_bytes: int = FRAME.max_payload_bytes,
     secure: str = "",
+    session: str = "",
 ) -> ZenohLink:
     """Open a link to `robot`; use it in a `with`.
 
     Who listens is the router, inside this process, and reaches `connect` in the background; who only connects is a
     client and reconnects by itself. `role` is the default source of what is published towards the robot. `secure` is a
-    folder of `sightline keys`: mutual TLS, and only what the certificate's role may say or hear passes. Raises
-    ConfigError for a robot id, endpoint or limit that is none or for a missing Zenoh; LinkError for a port in use or if
-    nobody answers within `timeout_s`.
+    folder of `sightline keys`: mutual TLS, and only what the certificate's role may say or hear passes. Who has a role
+    answers when somebody asks who is there, as `session` if given. Raises ConfigError for a robot id, endpoint or limit
+    that is none or for a missing Zenoh; LinkError for a port in use, if nobody answers within `timeout_s`, or for a
+    robot whose id another has there.
     """
     rules = LinkRules(robot, role, max_frame_bytes)
     check_endpoints(listen, connect)
-    return ZenohLink(open_session(listen, connect, timeout_s, secured_for(secure, role)), rules)
-
-
-def list_robots(connect: Sequence[str], seconds: float, secure: str = "") -> dict[str, Message]:
-    """The newest `status` of every robot heard within `seconds` at `connect`. Raises as `open_zenoh` does."""
-    import zenoh
-
-    check_endpoints((), connect)
-    found: dict[str, Message] = {}
-
-    def note(sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)
-        parsed = parse_key(key)
-        if parsed is not None and (parsed[0] in found or len(found) < MAX_ROBOTS):
-            robot = parsed[0]
-            LinkRules(robot).deliver(STATUS, key, *_parts(sample), lambda message: found.update({robot: message}))
-
-    with ExitStack() as ending:
-        session = open_session((), connect, seconds, secured_for(secure, "operator"))
-        ending.callback(session.close)
-        handler = zenoh.handlers.Callback(note, indirect=False)
-        subscriber = session.declare_subscriber(f"{KEY_PREFIX}/*/{STATUS.name}", handler)
-        ending.callback(subscriber.undeclare)
-        time.sleep(seconds)
-    return found
+    opened = open_session(listen, connect, timeout_s, secured_for(secure, role))
+    with ExitStack() as undo:
+        link = undo.enter_context(ZenohLink(opened, rules))
+        if role:
+            link.announce(Here(role, robot, session or secrets.token_hex(4)))
+        undo.pop_all()
+    return link
 
 
 def _parts(sample: zenoh.Sample) -> tuple[bytes, bytes]:
@@ -163,6 +147,22 @@ class ZenohLink:
             return self.connected and self._outlet(self._rules.key(channel), channel).matched
         except zenoh.ZError:
             return False
+
+    def announce(self, here: Here) -> None:
+        """Answer whoever asks who is there. Raises LinkError for a robot whose id another has."""
+        with self._declaring:
+            self._ending.callback(here.answer_in(self._session))
+        if here.role == ROBOT:
+            here.claim(self._session)
+
+    def peers(self) -> list[Peer]:
+        """Everybody else who can be reached, with round trips; waits up to half a second. For display only."""
+        import zenoh
+
+        try:
+            return [] if self._closed else ask(self._session)
+        except zenoh.ZError:  # closed meanwhile
+            return []
 
     def close(self) -> None:
         """Undeclare all and close the session; idempotent, over within two seconds, safe even inside a callback."""

@@ -1,7 +1,8 @@
 """Opening a Zenoh session the way Sightline uses it, with its errors in words. Shell.
 
-Shared memory is off because it hides the network, scouting because it finds strangers; a lease of 2 s tells of a silent
-link before a person wonders; a message over 1 MiB is refused before it is buffered.
+Shared memory is off because it hides the network, gossip because it finds strangers (who listens may be found by
+people, see `zenoh_discovery`); a lease of 2 s tells of a silent link before a person wonders; a message over 1 MiB is
+refused before it is buffered.
 """
 
 from __future__ import annotations
@@ -17,15 +18,19 @@ from protocol.transports.endpoints import check_endpoint, with_send_buffer
 from protocol.transports.port_owner import port_owner
 from protocol.transports.secured import Secured
 from protocol.transports.tls_trouble import tls_trouble
+from protocol.transports.zenoh_discovery import NO_MULTICAST, multicast_section
 
 if TYPE_CHECKING:
     import zenoh
 
 LEASE_MS: Final = 2000
-KEEP_ALIVES_PER_LEASE: Final = 4
+KEEP_ALIVES_PER_LEASE: Final = 50
+"""One 40 ms after the last message. TCP learns from what follows that a packet was lost; of a last one that nothing
+follows, a frame's end or a twist, it learns only by its timeout of 200 ms and more."""
 MAX_MESSAGE_BYTES: Final = 1_048_576
 HANDSHAKE_MS: Final = 3000
-MAX_SESSIONS: Final = 16
+MAX_SESSIONS: Final = 64
+"""At one who listens: a fleet of twenty robots, its visions, and the people who watch."""
 RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
 
@@ -39,16 +44,30 @@ def open_session(
     """
     if secured is not None:
         secured.check((*listen, *connect))
+    elif keyless := next((one for one in (*listen, *connect) if one.startswith(("tls/", "quic/"))), ""):
+        raise LinkError(f"refused at {keyless}: a {keyless.partition('/')[0]}/ endpoint needs keys; give --secure DIR")
     try:
         import zenoh
     except ImportError:
         raise ConfigError("Zenoh is not installed: pip install 'sightline[zenoh]'") from None
     logging.getLogger("zenoh").addHandler(logging.NullHandler())  # else Python prints its warnings to the terminal
-    config = zenoh.Config.from_json5(json.dumps(session_config(listen, connect, timeout_s, secured)))
     try:
-        return zenoh.open(config)
+        return _open(session_config(listen, connect, timeout_s, secured))
     except zenoh.ZError as error:
         raise _explain(str(error), listen, connect, timeout_s, secured) from None
+
+
+def _open(config: dict[str, Any]) -> zenoh.Session:
+    """Open it; where multicast is what fails, without it."""
+    import zenoh
+
+    try:
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+    except zenoh.ZError:
+        if config["scouting"]["multicast"] == NO_MULTICAST:
+            raise
+    config["scouting"]["multicast"] = NO_MULTICAST
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
 
 
 def session_config(
@@ -73,7 +92,7 @@ def _session_config(listen: Sequence[str], connect: Sequence[str], timeout_s: fl
             "exit_on_failure": not listen,
             "retry": RETRY,
         },
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
+        "scouting": {"multicast": multicast_section(listen), "gossip": {"enabled": False}, "delay": 0},
         "open": {"return_conditions": {"connect_scouted": False}},
         "timestamping": {"enabled": False},
         "transport": _transport_config(),
@@ -105,7 +124,8 @@ def _explain(
         trouble = next((found for endpoint in connect if (found := tls_trouble(endpoint, secured))), "")
         if trouble:
             return LinkError(f"refused at {where}: {trouble}")
-        return LinkError(f"nobody answers at {where}; is the robot running? tried for {timeout_s:g} s")
+        refused = "" if "quic/" not in where else ", or one end refuses the other's keys: the robot's log says which"
+        return LinkError(f"nobody answers at {where}; is the robot running? tried for {timeout_s:g} s{refused}")
     where = next((endpoint for endpoint in listen if endpoint.partition("#")[0] in text), " or ".join(listen))
     if "in use" in text:
         return _port_in_use(where)

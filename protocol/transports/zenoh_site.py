@@ -6,11 +6,12 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from fnmatch import fnmatchcase
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from protocol.channels import FRAME, KEY_PREFIX, STATUS, parse_key
 from protocol.errors import ConfigError
@@ -18,11 +19,15 @@ from protocol.transports.endpoints import check_endpoints
 from protocol.transports.link import Link
 from protocol.transports.link_rules import LinkRules
 from protocol.transports.secured import secured_for
-from protocol.transports.zenoh import MAX_ROBOTS, ZenohLink
+from protocol.transports.zenoh import ZenohLink
+from protocol.transports.zenoh_presence import Here
 from protocol.transports.zenoh_session import open_session
 
 if TYPE_CHECKING:
     import zenoh
+
+MAX_ROBOTS: Final = 256
+"""Security limit: no more robots than this, whatever a network claims."""
 
 
 def open_site(
@@ -37,14 +42,18 @@ def open_site(
 ) -> ZenohSite:
     """Open a session for every robot whose id fits `pattern` (`*` any text, `?` any letter); use it in a `with`.
 
-    Raises ConfigError for an endpoint that is none or not of Zenoh, LinkError as `open_zenoh` does.
+    Raises ConfigError for an endpoint or pattern that is none or not of Zenoh, LinkError as `open_zenoh` does.
     """
     for endpoint in (*listen, *connect):
         if "://" in endpoint:
             raise ConfigError(f"{endpoint}: several robots (--robot {pattern!r}) need Zenoh; write tcp/<host>:<port>")
     check_endpoints(listen, connect)
+    here = Here(role, pattern, secrets.token_hex(4)) if role else None
     session = open_session(listen, connect, timeout_s, secured_for(secure, role))
-    return ZenohSite(session, pattern, role, max_frame_bytes)
+    site = ZenohSite(session, pattern, role, max_frame_bytes)
+    if here is not None:
+        site.announce(here)
+    return site
 
 
 class ZenohSite:
@@ -58,6 +67,10 @@ class ZenohSite:
         self._seen: dict[str, None] = {}
         self._news: Callable[[], None] = lambda: None
         self._listen()
+
+    def announce(self, here: Here) -> None:
+        """Answer whoever asks who is there."""
+        self._ending.callback(here.answer_in(self._session))
 
     def robots(self) -> list[str]:
         """Ids of all that were heard so far, in the order of their first word."""

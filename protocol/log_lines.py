@@ -1,0 +1,83 @@
+"""The lines that a service says, as text or as JSON: one object a line, for what collects logs. Shell (streams).
+
+    sightline robot --log json        {"time":"2026-03-01T10:00:00.123Z","level":"info","service":"robot","message":...}
+
+The choice is in the environment, so that a robot's two processes speak alike.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import sys
+from datetime import UTC, datetime
+from typing import Final, TextIO
+
+from protocol.errors import ConfigError
+
+ENV_NAME: Final = "SIGHTLINE_LOG"
+FORMS: Final = ("text", "json")
+_LONGEST_LINE: Final = 10_000
+"""More without an end is no line of a log; it is cut there."""
+
+
+class JsonLines(io.TextIOBase):
+    """A text stream that writes every finished line to `stream` as one JSON object."""
+
+    def __init__(self, stream: TextIO, service: str, level: str) -> None:
+        self._stream, self._service, self._level = stream, service, level
+        self._begun = ""
+
+    def over(self, stream: TextIO) -> JsonLines:
+        """The same on another stream."""
+        return JsonLines(stream, self._service, self._level)
+
+    def write(self, text: str) -> int:
+        """Keep `text` until its line ends."""
+        *lines, self._begun = (self._begun + text).split("\n")
+        if len(self._begun) > _LONGEST_LINE:
+            lines, self._begun = [*lines, self._begun], ""
+        for line in lines:
+            if line.strip():
+                self._stream.write(as_json(line, self._service, self._level, datetime.now(UTC)) + "\n")
+        return len(text)
+
+    def flush(self) -> None:
+        """What is finished is on its way."""
+        self._stream.flush()
+
+    def fileno(self) -> int:
+        """The descriptor below."""
+        return self._stream.fileno()
+
+    def writable(self) -> bool:
+        """Yes."""
+        return True
+
+
+def as_json(line: str, service: str, level: str, time: datetime) -> str:
+    """One line as an object; whatever begins with `error: ` is an error on any stream."""
+    message = line.removeprefix("error: ")
+    return json.dumps({
+        "time": f"{time:%Y-%m-%dT%H:%M:%S}.{time.microsecond // 1000:03}Z",
+        "level": "error" if message != line else level,
+        "service": service,
+        "message": message,
+    }, separators=(",", ":"))
+
+
+def use_form(form: str | None, service: str) -> None:
+    """Say everything in `form` from now on, here and in processes started from here; None is what the environment says.
+
+    Raises ConfigError for a form that is none.
+    """
+    chosen = form or os.environ.get(ENV_NAME) or FORMS[0]
+    if chosen not in FORMS:
+        where = "--log" if form else ENV_NAME
+        raise ConfigError(f"{where} {chosen!r} is no form of a log: {' or '.join(FORMS)}")
+    if form:
+        os.environ[ENV_NAME] = form
+    if chosen == "json" and not isinstance(sys.stdout, JsonLines):
+        sys.stdout = JsonLines(sys.stdout, service, "info")
+        sys.stderr = JsonLines(sys.stderr, service, "warning")

@@ -1,0 +1,90 @@
+"""Who is heard at an endpoint: robots by their status, everybody by presence; and where robots listen. Shell."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from protocol.channels import KEY_PREFIX, STATUS, parse_key
+from protocol.transports.endpoints import check_endpoints
+from protocol.transports.link import Message
+from protocol.transports.link_rules import LinkRules
+from protocol.transports.presence import ASKS, MAX_PEERS, Peer, quickest
+from protocol.transports.secured import secured_for
+from protocol.transports.zenoh_presence import ANSWER_S, ask
+from protocol.transports.zenoh_session import open_session
+
+if TYPE_CHECKING:
+    import zenoh
+
+ROLE: Final = "operator"
+_BETWEEN_ASKS_S: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Around:
+    """The newest status of each robot, and everybody who answered."""
+
+    statuses: dict[str, Message]
+    peers: list[Peer]
+
+
+def look_around(connect: Sequence[str], seconds: float, secure: str = "") -> Around:
+    """Everybody heard at `connect` within `seconds`. Raises as `open_zenoh` does."""
+    check_endpoints((), connect)
+    with ExitStack() as ending:
+        session = open_session((), connect, seconds, secured_for(secure, ROLE))
+        ending.callback(session.close)
+        return Around(_statuses(session, ending), _listen(session, seconds))
+
+
+def list_robots(connect: Sequence[str], seconds: float, secure: str = "") -> dict[str, Message]:
+    """The newest `status` of every robot heard within `seconds` at `connect`. Raises as `open_zenoh` does."""
+    return look_around(connect, seconds, secure).statuses
+
+
+def peers_at(connect: Sequence[str], seconds: float, secure: str = "") -> list[Peer]:
+    """Everybody who answers at `connect`, with the quickest of a few round trips. Raises as `open_zenoh` does."""
+    check_endpoints((), connect)
+    with ExitStack() as ending:
+        session = open_session((), connect, seconds, secured_for(secure, ROLE))
+        ending.callback(session.close)
+        return _asked(session, time.monotonic() + seconds)
+
+
+def _listen(session: zenoh.Session, seconds: float) -> list[Peer]:
+    ends_s = time.monotonic() + seconds
+    peers = _asked(session, ends_s)
+    time.sleep(max(0.0, ends_s - time.monotonic()))
+    return peers
+
+
+def _asked(session: zenoh.Session, ends_s: float) -> list[Peer]:
+    rounds = []
+    for _ in range(ASKS):
+        rounds.append(ask(session, max(0.1, min(ANSWER_S, ends_s - time.monotonic()))))
+        time.sleep(_BETWEEN_ASKS_S)
+    return quickest(rounds)
+
+
+def _statuses(session: zenoh.Session, ending: ExitStack) -> dict[str, Message]:
+    """The newest status of every robot, kept up to date until `ending`."""
+    import zenoh
+
+    found: dict[str, Message] = {}
+
+    def note(sample: zenoh.Sample) -> None:
+        key, attachment = str(sample.key_expr), sample.attachment
+        parsed = parse_key(key)
+        if parsed is None or (parsed[0] not in found and len(found) >= MAX_PEERS):
+            return
+        robot, header = parsed[0], b"" if attachment is None else attachment.to_bytes()
+        LinkRules(robot).deliver(STATUS, key, header, sample.payload.to_bytes(),
+                                 lambda message: found.update({robot: message}))
+
+    handler = zenoh.handlers.Callback(note, indirect=False)
+    ending.callback(session.declare_subscriber(f"{KEY_PREFIX}/*/{STATUS.name}", handler).undeclare)
+    return found

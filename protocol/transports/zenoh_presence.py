@@ -1,0 +1,118 @@
+"""Presence over Zenoh: a peer answers one question, and only when it is asked. Shell.
+
+A query that nobody asks costs nothing; an answer costs some microseconds. The way of frames and commands knows nothing
+of it. An answer comes from the living process itself, so who has died or hangs is not there.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from importlib import metadata
+from typing import TYPE_CHECKING, Final
+
+from pydantic import ValidationError
+
+from protocol.codec import encode
+from protocol.errors import ConfigError, LinkError
+from protocol.transports.presence import (
+    EVERYBODY,
+    MAX_PEERS,
+    Peer,
+    Presence,
+    key_of,
+    namesake,
+    read_answer,
+)
+
+if TYPE_CHECKING:
+    import zenoh
+
+ANSWER_S: Final = 0.5
+"""Who has not answered by then is not there."""
+_SECOND_LOOK_S: Final = 1.0
+"""What is left of a robot that has just ended is gone by then: it leaves when its socket closes."""
+_HOST_CHARACTERS: Final = 64
+
+
+class Here:
+    """This end of a session: what it answers when it is asked. Raises ConfigError for a role that is none."""
+
+    def __init__(self, role: str, robot: str, session: str) -> None:
+        self.role = role
+        self._began_ns = time.monotonic_ns()
+        try:
+            self._fixed = Presence(role=role, robot=robot, session=session, software=software(), host=_host())
+        except ValidationError:
+            raise ConfigError(f"role {role!r} of robot {robot!r} cannot be announced: a role is 1 to 16 lower-case "
+                              "letters, digits or '_', e.g. vision") from None
+
+    def now(self) -> Presence:
+        """Of this moment."""
+        up_us = (time.monotonic_ns() - self._began_ns) // 1000
+        return self._fixed.model_copy(update={"up_us": up_us, "clock_us": time.time_ns() // 1000})
+
+    def answer_in(self, session: zenoh.Session) -> Callable[[], None]:
+        """Answer whoever asks, until what this returns is called."""
+        import zenoh
+
+        key = key_of(self._fixed.role, self._fixed.session)
+
+        def answer(query: zenoh.Query) -> None:
+            with suppress(zenoh.ZError):  # it went away, or waits no longer
+                query.reply(key, encode(self.now()))
+
+        handler = zenoh.handlers.Callback(answer, indirect=False)
+        return session.declare_queryable(key, handler, allowed_origin=zenoh.Locality.REMOTE).undeclare
+
+    def claim(self, session: zenoh.Session) -> None:
+        """Raise LinkError if another robot that is reached here has this id; look twice before saying so."""
+        other = namesake(self.now(), ask(session))
+        if other is not None:
+            time.sleep(_SECOND_LOOK_S)
+            other = namesake(self.now(), ask(session))
+        if other is None:
+            return
+        raise LinkError(
+            f"robot id {self._fixed.robot!r} is taken: a robot on {other.host or 'another machine'} has had it for "
+            f"{other.up_us / 1e6:.0f} s (session {other.session}); give this one another with --robot"
+        )
+
+
+def ask(session: zenoh.Session, timeout_s: float = ANSWER_S) -> list[Peer]:
+    """Everybody else who can be reached, each once; over as soon as all have answered."""
+    import zenoh
+
+    answers: list[Peer] = []
+    asked_us = _now_us()
+    replies = session.get(
+        EVERYBODY, zenoh.handlers.FifoChannel(MAX_PEERS), target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s,
+    )
+    for reply in replies:
+        sample = reply.ok
+        if sample is None or len(answers) >= MAX_PEERS:
+            continue
+        peer = read_answer(str(sample.key_expr), sample.payload.to_bytes(), asked_us, _now_us(),
+                           time.time_ns() // 1000)
+        if peer is not None:
+            answers.append(peer)
+    return answers
+
+
+def software() -> str:
+    """This program's name and version."""
+    try:
+        return f"sightline {metadata.version('sightline')}"
+    except metadata.PackageNotFoundError:
+        return "sightline"
+
+
+def _host() -> str:
+    return "".join(letter for letter in socket.gethostname() if letter.isprintable())[:_HOST_CHARACTERS]
+
+
+def _now_us() -> int:
+    return time.monotonic_ns() // 1000

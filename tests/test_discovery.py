@@ -1,0 +1,80 @@
+"""Being found by multicast: who listens beyond loopback, nobody else; and it fails nothing."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from protocol.transports.zenoh_discovery import NO_MULTICAST, find_listeners, multicast_section
+from protocol.transports.zenoh_session import session_config
+
+INSIDE = """
+import fcntl, os, socket, struct, subprocess, sys
+from operator_side import cli
+from protocol.transports.zenoh_discovery import GROUP
+
+ROBOT = '''
+import sys, time
+from protocol.transports.zenoh import open_zenoh
+with open_zenoh(sys.argv[2], listen=[sys.argv[1]], role="robot"):
+    print("on", flush=True)
+    time.sleep(60)
+'''
+tap = os.open("/dev/net/tun", os.O_RDWR)  # an interface is up for as long as somebody has its other end
+fcntl.ioctl(tap, 0x400454CA, struct.pack("16sH22x", b"eye", 0x1002))  # TUNSETIFF, IFF_TAP | IFF_NO_PI
+for command in ("link set lo up", "link set eye up", "addr add 10.9.8.1/24 dev eye",
+                "route add 224.0.0.0/4 dev eye"):
+    subprocess.run(["ip", *command.split()], check=True)
+
+def robot(endpoint, name):
+    process = subprocess.Popen([sys.executable, "-c", ROBOT, endpoint, name], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "on\\n"
+    return process
+
+running = [robot("tcp/0.0.0.0:7701", "r1"), robot("tcp/10.9.8.1:7702", "r2"), robot("tcp/127.0.0.1:7703", "r3")]
+cli.run(["robots"])
+for process in running:
+    process.kill()
+    process.wait()
+with socket.socket(type=socket.SOCK_DGRAM) as taken:
+    taken.bind(("", GROUP[1]))
+    last = robot("tcp/0.0.0.0:7704", "r4")
+    cli.run(["robots", "--connect", "tcp/127.0.0.1:7704"])
+    last.kill()
+"""
+
+
+@pytest.mark.parametrize("listen", [(), ("tcp/127.0.0.1:7447",), ("tls/localhost:1", "tcp/[::1]:2")])
+def test_who_listens_on_loopback_only_is_not_to_be_found(listen):
+    assert multicast_section(listen) == NO_MULTICAST
+
+
+@pytest.mark.parametrize("listen", [("tcp/0.0.0.0:7447",), ("tcp/127.0.0.1:1", "quic/192.168.1.20:2"), ("tcp/[::]:1",)])
+def test_who_listens_beyond_answers_in_a_group_of_our_own_and_connects_to_nobody(listen):
+    section = multicast_section(listen)
+    assert section["enabled"] and section["listen"]
+    assert section["address"] == "224.0.0.224:7449"  # Zenoh's own is 7446
+    assert not any(section["autoconnect"].values())
+    assert session_config(listen, (), 1.0)["scouting"]["multicast"] == section
+
+
+def test_nobody_is_found_where_nobody_is():
+    assert [one for one in find_listeners(0.1) if one.startswith("tcp/127.")] == []
+
+
+def _can_have_a_network_of_its_own():
+    return os.geteuid() == 0 and subprocess.run(["unshare", "-n", "true"], check=False).returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not _can_have_a_network_of_its_own(), reason="network namespaces: needs root")
+def test_in_a_network_of_two_robots_both_are_found_and_a_taken_group_port_hinders_nobody():
+    """A namespace with an address: two robots listen on it, one on loopback; then a stranger has the group's port."""
+    command = ["unshare", "-n", "--kill-child", sys.executable, "-c", INSIDE]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert [line.partition("  sightline")[0] for line in done.stdout.splitlines()] == [
+        "tcp/10.9.8.1:7701: robot     r1: says nothing of its state",
+        "tcp/10.9.8.1:7702: robot     r2: says nothing of its state",
+        "robot     r4: says nothing of its state",
+    ], done
