@@ -1,10 +1,11 @@
-# One image per service from one file: targets robot, vision, sim. compose.yaml runs them together.
+# The images from one file: targets robot, vision, sim, keys, examples. compose.yaml runs them together.
 # Plain multi-stage: works with BuildKit and without.
 
 # --- what every image runs on: a user without rights, and the folders it may write to when they are mounted ----------
 FROM python:3.11-slim-bookworm AS service
 RUN useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin sightline \
- && install -d -m 0700 -o sightline -g sightline /run/sightline /var/lib/sightline
+ && install -d -m 0700 -o sightline -g sightline /run/sightline /var/lib/sightline \
+                      /keys /keys/site /keys/robot /keys/vision /keys/operator
 ENV PATH=/opt/sightline/bin:$PATH PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \
     SIGHTLINE_ROBOT__STATE_DIR=/var/lib/sightline
 USER sightline
@@ -33,7 +34,7 @@ RUN pip wheel --no-deps --wheel-dir /dist .
 
 # --- robot: no OpenCV, no NumPy, no PyBullet ---------------------------------------------------------------------------
 FROM build AS robot-packages
-RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[zenoh]"
+RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[zenoh,websocket]"
 COPY --from=wheel /dist /dist
 RUN /opt/sightline/bin/pip install --no-deps --force-reinstall /dist/*.whl
 
@@ -41,9 +42,13 @@ FROM service AS robot
 COPY --from=robot-packages /opt/sightline /opt/sightline
 CMD ["robot"]
 
+# --- what vision and sim have in common: OpenCV, NumPy -----------------------------------------------------------------
+FROM build AS pictures
+RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[camera]"
+
 # --- vision ------------------------------------------------------------------------------------------------------------
-FROM build AS vision-packages
-RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[vision]"
+FROM pictures AS vision-packages
+RUN /opt/sightline/bin/pip install "$(echo /empty/*.whl)[vision,websocket]"
 COPY --from=wheel /dist /dist
 RUN /opt/sightline/bin/pip install --no-deps --force-reinstall /dist/*.whl
 
@@ -52,13 +57,30 @@ COPY --from=vision-packages /opt/sightline /opt/sightline
 CMD ["vision"]
 
 # --- sim ---------------------------------------------------------------------------------------------------------------
-FROM build AS sim-packages
+FROM pictures AS sim-packages
 # PyBullet has a ready-made wheel for x86_64 only; elsewhere pip compiles it.
 RUN [ "$(uname -m)" = x86_64 ] || { apt-get update && apt-get install -y --no-install-recommends g++; }
-RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[sim]"
+RUN /opt/sightline/bin/pip install "$(echo /empty/*.whl)[sim]"
 COPY --from=wheel /dist /dist
 RUN /opt/sightline/bin/pip install --no-deps --force-reinstall /dist/*.whl
 
 FROM service AS sim
 COPY --from=sim-packages /opt/sightline /opt/sightline
 CMD ["sim"]
+
+# --- keys: makes certificates, speaks to nobody ----------------------------------------------------------------------------
+FROM build AS keys-packages
+RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[secure]"
+COPY --from=wheel /dist /dist
+RUN /opt/sightline/bin/pip install --no-deps --force-reinstall /dist/*.whl
+
+FROM service AS keys
+COPY --from=keys-packages /opt/sightline /opt/sightline
+CMD ["keys", "--help"]
+
+# --- examples: programs of one's own, with what vision has -----------------------------------------------------------------
+FROM vision AS examples
+WORKDIR /opt/examples
+COPY examples/detector_service.py examples/compose/older_client.py ./
+ENTRYPOINT ["python"]
+CMD ["detector_service.py", "tcp/127.0.0.1:7447"]
