@@ -1,7 +1,6 @@
 """The commands `conform robot | vision | codec | page`: does any peer speak the protocol, point by point. Shell."""
 
 import json
-import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -9,16 +8,19 @@ from typing import Annotated, Any
 
 import typer
 
+from operator_side.conform_access import access_for
 from operator_side.conform_table import listing, print_results, progress
 from protocol.conformance.html_report import to_html
 from protocol.conformance.live import LiveBench
 from protocol.conformance.report import to_dict, to_junit, to_page
 from protocol.conformance.runner import Result, chosen, passed, run_cases
-from protocol.errors import ConfigError
+from protocol.errors import ConfigError, LinkError
 
 CHECK_FAILED = 5
-TRIES = 2
-"""A message may be lost on any network; a case that fails twice in a row failed."""
+_ROLES = ("vision", "operator")
+"""Whom the kit plays where each role has keys of its own."""
+TRIES = 3
+"""A message may be lost on any network, and a machine busy; a case that fails three times in a row failed."""
 
 Only = Annotated[
     list[str] | None, typer.Option("--only", metavar="ID", help="A case, or how several begin: R-CAUS; repeatable.")
@@ -26,9 +28,18 @@ Only = Annotated[
 Groups = Annotated[list[str] | None, typer.Option("--group", metavar="NAME", help="A group such as lease; repeatable.")]
 Listing = Annotated[bool, typer.Option("--list", help="Name the cases and what each demands; test nothing.")]
 Robot = Annotated[str, typer.Option("--robot", metavar="ID", help="The robot's id.")]
-Secure = Annotated[str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`.")]
-Token = Annotated[
-    str, typer.Option("--token", metavar="TEXT", help="WebSocket token of role vision; other roles are then kept out.")
+Secure = Annotated[
+    str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`: for tls/, wss:// and tokens.")
+]
+Tokens = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--token", metavar="[ROLE=]FILE",
+        help="File with the WebSocket token of vision or operator, or of both; repeatable.",
+    ),
+]  # fmt: skip
+OwnToken = Annotated[
+    list[str] | None, typer.Option("--token", metavar="FILE", help="File with the WebSocket token to ask for.")
 ]
 Junit = Annotated[Path | None, typer.Option("--junit", metavar="FILE", help="Write JUnit XML, for a CI.")]
 Html = Annotated[Path | None, typer.Option("--html", metavar="FILE", help="Write one HTML file, for a person.")]
@@ -58,7 +69,7 @@ def robot(
         str, typer.Option("--older", metavar="ENDPOINT", help="Its older dialect's port, ws-legacy://HOST:9091.")
     ] = "",
     secure: Secure = "",
-    token: Token = "",
+    tokens: Tokens = None,
     only: Only = None,
     groups: Groups = None,
     list_cases: Listing = False,
@@ -71,6 +82,7 @@ def robot(
     """Test a robot as its driver, its watcher and its enemy. It is armed and its wheels turn: lift it off the floor."""
     from protocol.conformance import robot as side
     from protocol.conformance.robot_sockets import put_over_websocket
+    from protocol.conformance.strangers import ZenohStranger
     from protocol.conformance.virtual import FROM_ROBOT
     from protocol.transports.opening import open_link
 
@@ -80,17 +92,22 @@ def robot(
         return 0
     _check_files(junit, html, save)
     with ExitStack() as ending:
-        secure = secure or _folder_of(token, ending)
+        access = access_for(secure, tokens or (), _ROLES, ending)
 
-        def open_it() -> Any:
-            return open_link(robot, connect=[endpoint], role="vision", secure=secure)
+        def open_it(role: str) -> Any:
+            return open_link(robot, connect=[endpoint], role=role, secure=access.folder)
 
         def put_it(key: str, header: bytes, payload: bytes) -> None:
             put_over_websocket(bench, key, header, payload)
 
-        put = put_it if "://" in endpoint else None
-        bench = LiveBench(robot, open_it, FROM_ROBOT, put, endpoint=endpoint, older=older, token=token)
+        put = put_it if "://" in endpoint else ending.enter_context(ZenohStranger(endpoint, access.folder)).put
+        roles = _ROLES if access.is_guarded else _ROLES[:1]
+        bench = LiveBench(
+            robot, open_it, FROM_ROBOT, put, roles=roles, endpoint=endpoint, older=older, access=access
+        )  # fmt: skip
         ending.enter_context(bench)
+        if not side.is_there(bench):
+            raise LinkError(f"{endpoint} answers, but no robot {robot} says its status there; is that its id?")
         tell = ending.enter_context(progress(len(cases)))
         results = run_cases(cases, bench, side.prepare, tell, TRIES)
     return _report(results, "robot", name or endpoint, (junit, html, save), as_json)
@@ -102,6 +119,7 @@ def vision(
     robot: Robot = "r1",
     dial: Annotated[bool, typer.Option("--dial", help="Connect to a vision or router that listens there.")] = False,
     secure: Secure = "",
+    tokens: OwnToken = None,
     only: Only = None,
     groups: Groups = None,
     list_cases: Listing = False,
@@ -113,6 +131,7 @@ def vision(
 ) -> int:
     """Test a vision: the kit plays its robot at ENDPOINT; start the vision against it, before or after."""
     from protocol.conformance import vision as side
+    from protocol.conformance.strangers import ZenohStranger
     from protocol.conformance.virtual import TO_ROBOT
     from protocol.transports.opening import open_link
 
@@ -122,12 +141,20 @@ def vision(
         return 0
     _check_files(junit, html, save)
     with ExitStack() as ending:
+        access = access_for(secure, tokens or (), _ROLES[:1], ending)
 
-        def open_it() -> Any:
+        def open_it(role: str) -> Any:
             ends: dict[str, Any] = {"connect": [endpoint]} if dial else {"listen": [endpoint]}
-            return open_link(robot, role="robot", secure=secure, **ends)
+            return open_link(robot, role=role, secure=access.folder, **ends)
 
-        bench = ending.enter_context(LiveBench(robot, open_it, TO_ROBOT, endpoint=endpoint))
+        stranger = ending.enter_context(ZenohStranger(endpoint, access.folder, "robot"))
+        put = None if "://" in endpoint else stranger.put
+        bench = ending.enter_context(
+            LiveBench(robot, open_it, TO_ROBOT, put, roles=("robot",), endpoint=endpoint, access=access)
+        )
+        if not side.is_there(bench):
+            raise LinkError(f"no vision answers robot {robot} at {endpoint}; start one, before or after this: "
+                            f"sightline vision --connect {endpoint} --robot {robot}")
         tell = ending.enter_context(progress(len(cases)))
         results = run_cases(cases, bench, side.prepare, tell, TRIES)
     return _report(results, "vision", name or endpoint, (junit, html, save), as_json)
@@ -173,22 +200,12 @@ def page(
         out.write_text(text, "utf-8")
 
 
-def _folder_of(token: str, ending: ExitStack) -> str:
-    """A folder of keys with this token alone, gone at the end; "" without one."""
-    if not token:
-        return ""
-    folder = ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-conform-"))
-    (Path(folder) / "vision.token").write_text(token, "utf-8")
-    (Path(folder) / "vision.token").chmod(0o600)
-    return folder
-
-
 def _read(path: Path) -> dict[str, Any]:
     try:
         run = json.loads(path.read_text("utf-8"))
         return {name: run[name] for name in ("ok", "side", "peer", "counts", "checks")}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        what = f"{path}: not a run of this kit ({type(error).__name__}); make one with --save {path}"
+        what = f"{path}: not a run of this kit ({type(error).__name__}); make one: sightline conform ... --save FILE"
         raise ConfigError(what) from None
 
 

@@ -14,6 +14,8 @@ from protocol.conformance.case import Case, Level
 from protocol.conformance.report import summary
 from protocol.conformance.runner import Outcome, Result
 
+_FEW: Final = 3
+"""So many that lack the same and more are one line."""
 _COLOURS: Final = {Outcome.PASSED: "green", Outcome.FAILED: "red", Outcome.SKIPPED: "dim"}
 
 
@@ -45,10 +47,28 @@ def print_results(results: Sequence[Result]) -> None:
         listed = list(members)
         good = sum(one.outcome is Outcome.PASSED for one in listed)
         table.add_row(f"[bold]{group}[/bold]", "", "", f"[bold]{good} of {len(listed)} passed[/bold]")
-        for one in listed:
-            table.add_row(*_row(one))
+        for alike in _alike(listed):
+            table.add_row(*_row(alike[0]) if len(alike) < _FEW else _row_of_many(alike))
+            for one in alike[1:] if len(alike) < _FEW else ():
+                table.add_row(*_row(one))
     console.print(table)
     console.print(summary(results), markup=False, highlight=False)
+
+
+def _alike(results: Sequence[Result]) -> Iterator[list[Result]]:
+    """Neighbours that are not applicable for the same reason together, every other case alone."""
+
+    def sort(numbered: tuple[int, Result]) -> tuple[int, str]:
+        number, one = numbered
+        return (-1, one.reason) if one.outcome is Outcome.SKIPPED else (number, "")
+
+    for _sort, members in groupby(enumerate(results), sort):
+        yield [one for _, one in members]
+
+
+def _row_of_many(alike: Sequence[Result]) -> tuple[str, str, str, str]:
+    said = f"{len(alike)} cases, to {alike[-1].case.id}\n[dim]{escape(alike[0].reason)}[/dim]"
+    return f"  {alike[0].case.id}", "", f"[dim]{Outcome.SKIPPED.value}[/dim]", said
 
 
 def _row(one: Result) -> tuple[str, str, str, str]:

@@ -93,8 +93,8 @@ class JsRobot(JsProcess):
 class JsVision(JsProcess):
     """A vision for robot `robot` at `endpoint`."""
 
-    def __init__(self, folder: Path, endpoint: str, robot: str) -> None:
-        super().__init__(folder, "vision_client.mjs", "--connect", endpoint, "--robot", robot)
+    def __init__(self, folder: Path, endpoint: str, robot: str, *arguments: str) -> None:
+        super().__init__(folder, "vision_client.mjs", "--connect", endpoint, "--robot", robot, *arguments)
 
 
 def hello(robot: str, wants: list[str] | None = None) -> str:

@@ -1,9 +1,7 @@
 """The kit against our own robot and against one broken robot per case, in virtual time; and the kit's own parts."""
 
 import os
-import re
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 
 import pytest
 
@@ -17,16 +15,19 @@ from tests.conformance import (  # noqa: F401  (they fill BROKEN)
     broken_judging,
     broken_lease,
     broken_motion,
+    broken_order,
     broken_output,
     broken_requests,
     broken_traffic,
 )
 from tests.conformance.breaking import BROKEN
+from tests.conformance.clauses import clauses
 from tests.conformance.reference import quicken, virtual_robot
 
-README = Path(__file__).parent.parent / "protocol" / "README.md"
 VIRTUAL = [case for case in CASES if not case.real]
 NAMES = [case.id for case in VIRTUAL]
+MOST_S = 300.0
+"""One broken robot at all cases takes 5 s of a processor, and waits for those before it."""
 
 
 def result_of(case, break_it=None):
@@ -42,8 +43,10 @@ def failures_of(broken_id):
 
 @pytest.fixture(scope="module")
 def matrix():
-    with ProcessPoolExecutor(os.cpu_count(), initializer=quicken) as pool:
-        return dict(zip(BROKEN, pool.map(failures_of, BROKEN), strict=True))
+    """Broken robot -> what will be found of it, so that each is reported when it is done and not all at the end."""
+    pool = ProcessPoolExecutor(os.cpu_count(), initializer=quicken)
+    yield {name: pool.submit(failures_of, name) for name in BROKEN}
+    pool.shutdown(cancel_futures=True)
 
 
 # --- our robot, and broken ones --------------------------------------------------------------------------------------
@@ -68,15 +71,15 @@ def test_each_case_finds_its_broken_robot(case):
 @pytest.mark.kit
 @pytest.mark.parametrize("broken_id", BROKEN, ids=lambda name: f"{name} {BROKEN[name].__name__}")
 def test_a_broken_robot_fails_exactly_its_case(matrix, broken_id):
-    assert set(matrix[broken_id]) == {broken_id}, matrix[broken_id]
+    failed = matrix[broken_id].result(timeout=MOST_S)
+    assert set(failed) == {broken_id}, failed
 
 
 def test_one_robot_passes_all_cases_in_a_row():
     bench, _robot = virtual_robot()
     results = run_cases(VIRTUAL, bench, prepare)
     assert {one.case.id: one.reason for one in results if one.outcome is Outcome.FAILED} == {}
-    skipped = [one.case.id for one in results if one.outcome is Outcome.SKIPPED]
-    assert len(skipped) <= 2, skipped
+    assert {one.case.id: one.reason for one in results if one.outcome is Outcome.SKIPPED} == {}
 
 
 def test_a_robot_without_guests_passes_what_applies():
@@ -96,9 +99,8 @@ def test_a_dead_robot_fails_everything():
 
 
 def test_there_are_enough_and_each_is_of_a_clause():
-    headings = {re.sub(r"^\d+\. ", "", line[3:]) for line in README.read_text().splitlines() if line.startswith("## ")}
     assert len(CASES) >= 60
-    assert {case.clause for case in CASES} <= headings
+    assert {case.clause for case in CASES} <= set(clauses())
     assert all(len(case.title) > 15 and case.title.endswith(".") for case in CASES)
     assert {case.group for case in CASES} >= {
         "framing", "causality", "sequence", "limits", "lease", "stop", "flow", "dialect", "hostile input", "reconnect",
@@ -163,7 +165,7 @@ def test_a_case_may_be_tried_again_and_says_so():
     runs.clear()
     twice = run_cases([case], bench, tries=2)
     assert [one.outcome for one in (*once, *twice)] == [Outcome.FAILED, Outcome.PASSED]
-    assert twice[0].reason == "at a second try; at first lost"
+    assert twice[0].reason == "at try 2; before: lost"
     always = Case("R-CAUS-98", Level.MUST, "Headers", "A title.", lambda bench: bench.expect(False, "never"))
     assert run_cases([always], bench, tries=3)[0].reason == "never"
     runs.clear()

@@ -2,10 +2,15 @@
 
 import json
 import xml.etree.ElementTree as ET
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
-from operator_side import cli
+from operator_side import cli, keys
+from operator_side.conform_access import access_for
+from protocol.conformance import vision
+from protocol.conformance.bench import Access
 from protocol.conformance.case import Case, Level
 from protocol.conformance.html_report import to_html
 from protocol.conformance.report import summary, to_dict, to_junit, to_page
@@ -59,6 +64,21 @@ def test_a_broken_robot_does_not_and_every_report_says_why(capsys, tmp_path):
     assert json.loads(files["save"].read_text())["ok"] is False
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["tls/", "wss://"])
+def test_a_robot_behind_keys_conforms(capsys, tmp_path, scheme):
+    """Roles have keys of their own there, so the kit comes in as vision and as operator at once."""
+    endpoint = free_endpoint().replace("tcp/", scheme)
+    keys.make(tmp_path / "keys", [])
+    cases = (*QUICK, "R-STOP-02", *(("R-SOCK-34", "R-SOCK-40") if scheme == "wss://" else ()))
+    with RobotProcess(tmp_path, endpoint=endpoint, secure=str(tmp_path / "keys"), safety={}) as robot:
+        assert until(lambda: f"on {endpoint}" in robot.output(), 20.0), robot.output()
+        code, out, _err = run(capsys, "robot", endpoint, "--secure", tmp_path / "keys", *only(*cases), "--json")
+    outcomes = {check["name"]: (check["value"], check["reason"]) for check in json.loads(out)["checks"]}
+    assert (code, set(outcomes)) == (0, set(cases))
+    assert {value for value, _ in outcomes.values()} == {"passed"}, outcomes
+
+
 # --- mistakes --------------------------------------------------------------------------------------------------------
 
 
@@ -77,6 +97,16 @@ def test_nobody_there_is_exit_code_4(capsys):
         (["robot", "ws://127.0.0.1:1", "--html", "/nowhere/r.html"], "there is no folder /nowhere"),
         (["page", "/nowhere/r.json"], "not a run of this kit"),
         (["robot"], "ENDPOINT"),
+        (["vision"], "ENDPOINT"),
+        (["robot", "tcp/127.0.0.1"], "write <protocol>/<host>:<port>"),
+        (["robot", "ws://127.0.0.1:1", "--token", "/nowhere/token"], "--token /nowhere/token cannot be read"),
+        (["robot", "ws://127.0.0.1:1", "--token", __file__], "holds no token"),
+        (["robot", "ws://127.0.0.1:1", "--token", "driver=x"], "there is no role 'driver' here"),
+        (["robot", "wss://127.0.0.1:1", "--secure", "/nowhere"], "there is no such folder"),
+        (["robot", "ws://127.0.0.1:1", "--robot", "../x"], "robot id"),
+        (["vision", "ws://0.0.0.0:1"], "anybody could drive"),
+        (["codec"], "no command"),
+        (["codec", "--", "/nowhere/codec"], "cannot start"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -84,6 +114,77 @@ def test_a_mistake_is_one_line_and_exit_code_2(capsys, arguments, says):
     code, out, err = run(capsys, *arguments)
     assert (code, out) == (2, "")
     assert says in err and err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_a_robot_of_another_name_is_exit_code_4(capsys, tmp_path):
+    endpoint = free_endpoint()
+    with RobotProcess(tmp_path, endpoint=endpoint) as robot:
+        assert until(lambda: f"on {endpoint}" in robot.output(), 20.0), robot.output()
+        code, out, err = run(capsys, "robot", endpoint, "--robot", "r9")
+    assert (code, out) == (4, "")
+    assert "no robot r9 says its status there" in err and err.count("\n") == 1
+
+
+def test_no_vision_is_exit_code_4(capsys, monkeypatch):
+    monkeypatch.setattr(vision, "_FIRST_US", 300_000)
+    endpoint = free_endpoint().replace("tcp/", "ws://")
+    code, out, err = run(capsys, "vision", endpoint)
+    assert (code, out) == (4, "")
+    assert f"sightline vision --connect {endpoint}" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("program", "reason"),
+    [
+        (["sh", "-c", "while read line; do echo nonsense; done"], "this line is no JSON"),
+        (["true"], "it ended with 0 before it had answered"),
+    ],
+)
+def test_a_program_that_is_no_codec_is_told_once(capsys, program, reason):
+    code, out, err = run(capsys, "codec", "--", *program)
+    assert code == 5
+    assert err.count("\n") == 1 and reason in err
+    assert len(out.splitlines()) < 12 and "the program is gone" in out
+
+
+# --- keys ------------------------------------------------------------------------------------------------------------
+
+TOKEN = "0123456789abcdefABCDEF_-"
+
+
+def test_one_token_stands_for_every_role_and_named_ones_for_theirs(tmp_path):
+    one, other = tmp_path / "one", tmp_path / "other"
+    one.write_text(TOKEN + "\n")
+    other.write_text(TOKEN[::-1])
+    with ExitStack() as ending:
+        assert access_for("", (), ("vision", "operator"), ending) == Access()
+        alike = access_for("", [str(one)], ("vision", "operator"), ending)
+        assert alike.tokens == {"vision": TOKEN, "operator": TOKEN} and alike.is_guarded
+        apart = access_for("", [str(one), f"operator={other}"], ("vision", "operator"), ending)
+        assert apart.tokens == {"vision": TOKEN, "operator": TOKEN[::-1]}
+        assert Path(apart.folder, "operator.token").stat().st_mode & 0o77 == 0
+    assert not Path(apart.folder).exists()
+
+
+def test_a_token_beside_a_folder_stands_before_the_one_in_it(tmp_path):
+    (tmp_path / "keys").mkdir()
+    (tmp_path / "keys" / "vision.token").write_text(TOKEN)
+    (tmp_path / "keys" / "ca.pem").write_text("an authority")
+    (tmp_path / "one").write_text(TOKEN[::-1])
+    with ExitStack() as ending:
+        assert access_for(str(tmp_path / "keys"), (), ("vision",), ending).tokens == {"vision": TOKEN}
+        both = access_for(str(tmp_path / "keys"), [f"vision={tmp_path / 'one'}"], ("vision",), ending)
+        assert both.tokens == {"vision": TOKEN[::-1]}
+        assert Path(both.folder, "ca.pem").read_text() == "an authority"
+    assert (tmp_path / "keys" / "vision.token").read_text() == TOKEN
+
+
+def test_behind_keys_a_viewer_is_mute_so_an_operator_watches():
+    assert (Access().watcher, Access().may_ask("vision")) == ("viewer", True)
+    guarded = Access({"operator": TOKEN})
+    assert (guarded.watcher, guarded.may_ask("vision"), guarded.may_ask("teleop")) == ("operator", False, True)
+    assert (guarded.token_of("teleop"), guarded.token_of("vision")) == (TOKEN, "")
 
 
 def test_cases_are_listed_without_a_peer(capsys):

@@ -1,9 +1,12 @@
 """The cases with sockets of their own, in real time: our own links, a small server, and that server with one defect."""
 
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
+from protocol.conformance.bench import Access
 from protocol.conformance.live import LiveBench
 from protocol.conformance.raw_websocket import LOST, PING, TEXT, RawWebSocket, split_url, xor
 from protocol.conformance.robot import CASES, prepare
@@ -11,38 +14,53 @@ from protocol.conformance.runner import Outcome, run_cases
 from protocol.conformance.virtual import FROM_ROBOT
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.opening import open_link
-from tests.conformance.broken_sockets import DEFECTS
+from tests.conformance.broken_sockets import BEHIND_TOKENS, DEFECTS
 from tests.conformance.small_server import SmallServer
 from tests.link_rigs import free_endpoint
 from tests.robot_process import RobotProcess
 
 REAL = [case for case in CASES if case.real]
+TOKENS = {"vision": "vision-0123456789abcdef", "operator": "operator-0123456789abcdef"}
+DEFECTS_BEHIND_TOKENS = {DEFECTS[name]: True for name in BEHIND_TOKENS}
+MOST_S = 900.0
+"""One defect at all cases takes two minutes, and waits for those before it."""
 AT_ONCE = 8
 """Servers at a time: they wait far more than they compute."""
 
 
-def run_at(endpoint, older=""):
-    def open_it():
-        return open_link("r1", connect=[endpoint], role="vision", timeout_s=20)
+def run_at(endpoint, older="", folder="", cases=REAL):
+    """The results of `cases`; with a `folder` of keys the kit comes in with those."""
+    tokens = {role: (Path(folder) / f"{role}.token").read_text().strip() for role in TOKENS} if folder else {}
 
-    with LiveBench("r1", open_it, FROM_ROBOT, endpoint=endpoint, older=older) as bench:
-        return run_cases(REAL, bench, prepare)
+    def open_it(role):
+        return open_link("r1", connect=[endpoint], role=role, timeout_s=20, secure=folder)
+
+    roles = tuple(TOKENS) if folder else ("vision",)
+    options = {"roles": roles, "endpoint": endpoint, "older": older, "access": Access(tokens, folder)}
+    with LiveBench("r1", open_it, FROM_ROBOT, **options) as bench:
+        return run_cases(cases, bench, prepare)
 
 
 def bad(results):
     return {one.case.id: one.reason for one in results if one.outcome is not Outcome.PASSED}
 
 
-def failures_at(defect):
-    with SmallServer({defect} if defect else ()) as server:
-        results = run_at(server.endpoint, server.older)
+def failures_at(defect, cases=REAL, guarded=None):
+    """The cases that fail at a small server with `defect`: all, or those that a defect behind tokens can concern."""
+    guarded = DEFECTS_BEHIND_TOKENS.get(defect) if guarded is None else guarded
+    with TemporaryDirectory() as folder, SmallServer({defect} if defect else (), TOKENS if guarded else None) as server:
+        for role, token in TOKENS.items():
+            (Path(folder) / f"{role}.token").write_text(token)
+        results = run_at(server.endpoint, server.older, folder if guarded else "", cases)
     return {one.case.id: one.reason for one in results if one.outcome is Outcome.FAILED}
 
 
 @pytest.fixture(scope="module")
 def matrix():
-    with ProcessPoolExecutor(AT_ONCE) as pool:
-        return dict(zip(DEFECTS, pool.map(failures_at, DEFECTS.values()), strict=True))
+    """Case -> what its defect will make fail, so that each is reported when it is done."""
+    pool = ProcessPoolExecutor(AT_ONCE)
+    yield {name: pool.submit(failures_at, defect) for name, defect in DEFECTS.items()}
+    pool.shutdown(cancel_futures=True)
 
 
 def test_every_case_has_its_defect():
@@ -51,8 +69,16 @@ def test_every_case_has_its_defect():
 
 
 @pytest.mark.kit
-def test_a_small_server_without_defect_passes():
-    assert failures_at("") == {}
+@pytest.mark.parametrize("guarded", [False, True], ids=["open", "behind tokens"])
+def test_a_small_server_without_defect_passes(guarded):
+    assert failures_at("", guarded=guarded) == {}
+
+
+@pytest.mark.parametrize("case_id", BEHIND_TOKENS)
+def test_a_defect_behind_tokens_is_found(case_id):
+    cases = [case for case in REAL if case.id == case_id]
+    assert set(failures_at(DEFECTS[case_id], cases)) == {case_id}
+    assert failures_at("", cases, guarded=True) == {}
 
 
 @pytest.mark.kit
@@ -65,7 +91,8 @@ def test_our_own_robot_passes(tmp_path):
 @pytest.mark.kit
 @pytest.mark.parametrize("case_id", DEFECTS, ids=lambda name: f"{name} {DEFECTS[name]}")
 def test_a_defect_fails_exactly_its_case(matrix, case_id):
-    assert set(matrix[case_id]) == {case_id}, matrix[case_id]
+    failed = matrix[case_id].result(timeout=MOST_S)
+    assert set(failed) == {case_id}, failed
 
 
 # --- the client of bytes ---------------------------------------------------------------------------------------------

@@ -3,9 +3,12 @@
 import socket
 import threading
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
+from protocol.conformance.bench import Access
 from protocol.conformance.live import LiveBench
 from protocol.conformance.runner import Outcome, run_case
 from protocol.conformance.virtual import TO_ROBOT
@@ -17,6 +20,7 @@ from vision_side.config import VisionConfig
 from vision_side.service import serve
 
 REAL = [case for case in CASES if case.real]
+TOKEN = "0123456789abcdefABCDEF_-"
 
 
 def free_endpoint():
@@ -27,13 +31,14 @@ def free_endpoint():
 
 @contextmanager
 def bench_with(vision, endpoint=None):
-    """A kit that listens, and `vision(endpoint)`, a context, that connects."""
+    """A kit that listens, and `vision(endpoint)`, a context, that connects; it looks at the token and asks for none."""
     endpoint = endpoint or free_endpoint()
 
-    def open_it():
-        return open_link("r1", listen=[endpoint], role="robot")
+    def open_it(role):
+        return open_link("r1", listen=[endpoint], role=role)
 
-    with LiveBench("r1", open_it, TO_ROBOT, endpoint=endpoint) as bench, vision(endpoint):
+    options = {"roles": ("robot",), "endpoint": endpoint, "access": Access({"vision": TOKEN})}
+    with LiveBench("r1", open_it, TO_ROBOT, **options) as bench, vision(endpoint):
         yield bench
 
 
@@ -41,7 +46,7 @@ def bench_with(vision, endpoint=None):
 def our_vision(endpoint):
     """The service as the command runs it, in a thread."""
     ending = threading.Event()
-    with open_link("r1", connect=[endpoint], role="vision") as link:
+    with folder_of(TOKEN) as folder, open_link("r1", connect=[endpoint], role="vision", secure=folder) as link:
         running = threading.Thread(target=serve, args=(VisionConfig(), link, ending, lambda line: None))
         running.start()
         yield
@@ -49,7 +54,18 @@ def our_vision(endpoint):
         running.join(2)
 
 
-@pytest.mark.parametrize("vision", [our_vision, SocketVision], ids=["ours", "plain"])
+@contextmanager
+def folder_of(token):
+    with TemporaryDirectory() as folder:
+        (Path(folder) / "vision.token").write_text(token)
+        yield folder
+
+
+def plain_vision(endpoint, broken=""):
+    return SocketVision(endpoint, broken, TOKEN)
+
+
+@pytest.mark.parametrize("vision", [our_vision, plain_vision], ids=["ours", "plain"])
 def test_a_good_vision_passes_them_all(vision):
     with bench_with(vision) as bench:
         results = [run_case(case, bench) for case in REAL]
@@ -60,7 +76,7 @@ def failed_of(broken, cases):
     """Each on a bench of its own: a vision that gave up would fail what follows."""
     found = set()
     for case in cases:
-        with bench_with(lambda endpoint: SocketVision(endpoint, broken)) as bench:
+        with bench_with(lambda endpoint: plain_vision(endpoint, broken)) as bench:
             if run_case(case, bench).outcome is Outcome.FAILED:
                 found.add(case.id)
     return found

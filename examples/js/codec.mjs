@@ -47,6 +47,8 @@ export const CHANNELS = Object.assign(Object.create(null), {
   scan: channel("scan", false, tables.ScanHeader, null, 16_384, 3),
   camera: channel("camera", false, tables.Stamp, tables.CameraModel, 1024, 1),
   detections: channel("detections", true, tables.DetectionsHeader, tables.Detections, 32_768, 1),
+  mission: channel("mission", true, tables.RequestHeader, tables.MissionRequest, 4096, 1),
+  report: channel("report", true, tables.DetectionsHeader, tables.MissionReport, 2048, 1),
 });
 
 const ROBOT_ID = /^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/;

@@ -48,8 +48,9 @@ const list = (type, least, most) => (value, where) =>
     ? value.map((item, index) => type(item, `${where}.${index}`))
     : fail(where, `a list of ${least} to ${most}`);
 
-const map = (type, most = Infinity) => (value, where) => {
+const map = (type, most = Infinity, named = /^/) => (value, where) => {
   if (!isObject(value) || Object.keys(value).length > most) fail(where, `an object of at most ${most} fields`);
+  for (const name of Object.keys(value)) if (!named.test(name)) fail(where, `names like ${named}`);
   return Object.fromEntries(Object.entries(value).map(([name, item]) => [name, type(item, `${where}.${name}`)]));
 };
 
@@ -103,7 +104,11 @@ export const ScanHeader = {
   ...Stamp, angle_min_rad: [real], angle_increment_rad: [real], range_min_m: [real], range_max_m: [real],
 };
 const asker = { v: [version, VERSION], source: [source], session: [session], seq: [counter] };
-export const AnswerHeader = { ...asker, echo: [object(Echo)], compute_us: [counter, 0] };
+export const Asked = { session: [session], id: [counter] };
+export const AnswerHeader = {
+  ...asker, echo: [object(Echo)], compute_us: [counter, 0], scan: [orNull(counter), null],
+  mission: [orNull(object(Asked)), null],
+};
 export const RequestHeader = { ...asker, echo: [orNull(object(Echo)), null] };
 
 export const VERBS = ["arm", "disarm", "stop", "reset", "acquire", "release"];
@@ -177,6 +182,26 @@ const DetectedBox = (value, where) => {
 export const DetectionsHeader = { ...asker, echo: [orNull(object(Echo)), null], compute_us: [counter, 0] };
 export const Detections = {
   width_px: [integer(16, 8192)], height_px: [integer(16, 8192)], boxes: [list(DetectedBox, 0, 64), []],
+};
+const metres = number(-100, 100);
+const option = (value, where) => (typeof value === "boolean" ? value : typeof value === "string" ? text(64)(value, where) : real(value, where));
+export const MissionRequest = {
+  id: [counter],
+  name: [matching(/^[a-z][a-z0-9-]{0,31}$/)],
+  waypoints: [list(list(metres, 2, 2), 0, 64), []],
+  options: [map(option, 16, /^[a-z][a-z0-9_.]{0,63}$/), {}],
+};
+export const MissionReport = {
+  mission: [text(64)],
+  phase: [text(32)],
+  note: [text(200), ""],
+  done: [boolean, false],
+  asked: [orNull(object(Asked)), null],
+  refused: [text(200), ""],
+  detector: [text(64), ""],
+  device: [text(32), ""],
+  model: [text(64), ""],
+  inference_us: [orNull(counter), null],
 };
 export const Hello = {
   v: [version, VERSION],

@@ -2,28 +2,57 @@
 
 import { Viewer, canvasLook, markTarget } from "./viewer.mjs";
 
+const REFRESH_MS = 100;
+const OLD_MS = 500; // what is older than this must not look like the present
 const part = (id) => document.getElementById(id);
 const write = (id, text) => {
   part(id).textContent = text;
 };
+const drawnAt_ms = []; // of the last second
 
 /** @param {object} what one thing that changed */
 function show({ link, status, reply, stop, target }) {
-  if (link !== undefined) write("link", link);
-  if (status !== undefined) {
-    write("state", status.state);
-    const [linear, angular] = status.applied;
-    write("reason", `${status.reason}; ${linear.toFixed(2)} m/s, ${angular.toFixed(2)} rad/s; driver: ${status.holder?.source ?? "nobody"}`);
+  if (link !== undefined) {
+    write("link", link);
+    part("link").className = link === "connected" ? "" : "lost";
   }
+  if (status !== undefined) showStatus(status);
   if (reply !== undefined) write("news", reply.detail);
   if (stop !== undefined) write("news", stop);
-  if (target !== undefined) markTarget(part("picture"), target);
+  if (target !== undefined) {
+    drawnAt_ms.push(performance.now());
+    markTarget(part("picture"), target);
+  }
+}
+
+function showStatus({ state, reason, holder, applied, frame_age_us, latency_us, stream }) {
+  write("state", state);
+  part("state").className = state;
+  write("reason", reason);
+  const side = applied[1] < 0 ? "right" : "left";
+  write("wheels", `${applied[0].toFixed(2)} m/s, turning ${side} at ${Math.abs(applied[1]).toFixed(2)} rad/s`);
+  write("driver", holder === null ? "nobody" : holder.session === viewer.session ? "this page" : `${holder.source} ${holder.session}`);
+  const ages = [["now", frame_age_us], ["when the last command came", latency_us]].filter(([, age_us]) => age_us !== null);
+  write("sight", ages.map(([what, age_us]) => `${Math.round(age_us / 1000)} ms old ${what}`).join(", ") || "none");
+  write("pictures", `${stream.sent} sent, ${viewer.eyes.answered} answered here, ${stream.credit_timeouts} unanswered in time`);
+}
+
+/** What stands still must be seen to stand still: the age grows while nothing comes. */
+function showAge() {
+  const now_ms = performance.now();
+  while (drawnAt_ms.length > 1 && drawnAt_ms[0] < now_ms - 1000) drawnAt_ms.shift();
+  if (drawnAt_ms.length === 0) return;
+  const age_ms = now_ms - drawnAt_ms.at(-1);
+  const old = age_ms > OLD_MS;
+  part("figure").className = old ? "old" : "";
+  write("age", old ? `no picture for ${(age_ms / 1000).toFixed(1)} s` : `${drawnAt_ms.length} pictures/s, the newest ${Math.round(age_ms)} ms ago`);
 }
 
 const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/`;
 const token = location.hash.slice(1); // what stands behind the # is never sent with a request
 const viewer = new Viewer({ url, robot: document.body.dataset.robot, token, look: canvasLook(part("picture")), show });
 viewer.open();
+setInterval(showAge, REFRESH_MS);
 
 part("stop").onclick = () => viewer.stop();
 document.addEventListener("keydown", (event) => {

@@ -11,7 +11,7 @@ import { Stream } from "./stream.mjs";
 
 const PERIODS_US = { status: 100_000, odometry: 50_000, camera: 500_000 };
 /** Channels that a robot wants of its peers. */
-export const ROBOT_WANTS = Object.freeze(["twist", "ack", "request", "detections"]);
+export const ROBOT_WANTS = Object.freeze(["twist", "ack", "request", "detections", "mission", "report"]);
 
 export class Robot {
   /**
@@ -53,7 +53,8 @@ export class Robot {
       else return read.header.source === source;
     } catch (error) {
       if (channel.name === "twist" || channel.name === "request") this.gate.refuse(source, error);
-      else if (!(error instanceof WireError)) throw error; // an ack that cannot be read is dropped
+      else if (!(error instanceof WireError)) throw error;
+      else if (channel.name === "ack") this.gate.count(error.reason);
     }
     return false;
   }

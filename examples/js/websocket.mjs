@@ -141,13 +141,13 @@ export function admissionProblem(rawHeaders, listenHost) {
 
 const TOKEN_ENTRY = "sightline.token."; // beside the sub-protocol: all that a browser can do
 
-/** Whether a request shows the token, in the sub-protocols it offers or as `Authorization: Bearer`. */
+/** Whether a request shows the token and no other, in the sub-protocols it offers or as `Authorization: Bearer`. */
 function showsToken(headers, offered, token) {
   const shown = offered.filter((name) => name.startsWith(TOKEN_ENTRY)).map((name) => name.slice(TOKEN_ENTRY.length));
   const bearer = /^Bearer +(\S+)$/i.exec(headers.authorization ?? "");
   if (bearer !== null) shown.push(bearer[1]);
   const digest = (text) => createHash("sha256").update(text).digest(); // of one length, as the comparison needs
-  return shown.some((one) => timingSafeEqual(digest(one), digest(token)));
+  return shown.length === 1 && timingSafeEqual(digest(shown[0]), digest(token));
 }
 
 function upgradeProblem(request, token) {

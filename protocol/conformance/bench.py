@@ -8,8 +8,8 @@ import heapq
 import itertools
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
 from protocol.channels import Channel
@@ -18,11 +18,38 @@ from protocol.conformance.case import ConformanceError, NotApplicableError
 from protocol.errors import WireError
 from protocol.messages import Wire
 from protocol.transports.link import Message
+from protocol.transports.secured import SOURCES, certificate_role
 
 KEPT_MESSAGES: Final = 600
 """Per channel; 20 s of frames at 30 fps, longer than any case lasts."""
 
 Model = TypeVar("Model", bound=Wire)
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """What the kit shows, or asks for: a token for each role, and a folder of keys. Both are empty at an open peer."""
+
+    tokens: Mapping[str, str] = field(default_factory=dict)
+    folder: str = ""
+
+    @property
+    def is_guarded(self) -> bool:
+        """Whether roles are kept apart by tokens or certificates."""
+        return bool(self.tokens or self.folder)
+
+    @property
+    def watcher(self) -> str:
+        """A role that may ask and may not drive: where keys are asked for, a viewer may say nothing at all."""
+        return "operator" if self.is_guarded else "viewer"
+
+    def may_ask(self, source: str) -> bool:
+        """Whether requests of `source` get through."""
+        return not self.is_guarded or source in SOURCES["operator"]
+
+    def token_of(self, source: str) -> str:
+        """What `source` shows; "" where nothing is asked for."""
+        return self.tokens.get(certificate_role(source), "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +79,12 @@ def _read(model: type[Model], data: bytes, max_bytes: int) -> Model | None:
 class Bench(ABC):
     """One peer under test. `robot` is the robot's id: the peer's own, or the one that the kit plays."""
 
-    def __init__(self, robot: str, endpoint: str = "", older: str = "", token: str = "") -> None:
-        """`endpoint` is where the peer is, `older` where it speaks the older dialect, `token` what it demands.
+    def __init__(self, robot: str, endpoint: str = "", older: str = "", access: Access | None = None) -> None:
+        """`endpoint` is where the peer is, `older` where it speaks the older dialect, `access` what opens its doors.
 
         These three are for cases with sockets of their own.
         """
-        self.robot, self.endpoint, self.older, self.token = robot, endpoint, older, token
+        self.robot, self.endpoint, self.older, self.access = robot, endpoint, older, access or Access()
         self._log: dict[str, deque[Heard]] = {}
         self._reactions: list[tuple[Channel, Callable[[Heard], None]]] = []
         self._timers: list[tuple[int, int, Callable[[], None]]] = []

@@ -26,7 +26,8 @@ def _cases(asked: Sequence[CodecCase]) -> tuple[Case, ...]:
     for one in asked:
         level = Level.MUST if one.must else Level.SHOULD
         suite.add(Case(f"C-CODEC-{one.number}", level, one.clause, one.purpose, _on_a_pipe))
-    suite.add(Case(END, Level.SHOULD, "17.3", "The program ends, with 0, when its input ends.", _on_a_pipe))
+    title = "The program ends, with 0, when its input ends."
+    suite.add(Case(END, Level.SHOULD, "17.3 A codec on a pipe", title, _on_a_pipe))
     return tuple(suite.cases)
 
 

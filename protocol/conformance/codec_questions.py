@@ -66,7 +66,8 @@ def _vector_case(number: int, name: str, vector: dict[str, Any]) -> CodecCase:
         asked = {field.removesuffix(_HEX): bytes.fromhex(value) if field.endswith(_HEX) else value
                  for field, value in asked.items()}
     purpose = f"`vectors/{name}.json`: {vector['purpose']}."
-    return CodecCase(number, "vector", purpose, True, "17.1", lambda: iter((Question(kind, asked, expected),)))
+    clause = "17.1 Golden vectors"
+    return CodecCase(number, "vector", purpose, True, clause, lambda: iter((Question(kind, asked, expected),)))
 
 
 def _cut_case(number: int, name: str, vector: dict[str, Any]) -> CodecCase:
@@ -82,7 +83,7 @@ def _cut_case(number: int, name: str, vector: dict[str, Any]) -> CodecCase:
 
     where = "every byte" if step == 1 else f"every {step}th byte"
     purpose = f"`vectors/{name}.json`, header or payload cut short at {where}."
-    return CodecCase(number, "cut", purpose, True, "17.2", questions)
+    return CodecCase(number, "cut", purpose, True, "17.2 Golden vectors", questions)
 
 
 def _message(key: str, header: bytes, payload: bytes) -> Question:

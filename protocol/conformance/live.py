@@ -8,9 +8,10 @@ from types import TracebackType
 from typing import Final, Self
 
 from protocol.channels import Channel
-from protocol.conformance.bench import Bench
+from protocol.conformance.bench import Access, Bench
 from protocol.conformance.case import NotApplicableError
 from protocol.transports.link import Link, Message
+from protocol.transports.secured import certificate_role
 
 _WAITING: Final = 1024  # messages that a case has not yet looked at; it looks every few milliseconds
 _NAP_S: Final = 0.005
@@ -22,21 +23,23 @@ class LiveBench(Bench):
     def __init__(
         self,
         robot: str,
-        open_it: Callable[[], Link],
+        open_it: Callable[[str], Link],
         hears: Sequence[Channel],
         put_it: Callable[[str, bytes, bytes], None] | None = None,
         *,
+        roles: Sequence[str] = ("vision",),
         endpoint: str = "",
         older: str = "",
-        token: str = "",
+        access: Access | None = None,
     ) -> None:
-        """`open_it` opens the kit's link, again after each `leave`; `put_it` sends what a link refuses to send.
+        """`open_it(role)` opens a link, again after each `leave`; `put_it` sends what a link refuses to send.
 
-        Raises what `open_it` raises.
+        Each of `roles` has a link of its own, where keys decide who may say what; the first hears, and says whatever
+        no other may say. Raises what `open_it` raises.
         """
-        super().__init__(robot, endpoint, older, token)
-        self._open_it, self._hears, self._put_it = open_it, hears, put_it
-        self._link: Link | None = None
+        super().__init__(robot, endpoint, older, access)
+        self._open_it, self._hears, self._put_it, self._roles = open_it, hears, put_it, roles
+        self._links: dict[str, Link] = {}
         self._news = threading.Condition()
         self._waiting: deque[Message] = deque(maxlen=_WAITING)
         self._dropped: Counter[str] = Counter()
@@ -48,27 +51,29 @@ class LiveBench(Bench):
 
     @property
     def dropped_here(self) -> Counter[str]:
-        return self._dropped + _refused(self._link)
+        return sum(map(_refused, self._links.values()), self._dropped)
 
     def send(self, channel: Channel, header: bytes, payload: bytes, source: str) -> None:
-        if self._link is not None:
-            self._link.publish(channel, header, payload, source)
+        link = self._links.get(certificate_role(source)) or self._links.get(self._roles[0])
+        if link is not None:
+            link.publish(channel, header, payload, source)
 
     def put(self, key: str, header: bytes, payload: bytes) -> None:
         if self._put_it is None:
-            raise NotApplicableError("the kit has no way to send on this transport what the rules forbid")
+            raise NotApplicableError("over WebSocket nothing is sent under a key")
         self._put_it(key, header, payload)
 
     def leave(self) -> None:
-        if self._link is not None:
-            self._link.close()
-            self._dropped += _refused(self._link)
-            self._link = None
+        for role in tuple(self._links):
+            link = self._links.pop(role)
+            link.close()
+            self._dropped += _refused(link)
 
     def join(self) -> None:
-        self._link = self._open_it()
+        for role in self._roles:
+            self._links[role] = self._open_it(role)
         for channel in self._hears:
-            self._link.subscribe(channel, self._store)
+            self._links[self._roles[0]].subscribe(channel, self._store)
 
     def _store(self, message: Message) -> None:
         with self._news:
@@ -93,5 +98,5 @@ class LiveBench(Bench):
         self.leave()
 
 
-def _refused(link: Link | None) -> Counter[str]:
+def _refused(link: Link) -> Counter[str]:
     return Counter(getattr(link, "refused", Counter()))

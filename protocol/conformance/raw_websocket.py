@@ -43,8 +43,10 @@ class RawWebSocket:
         url: str,
         protocols: Sequence[str] = (SUBPROTOCOL,),
         headers: Sequence[tuple[str, str]] = (),
+        *,
         host: str = "",
         answers_pings: bool = True,
+        path: str = "/",
     ) -> None:
         """Connect and shake hands; `host` replaces the Host header. Raises LinkError where nobody answers."""
         secure, address, port = split_url(url)
@@ -62,7 +64,8 @@ class RawWebSocket:
                  *headers]  # fmt: skip
         if protocols:
             lines.append(("Sec-WebSocket-Protocol", ", ".join(protocols)))
-        self.write(("GET / HTTP/1.1\r\n" + "".join(f"{name}: {value}\r\n" for name, value in lines) + "\r\n").encode())
+        head = "".join(f"{name}: {value}\r\n" for name, value in lines)
+        self.write(f"GET {path} HTTP/1.1\r\n{head}\r\n".encode())
         self.status, self.headers = self._answer()
 
     def _answer(self) -> tuple[int, dict[str, str]]:

@@ -10,8 +10,10 @@ from protocol.conformance.runner import Outcome, Result, passed, printable
 
 _MARKS: Final = {Outcome.PASSED: "ok", Outcome.FAILED: "FAIL", Outcome.SKIPPED: "n/a"}
 
-_PREFACE: Final = """Made by `sightline conform page` from runs of the kit. A case that a peer's choices leave nothing
-to test in (no guests, no scan, no port of the older dialect, another transport) counts as not applicable."""
+_PREFACE: Final = """Made by `sightline conform page` from runs of the kit; `python -m tests.conformance.page_runs`
+runs it over these peers and writes this page. A case that a peer's choices leave nothing to test in (no guests, no
+scan, no port of the older dialect, no token, another transport) counts as not applicable. Clauses are those of
+[protocol/README.md](../protocol/README.md)."""
 
 _LISTED_ELSEWHERE: Final = ("codec",)
 """Sides without a table of every case: a codec's are the golden vectors, each of which says what it is for."""

@@ -2,10 +2,13 @@
 
 from typing import Final
 
+from protocol.channels import STATUS
 from protocol.conformance import (
     robot_arming,
     robot_asking,
     robot_commands,
+    robot_credit,
+    robot_doors,
     robot_flow,
     robot_framing,
     robot_hostile,
@@ -13,13 +16,16 @@ from protocol.conformance import (
     robot_messages,
     robot_motion,
     robot_older,
+    robot_order,
+    robot_requests,
     robot_sockets,
     robot_stop,
+    robot_tokens,
 )
-from protocol.conformance.case import GROUPS, Case
-from protocol.conformance.robot_rig import prepare
-
-__all__ = ["CASES", "prepare"]
+from protocol.conformance.bench import Bench
+from protocol.conformance.case import GROUPS, Case, ConformanceError
+from protocol.conformance.robot_rig import Robot, Sender
+from protocol.messages import State, Status
 
 _SUITES: Final = (
     robot_framing.SUITE,
@@ -34,7 +40,14 @@ _SUITES: Final = (
     robot_older.SUITE,
     robot_sockets.SUITE,
     robot_messages.SUITE,
+    robot_tokens.SUITE,
+    robot_order.SUITE,
+    robot_requests.SUITE,
+    robot_doors.SUITE,
+    robot_credit.SUITE,
 )
+_SETTLES_US: Final = 6_000_000
+_FIRST_US: Final = 5_000_000
 _ORDER: Final = tuple(GROUPS)
 
 CASES: Final[tuple[Case, ...]] = tuple(
@@ -43,3 +56,30 @@ CASES: Final[tuple[Case, ...]] = tuple(
         key=lambda case: (_ORDER.index(case.id.split("-")[1]), case.id),
     )
 )
+
+
+def is_there(bench: Bench) -> bool:
+    """Whether a robot of this id says anything: a case can be judged by nothing else."""
+    return bench.wait(lambda: bench.newest(STATUS), _FIRST_US)
+
+
+def prepare(bench: Bench) -> None:
+    """Bring the robot to where a case begins: DISARMED, nobody drives, wheels at zero. Raises ConformanceError."""
+    robot = Robot(bench)
+    robot.status()
+    operator = Sender(robot, "operator", acks=False)
+    robot.next_status()
+    for _ in range(3):
+        if robot.status().state in (State.STOPPED, State.FAULT):
+            operator.ask("reset")
+        elif robot.status().state is not State.DISARMED:
+            operator.ask("disarm")
+        if robot.reaches(_is_at_rest, _SETTLES_US // 3):
+            break
+    else:
+        raise ConformanceError("before the case the robot could not be brought to DISARMED, without holder, at zero")
+    bench.forget()
+
+
+def _is_at_rest(status: Status) -> bool:
+    return status.state is State.DISARMED and status.holder is None and status.applied == (0.0, 0.0)

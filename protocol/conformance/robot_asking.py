@@ -9,7 +9,6 @@ from protocol.conformance.robot_rig import GOOD, Robot, Sender, armed
 from protocol.messages import Reply, Stamp, State
 
 SUITE: Final = Suite("R")
-_ASKING: Final = "Requests and replies"
 
 
 def _operator(bench: Bench) -> Sender:
@@ -22,7 +21,7 @@ def _replies(bench: Bench, since: int) -> list[Reply]:
     return [reply for one in bench.heard(REPLY, since) if (reply := one.payload(Reply)) is not None]
 
 
-@SUITE.must("R-REQ-01", _ASKING)
+@SUITE.must("R-REQ-01", "8.1 Requests and replies")
 def one_reply(bench: Bench) -> None:
     """A request that can be read gets exactly one reply."""
     operator, mark = _operator(bench), bench.mark()
@@ -32,7 +31,7 @@ def one_reply(bench: Bench) -> None:
     bench.expect(len(_replies(bench, mark)) == 1, f"no Reply: {bench.heard(REPLY, mark)[0].message.payload!r}")
 
 
-@SUITE.must("R-REQ-02", _ASKING)
+@SUITE.must("R-REQ-02", "8.1 Requests and replies")
 def reply_names_the_request(bench: Bench) -> None:
     """`id` of a reply is the request's."""
     operator = _operator(bench)
@@ -43,18 +42,18 @@ def reply_names_the_request(bench: Bench) -> None:
         bench.expect(reply.id == number, f"id {reply.id}, the request had {number}")
 
 
-@SUITE.must("R-REQ-03", _ASKING)
+@SUITE.must("R-REQ-03", "8.1 Requests and replies")
 def reply_names_the_asker(bench: Bench) -> None:
     """`to` of a reply is the session of who asked."""
     first = _operator(bench)
-    for asker in (first, Sender(first.robot, "viewer")):
+    for asker in (first, Sender(first.robot, bench.access.watcher)):
         reply = asker.ask("disarm")
         bench.need(reply is not None, "no reply (R-REQ-01)")
         assert reply is not None
         bench.expect(reply.to == asker.session, f"to {reply.to}, asked by {asker.session}")
 
 
-@SUITE.must("R-REQ-04", _ASKING)
+@SUITE.must("R-REQ-04", "8.2 Requests and replies")
 def repeated_request(bench: Bench) -> None:
     """The same request, asked again because its reply was lost, is answered again."""
     operator = _operator(bench)
@@ -63,7 +62,7 @@ def repeated_request(bench: Bench) -> None:
         bench.expect(reply is not None and reply.ok, f"the {attempt} time: {reply}")
 
 
-@SUITE.must("R-REQ-05", _ASKING)
+@SUITE.must("R-REQ-05", "8.1 Requests and replies")
 def unknown_verb(bench: Bench) -> None:
     """A verb that the robot does not know is counted as MALFORMED, granted by no reply, and changes nothing."""
     operator, mark = _operator(bench), bench.mark()
@@ -74,15 +73,15 @@ def unknown_verb(bench: Bench) -> None:
     bench.expect(operator.robot.status().state is before.state, f"then it is {operator.robot.status().state}")
 
 
-@SUITE.must("R-REQ-06", "Peers, channels, keys")
+@SUITE.must("R-REQ-06", "8.4 Requests and replies")
 def source_disagrees(bench: Bench) -> None:
     """A request whose header names another source than its key is refused as UNKNOWN_SOURCE."""
-    operator = _operator(bench)
-    verdict = operator.verdict(lambda: operator.request("disarm", source="teleop"))
+    human = Sender(_operator(bench).robot, "teleop")
+    verdict = human.verdict(lambda: human.request("disarm", source="operator"))
     bench.expect(verdict == "UNKNOWN_SOURCE", f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-REQ-07", _ASKING)
+@SUITE.must("R-REQ-07", "8.1 Requests and replies")
 def state_after(bench: Bench) -> None:
     """`state` of a reply is the state after the request."""
     operator = _operator(bench)
@@ -92,7 +91,7 @@ def state_after(bench: Bench) -> None:
     bench.expect(reply.state == State.STOPPED, f"after STOP the reply says {reply.state}")
 
 
-@SUITE.must("R-REQ-08", "Headers")
+@SUITE.must("R-REQ-08", "8.1 Requests and replies")
 def header_is_needed(bench: Bench) -> None:
     """A request without header is counted as MALFORMED and not obeyed, STOP included: the asker has no name."""
     operator = _operator(bench)
@@ -100,14 +99,14 @@ def header_is_needed(bench: Bench) -> None:
     bench.expect(verdict == "MALFORMED", f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-REQ-09", "Headers")
+@SUITE.must("R-REQ-09", "2.1 JSON")
 def unknown_fields(bench: Bench) -> None:
     """Unknown fields of a request are ignored."""
     reply = _operator(bench).ask("disarm", extra={"colour": "red"}, mood="calm")
     bench.expect(reply is not None and reply.ok, f"the reply: {reply}")
 
 
-@SUITE.must("R-REQ-10", _ASKING)
+@SUITE.must("R-REQ-10", "8.1 Requests and replies")
 def reason_in_words(bench: Bench) -> None:
     """A reply that refuses gives the reason in `detail`, and then words for a person."""
     reply = _operator(bench).ask("arm")
@@ -117,7 +116,7 @@ def reason_in_words(bench: Bench) -> None:
     bench.expect(told, f"detail is {reply.detail!r}, expected NOT_ALLOWED: and why")
 
 
-@SUITE.must("R-REQ-11", _ASKING)
+@SUITE.must("R-REQ-11", "8.3 Freshness")
 def other_session(bench: Bench) -> None:
     """What lets a robot move again must cite this session of the robot, else OTHER_SESSION."""
     operator = _operator(bench)
@@ -135,7 +134,7 @@ def other_session(bench: Bench) -> None:
 # --- status ----------------------------------------------------------------------------------------------------------
 
 
-@SUITE.must("R-STAT-01", "Status")
+@SUITE.must("R-STAT-01", "9. Status")
 def counts_each(bench: Bench) -> None:
     """Each refused twist is counted once under its reason."""
     sender = Sender(Robot(bench))
@@ -149,7 +148,7 @@ def counts_each(bench: Bench) -> None:
     bench.expect(counted == 5, f"5 twists on unknown frames were counted {counted} times")
 
 
-@SUITE.must("R-STAT-02", "Status")
+@SUITE.must("R-STAT-02", "9. Status")
 def last_refusal(bench: Bench) -> None:
     """`last_refusal` names source and reason of the newest refusal, in words."""
     sender = Sender(Robot(bench))
@@ -161,7 +160,7 @@ def last_refusal(bench: Bench) -> None:
     bench.expect(told, f"last_refusal is {last}")
 
 
-@SUITE.must("R-STAT-03", "Status")
+@SUITE.must("R-STAT-03", "9. Status")
 def accepted_counts(bench: Bench) -> None:
     """`accepted` counts the twists that were accepted, and no others."""
     robot, driver = armed(bench)
@@ -177,7 +176,7 @@ def accepted_counts(bench: Bench) -> None:
     bench.expect(grown == sent, f"{sent} good and {sent} bad twists raised `accepted` by {grown}")
 
 
-@SUITE.must("R-STAT-04", "Status")
+@SUITE.must("R-STAT-04", "9. Status")
 def frame_age(bench: Bench) -> None:
     """`frame_age_us` is the age of the frame behind the command in force, absent where there is none."""
     robot = Robot(bench)
@@ -188,7 +187,7 @@ def frame_age(bench: Bench) -> None:
     bench.expect(age_us is not None and age_us < 400_000, f"while driving it is {age_us}")
 
 
-@SUITE.must("R-STAT-05", "Status")
+@SUITE.must("R-STAT-05", "9. Status")
 def latency(bench: Bench) -> None:
     """`latency_us` is the robot's own measure from capture to accepted command."""
     robot, driver = armed(bench)
@@ -200,7 +199,7 @@ def latency(bench: Bench) -> None:
     bench.expect(55_000 <= latency_us <= 400_000, f"answers after 60 ms are said to take {latency_us / 1e3:.0f} ms")
 
 
-@SUITE.must("R-STAT-06", "Status")
+@SUITE.must("R-STAT-06", "9. Status")
 def sent_counts(bench: Bench) -> None:
     """`stream.sent` counts the frames."""
     robot = Robot(bench)
@@ -212,7 +211,7 @@ def sent_counts(bench: Bench) -> None:
     bench.expect(grown >= came // 2, f"{came} frames came, `stream.sent` grew by {grown}")
 
 
-@SUITE.must("R-STAT-07", "Status")
+@SUITE.must("R-STAT-07", "9. Status")
 def reason_of_the_state(bench: Bench) -> None:
     """`reason` says why the robot does not move, and changes with the state."""
     robot = Robot(bench)
@@ -223,7 +222,7 @@ def reason_of_the_state(bench: Bench) -> None:
     bench.expect(unarmed and stopped and unarmed != stopped, f"{unarmed!r}, then {stopped!r}")
 
 
-@SUITE.must("R-STAT-08", "Status")
+@SUITE.must("R-STAT-08", "9. Status")
 def applied_is_told(bench: Bench) -> None:
     """`applied` in `status` is what is given to the wheels: above zero while driving, zero at rest."""
     robot = Robot(bench)
@@ -237,7 +236,7 @@ def applied_is_told(bench: Bench) -> None:
     bench.expect(robot.next_status().applied[0] > 0.05, f"while driving it is {robot.status().applied}")
 
 
-@SUITE.must("R-STAT-09", "Status")
+@SUITE.must("R-STAT-09", "9. Status")
 def holder_is_none(bench: Bench) -> None:
     """`holder` is absent once a driver has released the lease."""
     first = Sender(Robot(bench))

@@ -6,14 +6,13 @@ A robot that is not armed judges every command all the same and counts a good on
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
-from protocol.channels import TWIST
+from protocol.channels import MAX_HEADER_BYTES, TWIST
 from protocol.conformance.bench import Bench
 from protocol.conformance.case import Case, Level, Suite
 from protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, as_json
 from protocol.messages import MAX_INTEGER, FrameHeader
 
 SUITE: Final = Suite("R")
-_JUDGED = "How a robot judges"
 
 Fields = dict[str, Any]
 Making = Callable[[Fields], bytes]
@@ -48,52 +47,62 @@ Row = tuple[str, Level, str, str, str, Sequence[Making]]
 MUST, SHOULD = Level.MUST, Level.SHOULD
 
 HEADERS: Final[Sequence[Row]] = (
-    ("R-HEAD-01", MUST, "Headers", "Unknown fields of a header are ignored.", GOOD,
+    ("R-HEAD-01", MUST, "2.1 JSON", "Unknown fields of a header are ignored.", GOOD,
      (_set(colour="red", nested={"a": [1, 2]}), _echo(note="x"))),
-    ("R-HEAD-02", MUST, "Versions", "Another version is refused as UNSUPPORTED_VERSION.", "UNSUPPORTED_VERSION",
+    ("R-HEAD-02", MUST, "2.4 Version", "Another version is refused as UNSUPPORTED_VERSION.", "UNSUPPORTED_VERSION",
      (_set(v=2), _set(v=0))),
-    ("R-HEAD-03", MUST, "Headers", "An absent version means 1.", GOOD, (_without("v"),)),
-    ("R-HEAD-04", MUST, "Headers", "A header without `session` or `seq` is MALFORMED.", "MALFORMED",
+    ("R-HEAD-03", MUST, "2.4 Version", "An absent version means 1.", GOOD, (_without("v"),)),
+    ("R-HEAD-04", MUST, "2.8 Fields", "A header without `session` or `seq` is MALFORMED.", "MALFORMED",
      (_without("session"), _without("seq"))),
-    ("R-HEAD-05", MUST, "Headers", "A header without `echo` is MALFORMED.", "MALFORMED", (_without("echo"),)),
-    ("R-HEAD-06", MUST, "Headers", "A real number, a string, true or null in place of an integer is MALFORMED.",
+    ("R-HEAD-05", MUST, "2.8 Fields", "A header without `echo` is MALFORMED.", "MALFORMED", (_without("echo"),)),
+    ("R-HEAD-06", MUST, "2.1 JSON", "A real number, a string, true or null in place of an integer is MALFORMED.",
      "MALFORMED", (_set(seq=1000.5), _set(seq="1000"), _set(seq=True), _set(seq=None))),
-    ("R-HEAD-07", MUST, "Headers", "An integer beyond 2^53 - 1 is MALFORMED, be it 30 digits long.", "MALFORMED",
+    ("R-HEAD-07", MUST, "2.2 Numbers", "An integer beyond 2^53 - 1 is MALFORMED, be it 30 digits long.", "MALFORMED",
      (_set(seq=MAX_INTEGER + 1), _set(seq=10**29))),
-    ("R-HEAD-08", MUST, "Headers", "A negative integer is MALFORMED.", "MALFORMED",
+    ("R-HEAD-08", MUST, "2.2 Numbers", "A negative integer is MALFORMED.", "MALFORMED",
      (_set(compute_us=-1), _set(seq=-1))),
-    ("R-HEAD-09", MUST, "Headers", "A session that is not 8 lower-case hex digits is MALFORMED.", "MALFORMED",
-     (_set(session="ABCDEF01"), _set(session="abc"), _set(session="0123456789"))),
-    ("R-HEAD-10", MUST, "Headers", "Of a field given twice the last counts.", GOOD, (_again("session", '"ffffffff"'),
-                                                                                    _again("v", "9"))),
-    ("R-HEAD-11", MUST, "Headers", "A byte order mark before the header is MALFORMED.", "MALFORMED",
+    ("R-HEAD-09", MUST, "2.5 Session and sequence", "A session that is not 8 lower-case hex digits is MALFORMED.",
+     "MALFORMED", (_set(session="ABCDEF01"), _set(session="abc"), _set(session="0123456789"))),
+    ("R-HEAD-10", MUST, "2.1 JSON", "Of a field given twice the last counts.", GOOD,
+     (_again("session", '"ffffffff"'), _again("v", "9"))),
+    ("R-HEAD-11", MUST, "2.1 JSON", "A byte order mark before the header is MALFORMED.", "MALFORMED",
      (_wrapped(b"\xef\xbb\xbf"),)),
-    ("R-HEAD-12", MUST, "Headers", "A header that is no JSON object is MALFORMED.", "MALFORMED",
+    ("R-HEAD-12", MUST, "2.1 JSON", "A header that is no JSON object is MALFORMED.", "MALFORMED",
      (_bytes(b"[1,2]"), _bytes(b'{"v":1,'), _bytes(b"null"), _wrapped(b"", b"}"))),
-    ("R-HEAD-13", MUST, "Headers", "An absent `compute_us` means 0.", GOOD, (_without("compute_us"),)),
-    ("R-HEAD-14", MUST, "Headers", "NaN and Infinity in a header are MALFORMED.", "MALFORMED",
+    ("R-HEAD-13", MUST, "2.8 Fields", "An absent `compute_us` means 0.", GOOD, (_without("compute_us"),)),
+    ("R-HEAD-14", MUST, "2.2 Numbers", "NaN and Infinity in a header are MALFORMED.", "MALFORMED",
      (_bytes(b'{"v":1,"source":"vision","session":"0a0b0c0d","seq":NaN}'), _set(compute_us=float("inf")))),
-    ("R-HEAD-15", MUST, "Headers", "A header that is not UTF-8 is MALFORMED.", "MALFORMED",
+    ("R-HEAD-15", MUST, "2.1 JSON", "A header that is not UTF-8 is MALFORMED.", "MALFORMED",
      (lambda fields: as_json({**fields, "note": "#"}).replace(b"#", b"\xff\xfe"),)),
-    ("R-HEAD-16", MUST, "Twists", "A twist of a role other than guest without a header is MALFORMED.", "MALFORMED",
+    ("R-HEAD-16", MUST, "4.6 Guests", "A twist of a role other than guest without a header is MALFORMED.", "MALFORMED",
      (_bytes(b""),)),
-    ("R-HEAD-18", MUST, "Headers", "The greatest integer that the bounds allow, 2^53 - 1, is taken.", GOOD,
+    ("R-HEAD-18", MUST, "2.2 Numbers", "The greatest integer that the bounds allow, 2^53 - 1, is taken.", GOOD,
      (_set(compute_us=MAX_INTEGER),)),
+    ("R-HEAD-19", MUST, "2.4 Version", "`v` is judged before all else: whatever is not 1 is UNSUPPORTED_VERSION.",
+     "UNSUPPORTED_VERSION", (_set(v="1"), _set(v=True), _set(v=None), _set(v=1.0), _bytes(b'{"v":null,"seq":[]}'))),
+    ("R-HEAD-20", MUST, "2.2 Numbers", "An integer written with a point or an exponent is MALFORMED: 7.0, 7e0.",
+     "MALFORMED", (_set(compute_us=0.0), lambda fields: as_json({**fields, "compute_us": 7})[:-1] + b"e0}",
+                   lambda fields: _echo(seq=float(fields["echo"]["seq"]))(fields))),
+    ("R-HEAD-21", MUST, "1.4 Sizes", "A header of 512 bytes is read.", GOOD,
+     (lambda fields: as_json(fields)[:-1].ljust(MAX_HEADER_BYTES - 1) + b"}",)),
+    ("R-HEAD-22", MUST, "18.6 What an answer went by", "A twist may name the scan and the mission that it went by.",
+     GOOD, (_set(scan=7, mission={"session": "0a0b0c0d", "id": 3}),)),
 )  # fmt: skip
 
 CITED: Final[Sequence[Row]] = (
-    ("R-CAUS-02", MUST, _JUDGED, "A twist that cites a `seq` never issued is refused as UNKNOWN_FRAME.",
+    ("R-CAUS-02", MUST, "5.1 Order", "A twist that cites a `seq` never issued is refused as UNKNOWN_FRAME.",
      "UNKNOWN_FRAME", (_echo(seq=MAX_INTEGER), lambda fields: _echo(seq=fields["echo"]["seq"] + 1000)(fields))),
-    ("R-CAUS-03", MUST, _JUDGED, "A twist that cites a frame with a `t_us` off by one is refused as UNKNOWN_FRAME.",
+    ("R-CAUS-03", MUST, "5.1 Order", "A twist that cites a frame with a `t_us` off by one is refused as UNKNOWN_FRAME.",
      "UNKNOWN_FRAME", (lambda fields: _echo(t_us=fields["echo"]["t_us"] + 1)(fields),
                        lambda fields: _echo(t_us=fields["echo"]["t_us"] - 1)(fields))),
-    ("R-CAUS-05", MUST, _JUDGED, "A time from the future on a known `seq` is UNKNOWN_FRAME: the record before the age.",
-     "UNKNOWN_FRAME", (lambda fields: _echo(t_us=fields["echo"]["t_us"] + 10_000_000)(fields),)),
-    ("R-CAUS-06", MUST, _JUDGED, "A twist that cites another session of the robot is refused as OTHER_SESSION.",
+    ("R-CAUS-05", MUST, "5.1 Order",
+     "A time from the future on a known `seq` is UNKNOWN_FRAME: the record before the age.", "UNKNOWN_FRAME",
+     (lambda fields: _echo(t_us=fields["echo"]["t_us"] + 10_000_000)(fields),)),
+    ("R-CAUS-06", MUST, "5.1 Order", "A twist that cites another session of the robot is refused as OTHER_SESSION.",
      "OTHER_SESSION", (_echo(session="fffffff0"),)),
-    ("R-CAUS-08", MUST, "Twists", "A twist that cites a `beat` is refused as UNKNOWN_FRAME where none is issued.",
+    ("R-CAUS-08", MUST, "4.5 Echo", "A twist that cites a `beat` is refused as UNKNOWN_FRAME where none is issued.",
      "UNKNOWN_FRAME", (_echo(channel="beat"),)),
-    ("R-CAUS-09", MUST, "Twists", "A twist that cites a channel the robot does not know is MALFORMED.", "MALFORMED",
+    ("R-CAUS-09", MUST, "2.7 Echo", "A twist that cites a channel the robot does not know is MALFORMED.", "MALFORMED",
      (_echo(channel="camera"), _echo(channel="")),),
 )  # fmt: skip
 
@@ -137,6 +146,11 @@ TEXTS: Final[Sequence[tuple[str, str, str, Sequence[bytes]]]] = (
     ("R-GRAM-08", "An exponent of more than three digits is MALFORMED.", "MALFORMED", (b"1e0001|0",)),
     ("R-GRAM-09", "Another mark than the bar is MALFORMED.", "MALFORMED", (b"1,2", b"0.2-0.35", b"1/2", b"1||2")),
     ("R-GRAM-10", "Bytes that are no text are MALFORMED.", "MALFORMED", (b"\xff\xfe\0\x80", bytes(range(128, 192)))),
+    ("R-GRAM-11", "A number too small for a double is zero.", GOOD, (b"1e-999|0", b"0|-1e-400")),
+    ("R-GRAM-12", "`nan` in one of two fields is NOT_FINITE, whatever the other is.", "NOT_FINITE",
+     (b"nan|x", b"x|-NaN")),
+    ("R-GRAM-13", "`nan` alone, or as a part of a word, is MALFORMED.", "MALFORMED", (b"nan", b"nans|0", b"0|nano")),
+    ("R-GRAM-14", "A twist of 64 bytes is read.", GOOD, (b"0.1".ljust(62, b"0") + b"|0",)),
 )  # fmt: skip
 
 
@@ -147,7 +161,7 @@ def _text_case(number: str, title: str, expected: str, texts: Sequence[bytes]) -
             verdict = sender.judged(text)
             bench.expect(verdict == expected, f"{text!r}: {verdict or 'not counted'}, expected {expected}")
 
-    return Case(number, Level.MUST, "Twists", title, run)
+    return Case(number, Level.MUST, "4.1 Grammar", title, run)
 
 
 for _row in (*HEADERS, *CITED):
@@ -156,7 +170,7 @@ for _text in TEXTS:
     SUITE.add(_text_case(*_text))
 
 
-@SUITE.must("R-HEAD-17", "Peers, channels, keys")
+@SUITE.must("R-HEAD-17", "1.3 Keys")
 def source_disagrees(bench: Bench) -> None:
     """A source in the header other than the key's is refused as UNKNOWN_SOURCE."""
     sender = _ready(bench)
@@ -172,7 +186,7 @@ def source_disagrees(bench: Bench) -> None:
 # --- what a twist cites, over time -----------------------------------------------------------------------------------
 
 
-@SUITE.must("R-CAUS-01", _JUDGED)
+@SUITE.must("R-CAUS-01", "5.2 Record")
 def newest_frame(bench: Bench) -> None:
     """A twist that answers the newest frame at once is judged good."""
     sender = Sender(Robot(bench))
@@ -180,7 +194,7 @@ def newest_frame(bench: Bench) -> None:
     bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-CAUS-04", _JUDGED)
+@SUITE.must("R-CAUS-04", "5.3 Age")
 def stale_frame(bench: Bench) -> None:
     """A twist that cites a frame more than a second old is refused as STALE, or UNKNOWN_FRAME if that is forgotten."""
     sender = _ready(bench)
@@ -190,7 +204,7 @@ def stale_frame(bench: Bench) -> None:
     bench.expect(verdict in ("STALE", "UNKNOWN_FRAME"), f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-CAUS-07", _JUDGED)
+@SUITE.must("R-CAUS-07", "4.5 Echo")
 def cites_a_status(bench: Bench) -> None:
     """A twist that cites a `status` is refused as UNKNOWN_FRAME."""
     sender = _ready(bench)
@@ -202,7 +216,7 @@ def cites_a_status(bench: Bench) -> None:
     bench.expect(verdict == "UNKNOWN_FRAME", f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-CAUS-10", _JUDGED)
+@SUITE.must("R-CAUS-10", "5.1 Order")
 def earlier_frame(bench: Bench) -> None:
     """A twist that answers the frame before the newest is judged good while that is young."""
     sender = _ready(bench)
@@ -218,7 +232,7 @@ def _newest_seq(robot: Robot) -> int:
     return heard[-1][1].seq if heard else -1
 
 
-@SUITE.must("R-CAUS-11", _JUDGED)
+@SUITE.must("R-CAUS-11", "5.1 Order")
 def reasons_in_order(bench: Bench) -> None:
     """Of several faults the first in the order of judging is the reason: session before `seq`."""
     sender = _ready(bench)
@@ -231,7 +245,7 @@ def reasons_in_order(bench: Bench) -> None:
 # --- a sender's own seq ----------------------------------------------------------------------------------------------
 
 
-@SUITE.must("R-SEQ-06", _JUDGED)
+@SUITE.must("R-SEQ-06", "5.1 Order")
 def replayed_seq(bench: Bench) -> None:
     """A twist with the `seq` of the one before is refused as OUT_OF_ORDER."""
     sender = _ready(bench)
@@ -239,7 +253,7 @@ def replayed_seq(bench: Bench) -> None:
     bench.expect(verdict == "OUT_OF_ORDER", f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-SEQ-07", _JUDGED)
+@SUITE.must("R-SEQ-07", "5.1 Order")
 def earlier_seq(bench: Bench) -> None:
     """A twist with a `seq` below the last is refused as OUT_OF_ORDER."""
     sender = _ready(bench)
@@ -249,7 +263,7 @@ def earlier_seq(bench: Bench) -> None:
     bench.expect(verdict == "OUT_OF_ORDER", f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-SEQ-08", "Headers")
+@SUITE.must("R-SEQ-08", "2.5 Session and sequence")
 def gaps(bench: Bench) -> None:
     """A `seq` that jumps forward is taken."""
     sender = _ready(bench)
@@ -258,7 +272,7 @@ def gaps(bench: Bench) -> None:
     bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-SEQ-09", _JUDGED)
+@SUITE.must("R-SEQ-09", "5.1 Order")
 def new_session_counts_anew(bench: Bench) -> None:
     """Another session of the same role counts from its own beginning."""
     first = _ready(bench)
@@ -271,7 +285,7 @@ def new_session_counts_anew(bench: Bench) -> None:
     bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-SEQ-10", _JUDGED)
+@SUITE.must("R-SEQ-10", "5.1 Order")
 def refused_seq_bars_nobody(bench: Bench) -> None:
     """The `seq` of a twist refused for what it cites is not remembered: the next ordinary one is good."""
     sender = _ready(bench)

@@ -37,13 +37,13 @@ def _all_frames(bench: Bench, good: Callable[[Heard], object], what: str) -> Non
         bench.expect(False, f"{len(bad)} of {len(frames)} frames: {what}; first {bad[0].message.header[:120]!r}")
 
 
-@SUITE.must("R-FRAM-01", "Headers")
+@SUITE.must("R-FRAM-01", "2.8 Fields")
 def frame_headers_can_be_read(bench: Bench) -> None:
     """Every frame has a header with all that FrameHeader demands, in its bounds."""
     _all_frames(bench, lambda one: one.header(FrameHeader), "no FrameHeader")
 
 
-@SUITE.must("R-FRAM-02", "Frames")
+@SUITE.must("R-FRAM-02", "3.1 Payload")
 def payload_is_a_jpeg(bench: Bench) -> None:
     """The payload of every frame is a baseline or progressive JPEG of at most 1920 x 1080 pixels and nothing else."""
     _all_frames(bench, _is_jpeg, "no JPEG within bounds")
@@ -57,7 +57,7 @@ def _is_jpeg(one: Heard) -> bool:
     return one.message.payload.rstrip(b"\0")[-2:] == b"\xff\xd9"
 
 
-@SUITE.must("R-FRAM-03", "Headers")
+@SUITE.must("R-FRAM-03", "2.5 Session and sequence")
 def one_session(bench: Bench) -> None:
     """All channels carry the same session for as long as the robot runs."""
     watched(bench)
@@ -69,7 +69,7 @@ def one_session(bench: Bench) -> None:
     bench.expect(len(everything) == 1, f"sessions by channel: {sessions}")
 
 
-@SUITE.should("R-FRAM-04", "Peers, channels, keys")
+@SUITE.should("R-FRAM-04", "1.4 Sizes")
 def small_overhead(bench: Bench) -> None:
     """What is around a frame's JPEG (header and key) takes at most 320 bytes."""
     key_bytes = len(f"{KEY_PREFIX}/{bench.robot}/{FRAME.name}")
@@ -77,7 +77,7 @@ def small_overhead(bench: Bench) -> None:
     _all_frames(bench, lambda one: len(one.message.header) <= most, f"over {_MAX_OVERHEAD_BYTES} bytes")
 
 
-@SUITE.must("R-FRAM-05", "Peers, channels, keys")
+@SUITE.must("R-FRAM-05", "1.4 Sizes")
 def sizes_within_bounds(bench: Bench) -> None:
     """No header is over 512 bytes and no payload over its channel's bound."""
     before = bench.dropped_here[OVERSIZE]
@@ -86,7 +86,7 @@ def sizes_within_bounds(bench: Bench) -> None:
     bench.expect(not over, f"{over} messages were over their bound (header {MAX_HEADER_BYTES} bytes)")
 
 
-@SUITE.must("R-FRAM-06", "Peers, channels, keys")
+@SUITE.must("R-FRAM-06", "1.3 Keys")
 def exact_keys(bench: Bench) -> None:
     """The robot publishes under the exact keys of the table, never under a wildcard."""
     before = bench.dropped_here[INEXACT_KEY]
@@ -95,14 +95,14 @@ def exact_keys(bench: Bench) -> None:
     bench.expect(not other, f"{other} messages came under another key than their channel's")
 
 
-@SUITE.must("R-FRAM-07", "Status")
+@SUITE.must("R-FRAM-07", "10.1 Camera, odometry, scan")
 def camera_model(bench: Bench) -> None:
     """The camera model is published twice a second and can be read."""
     watched(bench)
     _rate(bench, CAMERA.name, CameraModel, 2)
 
 
-@SUITE.must("R-FRAM-08", "Status")
+@SUITE.must("R-FRAM-08", "10.1 Camera, odometry, scan")
 def camera_model_is_of_the_picture(bench: Bench) -> None:
     """The camera model's width and height are those of the encoded picture."""
     robot = watched(bench)
@@ -116,14 +116,14 @@ def camera_model_is_of_the_picture(bench: Bench) -> None:
     )
 
 
-@SUITE.must("R-FRAM-09", "Status")
+@SUITE.must("R-FRAM-09", "9. Status")
 def status_rate(bench: Bench) -> None:
     """`status` is published at 10 Hz and can be read."""
     watched(bench)
     _rate(bench, STATUS.name, Status, 10)
 
 
-@SUITE.should("R-FRAM-10", "Peers, channels, keys")
+@SUITE.should("R-FRAM-10", "10.2 Camera, odometry, scan")
 def odometry_rate(bench: Bench) -> None:
     """Odometry, where the robot has it, comes at 20 Hz and can be read."""
     watched(bench)
@@ -139,7 +139,7 @@ def _rate(bench: Bench, name: str, model: type[CameraModel] | type[Status] | typ
     bench.expect(len(heard) >= least, f"{len(heard)} `{name}` in 2 s, at least {least} belong to {rate_hz} Hz")
 
 
-@SUITE.must("R-FRAM-11", "Headers")
+@SUITE.must("R-FRAM-11", "10.3 Camera, odometry, scan")
 def scans_can_be_read(bench: Bench) -> None:
     """A scan, where the robot has them, has a ScanHeader and whole, non-negative float32 ranges."""
     watched(bench)
@@ -153,7 +153,7 @@ def scans_can_be_read(bench: Bench) -> None:
             bench.expect(False, f"ranges: {error.detail}")
 
 
-@SUITE.must("R-FRAM-12", "Headers")
+@SUITE.must("R-FRAM-12", "2.8 Fields")
 def applied_in_frames(bench: Bench) -> None:
     """While the robot drives, `applied` in the frames is what was last given to the wheels."""
     robot, _driver = armed(bench)
@@ -178,7 +178,7 @@ def _falls(values: list[int], least_step: int) -> str:
     return next(falls, "")
 
 
-@SUITE.must("R-SEQ-01", "Headers")
+@SUITE.must("R-SEQ-01", "2.5 Session and sequence")
 def frame_seq_counts_up(bench: Bench) -> None:
     """`seq` of the frames counts up by at least one."""
     watched(bench)
@@ -186,7 +186,7 @@ def frame_seq_counts_up(bench: Bench) -> None:
     bench.expect(not fall, f"seq {fall}")
 
 
-@SUITE.must("R-SEQ-02", "Headers")
+@SUITE.must("R-SEQ-02", "2.6 Clock")
 def frame_time_goes_forward(bench: Bench) -> None:
     """`t_us` of the frames, the time of capture, always grows."""
     watched(bench)
@@ -194,7 +194,7 @@ def frame_time_goes_forward(bench: Bench) -> None:
     bench.expect(not fall, f"t_us {fall}")
 
 
-@SUITE.must("R-SEQ-03", "Headers")
+@SUITE.must("R-SEQ-03", "2.6 Clock")
 def status_seq_and_time(bench: Bench) -> None:
     """`seq` of `status` counts up and its `t_us` never goes back."""
     watched(bench)
@@ -203,7 +203,7 @@ def status_seq_and_time(bench: Bench) -> None:
     bench.expect(not fall, fall)
 
 
-@SUITE.must("R-SEQ-04", "Headers")
+@SUITE.must("R-SEQ-04", "2.5 Session and sequence")
 def each_channel_counts(bench: Bench) -> None:
     """Every other channel has a `seq` of its own that counts up."""
     watched(bench)
@@ -213,7 +213,7 @@ def each_channel_counts(bench: Bench) -> None:
         bench.expect(not fall, f"{name}: seq {fall}")
 
 
-@SUITE.must("R-SEQ-05", "Headers")
+@SUITE.must("R-SEQ-05", "2.6 Clock")
 def one_clock(bench: Bench) -> None:
     """All channels are stamped by one clock: a frame is captured before the status that follows it is published."""
     robot = watched(bench)

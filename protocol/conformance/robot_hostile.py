@@ -6,11 +6,9 @@ from protocol.channels import FRAME, REQUEST, STATUS, TWIST, key_for
 from protocol.conformance.bench import Bench
 from protocol.conformance.case import Suite
 from protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, arm, armed, as_json
-from protocol.messages import Stamp, State
+from protocol.messages import Holder, Stamp, State
 
 SUITE: Final = Suite("R")
-_GUESTS: Final = "Twists"
-_KEYS: Final = "Peers, channels, keys"
 _GUEST_MPS: Final = 0.2
 _GUEST_RAD_S: Final = 1.0
 
@@ -21,21 +19,22 @@ def _bare(bench: Bench, text: bytes = CRAWL) -> None:
 
 def _guest(bench: Bench) -> Sender:
     """A watcher beside a robot that hears guests."""
-    watcher = Sender(Robot(bench), "viewer")
+    watcher = Sender(Robot(bench), bench.access.watcher)
     verdict = watcher.verdict(lambda: _bare(bench))
     bench.need(verdict == GOOD, f"guests are not heard here: {verdict or 'not counted'}")
     return watcher
 
 
-@SUITE.must("R-DIAL-01", _GUESTS)
+@SUITE.must("R-DIAL-01", "4.6 Guests")
 def guests(bench: Bench) -> None:
     """A twist of `guest` without header is judged, or refused as UNKNOWN_SOURCE where guests are switched off."""
-    watcher = Sender(Robot(bench), "viewer")
+    bench.need(not bench.access.is_guarded, "where keys are asked for no guest gets in")
+    watcher = Sender(Robot(bench), bench.access.watcher)
     verdict = watcher.verdict(lambda: _bare(bench))
     bench.expect(verdict in (GOOD, "UNKNOWN_SOURCE"), f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-DIAL-02", _GUESTS)
+@SUITE.must("R-DIAL-02", "4.6 Guests")
 def guests_crawl(bench: Bench) -> None:
     """A guest's twist is limited to 0.2 m/s and 1 rad/s."""
     watcher = _guest(bench)
@@ -55,7 +54,7 @@ def _arm_guest(watcher: Sender) -> None:
     arm(watcher)
 
 
-@SUITE.must("R-DIAL-03", _GUESTS)
+@SUITE.must("R-DIAL-03", "6.1 Lease")
 def guests_yield(bench: Bench) -> None:
     """`vision` takes the lease from a guest."""
     watcher = _guest(bench)
@@ -64,7 +63,7 @@ def guests_yield(bench: Bench) -> None:
     bench.expect(verdict == GOOD, f"a twist of vision is {verdict}")
 
 
-@SUITE.must("R-DIAL-04", "How a robot judges")
+@SUITE.must("R-DIAL-04", "4.6 Guests")
 def guests_with_header(bench: Bench) -> None:
     """A guest's twist with a header is judged by it."""
     _guest(bench)
@@ -75,7 +74,7 @@ def guests_with_header(bench: Bench) -> None:
     bench.expect(verdict == "OTHER_SESSION", f"one that cites another session is {verdict or 'not counted'}")
 
 
-@SUITE.must("R-DIAL-05", _GUESTS)
+@SUITE.must("R-DIAL-05", "4.6 Guests")
 def guests_are_silent_soon(bench: Bench) -> None:
     """A guest's twist lives 250 ms."""
     watcher = _guest(bench)
@@ -87,24 +86,35 @@ def guests_are_silent_soon(bench: Bench) -> None:
     bench.expect(held, f"silence left it {watcher.robot.status().state}")
 
 
+@SUITE.must("R-DIAL-06", "4.6 Guests")
+def guests_are_one(bench: Bench) -> None:
+    """All who send without a header are one driver, `guest` of session 00000000."""
+    watcher = _guest(bench)
+    _bare(bench)
+    told = watcher.robot.reaches(lambda status: status.holder is not None, 500_000)
+    bench.need(told, "`status` names no holder (R-LEASE-01)")
+    holder = watcher.robot.status().holder
+    bench.expect(holder == Holder(source="guest", session="00000000"), f"holder is {holder}")
+
+
 # --- roles and keys --------------------------------------------------------------------------------------------------
 
 
-@SUITE.must("R-HOST-01", "How a robot judges")
+@SUITE.must("R-HOST-01", "5.1 Order")
 def watchers_do_not_drive(bench: Bench) -> None:
     """A twist of a role that may not drive is refused as UNKNOWN_SOURCE."""
-    sender = Sender(Robot(bench), "viewer")
+    sender = Sender(Robot(bench), bench.access.watcher)
     verdict = sender.judged()
     bench.expect(verdict == "UNKNOWN_SOURCE", f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-HOST-02", _KEYS)
+@SUITE.must("R-HOST-02", "1.3 Keys")
 def wildcard_keys(bench: Bench) -> None:
     """A twist under a wildcard key is dropped."""
     _dropped(bench, f"sightline/{bench.robot}/twist/*", "sightline/**")
 
 
-@SUITE.must("R-HOST-03", _KEYS)
+@SUITE.must("R-HOST-03", "1.3 Keys")
 def other_robots_keys(bench: Bench) -> None:
     """A twist for another robot, or under a key with more parts, is dropped."""
     _dropped(bench, "sightline/other/twist/vision", f"sightline/{bench.robot}/twist/vision/more")
@@ -121,13 +131,13 @@ def _dropped(bench: Bench, *keys: str) -> None:
         bench.expect(verdict != GOOD, f"a twist under {key} was judged good")
 
 
-@SUITE.must("R-HOST-04", _KEYS)
+@SUITE.must("R-HOST-04", "1.4 Sizes")
 def long_twists(bench: Bench) -> None:
     """A twist of more than 64 bytes is not obeyed, though its number is one."""
     _oversize(bench, b"", b"0.1" + b"0" * 80 + b"|0")
 
 
-@SUITE.must("R-HOST-05", _KEYS)
+@SUITE.must("R-HOST-05", "1.4 Sizes")
 def long_headers(bench: Bench) -> None:
     """A header of more than 512 bytes is not obeyed, though all its fields are right."""
     _oversize(bench, b'"note":"' + b"x" * 600 + b'",', CRAWL)
@@ -162,27 +172,27 @@ def _survives(bench: Bench, send: list[tuple[bytes, bytes]], source: str = "visi
     bench.expect(verdict == GOOD, f"after it an ordinary twist is {verdict or 'not counted'}")
 
 
-@SUITE.must("R-HOST-06", _KEYS)
+@SUITE.must("R-HOST-06", "13.2 Bounds")
 def noise(bench: Bench) -> None:
     """Bytes that are no protocol at all end nothing."""
     parts = [(bytes(range(200, 256)), bytes(range(60))), (b"\0" * 40, b"\xff" * 60), (b"{", b"{"), (b'"', b"|")]
     _survives(bench, parts)
 
 
-@SUITE.must("R-HOST-07", _KEYS)
+@SUITE.must("R-HOST-07", "13.2 Bounds")
 def deep_nesting(bench: Bench) -> None:
     """A header nested as deep as its size allows ends nothing."""
     _survives(bench, [(b"[" * 512, b"1|1"), (b'{"a":' * 90 + b"1" + b"}" * 30, b"1|1")])
 
 
-@SUITE.must("R-HOST-08", _KEYS)
+@SUITE.must("R-HOST-08", "2.3 Text")
 def surrogates(bench: Bench) -> None:
     """Text that is no Unicode ends nothing."""
     headers = b'{"v":1,"source":"\\ud800"}', b'{"session":"\\udfff\\u0000"}'
     _survives(bench, [(headers[0], b"1|1"), (headers[1], b'{"verb":"\\ud800"}')])
 
 
-@SUITE.must("R-HOST-09", "Peers, channels, keys")
+@SUITE.must("R-HOST-09", "13.2 Bounds")
 def flood(bench: Bench) -> None:
     """A flood of 500 refused twists a second keeps neither status nor the driver back."""
     robot, driver = armed(bench)
@@ -198,7 +208,7 @@ def flood(bench: Bench) -> None:
     bench.expect(accepted >= 0.7 * wanted, f"{accepted} of the driver's {wanted} twists were accepted")
 
 
-@SUITE.must("R-HOST-10", "Peers, channels, keys")
+@SUITE.must("R-HOST-10", "13.2 Bounds")
 def many_peers(bench: Bench) -> None:
     """A hundred sessions that send twists leave the lease where it was."""
     robot = Robot(bench)
@@ -226,7 +236,7 @@ def _away(bench: Bench, for_us: int) -> None:
     bench.join()
 
 
-@SUITE.must("R-RECO-01", "Peers, channels, keys")
+@SUITE.must("R-RECO-01", "1.2 Messages")
 def serves_again(bench: Bench) -> None:
     """Who connects again gets status and frames again."""
     sender = Sender(Robot(bench))
@@ -237,7 +247,7 @@ def serves_again(bench: Bench) -> None:
     bench.expect_within(lambda: bench.heard(FRAME, mark), 5_000_000, "no frame after a reconnect")
 
 
-@SUITE.must("R-RECO-02", "Headers")
+@SUITE.must("R-RECO-02", "2.5 Session and sequence")
 def session_goes_on(bench: Bench) -> None:
     """Over a reconnect of the peer the robot's session is the same and its `seq` goes on."""
     sender = Sender(Robot(bench))
@@ -253,7 +263,7 @@ def session_goes_on(bench: Bench) -> None:
     bench.expect(after.seq > before.seq, f"seq {after.seq}, before {before.seq}")
 
 
-@SUITE.must("R-RECO-03", "How a robot judges")
+@SUITE.must("R-RECO-03", "5.4 Silence")
 def stays_still(bench: Bench) -> None:
     """A driver that is cut off stops the robot, and its coming back moves nothing until it sends again."""
     robot, driver = armed(bench)
@@ -265,7 +275,7 @@ def stays_still(bench: Bench) -> None:
     bench.expect(not moving, f"it moves: {robot.status().applied}, {robot.status().state}")
 
 
-@SUITE.must("R-RECO-04", "Lease, arming, STOP")
+@SUITE.must("R-RECO-04", "6.1 Lease")
 def lease_is_not_the_connection(bench: Bench) -> None:
     """The lease is not the connection: within its second it holds though the driver was cut off."""
     sender = Sender(Robot(bench))

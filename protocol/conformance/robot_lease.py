@@ -8,7 +8,6 @@ from protocol.conformance.robot_rig import GOOD, Robot, Sender, armed
 from protocol.messages import Holder, State
 
 SUITE: Final = Suite("R")
-_CLAUSE: Final = "Lease, arming, STOP"
 _LEASE_US: Final = 1_000_000
 
 
@@ -42,14 +41,14 @@ def _holder_is(sender: Sender, within_us: int = 400_000) -> bool:
     return sender.robot.reaches(lambda status: status.holder == me, within_us)
 
 
-@SUITE.must("R-LEASE-01", _CLAUSE)
+@SUITE.must("R-LEASE-01", "6.1 Lease")
 def first_holds(bench: Bench) -> None:
     """Who sends the first good twist holds the lease, and `status` says so."""
     sender = _held(bench)
     bench.expect(_holder_is(sender), f"holder is {sender.robot.status().holder}, not vision {sender.session}")
 
 
-@SUITE.must("R-LEASE-02", _CLAUSE)
+@SUITE.must("R-LEASE-02", "6.1 Lease")
 def equal_rank_waits(bench: Bench) -> None:
     """A second driver of the same rank is refused as NOT_HOLDER."""
     first = _held(bench)
@@ -57,7 +56,7 @@ def equal_rank_waits(bench: Bench) -> None:
     bench.expect(verdict == "NOT_HOLDER", f"it was {verdict or 'not counted'}")
 
 
-@SUITE.should("R-LEASE-03", _CLAUSE)
+@SUITE.should("R-LEASE-03", "5.1 Order")
 def loser_is_told(bench: Bench) -> None:
     """The words of the refusal name the source and session that drive."""
     first = _held(bench)
@@ -67,7 +66,7 @@ def loser_is_told(bench: Bench) -> None:
     bench.expect(told, f"last_refusal is {last}")
 
 
-@SUITE.must("R-LEASE-04", _CLAUSE)
+@SUITE.must("R-LEASE-04", "6.1 Lease")
 def lease_ends(bench: Bench) -> None:
     """The lease ends one second after the last good twist; then another may drive."""
     first = _held(bench)
@@ -77,7 +76,7 @@ def lease_ends(bench: Bench) -> None:
     bench.expect(verdict == GOOD, f"after 1.5 s of silence a second driver is {verdict or 'not counted'}")
 
 
-@SUITE.must("R-LEASE-05", _CLAUSE)
+@SUITE.must("R-LEASE-05", "6.1 Lease")
 def lease_lasts(bench: Bench) -> None:
     """Half a second after the last good twist the lease still holds."""
     first, second = _held_alone(bench)
@@ -87,7 +86,7 @@ def lease_lasts(bench: Bench) -> None:
     bench.expect(verdict == "NOT_HOLDER", f"a second driver is {verdict or 'not counted'}")
 
 
-@SUITE.must("R-LEASE-06", _CLAUSE)
+@SUITE.must("R-LEASE-06", "6.1 Lease")
 def refused_twists_renew_nothing(bench: Bench) -> None:
     """Refused twists of the holder do not renew its lease."""
     first = _held_for_a_while(bench)
@@ -102,7 +101,7 @@ def refused_twists_renew_nothing(bench: Bench) -> None:
     bench.expect(verdict == GOOD, f"after 1.4 s of refused twists a second driver is {verdict or 'not counted'}")
 
 
-@SUITE.must("R-LEASE-07", _CLAUSE)
+@SUITE.must("R-LEASE-07", "6.1 Lease")
 def acks_renew_nothing(bench: Bench) -> None:
     """Acks of the holder do not renew its lease."""
     first = _held_for_a_while(bench)
@@ -113,7 +112,7 @@ def acks_renew_nothing(bench: Bench) -> None:
     bench.expect(verdict == GOOD, f"after 1.5 s of acks alone a second driver is {verdict or 'not counted'}")
 
 
-@SUITE.must("R-LEASE-08", _CLAUSE)
+@SUITE.must("R-LEASE-08", "6.1 Lease")
 def acks_take_nothing(bench: Bench) -> None:
     """Acks take no lease."""
     watcher = Sender(Robot(bench))
@@ -123,7 +122,7 @@ def acks_take_nothing(bench: Bench) -> None:
     bench.expect(holder is None, f"{holder} holds it, though nobody sent a twist")
 
 
-@SUITE.must("R-LEASE-09", _CLAUSE)
+@SUITE.must("R-LEASE-09", "6.1 Lease")
 def human_takes(bench: Bench) -> None:
     """`teleop` takes the lease from `vision`."""
     first = _held(bench)
@@ -132,7 +131,7 @@ def human_takes(bench: Bench) -> None:
     bench.expect(verdict == GOOD, f"a twist of teleop is {verdict or 'not counted'}")
 
 
-@SUITE.must("R-LEASE-10", _CLAUSE)
+@SUITE.must("R-LEASE-10", "6.1 Lease")
 def human_keeps(bench: Bench) -> None:
     """`vision` does not take the lease from `teleop`."""
     human = _held(bench, "teleop")
@@ -140,7 +139,7 @@ def human_keeps(bench: Bench) -> None:
     bench.expect(verdict == "NOT_HOLDER", f"a twist of vision is {verdict or 'not counted'}")
 
 
-@SUITE.must("R-LEASE-11", _CLAUSE)
+@SUITE.must("R-LEASE-11", "6.2 Losing the human")
 def lost_human_disarms(bench: Bench) -> None:
     """A human driver who falls silent disarms the robot, also while vision's commands flow."""
     robot, human = armed(bench, "teleop")
@@ -152,7 +151,7 @@ def lost_human_disarms(bench: Bench) -> None:
     bench.expect(robot.status().state is State.DISARMED, f"then it went on as {robot.status().state}")
 
 
-@SUITE.must("R-LEASE-12", _CLAUSE)
+@SUITE.must("R-LEASE-12", "6.2 Losing the human")
 def human_lets_go(bench: Bench) -> None:
     """A human driver who releases the lease disarms the robot."""
     robot, human = armed(bench, "teleop")
@@ -162,7 +161,7 @@ def human_lets_go(bench: Bench) -> None:
     bench.expect(reached, f"half a second after the release it is {robot.status().state}")
 
 
-@SUITE.must("R-LEASE-13", "Requests and replies")
+@SUITE.must("R-LEASE-13", "8.2 Requests and replies")
 def acquire(bench: Bench) -> None:
     """`acquire` takes the lease before the first twist."""
     sender = Sender(Robot(bench))
@@ -171,7 +170,7 @@ def acquire(bench: Bench) -> None:
     bench.expect(holds, f"holder is {sender.robot.status().holder}, and a second driver is not refused")
 
 
-@SUITE.must("R-LEASE-14", _CLAUSE)
+@SUITE.must("R-LEASE-14", "8.2 Requests and replies")
 def acquire_does_not_renew(bench: Bench) -> None:
     """Asking again does not keep the lease alive without twists."""
     sender = _held_for_a_while(bench)
@@ -187,7 +186,7 @@ def acquire_does_not_renew(bench: Bench) -> None:
     bench.expect(verdict == GOOD, f"1.3 s after the first, 0.5 s after the last acquire another is {verdict}")
 
 
-@SUITE.must("R-LEASE-15", "Requests and replies")
+@SUITE.must("R-LEASE-15", "8.2 Requests and replies")
 def release(bench: Bench) -> None:
     """`release` frees the lease at once."""
     first = _held(bench)
@@ -196,7 +195,7 @@ def release(bench: Bench) -> None:
     bench.expect(verdict == GOOD, f"then a second driver is {verdict or 'not counted'}")
 
 
-@SUITE.must("R-LEASE-16", "Requests and replies")
+@SUITE.must("R-LEASE-16", "8.2 Requests and replies")
 def release_is_the_holders(bench: Bench) -> None:
     """`release` by somebody else frees nothing."""
     _first, second = _held_alone(bench)
@@ -205,7 +204,7 @@ def release_is_the_holders(bench: Bench) -> None:
     bench.expect(verdict == "NOT_HOLDER", f"after its release a stranger's twist is {verdict or 'not counted'}")
 
 
-@SUITE.must("R-LEASE-17", "Requests and replies")
+@SUITE.must("R-LEASE-17", "8.2 Requests and replies")
 def acquire_waits(bench: Bench) -> None:
     """`acquire` is refused while an equal or higher rank drives."""
     _first, second = _held_alone(bench)
@@ -214,10 +213,31 @@ def acquire_waits(bench: Bench) -> None:
     bench.expect(reply is not None and not reply.ok, "a second vision was granted the lease")
 
 
-@SUITE.must("R-LEASE-18", "Requests and replies")
+@SUITE.must("R-LEASE-18", "8.2 Requests and replies")
 def acquire_is_for_drivers(bench: Bench) -> None:
     """`acquire` is refused to a role that may not drive."""
     watcher = Sender(Robot(bench), "operator")
     reply = watcher.ask("acquire")
     bench.need(reply is not None, "no reply to acquire (R-REQ-01)")
     bench.expect(reply is not None and not reply.ok, "a role that may not drive was granted the lease")
+
+
+@SUITE.must("R-LEASE-19", "8.2 Requests and replies")
+def release_of_nothing(bench: Bench) -> None:
+    """`release` of what the asker does not hold is granted all the same."""
+    human = Sender(Robot(bench), "teleop")
+    reply = human.ask("release")
+    bench.need(reply is not None, "no reply to release (R-REQ-01)")
+    bench.expect(reply is not None and reply.ok, f"it was refused: {reply}")
+
+
+@SUITE.must("R-LEASE-20", "8.3 Freshness")
+def acquire_needs_echo(bench: Bench) -> None:
+    """`acquire` without `echo` is refused as MALFORMED."""
+    human = Sender(Robot(bench), "teleop")
+    before = human.robot.status().refused.get("MALFORMED", 0)
+    reply = human.ask("acquire", cite=False)
+    bench.need(reply is not None, "no reply to acquire (R-REQ-01)")
+    bench.expect(reply is not None and not reply.ok, "it was granted")
+    counted = human.robot.reaches(lambda status: status.refused.get("MALFORMED", 0) > before, 400_000)
+    bench.expect(counted, f"it was not counted as MALFORMED: {reply}")

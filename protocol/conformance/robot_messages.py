@@ -11,7 +11,6 @@ from protocol.conformance.case import Suite
 from protocol.conformance.raw_websocket import BINARY, CONTINUED, PING, PONG, TEXT, Frame, RawWebSocket
 from protocol.conformance.robot_rig import Robot, Sender, as_json
 from protocol.conformance.robot_sockets import (
-    CLAUSE,
     PASSING_S,
     SESSION,
     SOON_S,
@@ -31,7 +30,7 @@ from protocol.transports.websocket_framing import MAX_BLOCK_BYTES
 SUITE: Final = Suite("R")
 
 
-@SUITE.must("R-SOCK-16", CLAUSE, real=True)
+@SUITE.must("R-SOCK-16", "14.6 Messages", real=True)
 def messages_can_be_taken_apart(bench: Bench) -> None:
     """Every message has a header block of at most 576 bytes that names its channel, and a header within 512."""
     with spoken(bench, *(name for name in CHANNELS)) as raw:
@@ -42,20 +41,20 @@ def messages_can_be_taken_apart(bench: Bench) -> None:
             bench.expect(good, f"{packet.key or 'no channel'}: {packet.payload[:60]!r}")
 
 
-@SUITE.must("R-SOCK-17", CLAUSE, real=True)
+@SUITE.must("R-SOCK-17", "14.6 Messages", real=True)
 def channel_anywhere(bench: Bench) -> None:
     """`channel` need not be the first field of the block."""
     with spoken(bench, "reply") as raw:
-        fields = {"v": 1, "source": "viewer", "session": SESSION, "seq": 1, "channel": "request"}
+        fields = {"v": 1, "source": bench.access.watcher, "session": SESSION, "seq": 1, "channel": "request"}
         raw.send(BINARY, block(as_json(fields), b'{"id":1,"verb":"disarm"}'))
         bench.expect(is_answered(raw, bench), "a request whose block names its channel last is not answered")
 
 
-@SUITE.must("R-SOCK-18", CLAUSE, real=True)
+@SUITE.must("R-SOCK-18", "14.6 Messages", real=True)
 def fragments(bench: Bench) -> None:
     """A message may come in fragments, with pings between them."""
     with spoken(bench, "reply") as raw:
-        message = disarm_request()
+        message = disarm_request(bench)
         raw.send(BINARY, message[:20], fin=False)
         raw.send(PING, b"between")
         raw.send(CONTINUED, message[20:40], fin=False)
@@ -63,7 +62,7 @@ def fragments(bench: Bench) -> None:
         bench.expect(is_answered(raw, bench), "a request in three fragments is not answered")
 
 
-@SUITE.must("R-SOCK-19", CLAUSE, real=True)
+@SUITE.must("R-SOCK-19", "14.8 Liveness", real=True)
 def pings_are_answered(bench: Bench) -> None:
     """A ping is answered with its own data."""
     with spoken(bench) as raw:
@@ -90,7 +89,7 @@ def _breaks(
             ends_with(raw, bench, codes, title, within_s)
 
     run.__doc__ = title
-    SUITE.must(number, CLAUSE, real=True)(run)
+    SUITE.must(number, "14.9 Ends", real=True)(run)
 
 
 _breaks("R-SOCK-20", "A header block that is cut ends with 1007 or 1002.", (1002, 1007),
@@ -111,18 +110,18 @@ _breaks("R-SOCK-27", "A control frame over 125 bytes ends with 1002.", (1002,),
         lambda raw: raw.send(PING, b"x" * 200))  # fmt: skip
 
 
-@SUITE.must("R-SOCK-28", CLAUSE, real=True)
+@SUITE.must("R-SOCK-28", "14.9 Ends", real=True)
 def bad_messages_end_nothing(bench: Bench) -> None:
     """A message of an unknown channel or source, or whose header is no JSON, is dropped; the connection stays."""
     with spoken(bench, "reply") as raw:
         bad = b'{"channel":"perfume"}', b'{"channel":"twist","source":"../x"}', b'{"channel":"twist","v":1,,}'
         for fields in bad:
             raw.send(BINARY, block(fields, b"1|1"))
-        raw.send(BINARY, disarm_request())
+        raw.send(BINARY, disarm_request(bench))
         bench.expect(is_answered(raw, bench), "after them a request is not answered")
 
 
-@SUITE.must("R-SOCK-29", CLAUSE, real=True)
+@SUITE.must("R-SOCK-29", "14.8 Liveness", real=True)
 def pings_every_second(bench: Bench) -> None:
     """The robot pings about every second."""
     with spoken(bench) as raw:
@@ -130,7 +129,7 @@ def pings_every_second(bench: Bench) -> None:
         bench.expect(raw.pings >= 2, f"{raw.pings} pings in 3.2 s")
 
 
-@SUITE.must("R-SOCK-30", CLAUSE, real=True)
+@SUITE.must("R-SOCK-30", "14.8 Liveness", real=True)
 def the_deaf_are_dropped(bench: Bench) -> None:
     """A peer that leaves pings unanswered is dropped within about two seconds."""
     with RawWebSocket(door(bench), offered(bench), answers_pings=False) as raw:
@@ -141,7 +140,7 @@ def the_deaf_are_dropped(bench: Bench) -> None:
         bench.expect(end is not None and took_s < 4.0, f"after {took_s:.1f} s it is still connected")
 
 
-@SUITE.must("R-SOCK-31", CLAUSE, real=True)
+@SUITE.must("R-SOCK-31", "13.2 Bounds", real=True)
 def abrupt_ends(bench: Bench) -> None:
     """Connections that break off anywhere disturb nobody else."""
     door(bench)
@@ -149,22 +148,25 @@ def abrupt_ends(bench: Bench) -> None:
         with RawWebSocket(bench.endpoint, offered(bench)) as raw:
             raw.write(opening)
     with spoken(bench, "frame") as raw:
-        raw.send(BINARY, disarm_request()[:9], fin=False)
+        raw.send(BINARY, disarm_request(bench)[:9], fin=False)
     mark = bench.mark()
     bench.rest(1_000_000)
     came = len(bench.heard(STATUS, mark))
     bench.expect(came >= 7, f"{came} status within a second after it")
 
 
-@SUITE.should("R-SOCK-32", CLAUSE, real=True)
+@SUITE.should("R-SOCK-32", "14.4 Limits", real=True)
 def sixteen_clients(bench: Bench) -> None:
     """After sixteen clients the next is refused with 503, and those before are served."""
     with ExitStack() as ending:
-        statuses = []
+        statuses, opened = [], list[RawWebSocket]()
         for _ in range(17):
             raw = ending.enter_context(RawWebSocket(door(bench), offered(bench)))
             statuses.append(raw.status)
             raw.send(TEXT, hello(bench))
+            opened.append(raw)
+            for earlier in opened:
+                earlier.frame(0.001)  # answers its pings: on a slow machine the first may wait for seconds
             if raw.status != SWITCHED:
                 break
         bench.expect(statuses[-1] == 503, f"seventeen more clients: {statuses}")
@@ -172,7 +174,7 @@ def sixteen_clients(bench: Bench) -> None:
         bench.expect_within(lambda: len(bench.heard(STATUS, mark)) > 3, 1_500_000, "then nobody else is served")
 
 
-@SUITE.must("R-SOCK-33", CLAUSE, real=True)
+@SUITE.must("R-SOCK-33", "14.6 Messages", real=True)
 def says_hello_to_many_roles(bench: Bench) -> None:
     """The `role` of the hello is the source of messages that name none."""
     operator = Sender(Robot(bench), "operator", acks=False)

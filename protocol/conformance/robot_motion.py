@@ -14,7 +14,6 @@ from protocol.messages import FrameHeader, Planar, State, Status
 from protocol.refusals import CLAMPED
 
 SUITE: Final = Suite("R")
-_JUDGED: Final = "How a robot judges"
 _STOPS_WITHIN_US: Final = 700_000
 _RESOLUTION_US: Final = 100_000
 """Between two status."""
@@ -35,7 +34,7 @@ def _driven(bench: Bench, text: bytes) -> tuple[Status, Planar]:
     return robot.status(), applied
 
 
-@SUITE.must("R-LIM-01", _JUDGED)
+@SUITE.must("R-LIM-01", "2.8 Fields")
 def reaches_the_command(bench: Bench) -> None:
     """A twist within the limits is applied as it was sent: linear first, angular second, with their signs."""
     for text, wanted in ((b"0.1000|0.3000", (0.1, 0.3)), (b"-0.0500|-0.2000", (-0.05, -0.2))):
@@ -46,7 +45,7 @@ def reaches_the_command(bench: Bench) -> None:
         bench.forget()
 
 
-@SUITE.must("R-LIM-02", "Status")
+@SUITE.must("R-LIM-02", "9. Status")
 def limits_are_told(bench: Bench) -> None:
     """`status` tells the robot's limits, both above zero."""
     status = Robot(bench).status()
@@ -58,7 +57,7 @@ def _limits(status: Status) -> Planar:
     return status.max_linear_mps or math.inf, status.max_angular_rad_s or math.inf
 
 
-@SUITE.must("R-LIM-03", "Twists")
+@SUITE.must("R-LIM-03", "4.3 Limits")
 def linear_is_clamped(bench: Bench) -> None:
     """A linear speed beyond the limit is accepted and cut to the limit."""
     status, applied = _driven(bench, b"48.0000|0.0000")
@@ -66,7 +65,7 @@ def linear_is_clamped(bench: Bench) -> None:
     bench.expect(applied[0] <= status.max_linear_mps + _TOLERANCE, f"{applied[0]} m/s of {status.max_linear_mps}")
 
 
-@SUITE.must("R-LIM-04", "Twists")
+@SUITE.must("R-LIM-04", "4.3 Limits")
 def angular_is_clamped(bench: Bench) -> None:
     """A turn rate beyond the limit is accepted and cut to the limit."""
     status, applied = _driven(bench, b"0.0000|-48.0000")
@@ -75,7 +74,7 @@ def angular_is_clamped(bench: Bench) -> None:
     bench.expect(applied[1] >= least, f"{applied[1]} rad/s of {status.max_angular_rad_s}")
 
 
-@SUITE.must("R-LIM-05", "Twists")
+@SUITE.must("R-LIM-05", "4.3 Limits")
 def clamped_is_counted(bench: Bench) -> None:
     """A value beyond the limits is counted as CLAMPED, one within them is not."""
     robot, driver = armed(bench)
@@ -87,7 +86,7 @@ def clamped_is_counted(bench: Bench) -> None:
     bench.expect(grows, f"48 m/s was not counted as CLAMPED: {robot.status().refused}")
 
 
-@SUITE.should("R-LIM-06", "Twists")
+@SUITE.should("R-LIM-06", "4.3 Limits")
 def the_curve_stays(bench: Bench) -> None:
     """Both axes are cut by one factor, so that the robot drives the curve it was told."""
     robot = Robot(bench)
@@ -100,7 +99,7 @@ def the_curve_stays(bench: Bench) -> None:
     bench.expect(math.isclose(wanted, seen, rel_tol=0.1), f"curvature {seen:.2f} instead of {wanted:.2f} 1/m")
 
 
-@SUITE.should("R-LIM-07", "Lease, arming, STOP")
+@SUITE.should("R-LIM-07", "6.4 Arming")
 def ramps_up(bench: Bench) -> None:
     """Speed builds up in a ramp: the frames show values on the way to the limit."""
     robot = Robot(bench)
@@ -171,14 +170,14 @@ def _expect_stop(bench: Bench, mark: int, what: str) -> None:
     bench.expect(took_us <= _STOPS_WITHIN_US + _RESOLUTION_US, said)
 
 
-@SUITE.must("R-SIL-01", _JUDGED)
+@SUITE.must("R-SIL-01", "5.4 Silence")
 def silence_stops(bench: Bench) -> None:
     """When twists cease the robot holds, with the wheels at zero within 700 ms."""
     robot, driver = _driving(bench)
     _expect_stop(bench, _silent(robot, driver)[0], "silence")
 
 
-@SUITE.must("R-SIL-02", _JUDGED)
+@SUITE.must("R-SIL-02", "5.4 Silence")
 def refused_twists_keep_nothing_alive(bench: Bench) -> None:
     """Refused twists do not keep the wheels turning."""
     Sender(Robot(bench)).need_unknown()
@@ -189,7 +188,7 @@ def refused_twists_keep_nothing_alive(bench: Bench) -> None:
     _expect_stop(bench, mark, "refused twists")
 
 
-@SUITE.must("R-SIL-03", _JUDGED)
+@SUITE.must("R-SIL-03", "5.4 Silence")
 def others_keep_nothing_alive(bench: Bench) -> None:
     """Good twists of somebody who does not hold the lease do not keep the wheels turning."""
     robot, driver = _stopping(bench)
@@ -205,7 +204,7 @@ def others_keep_nothing_alive(bench: Bench) -> None:
     _expect_stop(bench, mark, "another's twists")
 
 
-@SUITE.must("R-SIL-04", _JUDGED)
+@SUITE.must("R-SIL-04", "5.3 Age")
 def old_sight_stops(bench: Bench) -> None:
     """Twists that go on citing one old frame do not keep the wheels turning: age is judged at every tick."""
     robot, driver = _stopping(bench)
@@ -215,7 +214,7 @@ def old_sight_stops(bench: Bench) -> None:
     _expect_stop(bench, mark, "twists on one frame")
 
 
-@SUITE.must("R-SIL-05", _JUDGED)
+@SUITE.must("R-SIL-05", "5.3 Age")
 def ageing_sight_slows(bench: Bench) -> None:
     """On frames between 150 and 400 ms old the robot drives, DEGRADED, at a lower speed."""
     robot, driver = armed(bench)
@@ -236,7 +235,7 @@ def ageing_sight_slows(bench: Bench) -> None:
     bench.expect(min(slow) < 0.9 * full, f"it still drives at {min(slow)} of {full} m/s")
 
 
-@SUITE.must("R-SIL-06", _JUDGED)
+@SUITE.must("R-SIL-06", "5.4 Silence")
 def hold_is_said(bench: Bench) -> None:
     """HOLD is said within 300 ms of the last good twist, give or take a status."""
     robot, driver = armed(bench)
@@ -245,7 +244,7 @@ def hold_is_said(bench: Bench) -> None:
     bench.expect(held, f"600 ms after the last twist it is {robot.status().state}")
 
 
-@SUITE.must("R-SIL-07", "Lease, arming, STOP")
+@SUITE.must("R-SIL-07", "6.3 States")
 def long_hold_disarms(bench: Bench) -> None:
     """Ten seconds of HOLD disarm."""
     robot, driver = armed(bench)
@@ -257,7 +256,7 @@ def long_hold_disarms(bench: Bench) -> None:
     bench.expect(reached, f"after 11 s it is {robot.status().state}")
 
 
-@SUITE.must("R-SIL-08", "Lease, arming, STOP")
+@SUITE.must("R-SIL-08", "6.3 States")
 def hold_goes_on(bench: Bench) -> None:
     """From HOLD the same driver's next twists drive on without arming again."""
     robot, driver = armed(bench)
@@ -270,7 +269,7 @@ def hold_goes_on(bench: Bench) -> None:
     bench.expect(on, f"then it is {robot.status().state}")
 
 
-@SUITE.must("R-SIL-09", _JUDGED)
+@SUITE.must("R-SIL-09", "5.4 Silence")
 def acks_keep_nothing_alive(bench: Bench) -> None:
     """Many acks of the driver do not keep the wheels turning."""
     robot, driver = _stopping(bench)

@@ -14,7 +14,6 @@ from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
 
 SUITE: Final = Suite("R")
-_CLAUSE: Final = "On WebSocket: the older dialect"
 _LINE: Final = 76
 _SWITCHED: Final = 101
 _SILENT_S: Final = 1.5
@@ -52,7 +51,7 @@ def _picture(text: bytes) -> bytes:
     return data
 
 
-@SUITE.must("R-DIAL-11", _CLAUSE, real=True)
+@SUITE.must("R-DIAL-11", "15.1 On WebSocket: the older dialect", real=True)
 def pictures_as_text(bench: Bench) -> None:
     """Who connects without a sub-protocol gets pictures: text, base64, a JPEG."""
     with _older(bench) as raw:
@@ -63,7 +62,7 @@ def pictures_as_text(bench: Bench) -> None:
         bench.expect(all(good), f"{len(good) - sum(map(bool, good))} of {len(good)} messages are no picture as text")
 
 
-@SUITE.should("R-DIAL-12", _CLAUSE, real=True)
+@SUITE.should("R-DIAL-12", "15.1 On WebSocket: the older dialect", real=True)
 def newlines(bench: Bench) -> None:
     """The base64 has a newline after every 76 characters and at the end (robots with `?oneline` have none)."""
     with _older(bench) as raw:
@@ -75,16 +74,16 @@ def newlines(bench: Bench) -> None:
             bench.expect(all(len(line) == _LINE for line in lines[:-1]), "its lines are not of 76 characters")
 
 
-@SUITE.must("R-DIAL-13", _CLAUSE, real=True)
+@SUITE.must("R-DIAL-13", "15.2 On WebSocket: the older dialect", real=True)
 def commands_as_text(bench: Bench) -> None:
     """`linear|angular` is judged as a twist of `guest`."""
-    watcher = Sender(Robot(bench), "viewer", acks=False)
+    watcher = Sender(Robot(bench), bench.access.watcher, acks=False)
     with _older(bench) as raw:
         verdict = watcher.verdict(lambda: raw.send(TEXT, b"0.1|0"))
         bench.expect(verdict in (GOOD, "UNKNOWN_SOURCE"), f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-DIAL-14", _CLAUSE, real=True)
+@SUITE.must("R-DIAL-14", "15.2 On WebSocket: the older dialect", real=True)
 def no_binary(bench: Bench) -> None:
     """A binary message ends the connection with 1003."""
     with _older(bench) as raw:
@@ -93,7 +92,7 @@ def no_binary(bench: Bench) -> None:
         bench.expect(end is not None and end[0] == 1003, f"it ends with {end}")
 
 
-@SUITE.must("R-DIAL-15", _CLAUSE, real=True)
+@SUITE.must("R-DIAL-15", "15.2 On WebSocket: the older dialect", real=True)
 def no_long_texts(bench: Bench) -> None:
     """A text over 256 bytes ends the connection."""
     with _older(bench) as raw:
@@ -101,10 +100,10 @@ def no_long_texts(bench: Bench) -> None:
         bench.expect(raw.end(2.5) is not None, "the connection stays open")
 
 
-@SUITE.must("R-DIAL-16", _CLAUSE, real=True)
+@SUITE.must("R-DIAL-16", "15.2 On WebSocket: the older dialect", real=True)
 def ill_formed_stays(bench: Bench) -> None:
     """An ill-formed twist is refused and counted; the connection stays."""
-    watcher = Sender(Robot(bench), "viewer", acks=False)
+    watcher = Sender(Robot(bench), bench.access.watcher, acks=False)
     with _older(bench) as raw:
         bench.need(watcher.verdict(lambda: raw.send(TEXT, b"0.1|0")), "twists are not judged here (R-DIAL-13)")
         before = sum(watcher.robot.status().refused.values())
@@ -114,7 +113,7 @@ def ill_formed_stays(bench: Bench) -> None:
         bench.expect(counted, "it was not counted")
 
 
-@SUITE.must("R-DIAL-17", _CLAUSE, real=True)
+@SUITE.must("R-DIAL-17", "15.3 On WebSocket: the older dialect", real=True)
 def silent_clients_stay(bench: Bench) -> None:
     """A client that neither says nor reads anything for a second and a half stays."""
     with _older(bench, answers_pings=True) as raw:
@@ -122,7 +121,7 @@ def silent_clients_stay(bench: Bench) -> None:
         bench.expect(raw.end(0.8) is None, "the connection ended")
 
 
-@SUITE.must("R-DIAL-18", _CLAUSE, real=True)
+@SUITE.must("R-DIAL-18", "15.3 On WebSocket: the older dialect", real=True)
 def twists_return_credit(bench: Bench) -> None:
     """Its twist after a frame returns the credit: who answers gets picture after picture."""
     with _older(bench) as raw:
@@ -138,7 +137,7 @@ def twists_return_credit(bench: Bench) -> None:
         bench.expect(answered >= 1.5 * silent, said)
 
 
-@SUITE.must("R-DIAL-19", _CLAUSE, real=True)
+@SUITE.must("R-DIAL-19", "15.2 On WebSocket: the older dialect", real=True)
 def origins(bench: Bench) -> None:
     """An Origin that is the Host, as older libraries send it, is let in; another site's fails with 403."""
     bench.need(bench.older, "no port of the older dialect was named (--older)")
@@ -148,10 +147,30 @@ def origins(bench: Bench) -> None:
             bench.expect(raw.status == status, f"Origin {origin}: HTTP {raw.status}, expected {status}")
 
 
-@SUITE.must("R-DIAL-20", _CLAUSE, real=True)
+@SUITE.must("R-DIAL-20", "15.3 On WebSocket: the older dialect", real=True)
 def several_clients(bench: Bench) -> None:
     """Several clients each get pictures."""
     with _older(bench) as first, _older(bench) as second:
         first_came, second_came = _pictures(first, 1.2), _pictures(second, 0.8)
         bench.need(first_came or second_came, "no pictures (R-DIAL-11)")
         bench.expect(first_came and second_came, f"{len(first_came)} to the first, {len(second_came)} to the second")
+
+
+@SUITE.must("R-DIAL-21", "15.3 On WebSocket: the older dialect", real=True)
+def first_client_drives(bench: Bench) -> None:
+    """Of several clients the first with a valid twist drives; what another sends meanwhile is NOT_HOLDER."""
+    watcher = Sender(Robot(bench), bench.access.watcher, acks=False)
+    with _older(bench) as first, _older(bench) as second:
+        verdict = watcher.verdict(lambda: first.send(TEXT, b"0.1|0"))
+        bench.need(verdict == GOOD, f"guests are not heard here: {verdict or 'not counted'}")
+        first.send(TEXT, b"0.1|0")
+        watcher.robot.next_status(2)
+        verdict = watcher.verdict(lambda: second.send(TEXT, b"0.1|0"))
+        bench.expect(verdict == "NOT_HOLDER", f"a second client's twist is {verdict or 'not counted'}")
+
+
+@SUITE.must("R-DIAL-22", "15.2 On WebSocket: the older dialect", real=True)
+def hosts(bench: Bench) -> None:
+    """A Host that a foreign site could own fails with 403 on this port too."""
+    with _older(bench, host="evil.example.com:9091") as raw:
+        bench.expect(raw.status == 403, f"HTTP {raw.status}, expected 403")

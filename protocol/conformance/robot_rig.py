@@ -11,7 +11,6 @@ from typing import Any, Final
 
 from protocol.channels import ACK, CAMERA, FRAME, REPLY, REQUEST, STATUS, TWIST
 from protocol.conformance.bench import Bench, Heard
-from protocol.conformance.case import ConformanceError
 from protocol.messages import CameraModel, FrameHeader, Reply, Stamp, State, Status
 from protocol.refusals import CLAMPED, Refusal
 
@@ -26,7 +25,6 @@ FRAME_US: Final = 1_500_000
 REPLY_US: Final = 1_000_000
 """After which a peer may ask again."""
 _SENT_AGAIN: Final = 2
-_SETTLES_US: Final = 6_000_000
 
 
 class Robot:
@@ -227,7 +225,11 @@ class Sender:
         return replies[0] if replies else None
 
     def request(self, verb: str, *, cite: Stamp | bool = True, **changes: Any) -> None:
-        """Send a request and wait for nothing."""
+        """Send a request and wait for nothing. Where keys keep this source from asking, an operator asks for it."""
+        if not self.bench.access.may_ask(self.source):
+            self.bench.need(verb not in ("acquire", "release"), f"with its keys {self.source} may ask for nothing")
+            Sender(self.robot, "operator", acks=False).request(verb, cite=cite, **changes)
+            return
         self.request_id += 1
         stamp = self.robot.stamp() if cite is True else cite
         fields: dict[str, Any] = {"v": 1, "source": self.source, "session": self.session, "seq": self.request_id}
@@ -276,25 +278,3 @@ def arm(driver: Sender) -> None:
         bench.rest(200_000)
     reached = driver.robot.reaches(lambda status: status.state in (State.ACTIVE, State.DEGRADED), 1_500_000)
     bench.need(reached, "the robot could not be armed and driven (R-ARM-03)")
-
-
-def prepare(bench: Bench) -> None:
-    """Bring the robot to where a case begins: DISARMED, nobody drives, wheels at zero. Raises ConformanceError."""
-    robot = Robot(bench)
-    robot.status()
-    operator = Sender(robot, "operator", acks=False)
-    robot.next_status()
-    for _ in range(3):
-        if robot.status().state in (State.STOPPED, State.FAULT):
-            operator.ask("reset")
-        elif robot.status().state is not State.DISARMED:
-            operator.ask("disarm")
-        if robot.reaches(_is_at_rest, _SETTLES_US // 3):
-            break
-    else:
-        raise ConformanceError("before the case the robot could not be brought to DISARMED, without holder, at zero")
-    bench.forget()
-
-
-def _is_at_rest(status: Status) -> bool:
-    return status.state is State.DISARMED and status.holder is None and status.applied == (0.0, 0.0)

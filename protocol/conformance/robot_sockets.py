@@ -13,7 +13,6 @@ from protocol.errors import WireError
 from protocol.transports.websocket_framing import SUBPROTOCOL, Packet, parse_hello, unpack
 
 SUITE: Final = Suite("R")
-CLAUSE: Final = "On WebSocket: `sightline.v1`"
 SWITCHED: Final = 101
 SOON_S: Final = 2.5
 PASSING_S: Final = 1.2
@@ -28,14 +27,14 @@ def door(bench: Bench) -> str:
 
 def hello(bench: Bench, *wants: str, **changes: Any) -> bytes:
     """A good hello, or one with other fields."""
-    fields = {"v": 1, "robot": bench.robot, "role": "viewer", "session": SESSION, "wants": list(wants), **changes}
-    return as_json(fields)
+    fields = {"v": 1, "robot": bench.robot, "role": bench.access.watcher, "session": SESSION, "wants": list(wants)}
+    return as_json({**fields, **changes})
 
 
 @contextmanager
 def spoken(bench: Bench, *wants: str, **changes: Any) -> Iterator[RawWebSocket]:
     """A connection on which both have said hello."""
-    with RawWebSocket(door(bench), offered(bench)) as raw:
+    with RawWebSocket(door(bench), offered(bench, source=changes.get("role", ""))) as raw:
         bench.need(raw.status == SWITCHED, f"the handshake fails with {raw.status} (R-SOCK-01)")
         raw.send(TEXT, hello(bench, *wants, **changes))
         answer = raw.frame(SOON_S)
@@ -43,9 +42,15 @@ def spoken(bench: Bench, *wants: str, **changes: Any) -> Iterator[RawWebSocket]:
         yield raw
 
 
-def offered(bench: Bench, *others: str) -> tuple[str, ...]:
-    """The sub-protocol entries of a client that may come in, after `others`."""
-    return (*others, SUBPROTOCOL, *([f"sightline.token.{bench.token}"] if bench.token else ()))
+def offered(bench: Bench, *others: str, source: str = "") -> tuple[str, ...]:
+    """The sub-protocol entries of a client that may come in, as a watcher unless it says more, after `others`."""
+    token = bench.access.token_of(source or bench.access.watcher)
+    return (*others, SUBPROTOCOL, *([entry_of(token)] if token else ()))
+
+
+def entry_of(token: str) -> str:
+    """The sub-protocol entry that shows `token`."""
+    return f"sightline.token.{token}"
 
 
 def put_over_websocket(bench: Bench, key: str, header: bytes, payload: bytes) -> None:
@@ -62,9 +67,9 @@ def block(fields: bytes, payload: bytes = b"") -> bytes:
     return len(fields).to_bytes(2) + fields + payload
 
 
-def disarm_request() -> bytes:
+def disarm_request(bench: Bench) -> bytes:
     """A request for `disarm` as one message: it changes nothing here, and it is answered."""
-    header = {"channel": "request", "v": 1, "source": "viewer", "session": SESSION, "seq": 1}
+    header = {"channel": "request", "v": 1, "source": bench.access.watcher, "session": SESSION, "seq": 1}
     return block(as_json(header), as_json({"id": 4711, "verb": "disarm"}))
 
 
@@ -112,7 +117,7 @@ def _refused(bench: Bench, status: int, what: str, **options: Any) -> None:
 # --- handshake -------------------------------------------------------------------------------------------------------
 
 
-@SUITE.must("R-SOCK-01", CLAUSE, real=True)
+@SUITE.must("R-SOCK-01", "14.1 Opening", real=True)
 def selects_the_sub_protocol(bench: Bench) -> None:
     """The handshake selects `sightline.v1` among what is offered."""
     with RawWebSocket(door(bench), offered(bench, "chat")) as raw:
@@ -121,14 +126,16 @@ def selects_the_sub_protocol(bench: Bench) -> None:
         bench.expect(selected == SUBPROTOCOL, f"it selects {selected!r}")
 
 
-@SUITE.must("R-SOCK-02", CLAUSE, real=True)
+@SUITE.must("R-SOCK-02", "14.1 Opening", real=True)
 def demands_the_sub_protocol(bench: Bench) -> None:
     """Without the sub-protocol the handshake fails with 400."""
-    _refused(bench, 400, "no sub-protocol", protocols=())
-    _refused(bench, 400, "another sub-protocol", protocols=("chat", "sightline.v9"))
+    token = bench.access.token_of(bench.access.watcher)
+    shown = (("Authorization", f"Bearer {token}"),) if token else ()
+    _refused(bench, 400, "no sub-protocol", protocols=(), headers=shown)
+    _refused(bench, 400, "another sub-protocol", protocols=("chat", "sightline.v9"), headers=shown)
 
 
-@SUITE.must("R-SOCK-03", CLAUSE, real=True)
+@SUITE.must("R-SOCK-03", "14.1 Opening", real=True)
 def no_compression(bench: Bench) -> None:
     """No extension is negotiated, though compression is offered."""
     offer = (("Sec-WebSocket-Extensions", "permessage-deflate; client_max_window_bits"),)
@@ -137,31 +144,32 @@ def no_compression(bench: Bench) -> None:
         bench.expect(raw.status == SWITCHED and not agreed, f"HTTP {raw.status}, extensions {agreed!r}")
 
 
-@SUITE.must("R-SOCK-04", CLAUSE, real=True)
+@SUITE.must("R-SOCK-04", "14.2 Host and Origin", real=True)
 def foreign_host(bench: Bench) -> None:
     """A Host that a foreign site could own fails with 403."""
     port = split_url(door(bench))[2]
     _refused(bench, 403, "Host: evil.example.com", host=f"evil.example.com:{port}")
 
 
-@SUITE.must("R-SOCK-05", CLAUSE, real=True)
+@SUITE.must("R-SOCK-05", "14.2 Host and Origin", real=True)
 def foreign_origin(bench: Bench) -> None:
     """A browser's Origin of another site fails with 403."""
     _refused(bench, 403, "Origin: http://evil.example.com", headers=(("Origin", "http://evil.example.com"),))
     _refused(bench, 403, "Origin: null", headers=(("Origin", "null"),))
 
 
-@SUITE.must("R-SOCK-06", CLAUSE, real=True)
+@SUITE.must("R-SOCK-06", "14.2 Host and Origin", real=True)
 def own_origin(bench: Bench) -> None:
     """An Origin that is the Host itself is let in."""
-    _tls, address, port = split_url(door(bench))
-    _refused(bench, SWITCHED, "Origin as the Host", headers=(("Origin", f"http://{address}:{port}"),))
+    tls, address, port = split_url(door(bench))
+    origin = f"http{'s' if tls else ''}://{address}:{port}"
+    _refused(bench, SWITCHED, "Origin as the Host", headers=(("Origin", origin),))
 
 
 # --- hello -----------------------------------------------------------------------------------------------------------
 
 
-@SUITE.must("R-SOCK-07", CLAUSE, real=True)
+@SUITE.must("R-SOCK-07", "14.5 Hello", real=True)
 def answers_hello(bench: Bench) -> None:
     """A hello is answered with the robot's own, as text, that names the robot."""
     with RawWebSocket(door(bench), offered(bench)) as raw:
@@ -185,13 +193,13 @@ def _no_hello(number: str, title: str, codes: tuple[int, ...], send: Callable[[R
             bench.expect(reason, "the close frame gives no reason")
 
     run.__doc__ = title
-    SUITE.must(number, CLAUSE, real=True)(run)
+    SUITE.must(number, "14.5 Hello", real=True)(run)
 
 
 _no_hello("R-SOCK-08", "A hello for another robot ends with 1008 and the reason.", (1008,),
           lambda raw, bench: raw.send(TEXT, hello(bench, robot="other")))  # fmt: skip
 _no_hello("R-SOCK-09", "A first message that is not text ends with 1003 and the reason.", (1003,),
-          lambda raw, _bench: raw.send(BINARY, disarm_request()))  # fmt: skip
+          lambda raw, bench: raw.send(BINARY, disarm_request(bench)))  # fmt: skip
 _no_hello("R-SOCK-10", "A text that is no hello ends with 1008 and the reason.", (1008,),
           lambda raw, _bench: raw.send(TEXT, b'{"let": "me in"}'))  # fmt: skip
 _no_hello("R-SOCK-11", "A hello of another version ends with 1008 and the reason.", (1008,),
@@ -200,7 +208,7 @@ _no_hello("R-SOCK-12", "Who says no hello within two seconds is dropped with 100
           lambda _raw, _bench: None)  # fmt: skip
 
 
-@SUITE.must("R-SOCK-13", CLAUSE, real=True)
+@SUITE.must("R-SOCK-13", "14.5 Hello", real=True)
 def only_what_is_wanted(bench: Bench) -> None:
     """Only the channels in `wants` come."""
     with spoken(bench, "status") as raw:
@@ -208,7 +216,7 @@ def only_what_is_wanted(bench: Bench) -> None:
         bench.expect(names <= {"status"}, f"wanted was status, there came {sorted(names)}")
 
 
-@SUITE.must("R-SOCK-14", CLAUSE, real=True)
+@SUITE.must("R-SOCK-14", "14.5 Hello", real=True)
 def hello_again(bench: Bench) -> None:
     """A later hello replaces `wants`."""
     with spoken(bench, "status") as raw:
@@ -218,7 +226,7 @@ def hello_again(bench: Bench) -> None:
         bench.expect("status" not in names and names, f"wanted are odometry and camera, there come {sorted(names)}")
 
 
-@SUITE.must("R-SOCK-15", CLAUSE, real=True)
+@SUITE.must("R-SOCK-15", "14.5 Hello", real=True)
 def unknown_wants(bench: Bench) -> None:
     """Unknown names in `wants` and unknown fields of a hello are ignored."""
     with spoken(bench, "status", "perfume", mood="calm") as raw:

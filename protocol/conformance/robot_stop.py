@@ -9,8 +9,6 @@ from protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, arm, arme
 from protocol.messages import State, Status
 
 SUITE: Final = Suite("R")
-_CLAUSE: Final = "Lease, arming, STOP"
-_ASKING: Final = "Requests and replies"
 _DRIVEN = (State.HOLD, State.ACTIVE, State.DEGRADED)
 
 
@@ -29,7 +27,7 @@ def _state(robot: Robot, state: State, what: str) -> Status:
     return status
 
 
-@SUITE.must("R-STOP-01", _CLAUSE)
+@SUITE.must("R-STOP-01", "6.5 STOP")
 def stops(bench: Bench) -> None:
     """STOP while driving: STOPPED is said within 300 ms, the reply says so, wheels at zero within 700 ms."""
     robot, _driver = armed(bench)
@@ -40,17 +38,17 @@ def stops(bench: Bench) -> None:
     bench.expect(reply is None or reply.ok, f"the reply says {reply}")
 
 
-@SUITE.must("R-STOP-02", _ASKING)
+@SUITE.must("R-STOP-02", "13.5 Security")
 def anybody_stops(bench: Bench) -> None:
     """STOP is granted to a role that may not drive, beside a human who drives."""
     human = Sender(Robot(bench), "teleop")
     human.need_good()
     human.drive()
-    Sender(human.robot, "viewer").request("stop")
+    Sender(human.robot, bench.access.watcher).request("stop")
     bench.expect(is_soon(human.robot, State.STOPPED), f"it is {human.robot.status().state}")
 
 
-@SUITE.must("R-STOP-03", _ASKING)
+@SUITE.must("R-STOP-03", "8.2 Requests and replies")
 def stop_needs_no_echo(bench: Bench) -> None:
     """STOP without `echo` is obeyed also from a robot at rest."""
     operator = Sender(Robot(bench), "operator")
@@ -59,7 +57,7 @@ def stop_needs_no_echo(bench: Bench) -> None:
     bench.expect(is_soon(operator.robot, State.STOPPED), f"it is {operator.robot.status().state}")
 
 
-@SUITE.must("R-STOP-04", _CLAUSE)
+@SUITE.must("R-STOP-04", "5.1 Order")
 def latched(bench: Bench) -> None:
     """In STOPPED good twists are refused as STOPPED and change nothing."""
     driver = Sender(Robot(bench))
@@ -71,7 +69,7 @@ def latched(bench: Bench) -> None:
     _state(operator.robot, State.STOPPED, "after six twists")
 
 
-@SUITE.must("R-STOP-05", _CLAUSE)
+@SUITE.must("R-STOP-05", "8.2 Requests and replies")
 def no_arming(bench: Bench) -> None:
     """In STOPPED `arm` is refused as STOPPED."""
     operator = _stopped(bench)
@@ -81,7 +79,7 @@ def no_arming(bench: Bench) -> None:
     _state(operator.robot, State.STOPPED, "after arm")
 
 
-@SUITE.must("R-STOP-06", _CLAUSE)
+@SUITE.must("R-STOP-06", "6.5 STOP")
 def reset_starts_nothing(bench: Bench) -> None:
     """`reset` leads to DISARMED and starts no motion, also while twists flow."""
     operator = _stopped(bench)
@@ -93,7 +91,7 @@ def reset_starts_nothing(bench: Bench) -> None:
     bench.expect(status.applied == (0.0, 0.0), f"the wheels move: {status.applied}")
 
 
-@SUITE.must("R-STOP-07", _ASKING)
+@SUITE.must("R-STOP-07", "8.3 Freshness")
 def reset_needs_echo(bench: Bench) -> None:
     """`reset` without `echo` is refused."""
     operator = _stopped(bench)
@@ -101,7 +99,7 @@ def reset_needs_echo(bench: Bench) -> None:
     _state(operator.robot, State.STOPPED, "after a reset that cites nothing")
 
 
-@SUITE.must("R-STOP-08", _ASKING)
+@SUITE.must("R-STOP-08", "8.3 Freshness")
 def reset_after_stop(bench: Bench) -> None:
     """`reset` that cites a `status` from before the STOP is refused."""
     robot = Robot(bench)
@@ -111,7 +109,7 @@ def reset_after_stop(bench: Bench) -> None:
     _state(robot, State.STOPPED, "after a reset from before the STOP")
 
 
-@SUITE.must("R-STOP-09", _CLAUSE)
+@SUITE.must("R-STOP-09", "6.5 STOP")
 def latched_over_reconnect(bench: Bench) -> None:
     """STOPPED holds while nobody is connected and after everybody has come again."""
     operator = _stopped(bench)
@@ -123,7 +121,7 @@ def latched_over_reconnect(bench: Bench) -> None:
     _state(operator.robot, State.STOPPED, "after a reconnect")
 
 
-@SUITE.must("R-STOP-10", _CLAUSE)
+@SUITE.must("R-STOP-10", "6.5 STOP")
 def disarm_lifts_nothing(bench: Bench) -> None:
     """`disarm` does not lift STOPPED."""
     operator = _stopped(bench)
@@ -131,7 +129,7 @@ def disarm_lifts_nothing(bench: Bench) -> None:
     _state(operator.robot, State.STOPPED, "after disarm")
 
 
-@SUITE.must("R-STOP-11", _ASKING)
+@SUITE.must("R-STOP-11", "8.2 Requests and replies")
 def stop_again(bench: Bench) -> None:
     """STOP may be repeated: it is granted again and stays."""
     operator = _stopped(bench)
@@ -140,7 +138,7 @@ def stop_again(bench: Bench) -> None:
     _state(operator.robot, State.STOPPED, "after the second STOP")
 
 
-@SUITE.must("R-STOP-12", _ASKING)
+@SUITE.must("R-STOP-12", "8.3 Freshness")
 def late_stop(bench: Bench) -> None:
     """A STOP that a link kept back is obeyed, however old the `status` that it cites."""
     robot = Robot(bench)
@@ -150,7 +148,7 @@ def late_stop(bench: Bench) -> None:
     bench.expect(is_soon(robot, State.STOPPED), f"it is {robot.status().state}")
 
 
-@SUITE.must("R-STOP-13", _ASKING)
+@SUITE.must("R-STOP-13", "8.2 Requests and replies")
 def reset_of_nothing(bench: Bench) -> None:
     """`reset` where there is nothing to reset changes nothing: an armed robot drives on."""
     robot, driver = armed(bench)
@@ -159,7 +157,7 @@ def reset_of_nothing(bench: Bench) -> None:
     bench.expect(status.state in _DRIVEN, f"then it is {status.state}")
 
 
-@SUITE.must("R-STOP-14", _CLAUSE)
+@SUITE.must("R-STOP-14", "6.5 STOP")
 def arms_after_reset(bench: Bench) -> None:
     """After `reset` the robot can be armed and driven again."""
     _robot, first = armed(bench)

@@ -64,20 +64,20 @@ def run_cases(
     results = []
     for case in cases:
         result = run_case(case, bench, prepare)
-        for _ in range(1, tries):
+        for count in range(2, tries + 1):
             if result.outcome is not Outcome.FAILED:
                 break
-            result = _after(result, run_case(case, bench, prepare))
+            result = _after(result, run_case(case, bench, prepare), count)
         results.append(result)
         on_result(result)
     return results
 
 
-def _after(first: Result, second: Result) -> Result:
-    """What to keep of two runs of a case, of which the first failed: only passing makes up for it."""
-    if second.outcome is not Outcome.PASSED:
-        return second if second.outcome is Outcome.FAILED else first
-    return Result(second.case, second.outcome, f"at a second try; at first {first.reason}", second.took_us)
+def _after(last: Result, this: Result, count: int) -> Result:
+    """What to keep of two runs of a case, of which the last failed: only passing, at try `count`, makes up for it."""
+    if this.outcome is not Outcome.PASSED:
+        return this if this.outcome is Outcome.FAILED else last
+    return Result(this.case, this.outcome, f"at try {count}; before: {last.reason}", this.took_us)
 
 
 def passed(results: Sequence[Result]) -> bool:

@@ -5,6 +5,7 @@ from typing import Final
 from protocol.conformance import (
     vision_answers,
     vision_causality,
+    vision_doors,
     vision_flow,
     vision_hostile,
     vision_limits,
@@ -16,17 +17,23 @@ from protocol.conformance.bench import Bench
 from protocol.conformance.case import Case
 from protocol.conformance.vision_robot import RobotPlayed
 
-_FIRST_US: Final = 10_000_000
-"""A vision may still be starting."""
+_FIRST_US: Final = 20_000_000
+"""A vision may still be starting, or be started now."""
 _AGAIN_US: Final = 3_000_000
 """One that lost its robot in the last case tries again every second."""
 _EVERY_US: Final = 100_000
 _PARTS: Final = (
     vision_answers, vision_causality, vision_flow, vision_limits, vision_hostile, vision_reconnect, vision_steering,
-    vision_sockets,
+    vision_sockets, vision_doors,
 )
 
 CASES: Final[tuple[Case, ...]] = tuple(case for part in _PARTS for case in part.SUITE.cases)
+
+
+def is_there(bench: Bench) -> bool:
+    """Whether a vision answers at all: it may have been started a moment ago, or be started now."""
+    prepare(bench)
+    return bool(bench.mark() or bench.dropped_here.total())
 
 
 def prepare(bench: Bench) -> None:

@@ -66,7 +66,7 @@ def steady(bench: Bench) -> None:
     bench.expect(answered >= _STEADY_ANSWERED * len(sent), f"{answered} of {len(sent)} frames were answered")
 
 
-@SUITE.must("V-FLOW-06", "10.1")
+@SUITE.must("V-FLOW-06", "10.1 Camera, odometry, scan")
 def no_camera_model(bench: Bench) -> None:
     """Frames of a robot that names no camera are answered, if only by acks."""
     robot = RobotPlayed(bench, camera=None)
@@ -75,7 +75,7 @@ def no_camera_model(bench: Bench) -> None:
         robot.answer_to(robot.frame())
 
 
-@SUITE.should("V-FLOW-07", "10.1")
+@SUITE.should("V-FLOW-07", "10.1 Camera, odometry, scan")
 def late_camera_model(bench: Bench) -> None:
     """A camera model that comes two seconds late is taken in: twists follow within a second."""
     robot = RobotPlayed(bench, camera=None)
@@ -86,7 +86,7 @@ def late_camera_model(bench: Bench) -> None:
     bench.expect(any(one.is_twist for frame in sent for one in robot.answers_to(frame)), "no twist came")
 
 
-@SUITE.should("V-FLOW-08", "10.1")
+@SUITE.should("V-FLOW-08", "10.1 Camera, odometry, scan")
 def other_camera_model(bench: Bench) -> None:
     """A camera that changes its picture size is followed: twists within a second."""
     robot = RobotPlayed(bench).met()

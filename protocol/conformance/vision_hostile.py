@@ -15,7 +15,7 @@ from protocol.golden_case import packed
 
 SUITE = Suite("V")
 _JSON, _NUMBERS, _VERSION, _FIELDS = "2.1 JSON", "2.2 Numbers", "2.4 Version", "2.8 Fields"
-_SESSION, _CAMERA = "2.5 Session and sequence", "10.1"
+_SESSION, _CAMERA = "2.5 Session and sequence", "10.1 Camera, odometry, scan"
 _NOISE: Final = 600
 Fields = dict[str, Any]
 

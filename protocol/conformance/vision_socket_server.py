@@ -9,6 +9,7 @@ import hashlib
 import re
 import secrets
 import socket
+import ssl
 import struct
 import time
 from types import TracebackType
@@ -34,8 +35,9 @@ class GoneError(Exception):
 class RawServer:
     """Listens on an address until left; use it in a `with`."""
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, tls: ssl.SSLContext | None = None) -> None:
         """Raises LinkError for an address that cannot be listened on."""
+        self._tls = tls
         self._socket = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -56,7 +58,9 @@ class RawServer:
             except TimeoutError:
                 return None
             try:
-                self._clients.append(RawClient(connection))
+                connection.settimeout(_SEND_S)
+                secured = connection if self._tls is None else self._tls.wrap_socket(connection, server_side=True)
+                self._clients.append(RawClient(secured))
                 return self._clients[-1]
             except (OSError, GoneError):
                 connection.close()
@@ -76,6 +80,7 @@ class RawServer:
 class RawClient:
     """One connection. `offered` are the sub-protocols that the client offered; `session` is of the robot played on it.
 
+    `request` is the first line of what it asked, `headers` all that it said beside, names in lower case.
     Each connection is to a robot started anew: a vision may take an earlier session for over.
     """
 
@@ -85,13 +90,17 @@ class RawClient:
         self._buffer = b""
         self.session = SESSION_BEGINS + secrets.token_hex(2)
         self.pings = 0
+        self.answers_pings = True
         connection.settimeout(_SEND_S)
         while b"\r\n\r\n" not in self._buffer:
             self._more()
             if len(self._buffer) > _MAX_REQUEST_BYTES:
                 raise GoneError("its request has no end")
         request, _, self._buffer = self._buffer.partition(b"\r\n\r\n")
-        fields = {name.lower(): value for name, value in _HEADER.findall(request.replace(b"\r", b""))}
+        said = request.replace(b"\r", b"")
+        self.request = said.partition(b"\n")[0].decode("latin-1")
+        self.headers = [(name.lower().decode(), value.decode("latin-1")) for name, value in _HEADER.findall(said)]
+        fields = {name.lower(): value for name, value in _HEADER.findall(said)}
         self.offered = [one.strip().decode("latin-1") for one in fields.get(b"sec-websocket-protocol", b"").split(b",")]
         token = base64.b64encode(hashlib.sha1(fields.get(b"sec-websocket-key", b"") + _GUID).digest())
         chosen = b"Sec-WebSocket-Protocol: sightline.v1\r\n" if "sightline.v1" in self.offered else b""
@@ -125,7 +134,8 @@ class RawClient:
             if kind != PING:
                 return kind, payload
             self.pings += 1
-            self.send(PONG, payload)
+            if self.answers_pings:
+                self.send(PONG, payload)
         return None
 
     def close(self) -> None:

@@ -17,9 +17,10 @@ from protocol.errors import WireError
 from protocol.messages import FrameHeader, Stamp
 from protocol.transports.websocket_endpoints import parse_endpoint
 from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL, pack, parse_hello
+from protocol.transports.websocket_tls import listening_context
 
 SUITE = Suite("V")
-_BACK_S: Final = 5.0
+BACK_S: Final = 5.0
 """A second at most between two tries, two until a silent peer is given up."""
 _HELLO_S: Final = 2.0
 _END_S: Final = 3.0
@@ -28,22 +29,29 @@ _TOO_LARGE_BYTES: Final = 3_000_000
 """Above what any peer can want: a frame has at most a million."""
 
 
+def need_websocket(bench: Bench) -> None:
+    there = bench.endpoint.startswith(("ws://", "wss://"))
+    bench.need(there, "only for a vision that connects to a WebSocket endpoint")
+
+
 @contextmanager
-def _server(bench: Bench) -> Iterator[RawServer]:
+def server_of(bench: Bench) -> Iterator[RawServer]:
     """A server of our own in the place of the kit's."""
-    bench.need(bench.endpoint.startswith("ws://"), "only for a vision that connects to a ws:// endpoint")
+    need_websocket(bench)
+    secure = bench.endpoint.startswith("wss://")
     end = parse_endpoint(bench.endpoint)
     bench.leave()
     try:
-        with RawServer(end.host, end.port) as server:
+        tls = listening_context(bench.access.folder, "robot") if secure else None
+        with RawServer(end.host, end.port, tls) as server:
             yield server
     finally:
         bench.join()
 
 
-def _client(bench: Bench, server: RawServer) -> RawClient:
-    client = server.accept(_BACK_S)
-    bench.expect(client is not None, f"it did not connect within {_BACK_S:g} s")
+def client_of(bench: Bench, server: RawServer) -> RawClient:
+    client = server.accept(BACK_S)
+    bench.expect(client is not None, f"it did not connect within {BACK_S:g} s")
     assert client is not None
     return client
 
@@ -77,9 +85,9 @@ def _frame(client: RawClient, seq: int) -> bytes:
     return _message(FRAME, FrameHeader(session=client.session, seq=seq, t_us=seq * 40_000), picture("left"))
 
 
-def _met(bench: Bench, server: RawServer) -> RawClient:
+def met(bench: Bench, server: RawServer) -> RawClient:
     """A client that has said hello, was greeted, and knows the camera."""
-    client = _client(bench, server)
+    client = client_of(bench, server)
     _hello(client)
     _greet(client, bench.robot)
     client.send(BINARY, _message(CAMERA, Stamp(session=client.session, seq=1, t_us=1), encode(LENS)))
@@ -99,9 +107,9 @@ def _answer(client: RawClient, within_s: float = _ANSWER_S) -> bytes | None:
     return None
 
 
-def _ends(client: RawClient) -> bool:
+def ends(client: RawClient, within_s: float = _END_S) -> bool:
     """Whether it ends the connection in time."""
-    deadline_s = time.monotonic() + _END_S
+    deadline_s = time.monotonic() + within_s
     while (left_s := deadline_s - time.monotonic()) > 0:
         try:
             client.receive(left_s)
@@ -116,16 +124,16 @@ def _ends(client: RawClient) -> bool:
 @SUITE.must("V-SOCK-01", "14.1 Opening", real=True)
 def offers_the_sub_protocol(bench: Bench) -> None:
     """It offers the sub-protocol `sightline.v1`."""
-    with _server(bench) as server:
-        offered = _client(bench, server).offered
+    with server_of(bench) as server:
+        offered = client_of(bench, server).offered
         bench.expect(SUBPROTOCOL in offered, f"it offered {offered}")
 
 
 @SUITE.must("V-SOCK-02", "14.5 Hello", real=True)
 def says_hello_first(bench: Bench) -> None:
     """Its first message is a hello for this robot: JSON text of at most 1024 bytes, within two seconds."""
-    with _server(bench) as server:
-        kind, text = _hello(_client(bench, server))
+    with server_of(bench) as server:
+        kind, text = _hello(client_of(bench, server))
         bench.expect(kind == TEXT and len(text) <= MAX_HELLO_BYTES, f"first came {kind}: {text[:80]!r}")
         try:
             hello = parse_hello(text.decode("utf-8", "replace"))
@@ -138,30 +146,30 @@ def says_hello_first(bench: Bench) -> None:
 @SUITE.must("V-SOCK-03", "14.5 Hello", real=True)
 def wants_frames(bench: Bench) -> None:
     """Its hello wants `frame`."""
-    with _server(bench) as server:
-        wants = _fields(_hello(_client(bench, server))[1]).get("wants", ["frame"])
+    with server_of(bench) as server:
+        wants = _fields(_hello(client_of(bench, server))[1]).get("wants", ["frame"])
         bench.expect("frame" in wants, f"it wants {wants}")
 
 
 @SUITE.must("V-SOCK-04", "14.5 Hello", real=True)
 def says_its_role(bench: Bench) -> None:
     """Its hello names the role that it drives as."""
-    with _server(bench) as server:
-        role = _fields(_hello(_client(bench, server))[1]).get("role")
+    with server_of(bench) as server:
+        role = _fields(_hello(client_of(bench, server))[1]).get("role")
         bench.expect(role == "vision", f"its role is {role!r}")
 
 
 @SUITE.must("V-SOCK-05", "14.5 Hello", real=True)
 def leaves_another_robot(bench: Bench) -> None:
     """It ends the connection to who says hello as another robot, and drives nothing there."""
-    with _server(bench) as server:
-        client = _client(bench, server)
+    with server_of(bench) as server:
+        client = client_of(bench, server)
         _hello(client)
         _greet(client, "another")
         client.send(BINARY, _message(CAMERA, Stamp(session=client.session, seq=1, t_us=1), encode(LENS)))
         client.send(BINARY, _frame(client, 1))
         bench.expect(_answer(client) is None, "it answered another robot's frame")
-        bench.expect(_ends(client), "it stayed with another robot")
+        bench.expect(ends(client), "it stayed with another robot")
 
 
 # --- messages --------------------------------------------------------------------------------------------------------
@@ -170,8 +178,8 @@ def leaves_another_robot(bench: Bench) -> None:
 @SUITE.must("V-SOCK-06", "14.6 Messages", real=True)
 def answers_in_binary(bench: Bench) -> None:
     """Its answer is one binary message whose header block names its channel."""
-    with _server(bench) as server:
-        client = _met(bench, server)
+    with server_of(bench) as server:
+        client = met(bench, server)
         client.send(BINARY, _frame(client, 1))
         data = _answer(client)
         bench.need(data is not None, "it answers nothing")
@@ -184,8 +192,8 @@ def answers_in_binary(bench: Bench) -> None:
 @SUITE.must("V-SOCK-07", "14.6 Messages", real=True)
 def reads_fragments(bench: Bench) -> None:
     """A frame in fragments, with a ping between them, is read."""
-    with _server(bench) as server:
-        client = _met(bench, server)
+    with server_of(bench) as server:
+        client = met(bench, server)
         whole = _frame(client, 1)
         client.send(BINARY, whole[:100], last=False)
         client.send(PING, b"between")
@@ -200,8 +208,8 @@ def reads_fragments(bench: Bench) -> None:
 @SUITE.must("V-SOCK-08", "14.8 Liveness", real=True)
 def answers_pings(bench: Bench) -> None:
     """A ping is answered within a second."""
-    with _server(bench) as server:
-        client = _met(bench, server)
+    with server_of(bench) as server:
+        client = met(bench, server)
         client.send(PING, b"are you there")
         deadline_s = time.monotonic() + _ANSWER_S
         got: tuple[int, bytes] | None = None
@@ -216,8 +224,8 @@ def answers_pings(bench: Bench) -> None:
 @SUITE.must("V-SOCK-09", "14.8 Liveness", real=True)
 def pings(bench: Bench) -> None:
     """It pings: within two and a half seconds one comes."""
-    with _server(bench) as server:
-        client = _met(bench, server)
+    with server_of(bench) as server:
+        client = met(bench, server)
         deadline_s = time.monotonic() + 2.5
         while not client.pings and time.monotonic() < deadline_s:
             try:
@@ -228,11 +236,11 @@ def pings(bench: Bench) -> None:
 
 
 def _ends_and_comes_back(bench: Bench, spoil: Callable[[RawClient], None], what: str) -> None:
-    with _server(bench) as server:
-        client = _met(bench, server)
+    with server_of(bench) as server:
+        client = met(bench, server)
         spoil(client)
-        bench.expect(_ends(client), f"it stayed after {what}")
-        bench.expect(server.accept(_BACK_S), f"it did not connect again after {what}")
+        bench.expect(ends(client), f"it stayed after {what}")
+        bench.expect(server.accept(BACK_S), f"it did not connect again after {what}")
 
 
 @SUITE.must("V-SOCK-10", "14.9 Ends", real=True)
@@ -250,16 +258,16 @@ def too_large(bench: Bench) -> None:
 @SUITE.must("V-SOCK-12", "14.9 Ends", real=True)
 def no_hello(bench: Bench) -> None:
     """A first message that is no hello ends the connection."""
-    with _server(bench) as server:
-        client = _client(bench, server)
+    with server_of(bench) as server:
+        client = client_of(bench, server)
         _hello(client)
         client.send(BINARY, _frame(client, 1))
-        bench.expect(_ends(client), "it stayed with a robot that said no hello")
+        bench.expect(ends(client), "it stayed with a robot that said no hello")
 
 
 @SUITE.must("V-SOCK-13", "14.8 Liveness", real=True)
 def comes_back_after_a_reset(bench: Bench) -> None:
     """A connection that is reset is made again."""
-    with _server(bench) as server:
-        _met(bench, server).drop()
-        bench.expect(server.accept(_BACK_S), f"it did not connect again within {_BACK_S:g} s")
+    with server_of(bench) as server:
+        met(bench, server).drop()
+        bench.expect(server.accept(BACK_S), f"it did not connect again within {BACK_S:g} s")

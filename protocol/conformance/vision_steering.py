@@ -27,28 +27,28 @@ def _last_twist(bench: Bench, robot: RobotPlayed, name: str, frames: int = _SECO
     return twists[-1]
 
 
-@SUITE.should("V-STEER-01", "2.8 Fields")
+@SUITE.should("V-STEER-01", "4.4 Signs")
 def turns_left(bench: Bench) -> None:
     """A target to the left is turned to: angular velocity above zero, counter-clockwise."""
     angular = _last_twist(bench, RobotPlayed(bench).met(), "left").speeds[1]
     bench.expect(angular > 0, f"it turns at {angular:g} rad/s")
 
 
-@SUITE.should("V-STEER-02", "2.8 Fields")
+@SUITE.should("V-STEER-02", "4.4 Signs")
 def turns_right(bench: Bench) -> None:
     """A target to the right is turned to: angular velocity below zero."""
     angular = _last_twist(bench, RobotPlayed(bench).met(), "right").speeds[1]
     bench.expect(angular < 0, f"it turns at {angular:g} rad/s")
 
 
-@SUITE.should("V-STEER-03", "2.8 Fields")
+@SUITE.should("V-STEER-03", "4.4 Signs")
 def goes_straight(bench: Bench) -> None:
     """A target straight ahead is no reason to turn."""
     angular = _last_twist(bench, RobotPlayed(bench).met(), "centre").speeds[1]
     bench.expect(abs(angular) < _AHEAD_RAD_S, f"it turns at {angular:g} rad/s")
 
 
-@SUITE.should("V-STEER-04", "12.2 Saw nothing, no answer")
+@SUITE.should("V-STEER-04", "4.4 Signs")
 def stays_without_target(bench: Bench) -> None:
     """Without ever a target it drives nowhere; it may turn to look for one."""
     robot = RobotPlayed(bench)
@@ -67,7 +67,7 @@ def stops_for_a_lost_target(bench: Bench) -> None:
     bench.expect(abs(linear) < _STILL_MPS, f"it still drives at {linear:g} m/s")
 
 
-@SUITE.should("V-STEER-06", "2.8 Fields")
+@SUITE.should("V-STEER-06", "4.4 Signs")
 def follows_to_the_other_side(bench: Bench) -> None:
     """A target that was on the left and is on the right now is turned to within two seconds."""
     robot = RobotPlayed(bench).met()
@@ -76,7 +76,7 @@ def follows_to_the_other_side(bench: Bench) -> None:
     bench.expect(angular < 0, f"it turns at {angular:g} rad/s")
 
 
-@SUITE.should("V-STEER-07", "2.6 Clock")
+@SUITE.should("V-STEER-07", "4.4 Signs")
 def same_frames_same_twists(bench: Bench) -> None:
     """The same frames of two sessions get the same twists, at whatever pace they come: its clock is the frames'."""
     first, second = (_replayed(bench, every_us) for every_us in (30_000, 90_000))

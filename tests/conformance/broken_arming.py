@@ -128,13 +128,15 @@ def arms_only_once(robot):
 
 @breaks("R-ARM-11")
 def counts_everybodys_commands(robot):
-    gate, total = robot.driving.gate, [0]
+    gate, total, last = robot.driving.gate, [0], [None]
 
     def around(inner, *arguments):
-        before = gate._lease.expires_us
+        before, held = gate._lease.expires_us, gate.holder(arguments[-1])
         verdict = inner(*arguments)
-        total[0] += gate._lease.expires_us > before
-        gate._live_commands = total[0]
+        if gate._lease.expires_us > before:
+            who = gate._lease.holder
+            total[0] = total[0] + 1 if held == who or who != last[0] else 1  # who comes back begins again
+            gate._live_commands, last[0] = total[0], who
         return verdict
 
     wrap(gate, "offer", around)

@@ -3,7 +3,8 @@
 from protocol.errors import WireError
 from protocol.messages import Verb
 from protocol.refusals import Refusal
-from tests.conformance.breaking import bend_out, bend_requests, breaks, fields_of, wrap
+from protocol.transports.link import Message
+from tests.conformance.breaking import as_json, bend_out, bend_requests, breaks, fields_of, wrap
 
 
 @breaks("R-REQ-01")
@@ -49,17 +50,14 @@ def any_other_verb_disarms(robot):
 
 @breaks("R-REQ-06")
 def requests_believe_the_key(robot):
-    def bend(header, _payload):
-        if header.get("source") == "teleop" and header.get("session", "") not in robot_sessions(robot):
-            header["source"] = "operator"
+    def around(inner, message):
+        fields = fields_of(message.header)
+        if message.source == "teleop" and (fields or {}).get("source") == "operator":
+            header = as_json({**fields, "source": "teleop"})
+            message = Message(message.channel, message.source, header, message.payload)
+        inner(message)
 
-    bend_requests(robot, bend)
-
-
-def robot_sessions(robot):
-    """Sessions that drive."""
-    holder = robot.driving.gate.holder(robot.now())
-    return (holder.session,) if holder else ()
+    wrap(robot, "on_request", around)
 
 
 @breaks("R-REQ-07")

@@ -34,6 +34,20 @@ DEFECTS = {
     "R-SOCK-31": "a lost peer stalls all",
     "R-SOCK-32": "any number of clients",
     "R-SOCK-33": "forgets the role",
+    "R-SOCK-34": "needs no token",
+    "R-SOCK-35": "the beginning of a token will do",
+    "R-SOCK-36": "one of two tokens will do",
+    "R-SOCK-37": "a token in the URL",
+    "R-SOCK-38": "bearers in capitals only",
+    "R-SOCK-39": "repeats the token",
+    "R-SOCK-40": "any token for every role",
+    "R-SOCK-41": "keeps detections",
+    "R-SOCK-42": "waits for ever for a handshake",
+    "R-SOCK-43": "hellos of any length",
+    "R-SOCK-44": "first role counts",
+    "R-SOCK-45": "twists need a header",
+    "R-SOCK-46": "drops what is no JSON",
+    "R-SOCK-47": "keeps missions",
     "R-DIAL-11": "pictures are binary",
     "R-DIAL-12": "one line",
     "R-DIAL-13": "deaf to twists",
@@ -44,4 +58,10 @@ DEFECTS = {
     "R-DIAL-18": "returns no credit",
     "R-DIAL-19": "older any origin",
     "R-DIAL-20": "one client at a time",
+    "R-DIAL-21": "any client drives",
+    "R-DIAL-22": "older any host",
 }
+
+BEHIND_TOKENS = tuple(name for name in DEFECTS if "R-SOCK-34" <= name <= "R-SOCK-40")
+"""These show only where a token is asked for."""
+

@@ -17,6 +17,11 @@ def stream_of(robot):
     return robot.sending._stream
 
 
+def owns_too(robot, when):
+    """Anybody's answers return credit `when(now_us)`."""
+    wrap(stream_of(robot), "_owns", lambda inner, who, now_us: when(now_us) or inner(who, now_us))
+
+
 @breaks("R-FLOW-01")
 def sends_without_credit(robot):
     wrap(robot, "film", lambda _inner, now_us: robot.capture(Picture(JPEG, now_us)) if robot.listening() else None)
@@ -30,7 +35,11 @@ def computing_widens_the_window(robot):
 
 @breaks("R-FLOW-03")
 def acks_are_not_heard(robot):
-    robot.on_ack = lambda message: None
+    def around(inner, message):
+        if "echo" not in (fields_of(message.header) or {}):
+            inner(message)
+
+    wrap(robot, "on_ack", around)
 
 
 @breaks("R-FLOW-04")
@@ -53,7 +62,7 @@ def credit_is_out_for_long(robot):
 
 @breaks("R-FLOW-06")
 def anybody_returns_credit(robot):
-    stream_of(robot)._owns = lambda who, now_us: True
+    owns_too(robot, lambda now_us: robot.driving.gate.holder(now_us) is not None)
 
 
 @breaks("R-FLOW-07")

@@ -78,8 +78,8 @@ class ReferenceRobot:
         """An acknowledgement."""
         try:
             self.sending.on_ack(message, self.now())
-        except WireError:
-            return
+        except WireError as error:
+            self.driving.turned_away[error.reason] += 1
 
     def emit(self, message):
         """What leaves."""

@@ -17,12 +17,15 @@ import time
 
 from protocol.channels import CHANNELS, Direction, key_for
 from protocol.conformance.raw_websocket import xor
+from protocol.errors import WireError
+from protocol.refusals import Refusal
 from protocol.transports.memory import MemoryNetwork
 from tests.conformance.reference import ReferenceRobot
 
+ENTRY = "sightline.token."
 GUID = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
-HELLO_S = 2.0
+HELLO_S = HANDSHAKE_S = 2.0
 MOST_BYTES = 2 + 576 + 256
 MOST_CLIENTS = 16
 
@@ -38,8 +41,10 @@ class EndError(Exception):
 class SmallServer:
     """Use it in a `with`: one thread, one robot, `sightline.v1` on `endpoint` and the older dialect on `older`."""
 
-    def __init__(self, defects=()):
-        self.defects = set(defects)
+    def __init__(self, defects=(), tokens=None):
+        """`tokens` are role -> token; with none anybody may come in."""
+        self.defects, self.tokens = set(defects), tokens or {}
+        self.driver, self.driven_s = None, 0.0
         self.network = MemoryNetwork()
         self.network.advance(time.monotonic_ns() // 1000)
         self.robot = ReferenceRobot(self.network)
@@ -115,7 +120,8 @@ class Client:
 
     def tick(self, now_s):
         if not self.opened or self.closing:
-            if now_s - self.began_s > 30 or (self.closing and now_s - self.pinged_s > 1):
+            patient = self.opened or self.has("waits for ever for a handshake")
+            if now_s - self.began_s > (30 if patient else HANDSHAKE_S) or (self.closing and now_s - self.pinged_s > 1):
                 self.drop()
             return
         if not self.greeted and now_s - self.began_s > HELLO_S and not self.has("waits for ever for a hello"):
@@ -227,9 +233,10 @@ class Client:
         if b"\r\n\r\n" not in self.data:
             return False
         head, _, self.data = self.data.partition(b"\r\n\r\n")
-        pairs = (line.partition(":") for line in head.decode("latin-1").split("\r\n")[1:])
+        first, *lines = head.decode("latin-1").split("\r\n")
+        pairs = (line.partition(":") for line in lines)
         headers = {name.strip().lower(): value.strip() for name, _, value in pairs}
-        status, reason = self.judge(headers)
+        status, reason = self.judge(headers, first)
         if status:
             self.write(f"HTTP/1.1 {status} {reason}\r\nContent-Length: 0\r\nConnection: close\r\n\r\n".encode())
             self.drop()
@@ -240,20 +247,43 @@ class Client:
         self.opened, self.began_s = True, time.monotonic()
         return True
 
-    def judge(self, headers):
+    def judge(self, headers, first):
         host, origin = headers.get("host", ""), headers.get("origin")
         name = host.rpartition(":")[0]
-        if name.replace(".", "").isalpha() and "." in name and not self.has("any host"):
+        any_host = self.has("older any host" if self.older else "any host")
+        if name.replace(".", "").isalpha() and "." in name and not any_host:
             return 403, "Forbidden"
         if origin is not None and self.is_foreign(origin, host):
             return 403, "Forbidden"
         offered = headers.get("sec-websocket-protocol", "").split(", ")
         if not self.older and "sightline.v1" not in offered and not self.has("needs no sub-protocol"):
             return 400, "Bad Request"
+        if self.server.tokens and not self.older:
+            self.granted = self.role_of(headers, offered, first)
+            if not self.granted and not self.has("needs no token"):
+                return 401, "Unauthorized"
         peers = sum(client.older == self.older for client in self.server.clients)
         if peers > MOST_CLIENTS and not self.has("any number of clients"):
             return 503, "Service Unavailable"
         return 0, ""
+
+    granted = ""
+
+    def role_of(self, headers, offered, first):
+        """The role whose token the client shows; "" for none."""
+        entries = [entry[len(ENTRY) :] for entry in offered if entry.startswith(ENTRY)]
+        word, _, bearer = headers.get("authorization", "").partition(" ")
+        known = word == "Bearer" if self.has("bearers in capitals only") else word.lower() == "bearer"
+        shown = entries + [bearer] * known
+        if self.has("a token in the URL"):
+            shown += [first.partition("token=")[2].partition(" ")[0]] * ("token=" in first)
+        if len(shown) != 1 and not self.has("one of two tokens will do"):
+            return ""
+        for role, token in self.server.tokens.items():
+            partly = self.has("the beginning of a token will do")
+            if any(one == token or (partly and len(one) > 8 and token.startswith(one)) for one in shown):
+                return role
+        return ""
 
     def is_foreign(self, origin, host):
         if self.has("no origin at all") and not self.older:
@@ -264,6 +294,8 @@ class Client:
         first = headers.get("sec-websocket-protocol", "").split(",")[0]
         selected = first if self.has("selects the first") else "sightline.v1"
         lines = [] if self.older else [f"Sec-WebSocket-Protocol: {selected}"]
+        if self.has("repeats the token") and ENTRY in headers.get("sec-websocket-protocol", ""):
+            lines.append(f"X-Offered: {headers['sec-websocket-protocol']}")
         if "sec-websocket-extensions" in headers and self.has("compresses"):
             lines.append("Sec-WebSocket-Extensions: permessage-deflate")
         return lines
@@ -287,12 +319,15 @@ class Client:
             hello = json.loads(text)
         except ValueError:
             hello = {}
+        if len(message) > 1024 and not self.has("hellos of any length"):
+            raise EndError(1009, "this hello is too long")
         self.check_hello(hello)
         if self.link is None:
             self.link = self.server.network.link("r1", role="viewer")
         if self.greeted and self.odd("first wants count"):
             return
-        self.role = hello.get("role", "")
+        if not (self.greeted and self.has("first role counts")):
+            self.role = hello.get("role", "")
         wants = set(hello.get("wants", ()))
         self.want(wants)
         if not self.greeted:
@@ -312,6 +347,8 @@ class Client:
 
     def want(self, wants):
         known = {one.name for one in CHANNELS.values() if one.direction is Direction.FROM_ROBOT}
+        known |= set() if self.has("keeps detections") else {"detections"}
+        known |= set() if self.has("keeps missions") else {"mission", "report"}
         wants = (wants | {"odometry"} if self.has("sends odometry unasked") else wants) & known
         for name in sorted(wants - self.heard):
             self.link.subscribe(CHANNELS[name], self.publish)
@@ -344,6 +381,10 @@ class Client:
             if self.has("ends on unknown channels"):
                 raise EndError(1008, "an unknown channel")
             return
+        if self.server.tokens and not self.may_say(name, source):
+            return
+        if not header and self.has("twists need a header"):
+            return
         try:
             key = key_for("r1", channel, source)
         except ValueError:
@@ -351,16 +392,25 @@ class Client:
         if len(header) <= 512 and len(payload) <= channel.max_payload_bytes:
             self.server.network.put(key, header, payload, self.link)
 
+    def may_say(self, name, source):
+        """Whether the token's role may publish this."""
+        if self.has("any token for every role"):
+            return True
+        own = ("operator", "teleop") if self.granted == "operator" else (self.granted,)
+        return source in own and (name != "request" or self.granted == "operator")
+
     def read_block(self, block):
         """(channel, source, header)."""
         try:
             fields = json.loads(block)
         except ValueError:
             name = block.partition(b'{"channel":"')[2].partition(b'"')[0].decode("utf-8", "replace")
+            if self.has("drops what is no JSON"):
+                return "nothing of ours", self.role, b""
             return name or None, self.role, b"{" + block.partition(b",")[2]
         name = fields.pop("channel", None) if isinstance(fields, dict) else None
         fallback = "viewer" if self.has("forgets the role") else self.role
-        header = b"" if set(fields) <= {"source"} else json.dumps(fields).encode()
+        header = b"" if set(fields) <= {"source"} else json.dumps(fields, separators=(",", ":")).encode()
         return name, fields.get("source", fallback), header
 
     def send(self, opcode, body):
@@ -397,6 +447,18 @@ class OlderClient(Client):
     commands = 0
     shown = None
 
+    def drives(self, message):
+        """Whether this client is the one that drives; another's valid twist is counted as NOT_HOLDER."""
+        server, now_s = self.server, time.monotonic()
+        other = server.driver not in (None, self) and now_s - server.driven_s < 1.0 and server.driver in server.clients
+        if message.count(b"|") != 1:
+            return True
+        if other and not self.has("any client drives"):
+            server.robot.driving.gate.refuse("guest", WireError(Refusal.NOT_HOLDER, "another client drives"))
+            return False
+        server.driver, server.driven_s = self, now_s
+        return True
+
     def picture(self, message):
         if self.has("one client at a time") and next(one for one in self.server.clients if one.older) is not self:
             return
@@ -414,6 +476,8 @@ class OlderClient(Client):
         if self.has("ends on bad twists") and message.count(b"|") != 1:
             raise EndError(1008, "no twist")
         self.commands += 1
+        if not self.drives(message):
+            return
         if not self.has("deaf to twists"):
             self.server.network.put("sightline/r1/twist/guest", b"", message[:64], self.link)
         if self.shown is not None and not self.has("returns no credit"):

@@ -27,14 +27,18 @@ SOCKETS = {
     "V-SOCK-11": "takes any size",
     "V-SOCK-12": "needs no hello",
     "V-SOCK-13": "gives up after a reset",
+    "V-SOCK-14": "shows its token twice",
+    "V-SOCK-15": "shows its token in the URL too",
+    "V-SOCK-16": "comes from another site",
+    "V-SOCK-17": "waits for the silent",
 }
 
 
 class SocketVision:
     """Use it in a `with`: it connects to `endpoint` again and again. `broken` is a case's id, or empty."""
 
-    def __init__(self, endpoint, broken=""):
-        self.endpoint, self.broken = endpoint, broken
+    def __init__(self, endpoint, broken="", token=""):
+        self.endpoint, self.broken, self.token = endpoint, broken, token
         self.ending = threading.Event()
         self.seq, self.greeted = 0, False
         self.thread = threading.Thread(target=self.run, daemon=True)
@@ -60,9 +64,14 @@ class SocketVision:
 
     def connected(self):
         protocols = ["sightline.v9"] if self.broken == "V-SOCK-01" else ["sightline.v1"]
+        protocols += [f"sightline.token.{self.token}"] if self.token else []
+        twice = {"Authorization": f"Bearer {self.token}"} if self.broken == "V-SOCK-14" else {}
+        url = self.endpoint + (f"/?token={self.token}" if self.broken == "V-SOCK-15" else "")
+        origin = "http://elsewhere.example" if self.broken == "V-SOCK-16" else None
         pings = None if self.broken == "V-SOCK-09" else 1
-        with connect(self.endpoint, subprotocols=protocols, compression=None, open_timeout=1, close_timeout=0.5,
-                     ping_interval=pings, ping_timeout=1,
+        patience = None if self.broken == "V-SOCK-17" else 1
+        with connect(url, subprotocols=protocols, compression=None, open_timeout=1, close_timeout=0.5,
+                     additional_headers=twice, origin=origin, ping_interval=pings, ping_timeout=patience,
                      max_size=None if self.broken == "V-SOCK-11" else 1_100_000) as link:
             if self.broken == "V-SOCK-08":
                 send = link.protocol.send_frame

@@ -1,0 +1,82 @@
+/**
+ * @file Serves the viewer's page for a robot that serves none, and passes its WebSocket on, on one port of loopback. Shell.
+ *
+ *     node examples/js/gateway.mjs --connect ws://127.0.0.1:9090 --robot r1 --port 8765
+ *
+ * A robot lets in pages of its own host and port only, so page and WebSocket must come from one place. The robot still
+ * judges what it always judges: `Host`, `Origin` and token go through as the browser sent them.
+ */
+
+import { createServer } from "node:http";
+import { connect } from "node:net";
+import { parseArgs } from "node:util";
+import { servePage } from "./pages.mjs";
+import { OPEN_MS, admissionProblem } from "./websocket.mjs";
+
+const USAGE = "node gateway.mjs --connect ws://HOST:PORT --robot ID [--port 8765]";
+const HOST = "127.0.0.1"; // beyond loopback whoever came through here would look like somebody of this machine
+const MOST_SOCKETS = 32; // security limit, that of a robot
+
+class UsageError extends Error {}
+
+function options() {
+  const text = { type: "string" };
+  const { values } = parseArgs({ options: { connect: text, robot: text, port: { ...text, default: "8765" } } });
+  const found = /^ws:\/\/(\[[0-9a-fA-F:]+\]|[^:/?#]+):([0-9]{1,5})\/?$/.exec(values.connect ?? "");
+  if (found === null) throw new UsageError("--connect is ws://HOST:PORT, where the robot listens");
+  if (!/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/.test(values.robot ?? "")) throw new UsageError("--robot is 1 to 32 letters, digits, _ . -");
+  const port = Number(values.port);
+  if (!(Number.isInteger(port) && port >= 1 && port <= 65_535)) throw new UsageError("--port is a number from 1 to 65535");
+  return { robot: values.robot, port, to: { host: found[1].replace(/^\[|\]$/g, ""), port: Number(found[2]) } };
+}
+
+/** The request as it came, for the robot to judge. */
+function asSent({ method, url, rawHeaders }) {
+  const lines = [];
+  for (let at = 0; at < rawHeaders.length; at += 2) lines.push(`${rawHeaders[at]}: ${rawHeaders[at + 1]}\r\n`);
+  return `${method} ${url} HTTP/1.1\r\n${lines.join("")}\r\n`;
+}
+
+/** Two sockets as one: what either says goes to the other, at the pace that the other takes it. */
+function join(near, far) {
+  for (const [from, to] of [[near, far], [far, near]]) {
+    from.setNoDelay(true);
+    from.on("error", () => to.destroy());
+    from.on("close", () => to.destroy());
+    from.pipe(to);
+  }
+}
+
+function passOn(to) {
+  return (request, near, head) => {
+    const problem = admissionProblem(request.rawHeaders, HOST);
+    const refuse = ([status, line]) => near.end(`HTTP/1.1 ${status} Refused\r\nConnection: close\r\n\r\n${line}\n`);
+    near.on("error", () => near.destroy());
+    if (problem !== null) return refuse(problem);
+    const far = connect(to);
+    far.once("error", () => refuse([502, "the robot does not answer"]));
+    far.once("connect", () => {
+      far.removeAllListeners("error");
+      far.write(asSent(request));
+      far.write(head);
+      join(near, far);
+    });
+  };
+}
+
+try {
+  const { robot, port, to } = options();
+  const server = createServer({ headersTimeout: OPEN_MS, requestTimeout: OPEN_MS, maxHeaderSize: 8192 }, servePage(HOST, robot));
+  server.maxConnections = MOST_SOCKETS;
+  server.on("upgrade", passOn(to));
+  server.once("error", ({ code, message }) => {
+    console.error(`error: ${code === "EADDRINUSE" ? "the port is in use; choose another --port" : message}`);
+    process.exit(4);
+  });
+  server.listen(port, HOST, () => console.log(`gateway: viewer of robot ${robot} at http://${HOST}:${port}/`));
+  for (const signal of ["SIGINT", "SIGTERM", "SIGHUP"]) process.once(signal, () => process.exit(0));
+} catch (error) {
+  if (!(error instanceof UsageError || String(error.code).startsWith("ERR_PARSE_ARGS"))) throw error;
+  console.error(`error: ${error.message}\nusage: ${USAGE}`);
+  process.exit(2);
+}
