@@ -178,3 +178,13 @@ VALUES = st.recursive(
 @given(st.dictionaries(NAMES, VALUES, max_size=4))
 def test_any_table_survives_as_toml(table):
     assert tomllib.loads(toml_text(table)) == table
+
+
+def test_a_vision_may_name_several_robots_and_a_robot_is_one():
+    assert load("vision", sets=("robot=r*",), environ={}).config.robot == "r*"
+    with pytest.raises(ConfigError, match="robot id 'r\\*' is not usable"):
+        load("robot", sets=("robot=r*",), environ={})
+
+
+def test_what_a_simulated_robot_is_made_of_may_be_a_file():
+    assert load("sim", sets=("robot=my/car.toml",), environ={}).config.robot == "my/car.toml"
