@@ -23,8 +23,11 @@ from operator_side import (
     cli_judge,
     cli_keys,
     cli_metrics,
+    cli_mission,
     cli_people,
+    cli_scenarios,
     cli_services,
+    cli_teleop,
 )
 from operator_side.settings_errors import no_such_name
 from protocol.errors import SightlineError
@@ -45,6 +48,7 @@ app = typer.Typer(
 for module in (
     cli_services, cli_judge, cli_people, cli_bench, cli_faults,
     cli_calibrate, cli_keys, cli_install, cli_doctor, cli_metrics, cli_config, cli_conform,
+    cli_teleop, cli_mission, cli_scenarios,
 ):
     module.register(app)
 
@@ -75,20 +79,29 @@ def _unexpected(error: Exception) -> int:
     """A usage error of the command line, or a fault of the program; either way one line."""
     usage = getattr(error, "format_message", None)
     if usage is not None:
-        return _say(_usage_line(" ".join(usage().split())), getattr(error, "exit_code", 2))
+        line = _usage_line(" ".join(usage().split()), getattr(error, "ctx", None))
+        return _say(line, getattr(error, "exit_code", 2))
     if os.environ.get("SIGHTLINE_DEBUG") == "1":
         raise error
     where = f"{type(error).__name__}: {' '.join(str(error).split())}"
     return _say(f"unexpected {where}; SIGHTLINE_DEBUG=1 shows where, please report it", UNEXPECTED)
 
 
-def _usage_line(text: str) -> str:
-    """A usage error with the nearest command, where it is about one."""
+def _usage_line(text: str, context: typer.Context | None) -> str:
+    """A usage error with the nearest command of the same group, where it is about one."""
     unknown = _UNKNOWN_COMMAND.match(text)
     if unknown is None:
         return f"{text.rstrip('.')}; see --help"
-    names = list(getattr(typer.main.get_command(app), "commands", ()))
-    return no_such_name("command", unknown[1], names) + "; see sightline --help"
+    path = context.command_path if context else "sightline"
+    here = _names_in(context.command if context else None)
+    if path != "sightline" and unknown[1] in _names_in(None):
+        return f"no command called {unknown[1]!r} in {path}; did you mean 'sightline {unknown[1]}'?; see {path} --help"
+    return no_such_name("command", unknown[1], here) + f"; see {path} --help"
+
+
+def _names_in(group: object) -> list[str]:
+    """Names of a group's commands; None is the program itself."""
+    return list(getattr(group or typer.main.get_command(app), "commands", ()))
 
 
 def _say(line: str, code: int) -> int:

@@ -44,13 +44,12 @@ def check(service: ServiceName, file: File = None, profile: Profile = None, sets
 def _check_names(config: BaseModel) -> None:
     """What the configuration names: devices with their options, scenario and robot. Opens nothing."""
     if isinstance(config, RobotConfig):
-        named = {"cameras": config.camera, "drives": config.drive, "range_sensors": config.ranging}
+        named = {"cameras": config.camera, "drives": config.motors, "range_sensors": config.ranging}
         for group, choice in named.items():
             if choice is not None:
                 configured(group, choice)
     if isinstance(config, SimConfig):
-        load_scenario(config.scenario)
-        load_robot(config.robot)
+        load_robot(config.robot or load_scenario(config.scenario).robot)
 
 
 def show(

@@ -27,8 +27,11 @@ def register(app: typer.Typer) -> None:
 
 def demo(
     *,
-    scenario: Annotated[str, typer.Option(help="static, circle, eight, pushed, behind, walls, or a .toml.")] = "circle",
-    seconds: Annotated[float, typer.Option(help="How long to drive; 0: until Ctrl-C.")] = 20.0,
+    scenario: Annotated[str, typer.Option(help="A name of `sightline scenarios`, or a .toml.")] = "circle",
+    mission: Annotated[str | None, typer.Option(help="In place of the scenario's own, e.g. a baseline law.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="How long; 0: until Ctrl-C [default: 20, or what the course takes].")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Draws the start and the noise.")] = 1,
     latency_ms: Annotated[float, typer.Option(help="Added from capture to command, half on each leg.")] = 0.0,
     loss: Annotated[float, typer.Option(help="Share of messages lost on each leg, e.g. 0.1.")] = 0.0,
@@ -37,13 +40,16 @@ def demo(
     open_it: Annotated[bool, typer.Option("--open", help="Show the film when it is over.")] = False,
     as_json: Json = False,
 ) -> int:
-    """Follow a ball by sight: simulation, robot and vision as three real processes over Zenoh, scored and filmed."""
+    """Follow a ball by sight, or what else a scenario is about: simulation, robot and vision as real processes over
+    Zenoh, scored and filmed.
+    """
     _check_installed("pybullet", "av", "matplotlib", "mcap")
     with needs("all"):
         from operator_side.demo import DemoOptions, run_demo
         from operator_side.demo_report import report, summary
     say = _to_stderr if as_json else typer.echo
-    run = run_demo(DemoOptions(scenario, seconds, seed, latency_ms, loss, out, transport), say)
+    lasting_s = _seconds(scenario, seconds)
+    run = run_demo(DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission), say)
     say("all three have ended; the run is being scored, replayed and filmed")
     judged = report(run)
     if as_json:
@@ -53,6 +59,16 @@ def demo(
     if open_it:
         webbrowser.open((judged.run.folder / "run.mp4").as_uri())
     return 0 if judged.ok else CHECK_FAILED
+
+
+def _seconds(scenario: str, asked: float | None) -> float:
+    """A ball is followed for as long as one likes; a course is driven to its end."""
+    from sim.scenario import load_scenario
+
+    if asked is not None:
+        return asked
+    loaded = load_scenario(scenario)
+    return loaded.seconds if loaded.goals_m or loaded.light else 20.0
 
 
 def _check_installed(*packages: str) -> None:
@@ -74,23 +90,38 @@ def score(
     latency_ms: Annotated[str, typer.Option(help="Added latencies, separated by commas.")] = "50",
     loss: Annotated[str, typer.Option(help="Losses on each leg, separated by commas.")] = "0.1",
     seconds: Annotated[float | None, typer.Option(min=1, max=3600, help="[default: the scenario's own]")] = None,
+    mission: Annotated[str | None, typer.Option(help="In place of the scenario's own, e.g. a baseline law.")] = None,
+    robot_model: Annotated[str | None, typer.Option(help="In place of the scenario's own robot.")] = None,
+    look: Annotated[str | None, typer.Option(help="In place of the scenario's own light, e.g. dim.")] = None,
+    page: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Run every behaviour and its baseline, and write this page.")
+    ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Runs at once [default: one per core].")] = None,
     as_json: Json = False,
 ) -> int:
-    """Follow in virtual time, many times, and judge: the services' own logic, world truth, median and worst."""
+    """Drive in virtual time, many times, and judge: the services' own logic, world truth, median and worst."""
     with needs("all"):
         from operator_side.score_runs import cases, run_cases
         from operator_side.score_table import progress, score_text
         from sim.scenario import scenario_names
+    if page is not None:
+        return _write_page(page, numbers("--seeds", seeds, int), jobs or os.cpu_count() or 1)
     wanted = cases(
         scenario_names() if scenario == "all" else scenario.split(","),
         numbers("--seeds", seeds, int), numbers("--latency-ms", latency_ms, float), numbers("--loss", loss, float),
-        seconds,
+        seconds, mission=mission, robot=robot_model, look=look,
     )
     with progress(len(wanted)) as advance:
         report = run_cases(wanted, jobs or os.cpu_count() or 1, lambda _case: advance())
     typer.echo(json.dumps(report.to_dict()) if as_json else score_text(report))
     return 0 if report.ok else CHECK_FAILED
+
+
+def _write_page(page: Path, seeds: list[int], jobs: int) -> int:
+    with needs("all"):
+        from operator_side.behaviours import write_page
+        from operator_side.score_table import progress
+    return 0 if write_page(page, seeds, jobs, progress) else CHECK_FAILED
 
 
 def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:

@@ -1,6 +1,7 @@
 """Commands that run a service: `sim`, `robot`, `vision`. Shell."""
 
 import os
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
@@ -8,6 +9,7 @@ import typer
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
+from protocol.log_lines import use_form
 from robot_side.config import DEFAULT_ENDPOINT
 
 ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help="TOML file; see `sightline config`.")]
@@ -25,6 +27,9 @@ _SECURE = typer.Option("--secure", metavar="DIR", help="Keys made by `sightline 
 Secure = Annotated[str, _SECURE]
 MaybeSecure = Annotated[str | None, _SECURE]
 RobotName = Annotated[str | None, typer.Option("--robot", metavar="ID", help="The robot's id [default: r1].")]
+LogForm = Annotated[
+    str | None, typer.Option("--log", metavar="FORM", help="text, or json: one object a line [default: text].")
+]
 SocketDir = Annotated[
     str | None, typer.Option("--socket-dir", metavar="DIR", help="Where the simulation's sockets are.")
 ]
@@ -41,19 +46,23 @@ def register(app: typer.Typer) -> None:
 def sim(
     *,
     scenario: Annotated[
-        str | None, typer.Option(help="static, circle, eight, pushed, behind, walls, or a .toml file.")
+        str | None, typer.Option(help="A name of `sightline scenarios`, or a .toml file [default: circle].")
     ] = None,
-    robot_model: Annotated[str | None, typer.Option(help="raspberry, or a .toml file.")] = None,
+    robot_model: Annotated[
+        str | None, typer.Option(help="raspberry, gazebo-raspi, thymio, chaser, or a .toml [default: the scenario's].")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Draws the start and the noise.")] = None,
     motor_log: Annotated[str | None, typer.Option(metavar="FILE", help="CSV of every motor command.")] = None,
     seconds: Annotated[float | None, typer.Option(help="End by itself after this long.")] = None,
     socket_dir: SocketDir = None,
     config: ConfigFile = None,
     sets: Sets = None,
+    log: LogForm = None,
 ) -> int:
     """Simulate a robot's hardware, in place of a real one, until Ctrl-C."""
     from sim.service import run
 
+    use_form(log, "sim")
     options = {
         "scenario": scenario, "robot": robot_model, "seed": seed, "motor_log": motor_log, "seconds": seconds,
         "socket_dir": socket_dir,
@@ -64,6 +73,10 @@ def sim(
 
 
 def robot(
+    task: Annotated[
+        str | None,
+        typer.Argument(metavar="[test-wheels]", help="Turn each wheel by itself, off the ground, instead of running."),
+    ] = None,
     *,
     robot: RobotName = None,
     listen: Listen = None,
@@ -73,9 +86,13 @@ def robot(
     zero_motors: Annotated[
         bool, typer.Option("--zero-motors", help="Only set the motors to zero, e.g. after a crash, and end.")
     ] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="With test-wheels: the wheels are off the ground, ask nothing.")
+    ] = False,
     socket_dir: SocketDir = None,
     config: ConfigFile = None,
     sets: Sets = None,
+    log: LogForm = None,
 ) -> int:
     """Run a robot: its wheels, its camera, its link, until Ctrl-C. Listens on this machine only unless told otherwise.
 
@@ -84,11 +101,16 @@ def robot(
     from robot_side.driver import run
     from robot_side.driver import zero_motors as set_to_zero
 
+    use_form(log, "robot")
     options: dict[str, Any] = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure}
     options |= {f"{device}.options.socket_dir": socket_dir for device in ("camera", "drive")}
     loaded = load_service(
         "robot", profile=profile, file=config, sets=sets or (), options=options, environ=os.environ
     )
+    if task is not None:
+        from operator_side.cli_robot_tools import run_task
+
+        return run_task(task, loaded.config, yes)  # type: ignore[arg-type]
     with needs("zenoh"):
         return (set_to_zero if zero_motors else run)(loaded.config)  # type: ignore[arg-type]
 
@@ -104,6 +126,9 @@ def vision(
     detector: Annotated[
         str | None, typer.Option("--detector", metavar="KIND", help="hsv, or boxes that a guest sends [default: hsv].")
     ] = None,
+    mission: Annotated[
+        str | None, typer.Option("--mission", metavar="NAME", help="What to do with what is seen [default: follow].")
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what is seen and steer nothing.")] = False,
     camera: Annotated[
         str | None, typer.Option("--camera", metavar="KIND", help="With --dry-run: a camera of this machine.")
@@ -111,9 +136,15 @@ def vision(
     camera_sets: Annotated[
         list[str] | None, typer.Option("--camera-set", metavar="KEY=VALUE", help="An option of it, e.g. fps=15.")
     ] = None,
+    metrics: Annotated[
+        str | None,
+        typer.Option("--metrics", metavar="[HOST:]PORT", help="Serve /metrics and /health there, e.g. 9465."),
+    ] = None,
+    log: LogForm = None,
     shape: Annotated[str | None, typer.Option("--shape", hidden=True)] = None,
 ) -> int:
     """Look at a robot's pictures and steer it, until Ctrl-C."""
+    use_form(log, "vision")
     if camera is not None and not dry_run:
         raise ConfigError("--camera looks without a robot, so there is nothing to steer: add --dry-run")
     if camera_sets and camera is None:
@@ -121,7 +152,7 @@ def vision(
     if robot is not None and "://" in robot:  # the address of a robot that has one endpoint and no other name
         connect, robot = [*(connect or ()), robot], None
     options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure,
-               "detector.kind": detector}
+               "detector.kind": detector, "mission.kind": mission}
     loaded = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
     with needs("vision"):
         if dry_run:
@@ -132,11 +163,23 @@ def vision(
             return run_shaped(loaded.config, shape)  # type: ignore[arg-type]
         from vision_side.service import run
 
+        if metrics is not None:
+            return _measured(run, loaded.config, metrics)
         return run(loaded.config)  # type: ignore[arg-type]
 
 
-def router(listen: Listen = None, connect: Connect = None, secure: Secure = "") -> int:
+def _measured(run: Any, config: Any, where: str) -> int:
+    with needs("metrics"):
+        import_module("prometheus_client")
+    from operator_side.vision_metrics import served
+
+    with served(where) as observe:
+        return int(run(config, observe))
+
+
+def router(listen: Listen = None, connect: Connect = None, secure: Secure = "", log: LogForm = None) -> int:
     """Run the place where robots, visions and people of one site meet, until Ctrl-C. All of them connect to it."""
+    use_form(log, "router")
     with needs("zenoh"):
         from operator_side.router import run
 

@@ -20,14 +20,15 @@ from operator_side.processes import Processes
 from operator_side.recording import Recorder
 from operator_side.replay import VISION_CONFIG
 from operator_side.requests import SOURCE, Operator
+from operator_side.scenario_settings import robot_of, robot_table, vision_table
 from operator_side.service_settings import load_service
 from operator_side.shaped_vision import Shape
 from operator_side.toml_text import toml_text
 from protocol.errors import ConfigError, HardwareError, SightlineError
 from protocol.transports.opening import open_link
 from sim.bus import TruthReader
-from sim.robot_model import load_robot
 from sim.scenario import Scenario, load_scenario
+from sim.toml_file import laid_over
 from sim.truth import Truth
 
 ROBOT: Final = "r1"
@@ -52,6 +53,8 @@ class DemoOptions:
     loss: float = 0.0
     out: Path | None = None
     transport: str = "zenoh"
+    mission: str | None = None
+    """In place of the scenario's own."""
 
     def __post_init__(self) -> None:
         """Raise ConfigError for what cannot be run."""
@@ -112,6 +115,8 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str]
         display(options.seconds, run.scenario.stand_off_m) as block,
     ):
         operator = Operator(link)
+        if run.scenario.labels:
+            processes.start("labels", ["labels", ROBOT, "--connect", endpoint, "--socket-dir", sockets])
         processes.start("vision", _vision_arguments(run, for_vision))
         _arm(operator, processes)
         try:
@@ -160,21 +165,21 @@ def _discard_old(truth: TruthReader) -> None:
 def _write_configuration(run: DemoRun, sockets: str) -> None:
     """Leave each service's file in the run folder, so that a person can start the same by hand."""
     device = {"kind": "sim", "options": {"socket_dir": sockets}}
-    legacy = run.options.transport == "legacy"
+    options, model = run.options, robot_of(run.scenario)
+    legacy = options.transport == "legacy"
     files: dict[str, dict[str, Any]] = {
         "sim": {
-            "scenario": run.options.scenario, "seed": run.options.seed, "socket_dir": sockets,
+            "scenario": options.scenario, "seed": options.seed, "socket_dir": sockets,
             "motor_log": str(run.folder / MOTOR_LOG),
         },
-        "robot": {
+        "robot": laid_over(robot_table(model), {
             "robot": ROBOT, "state_dir": str(run.folder / "state"), "camera": device, "drive": device,
             "safety": {"guests": legacy},
-        },
+        }),
         "vision": {
-            "robot": ROBOT,
-            "target": {"radius_m": run.scenario.target.radius_m, "stand_off_m": run.scenario.stand_off_m},
+            "robot": ROBOT, **vision_table(run.scenario, model, options.seed, options.mission),
             # The older dialect carries no camera model.
-            **({"camera": load_robot("raspberry").camera.camera_model().model_dump()} if legacy else {}),
+            **({"camera": model.camera.camera_model().model_dump()} if legacy else {}),
         },
     }
     for name, table in files.items():

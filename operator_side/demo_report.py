@@ -11,7 +11,9 @@ from operator_side.demo import RECORDING, DemoRun
 from operator_side.extras import needs
 from operator_side.processes import last_line
 from operator_side.replay import Replayed, replay
-from operator_side.score import Check, Score, judge, score
+from operator_side.score import Check, Score, score
+from operator_side.score_bounds import judge
+from operator_side.score_course import figures_of
 from operator_side.shaped_vision import INJECTED
 from protocol.errors import SightlineError
 
@@ -52,7 +54,7 @@ def report(run: DemoRun) -> DemoReport:
     """Judge `run` and write its files. Raises SightlineError for a run that was ended before it began."""
     if not run.samples:
         raise SightlineError(f"ended before the robot drove; the logs are in {run.folder}")
-    result = score(run.samples, run.scenario.stand_off_m)
+    result = score(run.samples, run.scenario.stand_off_m, figures_of(run.scenario, run.samples))
     checks = _checks(run, result)
     injected = _injected(run)
     recording = run.folder / RECORDING

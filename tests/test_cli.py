@@ -77,7 +77,9 @@ def test_alone_it_shows_its_help(capsys):
     ("arguments", "code", "expected"),
     [
         (["dmeo"], 2, "did you mean 'demo'"),
-        (["config", "chekc"], 2, "no command called 'chekc'"),
+        (["config", "chekc"], 2, "no command called 'chekc'; did you mean 'check'?; see sightline config --help"),
+        (["bench", "pipline"], 2, "no command called 'pipline'; did you mean 'pipeline'?; see sightline bench --help"),
+        (["bench", "vision"], 2, "no command called 'vision' in sightline bench; did you mean 'sightline vision'?"),
         (["config"], 2, "Missing command"),
         (["config", "check"], 2, "SERVICE"),
         (["config", "check", "robto"], 2, "did you mean 'robot'"),
