@@ -71,7 +71,7 @@ def test_red_stops_before_the_line_from_any_speed_it_was_seen_in_time_at() -> No
             wanted = stop.speed(left_m, speed, cruise)
             speed += max(-0.02, min(0.02, wanted - speed))
             left_m -= speed * 0.02
-        assert 0.02 < left_m < 0.08
+        assert 0.05 < left_m < 0.11
 
 
 @pytest.mark.parametrize(("left_m", "clears"), [(0.001, True), (0.03, True), (0.05, False), (0.5, False),
@@ -97,6 +97,13 @@ def test_green_lets_go_at_its_second_frame_and_red_stops_at_its_first() -> None:
     assert stop.speed(0.02, 0.0, 0.3) == 0.3
     stop.see("red", 0.03)
     assert stop.speed(0.02, 0.0, 0.3) == 0.0
+
+
+def test_who_is_across_goes_on_whatever_the_light_shows() -> None:
+    stop = StopLine(StopConfig())
+    stop.see("red", 0.03)
+    assert stop.speed(-0.05, 0.0, 0.3) == 0.0
+    assert stop.speed(-0.2, 0.0, 0.3) == 0.3
 
 
 def test_a_light_that_is_hidden_for_long_counts_as_red() -> None:

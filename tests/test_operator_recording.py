@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from operator_side.lockstep import Conditions, Lockstep
-from operator_side.scenario_settings import robot_config, vision_config
 from operator_side.recording import CHUNK_BYTES, MAX_WAITING, Recorder, read_about, read_recording
 from operator_side.replay import VISION_CONFIG, replay, replay_steps
+from operator_side.scenario_settings import robot_config, vision_config
 from protocol.channels import CAMERA, CHANNELS, FRAME, STATUS, TWIST
 from protocol.codec import encode
 from protocol.errors import ConfigError

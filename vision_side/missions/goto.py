@@ -141,15 +141,20 @@ class Goto:
     def _leave(self, view: View, out: Point) -> Plan:
         """Too near to something: straight out forwards or backwards, and turn only afterwards, where there is room."""
         then = self._then(view)
-        bearing_rad = _bearing(then.pose, self._room(then.pose) or out)
+        bearing_rad = _bearing(then.pose, self._room(then) or out)
         backs = abs(bearing_rad) > math.pi / 2
         turn_rad = math.remainder(bearing_rad + math.pi, math.tau) if backs else bearing_rad
         creep = self._config.creep_mps * max(0.0, math.cos(1.3 * turn_rad))
         twist = self._braked(then.pose, -creep if backs else creep, max(-_SHY_RAD_S, min(_SHY_RAD_S, 2 * turn_rad)))
         return Plan(twist, "backing out" if backs else "going out", self._score())
 
-    def _room(self, pose: Pose) -> Point | None:
-        """Where to creep straight to before a turn: away from what the robot's corners would come too near to."""
+    def _room(self, then: Motion) -> Point | None:
+        """Where to creep straight to before a turn: away from what the robot's corners would come too near to.
+
+        That is judged where the robot could come to rest: one that still rolls towards a wall must not turn yet.
+        """
+        rolls_m = then.linear_mps * abs(then.linear_mps) / (2 * self._config.brake_mps2)
+        pose: Pose = (*to_odometry(then.pose, rolls_m, 0.0), then.pose[2])
         points = about_robot(self._ground.points(), pose)
         if not len(points):
             return None
@@ -185,7 +190,7 @@ class Goto:
     def _drive(self, view: View, route: Route, carrot: Point) -> Plan:
         header, config, then = view.header, self._config, self._then(view)
         bearing_rad = _bearing(then.pose, carrot)
-        room = self._room(then.pose) if abs(bearing_rad) > _TURN_RAD else None
+        room = self._room(then) if abs(bearing_rad) > _TURN_RAD else None
         if room is not None:
             return self._leave(view, room)
         goal_m = math.dist(header.pose[:2], route.goal)

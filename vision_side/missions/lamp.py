@@ -17,6 +17,7 @@ from protocol.config import Config
 from vision_side.config import Fraction, HsvRange
 from vision_side.decode import Picture
 from vision_side.detect.colour import colour_table
+from vision_side.detect.edge import sharp_outline
 from vision_side.detect.port import Detection
 
 Box = tuple[float, float, float, float]
@@ -28,6 +29,7 @@ COLOURS: Final = ("red", "yellow", "green")
 UNKNOWN: Final = "unknown"
 _MAX_SHAPES = 24  # security limit: no more dark shapes than this are looked at, the largest first
 _MOST_TINT = 1.5  # no room's light is more coloured than this; what seems to be is a coloured thing that fills the view
+_PALEST = 0.08  # below it hue is noise; JPEG spreads the colour of a lamp of 5 pixels over 16
 _FLAT = 0.6  # rows of a housing that are narrower than this part of its widest are its pole
 _DISC = 0.85  # of a lamp's radius: its edge is mixed with the housing
 _BRIGHT_SHARE = 0.4  # of a lamp's pixels, the brightest: what tells its colour when it is only a few pixels wide
@@ -38,11 +40,13 @@ class LampConfig(Config):
 
     housing_width_m: Annotated[float, Field(gt=0.01, le=3)] = 0.10
     housing_height_m: Annotated[float, Field(gt=0.01, le=3)] = 0.26
+    housing_depth_m: Annotated[float, Field(ge=0, le=3)] = 0.06
     lamp_radius_m: Annotated[float, Field(gt=0.005, le=1)] = 0.033
     lamp_pitch_m: Annotated[float, Field(gt=0.005, le=1)] = 0.0867
     """From the middle of one lamp to the next."""
     box_width_m: Annotated[float, Field(gt=0.01, le=3)] = 0.317
     box_height_m: Annotated[float, Field(gt=0.01, le=3)] = 0.281
+    box_depth_m: Annotated[float, Field(ge=0, le=3)] = 0.266
     """Of a whole box that changes its colour."""
     red: HsvRange = HsvRange(hue_low_deg=335, hue_high_deg=24, saturation_low=0.3, value_low=0.1)
     yellow: HsvRange = HsvRange(hue_low_deg=34, hue_high_deg=72, saturation_low=0.3, value_low=0.1)
@@ -111,6 +115,8 @@ class HousingReader:
         tall = self._config.housing_height_m / self._config.housing_width_m
         if top <= 0:
             top = min(0, round(bottom - tall * (right - left)))
+        if bottom - top < self._config.min_height_px:
+            return None
         if bottom >= size[0] or not 0.6 * tall <= (bottom - top) / (right - left) <= 1.5 * tall:
             return None
         return float(left), float(top), float(right), float(bottom)
@@ -169,7 +175,9 @@ class BoxReader:
         mask = cv2.morphologyEx(cv2.LUT(codes, table), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
         shapes, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         lights: list[Light] = []
-        for shape in sorted(shapes, key=len, reverse=True)[:_MAX_SHAPES]:
+        for rough in sorted(shapes, key=len, reverse=True)[:_MAX_SHAPES]:
+            sharp = sharp_outline(picture.bgr, mask, cv2.boundingRect(rough))
+            shape = rough if sharp is None else sharp
             x, y, width, height = cv2.boundingRect(shape)
             is_box = cv2.contourArea(shape) > 0.7 * (width - 1) * (height - 1)
             if height >= self._config.min_height_px and is_box and 0.4 < width / height < 2.0:
@@ -188,8 +196,7 @@ def balanced(bgr: Bgr) -> Bgr:
     tint = np.median(some[:, 1:2] / some, axis=0)
     gains = np.clip(tint, 1 / _MOST_TINT, _MOST_TINT)
     steps = np.clip(np.rint(np.arange(256)[:, None] * gains), 0, 255).astype(np.uint8).reshape(1, 256, 3)
-    white: Bgr = cv2.LUT(bgr, steps)
-    return white
+    return np.asarray(cv2.LUT(bgr, steps), np.uint8)
 
 
 def _overlap(one: Box, other: Box) -> bool:
@@ -201,13 +208,12 @@ def _ranges(config: LampConfig) -> dict[str, HsvRange]:
 
 
 def _is(bgr: NDArray[np.float64], one: HsvRange) -> bool:
-    """Whether a colour lies in a range."""
+    """Whether a colour is of a range's hue; paler than the range where a small lamp's colour ran into the housing."""
     pixel = (bgr / 255).astype(np.float32)[None, None]
     hue, saturation, value = cv2.cvtColor(pixel, cv2.COLOR_BGR2HSV)[0, 0].tolist()
     above, below = hue >= one.hue_low_deg, hue <= one.hue_high_deg
     turn = (above and below) if one.hue_low_deg <= one.hue_high_deg else (above or below)
-    return bool(turn and one.saturation_low <= saturation <= one.saturation_high
-                and one.value_low <= value <= one.value_high)
+    return bool(turn and _PALEST <= saturation <= one.saturation_high and one.value_low <= value <= one.value_high)
 
 
 def _detection(box: Box, scale: int, label: str) -> Detection:

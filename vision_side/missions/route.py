@@ -167,7 +167,7 @@ def _flooded(blocked: NDArray[np.bool_], tight: NDArray[np.bool_], seeds: list[t
         counts = [*counts[1:], reached]
         waited += wave ^ 1
         step += 1
-        grown = cv2.dilate(wave, _SQUARE if step % 2 else _CROSS)
-        wave |= cv2.bitwise_and(grown, free if step % _TIGHT_STEPS == 0 else roomy)
+        grown = np.asarray(cv2.dilate(wave, _SQUARE if step % 2 else _CROSS), np.uint8)
+        wave |= grown & (free if step % _TIGHT_STEPS == 0 else roomy)
     waited[wave == 0] = _UNREACHED
     return waited

@@ -11,6 +11,9 @@ from vision_side.missions.lamp import UNKNOWN
 _FRAMES = 2  # a colour that lets go must be seen this often, one after the other; one that stops counts at once
 
 
+_CROSSED_M = 0.15  # nobody who stops for a line ends so far beyond it: the robot has crossed, or began there
+
+
 class StopConfig(Config):
     """How the robot stops and goes."""
 
@@ -18,8 +21,8 @@ class StopConfig(Config):
     """The line is this far before the light."""
     front_m: Annotated[float, Field(ge=0, le=2)] = 0.07
     """The robot's front is this far ahead of its axle: what must not cross the line."""
-    margin_m: Annotated[float, Field(ge=0, le=1)] = 0.06
-    """It stops this far before the line: what the light's measured range may be off, and a little."""
+    margin_m: Annotated[float, Field(ge=0, le=1)] = 0.1
+    """It stops this far before the line: what the light's range may be off, and near enough to see all of it."""
     brake_mps2: Annotated[float, Field(gt=0, le=10)] = 0.5
     """How it brakes for a line seen in time."""
     hardest_mps2: Annotated[float, Field(gt=0, le=10)] = 1.2
@@ -62,8 +65,10 @@ class StopLine:
         return min(cruise_mps, math.sqrt(2 * self._config.brake_mps2 * max(0.0, room_m)), max(0.0, 3.0 * room_m))
 
     def _decide(self, left_m: float, moving_mps: float) -> None:
-        """Across on green, or too late to stop when green ends: the hardest braking would end beyond the line."""
-        if self.colour == "green":
+        """Across already, or too late to stop when green ends: the hardest braking would end beyond the line."""
+        if left_m < -_CROSSED_M:
+            self.clearing = True
+        elif self.colour == "green":
             self.clearing = left_m <= 0 and moving_mps > 0
         elif self._was_green and left_m < moving_mps**2 / (2 * self._config.hardest_mps2):
             self.clearing = True

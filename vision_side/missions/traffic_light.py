@@ -119,26 +119,48 @@ class TrafficLight:
         next_m, shown = math.inf, UNKNOWN
         for one in lights:
             place = self._light_place(one, pose)
-            left_m = self._left_m(line, place, pose) if place else math.inf
-            if place and -self._config.stop.cleared_m <= left_m < next_m:
+            if place is None or (one.colour == UNKNOWN and not self._is_known(place, pose)):
+                continue  # a dark shape that shows no colour may be anything
+            left_m = self._left_m(line, place, pose)
+            if -self._config.stop.cleared_m <= left_m < next_m:
                 next_m, shown = left_m, one.colour
-                self._meet(place, pose, self._is_cut(one.box))
+                self._meet(place, pose, self._is_cut(one.box) or shown == UNKNOWN)
         if self._light:
             self._stop.see(shown, view.dt_s)
 
     def _light_place(self, one: Light, pose: Pose) -> Place | None:
-        lamp = self._config.lamp
-        if self.reader is BoxReader:
-            return self._place(one.box, pose, lamp.box_height_m, lamp.box_width_m)
-        return self._place(one.box, pose, lamp.housing_height_m, lamp.housing_width_m)
+        """Its middle: what is measured is the face towards the robot, half its depth nearer."""
+        lamp, is_box = self._config.lamp, self.reader is BoxReader
+        height_m = lamp.box_height_m if is_box else lamp.housing_height_m
+        depth_m = lamp.box_depth_m if is_box else lamp.housing_depth_m
+        seen_m = height_m + depth_m * self._underside(one.box)
+        face = self._place(one.box, pose, seen_m, lamp.box_width_m if is_box else lamp.housing_width_m)
+        if face is None:
+            return None
+        away_m = math.dist(face, pose[:2])
+        share = 1 + depth_m / 2 / max(away_m, 0.1)
+        return pose[0] + share * (face[0] - pose[0]), pose[1] + share * (face[1] - pose[1])
 
-    def _meet(self, place: Place, pose: Pose, is_cut: bool) -> None:
-        """Know better where the light is, near looks most; or that another one comes first."""
-        away_m = math.dist(place, pose[:2])
-        weight = 1.0 / max(away_m, 0.2) ** 4
-        if self._light is None or math.dist(place, self._light) > _SAME_M + _SAME_SHARE * away_m:
+    def _underside(self, box: Detection) -> float:
+        """How much of a light's depth shows below its face: a housing above the lens is seen from below."""
+        return max(0.0, (self._camera.cy_px - box.y2_px) / self._camera.fy_px + self._camera.pitch_rad)
+
+    def _is_known(self, place: Place, pose: Pose) -> bool:
+        """Whether a place is that of the light that is already known."""
+        off_m = math.dist(place, self._light) if self._light else math.inf
+        return off_m <= _SAME_M + _SAME_SHARE * math.dist(place, pose[:2])
+
+    def _meet(self, place: Place, pose: Pose, is_vague: bool) -> None:
+        """Know better where the light is, near looks most; or that another one comes first.
+
+        One that is cut off or cannot be read is measured badly: it may tell a colour, but no new place.
+        """
+        if is_vague and self._light:
+            return
+        weight = 1.0 / max(math.dist(place, pose[:2]), 0.2) ** 4
+        if self._light is None or not self._is_known(place, pose):
             self._light, self._sure, self._stop = place, weight, StopLine(self._config.stop)
-        elif not is_cut:
+        else:
             self._sure += weight
             share = weight / self._sure
             old = self._light
