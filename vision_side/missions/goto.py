@@ -26,10 +26,11 @@ from vision_side.track import to_odometry
 Metres = Annotated[float, Field(ge=-100, le=100)]
 
 _NEAR_M = 0.8  # points further off than this are none of the brakes' business
-_BRAKE_SLACK_M = 0.015  # what steering and cells of 0.03 m may be off, and so much that it can turn where it stopped
+_BRAKE_SLACK_M = 0.017  # what steering and cells of 0.03 m may be off, and so much that it can turn where it stopped
 _ROOMY_M = 0.03  # more than needed, where that is no long way round: so that the brakes need not act beside a wall
 _OUTSIDE_M = 1.2 * CELL_M  # no free cell nearer than this: the robot is where it should not be
 _SHY_RAD_S = 0.4
+_WHEELS_S = 0.03  # so much later than the gate's own ramp the wheels give way
 _TURN_RAD = math.radians(25)  # a turn by more than this brings the robot's corners to the front
 _CORNER_SLACK_M = 0.002
 _SIDE_RAD, _SIDE_M = math.radians(45), 0.15  # to the other side of what is in the way only for this much shorter a way
@@ -133,7 +134,7 @@ class Goto:
         if entry is None:
             return Plan(STILL, "closed in", self._score())
         out = route.middle(entry)
-        if math.dist(out, robot) > _OUTSIDE_M:
+        if math.dist(out, robot) > _OUTSIDE_M and self._room(self._then(view)) is not None:
             return self._leave(view, out)
         self._carrot = self._chosen(route, robot, route.carrot(robot, entry), route.left_m(entry))
         return self._drive(view, route, self._carrot)
@@ -217,7 +218,7 @@ class Goto:
         config = self._config
         seen_from = self._poses.at(self._scan.t_us) if self._scan else then.pose
         room_m = config.sight_m - config.clearance_m - _BRAKE_SLACK_M - math.dist(seen_from[:2], then.pose[:2])
-        return braking_mps(room_m, 0.0, config.brake_mps2)
+        return braking_mps(room_m, _WHEELS_S, config.brake_mps2)
 
     def _braked(self, pose: Pose, linear: float, angular: float) -> Twist:
         """The twist, slowed down towards what is known to stand near."""

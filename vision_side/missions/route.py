@@ -24,6 +24,7 @@ _SQUARE = np.ones((3, 3), np.uint8)  # by turns with the cross: circles of the w
 _TIGHT_STEPS = 3
 _AROUND = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
 _LOOK_AHEAD_CELLS = 48
+_NEAREST_CELLS = 6  # steering for a nearer point than this is weaving
 _TRIED_EVERY = 3  # of the way's cells, which are looked at for a straight line to them
 
 
@@ -91,11 +92,11 @@ class Route:
         if self.sees(robot, self.goal, skip):
             return self.goal
         way = self._way(entry)
-        for cell in way[:0:-_TRIED_EVERY]:
+        for cell in way[:_NEAREST_CELLS:-_TRIED_EVERY]:
             point = self.middle(cell)
             if self.sees(robot, point, skip):
                 return point
-        return self.middle(way[min(len(way) - 1, _TRIED_EVERY)])
+        return self.middle(way[min(len(way) - 1, _NEAREST_CELLS)])
 
     def left_from(self, point: Point) -> float:
         """Length of the way from `point`; inf where none leads from there."""
