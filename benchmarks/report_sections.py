@@ -60,14 +60,14 @@ SECTIONS: Final = (
         "pictures in the same run. On loopback transports tie: what is compared is what a user gets. Peers see as the "
         "older write-ups do, with OpenCV's whole-picture pipeline; `+our eyes` shows a peer's transport alone, with "
         "Sightline's pipeline in it and without credit, age or a gate, and is not judged.",
-        ("bench", "loop", "--seconds", "30"),
+        ("bench", "loop", "--seconds", "15"),
         "loop-zenoh.png",
     ),
     Section(
         "loop-websocket",
         "The whole loop over WebSocket",
         "The same with `sightline.v1` between robot and vision.",
-        ("bench", "loop", "--transport", "websocket", "--seconds", "30"),
+        ("bench", "loop", "--transport", "websocket", "--seconds", "15"),
         "loop-websocket.png",
     ),
     Section(
