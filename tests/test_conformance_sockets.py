@@ -85,7 +85,7 @@ def test_a_defect_behind_tokens_is_found(case_id):
 def test_our_own_robot_passes(tmp_path):
     ends = [free_endpoint().replace("tcp/", scheme) for scheme in ("ws://", "ws-legacy://")]
     with RobotProcess(tmp_path, listen=ends, safety={"guests": True}):
-        assert bad(run_at(*ends)) == {}
+        assert bad(run_at(*ends, cases=[case for case in REAL if case.id not in BEHIND_TOKENS])) == {}
 
 
 @pytest.mark.kit
