@@ -6,6 +6,8 @@ They look at nothing: every frame is answered by a twist of zeros. `SOCKETS` map
 import contextlib
 import json
 import threading
+import time
+from collections import deque
 
 from websockets.exceptions import ConnectionClosedError, WebSocketException
 from websockets.frames import Opcode
@@ -32,6 +34,9 @@ SOCKETS = {
     "V-SOCK-16": "comes from another site",
     "V-SOCK-17": "waits for the silent",
 }
+
+SILENCE_S = 2.0
+"""As long as pings and their patience take together."""
 
 
 class SocketVision:
@@ -95,9 +100,18 @@ class SocketVision:
         if isinstance(first, str) and json.loads(first)["robot"] != "r1" and self.broken != "V-SOCK-05":
             link.close(1008, "another robot")
             return
+        heard = self.listening(link)
         while not self.ending.is_set():
             with contextlib.suppress(TimeoutError):
                 self.hear(link, self.received(link))
+            if self.broken == "V-SOCK-09" and time.monotonic() - heard[-1] > SILENCE_S:
+                return
+
+    def listening(self, link):
+        """When the last bytes came: who never pings can still tell the silent by them, and must, for its one defect."""
+        heard, take = deque([time.monotonic()], maxlen=1), link.protocol.receive_data
+        link.protocol.receive_data = lambda data: (heard.append(time.monotonic()), take(data))[1]
+        return heard
 
     def received(self, link):
         if self.broken == "V-SOCK-07":
