@@ -260,7 +260,8 @@ class Client:
             return 400, "Bad Request"
         if self.server.tokens and not self.older:
             self.granted = self.role_of(headers, offered, first)
-            if not self.granted and not self.has("needs no token"):
+            shows_none = "authorization" not in headers and len(offered) < 2 and "?" not in first
+            if not self.granted and not (shows_none and self.has("needs no token")):
                 return 401, "Unauthorized"
         peers = sum(client.older == self.older for client in self.server.clients)
         if peers > MOST_CLIENTS and not self.has("any number of clients"):
@@ -268,6 +269,7 @@ class Client:
         return 0, ""
 
     granted = ""
+    again = False  # whether this peer has said hello more than once
 
     def role_of(self, headers, offered, first):
         """The role whose token the client shows; "" for none."""
@@ -322,6 +324,7 @@ class Client:
         if len(message) > 1024 and not self.has("hellos of any length"):
             raise EndError(1009, "this hello is too long")
         self.check_hello(hello)
+        self.again = self.greeted
         if self.link is None:
             self.link = self.server.network.link("r1", role="viewer")
         if self.greeted and self.odd("first wants count"):
@@ -409,7 +412,7 @@ class Client:
                 return "nothing of ours", self.role, b""
             return name or None, self.role, b"{" + block.partition(b",")[2]
         name = fields.pop("channel", None) if isinstance(fields, dict) else None
-        fallback = "viewer" if self.has("forgets the role") else self.role
+        fallback = "viewer" if self.has("forgets the role") and not self.again else self.role
         header = b"" if set(fields) <= {"source"} else json.dumps(fields, separators=(",", ":")).encode()
         return name, fields.get("source", fallback), header
 
