@@ -202,7 +202,8 @@ class Client:
             raise EndError(1002, "a reserved bit or opcode")
         if opcode >= CLOSE and size > 125 and not self.has("long pings"):
             raise EndError(1002, "a control frame over 125 bytes")
-        if size > self.most_bytes and not self.has("older any size" if self.older else "any size"):
+        most_bytes = self.most_bytes * (4 if self.has("hellos of any length") and not self.older else 1)
+        if size > most_bytes and not self.has("older any size" if self.older else "any size"):
             raise EndError(1009, f"{size} bytes, more than this end can want")
 
     def odd(self, defect):
