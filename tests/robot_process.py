@@ -88,8 +88,10 @@ class RobotProcess:
 
     def motor_rows(self):
         """(t_us, left_rad_s, right_rad_s) of the motors' own log."""
-        rows = [line.split(",") for line in self.drive_log.read_text().splitlines()]
-        return [(int(t), float(left), float(right)) for t, left, right in rows if right]
+        text = self.drive_log.read_text()
+        whole = text[: text.rfind("\n") + 1].splitlines()  # the last line may still be being written
+        rows = [line.split(",") for line in whole]
+        return [(int(t), float(left), float(right)) for t, left, right in rows]
 
     def speed(self) -> float:
         """The last speed given to a wheel, rad/s, the larger of the two."""
