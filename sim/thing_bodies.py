@@ -1,6 +1,7 @@
 """Balls, boxes, cylinders and legs as bodies of one PyBullet client. Shell (PyBullet); reads no clock."""
 
 import math
+from functools import cache
 
 from sim.engine import pybullet
 from sim.path import Place
@@ -102,6 +103,7 @@ def ball_visual(client: int, radius_m: float, colour: Colour) -> int:
     ))
 
 
+@cache
 def round_mesh(rings: int = 24, sides: int = 48) -> tuple[list[Vector], list[int]]:
     """A unit ball's points and triangles; PyBullet's own is so coarse that it looks 2.5 % too small."""
     points: list[Vector] = []

@@ -1,0 +1,81 @@
+"""The model card: what the file is, how it was made, how good it is. Pure."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from operator_side.score_detectors_text import markdown
+from operator_side.score_scenes import Report
+from operator_side.train_export import MOST_BOXES, OPSET
+from sim.scene_textures import JUDGED, TRAINED
+from sim.scenes import HEIGHT_PX, LABELS, VALIDATED_FROM, WIDTH_PX
+
+if TYPE_CHECKING:
+    from operator_side.train_loop import Training
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """All that stands on it."""
+
+    training: "Training"
+    scenes: int
+    device: str
+    thresholds: Sequence[float]
+    parameters: int
+    size_bytes: int
+    sha256: str
+    seconds: float
+    validated: int
+    report: Report
+
+
+def card_text(card: Card) -> str:
+    """Markdown."""
+    return "\n".join([
+        "# The detector that comes with Sightline", "",
+        f"Finds {', '.join(f'`{label}`' for label in LABELS)} in a picture: a heat-map network of {card.parameters} "
+        f"numbers, {card.size_bytes} bytes, ONNX opset {OPSET}.", "",
+        f"SHA-256 `{card.sha256}`", "", *_input(), "", "## How it was made", "", *_made(card), "",
+        "## How good it is", "", *_judged(card), "",
+        "## What it is not", "",
+        "It has only ever seen drawn scenes: balls, boxes, traffic lights of three lamps, legs as two cylinders. Try "
+        "it on your own robot's pictures (`sightline vision --shadow onnx`) before you let it drive.", "",
+    ])
+
+
+def _input() -> list[str]:
+    return [
+        f"- `image`: uint8 (1, {HEIGHT_PX}, {WIDTH_PX}, 3), BGR.",
+        f"- `boxes` ({MOST_BOXES}, 4): x1, y1, x2, y2 in pixels of the input; `scores` ({MOST_BOXES}); `labels` "
+        f"({MOST_BOXES}), indices into the metadata's `labels`.",
+        "- Overlaps are removed and boxes decoded inside; a box that a better one covers has the score 0.",
+        "- A detection counts from a score of 0.5 on (`min_score` of the metadata): each label's own threshold is "
+        "worked into the model.",
+    ]
+
+
+def _made(card: Card) -> list[str]:
+    training = card.training
+    thresholds = ", ".join(f"{label} {one:.2f}" for label, one in zip(LABELS, card.thresholds, strict=True))
+    return [
+        f"`sightline train --scenes {card.scenes} --steps {training.steps} --batch {training.batch} "
+        f"--seed {training.seed} --device {card.device}`", "",
+        f"- Scenes: seeds 0 to {card.scenes - 1}, floors and walls of the families {', '.join(TRAINED)}; defects are "
+        "drawn anew each time a scene is shown.",
+        f"- Steps: {training.steps} of {training.batch} cut-outs (the last {100 * (1 - training.whole_from):.0f} % "
+        f"half as many whole pictures), AdamW, learning rate {training.rate:g}, weights averaged.",
+        f"- Thresholds: {thresholds}, chosen on {card.validated} scenes a column of the seeds from {VALIDATED_FROM}.",
+        f"- It took {card.seconds / 60:.0f} minutes, on a machine that did other things besides.",
+    ]
+
+
+def _judged(card: Card) -> list[str]:
+    report = card.report
+    last = report.first_seed + report.frames - 1
+    return [
+        f"{report.frames} scenes a column, seeds {report.first_seed} to {last}: floors and walls of the families "
+        f"{', '.join(JUDGED)}, and light from heights that training never saw. `sightline score detectors onnx "
+        f"--frames {report.frames}` shows it again. What the columns and figures mean: docs/learned-detector.md.", "",
+        markdown(report),
+    ]

@@ -1,0 +1,188 @@
+"""Trained weights -> ONNX, opset 17: uint8 BGR in; boxes, scores and labels out, suppressed and decoded. Pure (ONNX).
+
+Written node by node, so that nothing but the table and the weights decides what is in the file.
+"""
+
+import json
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from operator_side.train_network import BRIGHTNESS, DARKEST, GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, Layer, network
+from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX
+
+OPSET: Final = 17
+IR_VERSION: Final = 8
+"""What runtimes of opset 17 read."""
+MOST_BOXES: Final = 32
+SAME_BOX: Final = 0.5
+"""Of two boxes that overlap by more (intersection by union), only the better is kept: the other's score becomes 0."""
+_LARGEST: Final = 3.2  # of a log size: 390 pixels; keeps exp() finite on any picture
+
+Weights = dict[str, npt.NDArray[np.float32]]
+
+
+class Graph:
+    """Nodes and constants as they are added."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def add(self, kind: str, takes: Sequence[str], name: str, **how: Any) -> str:
+        """One node with one output, whose name is returned."""
+        self.nodes.append(helper.make_node(kind, list(takes), [name], name=name, **how))
+        return name
+
+    def constant(self, name: str, value: Any, kind: Any = np.float32) -> str:
+        """A number or an array that the graph holds."""
+        self.constants.append(numpy_helper.from_array(np.asarray(value, kind), name))
+        return name
+
+
+def onnx_bytes(weights: Weights, properties: dict[str, str]) -> bytes:
+    """The file. `properties` go into its metadata, beside the labels."""
+    graph = Graph()
+    last = _image(graph)
+    for layer in network():
+        last = _layer(graph, layer, weights)
+    outputs = _suppressed(graph, *_decoded(graph, last))
+    model = helper.make_model(
+        helper.make_graph(
+            graph.nodes, "eyes",
+            [helper.make_tensor_value_info("image", TensorProto.UINT8, [1, HEIGHT_PX, WIDTH_PX, 3])],
+            [helper.make_tensor_value_info(name, kind, shape) for name, kind, shape in outputs], graph.constants,
+        ),
+        opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="sightline",
+    )
+    helper.set_model_props(model, {"labels": json.dumps(LABELS), **properties})
+    onnx.checker.check_model(model, full_check=True)
+    return bytes(model.SerializeToString())
+
+
+def _image(graph: Graph) -> str:
+    """uint8 NHWC -> float NCHW, scaled to the same mean brightness."""
+    graph.add("Transpose", ["image"], "image.planes", perm=[0, 3, 1, 2])
+    graph.add("Cast", ["image.planes"], "image.float", to=TensorProto.FLOAT)
+    graph.add("ReduceMean", ["image.float"], "image.mean", axes=[1, 2, 3], keepdims=1)
+    graph.add("Max", ["image.mean", graph.constant("darkest", 255 * DARKEST)], "image.level")
+    graph.add("Div", [graph.constant("brightness", BRIGHTNESS), "image.level"], "image.gain")
+    return graph.add("Mul", ["image.float", "image.gain"], "picture")
+
+
+def _layer(graph: Graph, layer: Layer, weights: Weights) -> str:
+    takes = ["picture" if name == "image" else name for name in layer.takes]
+    after = f"{layer.name}.sum" if layer.relu and layer.kind != "head" else layer.name
+    if layer.kind in ("add", "add-up"):
+        if layer.kind == "add-up":
+            takes[1] = _doubled(graph, takes[1])
+        graph.add("Add", takes, after)
+    else:
+        weight = weights[f"{layer.name}.weight"]
+        names = [graph.constant(f"{layer.name}.{part}", weights[f"{layer.name}.{part}"]) for part in ("weight", "bias")]
+        groups = layer.channels if layer.kind == "depthwise" else 1
+        side = weight.shape[2]
+        graph.add("Conv", [*takes, *names], after, kernel_shape=[side, side], strides=[layer.stride] * 2,
+                  pads=[side // 2] * 4, group=groups)
+    return graph.add("Relu", [after], layer.name) if after != layer.name else after
+
+
+def _doubled(graph: Graph, name: str) -> str:
+    scales = graph.constant(f"{name}.scales", [1, 1, 2, 2])
+    return graph.add("Resize", [name, "", scales], f"{name}.doubled", mode="nearest",
+                     coordinate_transformation_mode="asymmetric", nearest_mode="floor")
+
+
+def _decoded(graph: Graph, head: str) -> tuple[str, str, str]:
+    """The best cells: corners (K, 4), scores (K,), labels (K,)."""
+    rows, columns = HEIGHT_PX // STRIDE, WIDTH_PX // STRIDE
+    parts = graph.constant("parts", [len(LABELS), GEOMETRY], np.int64)
+    graph.nodes.append(helper.make_node("Split", [head, parts], ["heat", "geometry"], name="split", axis=1))
+    graph.add("Sigmoid", ["heat"], "likely")
+    graph.add("ReduceMax", ["likely"], "best", axes=[1], keepdims=1)
+    graph.add("ArgMax", ["heat"], "which", axis=1, keepdims=1)
+    graph.add("MaxPool", ["best"], "around", kernel_shape=[3, 3], pads=[1, 1, 1, 1], strides=[1, 1])
+    # A peak is no smaller than any cell around it: the difference is zero there and below zero elsewhere.
+    graph.add("GreaterOrEqual", ["best", "around"], "is_peak")
+    graph.add("Cast", ["is_peak"], "peak", to=TensorProto.FLOAT)
+    graph.add("Mul", ["best", "peak"], "peaks")
+    flat = graph.constant("flat", [rows * columns], np.int64)
+    graph.add("Reshape", ["peaks", flat], "peaks.flat")
+    graph.add("Reshape", ["which", flat], "which.flat")
+    most = graph.constant("most", [MOST_BOXES], np.int64)
+    graph.nodes.append(helper.make_node("TopK", ["peaks.flat", most], ["top.scores", "cells"], name="topk", axis=0))
+    graph.add("Gather", ["which.flat", "cells"], "labels", axis=0)
+    graph.add("Reshape", ["geometry", graph.constant("flat4", [GEOMETRY, rows * columns], np.int64)], "geometry.flat")
+    graph.add("Gather", ["geometry.flat", "cells"], "own", axis=1)
+    _corners(graph, columns)
+    return "corners", "top.scores", "labels"
+
+
+def _corners(graph: Graph, columns: int) -> None:
+    """Cells and their geometry -> x1, y1, x2, y2, within the picture, (4, K)."""
+    graph.add("Cast", ["cells"], "cell", to=TensorProto.FLOAT)
+    graph.add("Add", ["cell", graph.constant("half_cell", 0.5)], "cell.middle")
+    graph.add("Div", ["cell.middle", graph.constant("columns", columns)], "cell.rows")
+    graph.add("Floor", ["cell.rows"], "cell.y")
+    graph.add("Mul", ["cell.y", "columns"], "cell.before")
+    graph.add("Sub", ["cell.middle", "cell.before"], "middle.x")
+    graph.add("Add", ["cell.y", "half_cell"], "middle.y")
+    parts = graph.constant("four", [1, 1, 1, 1], np.int64)
+    names = ["off.x", "off.y", "log.x", "log.y"]
+    graph.nodes.append(helper.make_node("Split", ["own", parts], names, name="split.own", axis=0))
+    stride, size = graph.constant("stride", STRIDE), graph.constant("half_size", SIZE_PX / 2)
+    zero, largest = graph.constant("zero", 0.0), graph.constant("largest", _LARGEST)
+    for axis, limit_px in (("x", WIDTH_PX), ("y", HEIGHT_PX)):
+        graph.add("Add", [f"middle.{axis}", f"off.{axis}"], f"at.{axis}")
+        graph.add("Mul", [f"at.{axis}", stride], f"px.{axis}")
+        graph.add("Min", [f"log.{axis}", largest], f"bounded.{axis}")
+        graph.add("Exp", [f"bounded.{axis}"], f"exp.{axis}")
+        graph.add("Mul", [f"exp.{axis}", size], f"half.{axis}")
+        limit = graph.constant(f"limit.{axis}", limit_px)
+        for sign, end in (("Sub", "1"), ("Add", "2")):
+            graph.add(sign, [f"px.{axis}", f"half.{axis}"], f"edge.{axis}{end}")
+            graph.add("Max", [f"edge.{axis}{end}", zero], f"inner.{axis}{end}")
+            graph.add("Min", [f"inner.{axis}{end}", limit], f"{axis}{end}")
+    graph.add("Concat", ["x1", "y1", "x2", "y2"], "corners", axis=0)
+
+
+def _suppressed(graph: Graph, corners: str, scores: str, labels: str) -> list[tuple[str, int, list[int]]]:
+    """Scores of boxes that a better one covers become 0. The outputs' names, types and shapes."""
+    graph.add("Transpose", [corners], "boxes", perm=[1, 0])
+    column = graph.constant("column", [MOST_BOXES, 1], np.int64)
+    for name in ("x1", "y1", "x2", "y2"):
+        graph.add("Reshape", [name, column], f"{name}.column")
+    for axis in ("x", "y"):
+        graph.add("Min", [f"{axis}2", f"{axis}2.column"], f"right.{axis}")
+        graph.add("Max", [f"{axis}1", f"{axis}1.column"], f"left.{axis}")
+        graph.add("Sub", [f"right.{axis}", f"left.{axis}"], f"shared.{axis}")
+        graph.add("Max", [f"shared.{axis}", "zero"], f"common.{axis}")
+        graph.add("Sub", [f"{axis}2", f"{axis}1"], f"side.{axis}")
+    graph.add("Mul", ["common.x", "common.y"], "common")
+    graph.add("Mul", ["side.x", "side.y"], "area")
+    graph.add("Reshape", ["area", column], "area.column")
+    graph.add("Add", ["area", "area.column"], "areas")
+    graph.add("Sub", ["areas", "common"], "union")
+    graph.add("Mul", ["union", graph.constant("same", SAME_BOX)], "enough")
+    graph.add("Greater", ["common", "enough"], "is_same")
+    graph.add("Cast", ["is_same"], "same.float", to=TensorProto.FLOAT)
+    better = graph.constant("better", np.tril(np.ones((MOST_BOXES, MOST_BOXES)), -1))
+    graph.add("Mul", ["same.float", better], "covered")
+    graph.add("ReduceMax", ["covered"], "is_covered", axes=[1], keepdims=0)
+    graph.add("Sub", [graph.constant("one", 1.0), "is_covered"], "kept")
+    graph.add("Mul", [scores, "kept"], "scores")
+    return [("boxes", TensorProto.FLOAT, [MOST_BOXES, 4]), ("scores", TensorProto.FLOAT, [MOST_BOXES]),
+            (labels, TensorProto.INT64, [MOST_BOXES])]
+
+
+def shifted(weights: Weights, thresholds: Sequence[float]) -> Weights:
+    """The same detector, whose score is 0.5 where it was each label's threshold: what was chosen is in the file."""
+    bias = weights["head.bias"].copy()
+    for number, threshold in enumerate(thresholds):
+        bias[number] -= float(np.log(threshold / (1 - threshold)))
+    assert len(bias) == OUTPUTS
+    return {**weights, "head.bias": bias}

@@ -1,0 +1,147 @@
+"""The training itself: batches prepared beside it, checkpoints, an average of the weights. Shell (threads, files)."""
+
+import json
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from operator_side.train_module import Network, Weights, folded
+from operator_side.train_network import OUTPUTS
+from operator_side.train_samples import CUT_PX, WHOLE_PX, Sample, sample
+from operator_side.train_scenes import DrawnScenes
+from protocol.errors import ConfigError
+from sim.scenes import LABELS
+
+_PREPARED: Final = 3  # batches that wait
+_WARM_UP: Final = 100
+_LEAST_RATE: Final = 0.01  # of the learning rate, at the end
+_AVERAGED: Final = 0.998
+_GEOMETRY_WEIGHT: Final = 1.0
+_CHECKPOINT_EVERY: Final = 100
+_SAY_EVERY: Final = 50
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """What decides the outcome, and so stands in the model card."""
+
+    steps: int
+    batch: int = 24
+    rate: float = 3e-3
+    decay: float = 1e-4
+    seed: int = 1
+    whole_from: float = 0.8
+    """From this part of the steps on, whole pictures in place of cut-outs."""
+
+
+def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
+          say: Callable[[str], None]) -> Weights:
+    """Train, or go on from the checkpoint in `folder`; the averaged weights, normalisation folded in."""
+    torch.set_num_threads(1)  # two are slower on shared cores: the layers are small
+    torch.manual_seed(training.seed)
+    state = _State(training, torch.device(device))
+    checkpoint = folder / "checkpoint.pt"
+    begin = state.load(checkpoint)
+    if begin:
+        say(f"goes on at step {begin} of {training.steps}")
+    for step, batch in enumerate(_batches(scenes, training, begin), start=begin):
+        loss = state.learn(step, batch)
+        if (step + 1) % _SAY_EVERY == 0:
+            say(f"step {step + 1} of {training.steps}: loss {loss:.3f}")
+        if (step + 1) % _CHECKPOINT_EVERY == 0 or step + 1 == training.steps:
+            state.save(checkpoint, step + 1)
+    return folded(state.average)
+
+
+class _State:
+    """Network, optimiser and average."""
+
+    def __init__(self, training: Training, device: Any) -> None:
+        self._training, self._device = training, device
+        self.network = Network().to(device=device, memory_format=torch.channels_last).train()
+        self._optimiser = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay)
+        self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimiser, lambda step: _rate(step, training.steps))
+        self.average = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
+
+    def learn(self, step: int, batch: list[Sample]) -> float:
+        """One step; its loss."""
+        loss = _loss(self.network(self._on_device([one.image for one in batch])), batch, self._on_device)
+        self._optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
+        self._optimiser.step()
+        self._schedule.step()
+        share = min(_AVERAGED, (step + 1) / (step + 10))
+        for name, value in self.network.state_dict().items():
+            old = self.average[name]
+            self.average[name] = old.lerp(value.detach(), 1 - share) if value.is_floating_point() else value.clone()
+        return float(loss.detach())
+
+    def _on_device(self, arrays: list[Any]) -> Any:
+        return torch.from_numpy(np.stack(arrays)).to(self._device)
+
+    def save(self, path: Path, step: int) -> None:
+        """Written beside and moved, so that a cut leaves the one before."""
+        torch.save({
+            "training": json.dumps(asdict(self._training)), "step": step, "network": self.network.state_dict(),
+            "average": self.average, "optimiser": self._optimiser.state_dict(), "schedule": self._schedule.state_dict(),
+        }, path.with_suffix(".part"))
+        path.with_suffix(".part").replace(path)
+
+    def load(self, path: Path) -> int:
+        """The step to go on from; 0 without a checkpoint. Raises ConfigError for one of another training."""
+        if not path.exists():
+            return 0
+        kept = torch.load(path, map_location=self._device, weights_only=True)
+        if json.loads(kept["training"]) != asdict(self._training):
+            raise ConfigError(f"{path} is of a training with other settings: {kept['training']}; remove it, or name "
+                              "another --out")
+        self.network.load_state_dict(kept["network"])
+        self.average = kept["average"]
+        self._optimiser.load_state_dict(kept["optimiser"])
+        self._schedule.load_state_dict(kept["schedule"])
+        return int(kept["step"])
+
+
+def _rate(step: int, steps: int) -> float:
+    """Up, then down along a cosine."""
+    if step < _WARM_UP:
+        return (step + 1) / _WARM_UP
+    done = min(1.0, (step - _WARM_UP) / max(1, steps - _WARM_UP))
+    return float(_LEAST_RATE + (1 - _LEAST_RATE) * 0.5 * (1 + np.cos(np.pi * done)))
+
+
+def _loss(given: Any, batch: list[Sample], on_device: Callable[[list[Any]], Any]) -> Any:
+    """Focal loss on the heat maps, distances on the geometry of the middle cells."""
+    heat, geometry = given[:, : len(LABELS)], given[:, len(LABELS) : OUTPUTS]
+    wanted, counts = on_device([one.heat for one in batch]), on_device([one.counts for one in batch])[:, None]
+    likely = torch.sigmoid(heat)
+    is_middle = (wanted == 1.0).float()
+    found = is_middle * (1 - likely) ** 2 * torch.nn.functional.logsigmoid(heat)
+    empty = (1 - is_middle) * (1 - wanted) ** 4 * likely**2 * torch.nn.functional.logsigmoid(-heat)
+    middles = is_middle.sum().clamp(min=1.0)
+    sure = on_device([one.sure for one in batch])[:, None]
+    off = (geometry - on_device([one.geometry for one in batch])).abs() * sure
+    return -((found + empty) * counts).sum() / middles + _GEOMETRY_WEIGHT * off.sum() / sure.sum().clamp(min=1.0)
+
+
+def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[list[Sample]]:
+    """Prepared by a second thread, so that two cores have something to do; a few wait, no more."""
+    with ThreadPoolExecutor(1) as pool:
+        waiting: deque[Future[list[Sample]]] = deque()
+        for step in range(first, training.steps):
+            for coming in range(step + len(waiting), min(step + _PREPARED, training.steps)):
+                waiting.append(pool.submit(_batch, scenes, training, coming))
+            yield waiting.popleft().result()
+
+
+def _batch(scenes: DrawnScenes, training: Training, step: int) -> list[Sample]:
+    whole = step >= training.whole_from * training.steps
+    size_px, count = (WHOLE_PX, max(1, training.batch // 2)) if whole else (CUT_PX, training.batch)
+    return [sample(scenes, training.seed, step, place, size_px) for place in range(count)]

@@ -1,0 +1,83 @@
+"""The network's table as a PyTorch module, and its weights as arrays with the normalisation folded in. Pure (PyTorch).
+"""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from operator_side.train_network import BRIGHTNESS, DARKEST, Layer, network
+from sim.scenes import LABELS
+
+Weights = dict[str, npt.NDArray[np.float32]]
+"""`NAME.weight` and `NAME.bias` of every layer that has them."""
+
+_RARE = -4.6  # bias of the heat maps at the beginning: a hundredth of the cells
+
+
+class Network(nn.Module):  # type: ignore[misc]
+    """Runs the table. Takes RGB or BGR as it was trained, uint8 (N, 3, H, W)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = network()
+        channels = {"image": 3}
+        for layer in self.layers:
+            channels[layer.name] = layer.channels
+            made = _module(layer, channels[layer.takes[0]])
+            if made is not None:
+                self.add_module(_key(layer), made)
+
+    def forward(self, image: Any) -> Any:
+        """Heat maps (before the sigmoid) and geometry, (N, OUTPUTS, H/4, W/4)."""
+        seen = image.float() / 255
+        mean = seen.mean(dim=(1, 2, 3), keepdim=True).clamp(min=DARKEST)
+        known = {"image": seen * (BRIGHTNESS / mean)}
+        for layer in self.layers:
+            known[layer.name] = self._run(layer, [known[name] for name in layer.takes])
+        return known[self.layers[-1].name]
+
+    def _run(self, layer: Layer, takes: list[Any]) -> Any:
+        if layer.kind in ("add", "add-up"):
+            second = takes[1] if layer.kind == "add" else nn.functional.interpolate(takes[1], scale_factor=2)
+            return torch.relu(takes[0] + second)
+        return getattr(self, _key(layer))(takes[0])
+
+
+def _key(layer: Layer) -> str:
+    """What PyTorch calls it: modules have attributes of their own, such as `half`."""
+    return "layer_" + layer.name.replace(".", "_")
+
+
+def _module(layer: Layer, channels: int) -> Any:
+    if layer.kind in ("add", "add-up"):
+        return None
+    if layer.kind == "head":
+        head = nn.Conv2d(channels, layer.channels, 1)
+        nn.init.normal_(head.weight, std=0.01)
+        nn.init.zeros_(head.bias)
+        nn.init.constant_(head.bias[: len(LABELS)], _RARE)
+        return head
+    groups = channels if layer.kind == "depthwise" else 1
+    steps = [nn.Conv2d(channels, layer.channels, layer.kernel, layer.stride, layer.kernel // 2, groups=groups,
+                       bias=False), nn.BatchNorm2d(layer.channels)]
+    return nn.Sequential(*steps, nn.ReLU()) if layer.relu else nn.Sequential(*steps)
+
+
+def folded(state: dict[str, Any]) -> Weights:
+    """Every convolution's weight and bias, with the batch normalisation after it worked in."""
+    weights: Weights = {}
+    values = {name: value.detach().cpu().double().numpy() for name, value in state.items()}
+    for layer in network():
+        key = _key(layer)
+        if layer.kind == "head":
+            weights[f"{layer.name}.weight"] = values[f"{key}.weight"].astype(np.float32)
+            weights[f"{layer.name}.bias"] = values[f"{key}.bias"].astype(np.float32)
+        elif f"{key}.0.weight" in values:
+            gain = values[f"{key}.1.weight"] / np.sqrt(values[f"{key}.1.running_var"] + 1e-5)
+            bias = values[f"{key}.1.bias"] - gain * values[f"{key}.1.running_mean"]
+            weights[f"{layer.name}.weight"] = (values[f"{key}.0.weight"] * gain[:, None, None, None]).astype(np.float32)
+            weights[f"{layer.name}.bias"] = bias.astype(np.float32)
+    return weights

@@ -1,0 +1,123 @@
+"""Scenes into what the network learns from: a spoiled cut-out, and the heat maps that it should give. Pure."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import simplejpeg
+
+from operator_side.train_network import GEOMETRY, SIZE_PX, STRIDE
+from operator_side.train_scenes import DrawnScenes
+from sim.scene_defects import spoiled
+from sim.scenes import HEIGHT_PX, LABELS, TRAINED, WIDTH_PX, Box, Random, Truth
+
+CUT_PX: Final = (192, 160)
+"""Width and height of the cut-outs that most of the training sees: less than half the time of a whole picture."""
+WHOLE_PX: Final = (WIDTH_PX, HEIGHT_PX)
+_LEAST_LEFT: Final = 0.4  # of an object's box after the cut; with less left it is neither right nor wrong
+_SPREAD: Final = 0.09  # standard deviation of the bump on the heat map, by the object's side
+_LEAST_SPREAD: Final = 0.6  # cells
+_SURE: Final = 0.4  # of the bump: cells from there up learn where the object's edges are
+
+Array = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One picture BGR (3, H, W) and what is wanted of it."""
+
+    image: npt.NDArray[np.uint8]
+    heat: Array
+    """(labels, H/4, W/4), 1 in the middle cell of each object."""
+    geometry: Array
+    """(4, H/4, W/4)"""
+    sure: Array
+    """(H/4, W/4): how much a cell's geometry counts."""
+    counts: Array
+    """(H/4, W/4): 0 where nobody can say what is right."""
+
+
+def sample(scenes: DrawnScenes, seed: int, step: int, place: int, size_px: tuple[int, int]) -> Sample:
+    """Number `place` of the batch of that step: a scene, a cut, a side, defects; the same for the same numbers."""
+    draw = np.random.default_rng([seed, step, place])
+    number = int(draw.integers(len(scenes.truths)))
+    left, top = _cut(draw, scenes.truths[number], size_px)
+    rgb = scenes.pictures[number][top : top + size_px[1], left : left + size_px[0]]
+    mirrored = bool(draw.random() < 0.5)
+    picture = np.ascontiguousarray(rgb[:, ::-1] if mirrored else rgb)
+    bgr = simplejpeg.decode_jpeg(spoiled(picture, TRAINED, draw), "BGR")
+    moved = [(one, _moved(one.box, left, top, size_px, mirrored)) for one in scenes.truths[number]]
+    unclear = [_moved(one, left, top, size_px, mirrored) for one in scenes.unclear[number]]
+    return _wanted(np.ascontiguousarray(bgr.transpose(2, 0, 1)), moved, unclear)
+
+
+def _cut(draw: Random, truths: tuple[Truth, ...], size_px: tuple[int, int]) -> tuple[int, int]:
+    """The cut's corner: three times in four with the middle of one object in it."""
+    most = (WIDTH_PX - size_px[0], HEIGHT_PX - size_px[1])
+    corner = [int(draw.integers(0, one + 1)) for one in most]
+    if truths and draw.random() < 0.75:
+        box = truths[int(draw.integers(len(truths)))].box
+        for axis in (0, 1):
+            middle = (box[axis] + box[axis + 2]) / 2
+            corner[axis] = int(np.clip(middle - draw.uniform(0.05, 0.95) * size_px[axis], 0, most[axis]))
+    return corner[0], corner[1]
+
+
+def _moved(box: Box, left: int, top: int, size_px: tuple[int, int], mirrored: bool) -> Box:
+    x1, y1, x2, y2 = box[0] - left, box[1] - top, box[2] - left, box[3] - top
+    return (size_px[0] - x2, y1, size_px[0] - x1, y2) if mirrored else (x1, y1, x2, y2)
+
+
+def _wanted(image: npt.NDArray[np.uint8], objects: list[tuple[Truth, Box]], unclear: list[Box]) -> Sample:
+    rows, columns = image.shape[1] // STRIDE, image.shape[2] // STRIDE
+    one = Sample(image, np.zeros((len(LABELS), rows, columns), np.float32),
+                 np.zeros((GEOMETRY, rows, columns), np.float32), np.zeros((rows, columns), np.float32),
+                 np.ones((rows, columns), np.float32))
+    for box in unclear:
+        _blank(one, box)
+    for truth, box in sorted(objects, key=lambda pair: -_area(pair[1])):
+        _mark(one, truth, box)
+    return one
+
+
+def _area(box: Box) -> float:
+    return max(0.0, box[2] - box[0]) * max(0.0, box[3] - box[1])
+
+
+def _within(box: Box, one: Sample) -> Box:
+    height, width = one.image.shape[1:]
+    return max(0.0, box[0]), max(0.0, box[1]), min(float(width), box[2]), min(float(height), box[3])
+
+
+def _blank(one: Sample, box: Box) -> None:
+    x1, y1, x2, y2 = (int(edge // STRIDE) for edge in _within(box, one))
+    one.counts[y1 : y2 + 1, x1 : x2 + 1] = 0
+
+
+def _mark(one: Sample, truth: Truth, whole: Box) -> None:
+    """A bump on the label's heat map; in its middle cells, where the edges are."""
+    box = _within(whole, one)
+    if _area(box) <= 0:
+        return
+    if _area(box) * truth.seen < _LEAST_LEFT * _area(whole):
+        _blank(one, box)
+        return
+    rows, columns = one.sure.shape
+    x, y = (box[0] + box[2]) / 2 / STRIDE, (box[1] + box[3]) / 2 / STRIDE
+    wide, high = (box[2] - box[0]) / STRIDE, (box[3] - box[1]) / STRIDE
+    off_x, off_y = x - (np.arange(columns) + 0.5), y - (np.arange(rows) + 0.5)
+    bump = (np.exp(-0.5 * (off_y / max(_SPREAD * high, _LEAST_SPREAD)) ** 2)[:, None]
+            * np.exp(-0.5 * (off_x / max(_SPREAD * wide, _LEAST_SPREAD)) ** 2)).astype(np.float32)
+    heat = one.heat[LABELS.index(truth.label)]
+    np.maximum(heat, bump, out=heat)
+    middle = min(rows - 1, int(y)), min(columns - 1, int(x))
+    heat[middle] = 1.0
+    one.counts[middle] = 1.0
+    sure = bump >= _SURE
+    sure[middle] = True
+    one.sure[sure] = np.maximum(bump[sure], _SURE)
+    one.geometry[0][sure] = np.broadcast_to(off_x, bump.shape)[sure]
+    one.geometry[1][sure] = np.broadcast_to(off_y[:, None], bump.shape)[sure]
+    one.geometry[2][sure] = np.log(wide * STRIDE / SIZE_PX)
+    one.geometry[3][sure] = np.log(high * STRIDE / SIZE_PX)

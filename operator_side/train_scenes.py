@@ -1,0 +1,77 @@
+"""The scenes that a training run learns from, drawn once into a folder by as many processes as asked. Shell (files)."""
+
+import json
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from protocol.errors import ConfigError
+from sim.scene_render import SceneRenderer
+from sim.scenes import HEIGHT_PX, TRAINED, VALIDATED_FROM, WIDTH_PX, Box, Truth
+
+_SLICE: Final = 100
+"""Scenes that one process draws before it says so."""
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnScenes:
+    """Pictures (N, H, W, 3), RGB, on disk, and what is in each."""
+
+    pictures: npt.NDArray[np.uint8]
+    truths: tuple[tuple[Truth, ...], ...]
+    unclear: tuple[tuple[Box, ...], ...]
+
+
+def drawn_scenes(folder: Path, count: int, jobs: int, advance: Callable[[int], None]) -> DrawnScenes:
+    """Scenes of the seeds 0 to `count`, drawn now or taken from `folder`, where they were drawn before."""
+    if not 0 < count <= VALIDATED_FROM:
+        raise ConfigError(f"--scenes {count}: 1 to {VALIDATED_FROM}; seeds from there on validate and judge")
+    pictures, notes = folder / "scenes.npy", folder / "scenes.json"
+    if not notes.exists() or len(json.loads(notes.read_text("utf-8"))) != count:
+        folder.mkdir(parents=True, exist_ok=True)
+        _draw_all(pictures, notes, count, jobs, advance)
+    else:
+        advance(count)
+    rows = json.loads(notes.read_text("utf-8"))
+    truths = tuple(tuple(_truth(one) for one in row["truths"]) for row in rows)
+    unclear = tuple(tuple((*one,) for one in row["unclear"]) for row in rows)
+    return DrawnScenes(np.load(pictures, mmap_mode="r"), truths, unclear)
+
+
+def _truth(one: list[Any]) -> Truth:
+    label, box, seen = one
+    return Truth(label, (box[0], box[1], box[2], box[3]), seen)
+
+
+def _draw_all(pictures: Path, notes: Path, count: int, jobs: int, advance: Callable[[int], None]) -> None:
+    shape = (count, HEIGHT_PX, WIDTH_PX, 3)
+    np.lib.format.open_memmap(pictures, "w+", np.uint8, shape).flush()
+    rows: list[dict[str, Any]] = [{} for _ in range(count)]
+    # Spawned, since a forked child would share PyBullet's state; workers write straight into the file.
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        waiting = [pool.submit(_draw, pictures, range(first, min(first + _SLICE, count)))
+                   for first in range(0, count, _SLICE)]
+        for done in as_completed(waiting):
+            first, drawn = done.result()
+            rows[first : first + len(drawn)] = drawn
+            advance(len(drawn))
+    notes.write_text(json.dumps(rows), "utf-8")
+
+
+def _draw(pictures: Path, seeds: Sequence[int]) -> tuple[int, list[dict[str, Any]]]:
+    """One slice of seeds into the file; what is in them."""
+    store = np.lib.format.open_memmap(pictures, "r+")
+    rows = []
+    with SceneRenderer() as renderer:
+        for seed in seeds:
+            scene = renderer.scene(seed, TRAINED)
+            store[seed] = scene.rgb
+            rows.append({"truths": [[one.label, one.box, one.seen] for one in scene.truths], "unclear": scene.unclear})
+    store.flush()
+    return seeds[0], rows

@@ -1,0 +1,189 @@
+"""Labelled scenes to train and to judge detectors on: what is in one, drawn from its seed alone. Pure.
+
+A column says what is hard about a scene. Who judges never shows what was trained on: other seeds, other families of
+textures, light from heights in between.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from sim.light import State
+from sim.things import Colour
+
+JUDGED_FROM: Final = 900_000
+"""Seeds from here on are for judging only."""
+VALIDATED_FROM: Final = 800_000
+"""Seeds from here up to `JUDGED_FROM` choose thresholds; training draws below."""
+LABELS: Final = ("ball", "light-red", "light-yellow", "light-green", "legs")
+STATES: Final[tuple[State, ...]] = ("red", "yellow", "green")
+
+WIDTH_PX, HEIGHT_PX = 320, 240
+BALL_PX = (8.0, 120.0)
+MOST_HIDDEN = 0.6
+"""A ball that shows less is none that could be asked for."""
+MOST_DISTRACTORS = 5
+WITHOUT_BALL_EVERY = 5
+"""Of the judged scenes each fifth has no ball."""
+LIGHT_SIZES: Final = (0.6, 1.4)  # of a traffic light, by the one in the simulated lane
+
+Random = np.random.Generator
+Span = tuple[float, float]
+Box = tuple[float, float, float, float]
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """What is hard about a scene: the first four by what is in it, the rest by what the camera does to it."""
+
+    name: str
+    same_colour_boxes: float = 0.0
+    """How likely two boxes of the ball's own colour are about."""
+    lights: float = 0.15
+    legs: float = 0.15
+    any_colour: float = 0.0
+    """How likely the ball is of another colour than yellow."""
+    gain: Span = (0.9, 1.0)
+    white_balance: float = 0.03
+    """Red, green and blue are off by up to this share, each way."""
+    blurred: float = 0.0
+    blur_px: Span = (9.0, 21.0)
+    """Across the whole kernel: half of them out of focus, half of them moved."""
+    noise: Span = (1.0, 3.0)
+    quality: tuple[int, int] = (75, 95)
+
+
+_LIGHT = {"gain": (0.25, 1.0), "white_balance": 0.3}
+_HARD: Final = {"same_colour_boxes": 1.0, "blurred": 1.0, "quality": (30, 30), **_LIGHT}
+
+COLUMNS: Final = {one.name: one for one in (
+    Column("nominal"),
+    Column("same-colour boxes", same_colour_boxes=1.0),
+    Column("changed light", **_LIGHT),  # type: ignore[arg-type]
+    Column("blur", blurred=1.0),
+    Column("quality 30", quality=(30, 30)),
+    Column("all at once", **_HARD),  # type: ignore[arg-type]
+)}
+THINGS: Final = Column("lights and legs", lights=1.0, legs=1.0)
+"""For traffic lights and legs: one of each in every scene, the three states in turn."""
+TRAINED: Final = Column(
+    "trained", same_colour_boxes=0.45, lights=0.35, legs=0.3, any_colour=0.35, gain=(0.2, 1.1), white_balance=0.33,
+    blurred=0.35, blur_px=(3.0, 21.0), noise=(0.0, 6.0), quality=(25, 95),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """A camera at the origin, x forward, y left, z up, that looks down by `pitch_rad`."""
+
+    focal_px: float
+    pitch_rad: float
+
+    def axes(self) -> npt.NDArray[np.float64]:
+        """Columns right, down, forward."""
+        cos, sin = math.cos(self.pitch_rad), math.sin(self.pitch_rad)
+        return np.array([[0.0, -sin, cos], [-1.0, 0.0, 0.0], [0.0, -cos, -sin]])
+
+    def point(self, u_px: float, v_px: float, ahead_m: float) -> Point:
+        """What a pixel shows at that depth along the axis."""
+        x, y, z = (self.axes() @ self.ray(u_px, v_px) * ahead_m).tolist()
+        return x, y, z
+
+    def ray(self, u_px: float, v_px: float) -> npt.NDArray[np.float64]:
+        """The pixel's ray, one metre deep: right, down, forward."""
+        return np.array([(u_px - WIDTH_PX / 2) / self.focal_px, (v_px - HEIGHT_PX / 2) / self.focal_px, 1.0])
+
+    def horizon_px(self) -> float:
+        """The row of what is infinitely far away and level."""
+        return HEIGHT_PX / 2 - self.focal_px * math.tan(self.pitch_rad)
+
+    def ball_box(self, at_m: Point, radius_m: float) -> Box:
+        """The exact box around a whole ball, as if nothing hid it and the picture had no border."""
+        right, down, ahead = np.array(at_m) @ self.axes()
+        edges = []
+        for aside, middle in ((right, WIDTH_PX / 2), (down, HEIGHT_PX / 2)):
+            root = radius_m * math.sqrt(aside * aside + ahead * ahead - radius_m * radius_m)
+            under = ahead * ahead - radius_m * radius_m
+            edges.append([middle + self.focal_px * (aside * ahead + sign * root) / under for sign in (-1, 1)])
+        return edges[0][0], edges[1][0], edges[0][1], edges[1][1]
+
+
+@dataclass(frozen=True, slots=True)
+class Solid:
+    """One thing made of one or several bodies; `label` is empty for what nobody asks for."""
+
+    shape: str
+    """`ball`, `box`, `cylinder`, `legs`, `light`"""
+    at_m: Point
+    """Middle of a ball, a box, a cylinder; where legs stand; middle of a light's housing."""
+    size_m: Point
+    """Sides of a box; radius, radius, height of a cylinder or a leg; scale of a light."""
+    colour: Colour
+    turn_rad: float = 0.0
+    label: str = ""
+    step: float = 0.0
+    """Of legs: how far they are in their stride."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """A floor or a wall: family of texture, its own seed, metres that a tile covers."""
+
+    family: str
+    seed: int
+    tile_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class ScenePlan:
+    """All of one scene before it is drawn."""
+
+    seed: int
+    column: Column
+    lens: Lens
+    floor_m: float
+    """Height of the floor, below zero."""
+    wall_m: float
+    """Distance of the wall, and its turn."""
+    wall_turn_rad: float
+    floor: Surface
+    wall: Surface
+    light_from: Point
+    ambient: float
+    solids: tuple[Solid, ...]
+    glow: float
+    """How much a lit lamp shines by itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """One object that is asked for, in pixels."""
+
+    label: str
+    box: Box
+    """Around what is in view of it, from the segmentation mask."""
+    seen: float
+    """Share of it that is in view."""
+    whole: Box | None = None
+    """Of a ball: around all of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A drawn scene before the camera's defects: RGB, what is in it, and the boxes of all else that stands about."""
+
+    plan: ScenePlan
+    rgb: npt.NDArray[np.uint8]
+    truths: tuple[Truth, ...]
+    others: tuple[Box, ...]
+    unclear: tuple[Box, ...]
+    """Things that are asked for, but hardly in view: neither right nor wrong."""
+
+
+def is_judged(seed: int) -> bool:
+    """Whether a scene is for judging only."""
+    return seed >= JUDGED_FROM

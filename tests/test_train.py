@@ -1,0 +1,204 @@
+"""Training without PyTorch: the network's table, what is learned from a scene, and the ONNX graph."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pybullet")
+
+import cv2
+
+from operator_side import cli
+from operator_side.train_network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
+from operator_side.train_samples import CUT_PX, WHOLE_PX, sample
+from operator_side.train_scenes import DrawnScenes, drawn_scenes
+from protocol.errors import ConfigError
+from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX, Truth
+
+BALL = Truth("ball", (100.0, 60.0, 141.0, 99.0), 1.0)
+
+
+def one_scene(truths=(BALL,), unclear=()):
+    return DrawnScenes(np.full((1, HEIGHT_PX, WIDTH_PX, 3), 120, np.uint8), (tuple(truths),), (tuple(unclear),))
+
+
+def weights(seed=1):
+    """Random ones of the right shapes, which keep the signal about as large as it is."""
+    draw, channels, made = np.random.default_rng(seed), {"image": 3}, {}
+    for layer in network():
+        channels[layer.name] = layer.channels
+        if layer.kind in ("conv", "depthwise", "head"):
+            each = 1 if layer.kind == "depthwise" else channels[layer.takes[0]]
+            shape = (layer.channels, each, layer.kernel, layer.kernel)
+            made[f"{layer.name}.weight"] = draw.normal(0, (2 / np.prod(shape[1:])) ** 0.5, shape).astype(np.float32)
+            made[f"{layer.name}.bias"] = draw.normal(0, 0.1, layer.channels).astype(np.float32)
+    return made
+
+
+def test_the_table_is_a_network_of_the_agreed_size():
+    sizes = {"image": (HEIGHT_PX, WIDTH_PX)}
+    for layer in network():
+        rows, columns = sizes[layer.takes[0]]
+        assert rows % layer.stride == 0 and columns % layer.stride == 0, "halves evenly"
+        sizes[layer.name] = (rows // layer.stride, columns // layer.stride)
+        if layer.kind == "add-up":
+            assert sizes[layer.takes[0]] == tuple(2 * side for side in sizes[layer.takes[1]])
+    assert sizes["head"] == (HEIGHT_PX // STRIDE, WIDTH_PX // STRIDE)
+    assert network()[-1].channels == OUTPUTS == len(LABELS) + GEOMETRY
+    assert 130_000 <= sum(one.size for one in weights().values()) <= 180_000
+
+
+def decoded(one, row, column):
+    """The box that the geometry of a cell means."""
+    off_x, off_y, wide, high = one.geometry[:, row, column]
+    x, y = (column + 0.5 + off_x) * STRIDE, (row + 0.5 + off_y) * STRIDE
+    half_wide, half_high = np.exp(wide) * SIZE_PX / 2, np.exp(high) * SIZE_PX / 2
+    return x - half_wide, y - half_high, x + half_wide, y + half_high
+
+
+def test_the_cells_about_an_objects_middle_learn_its_box():
+    ones, mirrored = 0, 0
+    for place in range(20):
+        one = sample(one_scene(), 7, 0, place, WHOLE_PX)
+        assert one.image.shape == (3, HEIGHT_PX, WIDTH_PX) and one.image.dtype == np.uint8
+        box = BALL.box if one.heat[0, 19, 30] == 1.0 else (WIDTH_PX - 141, 60, WIDTH_PX - 100, 99)
+        mirrored += box is not BALL.box
+        assert np.argwhere(one.heat == 1.0).tolist() == [[0, 19, int((box[0] + box[2]) / 2 // STRIDE)]]
+        for row, column in np.argwhere(one.sure > 0):
+            assert decoded(one, row, column) == pytest.approx(box, abs=1e-3)
+            ones += 1
+        assert one.counts.min() == 1.0
+    assert ones >= 100 and 4 <= mirrored <= 16
+
+
+def test_the_same_numbers_give_the_same_sample():
+    first, again = (sample(one_scene(), 3, 11, 2, CUT_PX) for _ in range(2))
+    assert np.array_equal(first.image, again.image) and np.array_equal(first.heat, again.heat)
+    assert first.image.shape == (3, CUT_PX[1], CUT_PX[0])
+    assert not np.array_equal(first.image, sample(one_scene(), 3, 12, 2, CUT_PX).image)
+
+
+def test_what_the_cut_leaves_too_little_of_is_neither_right_nor_wrong():
+    blanked = marked = 0
+    for place in range(60):
+        one = sample(one_scene(), 5, 0, place, CUT_PX)
+        has_middle = bool((one.heat == 1.0).any())
+        marked += has_middle
+        blanked += not has_middle and one.counts.min() == 0
+        assert has_middle == bool(one.sure.any())
+    assert marked > 20 and blanked > 0
+
+
+def test_what_is_unclear_in_a_scene_is_not_learned():
+    one = sample(one_scene((), [(40.0, 40.0, 80.0, 80.0)]), 5, 0, 1, WHOLE_PX)
+    assert not one.heat.any() and 90 < np.count_nonzero(one.counts == 0) < 150
+
+
+def test_labels_have_maps_of_their_own():
+    for number, label in enumerate(LABELS):
+        one = sample(one_scene((Truth(label, (40.0, 60.0, 90.0, 200.0), 1.0),)), 5, 0, 1, WHOLE_PX)
+        assert np.unique(np.argwhere(one.heat > 0)[:, 0]).tolist() == [number]
+
+
+def test_scenes_are_drawn_once(tmp_path):
+    told = []
+    first = drawn_scenes(tmp_path, 8, 1, told.append)
+    stamp = (tmp_path / "scenes.npy").stat().st_mtime_ns
+    again = drawn_scenes(tmp_path, 8, 1, told.append)
+    assert (tmp_path / "scenes.npy").stat().st_mtime_ns == stamp and told == [8, 8]
+    assert first.truths == again.truths and first.pictures.shape == (8, HEIGHT_PX, WIDTH_PX, 3)
+    assert all(picture.std() > 1 for picture in first.pictures) and any(first.truths)
+
+
+def test_no_scene_of_another_purpose_is_trained_on(tmp_path):
+    with pytest.raises(ConfigError, match="--scenes 800001"):
+        drawn_scenes(tmp_path, 800_001, 1, lambda _: None)
+
+
+def test_training_without_pytorch_says_what_to_install(monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(__import__("sys").modules, "torch", None)
+    assert cli.run(["train", "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "sightline[train]" in error and "torch" in error and "\n" not in error
+
+
+@pytest.mark.parametrize("arguments", [["--steps", "0"], ["--device", "tpu"], ["--scenes", "3"], ["--batch", "1"]])
+def test_a_bad_option_is_one_line(arguments, capsys):
+    assert cli.run(["train", *arguments]) == 2
+    error = capsys.readouterr().err.strip()
+    assert arguments[0] in error and "\n" not in error
+
+
+class TestGraph:
+    """The ONNX file, by weights that mean nothing."""
+
+    @pytest.fixture(scope="class")
+    def made(self, tmp_path_factory):
+        pytest.importorskip("onnx")
+        from operator_side.train_export import onnx_bytes
+
+        path = tmp_path_factory.mktemp("model") / "random.onnx"
+        path.write_bytes(onnx_bytes(weights(), {"min_score": "0.5"}))
+        return path
+
+    def outputs(self, path, image):
+        net = cv2.dnn.readNetFromONNX(str(path))
+        net.setInput(image, "image")
+        names = ["boxes", "scores", "labels"]
+        found = dict(zip(names, net.forward(names), strict=True))
+        return found["boxes"].reshape(-1, 4), found["scores"].reshape(-1), found["labels"].reshape(-1)
+
+    def picture(self, seed=3):
+        return np.random.default_rng(seed).integers(0, 256, (1, HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
+
+    def test_the_file_is_opset_17_and_says_what_it_finds(self, made):
+        import onnx
+
+        model = onnx.load(made)
+        assert [one.version for one in model.opset_import] == [17]
+        properties = {one.key: one.value for one in model.metadata_props}
+        assert json.loads(properties["labels"]) == list(LABELS) and properties["min_score"] == "0.5"
+        assert made.stat().st_size < 1_000_000
+
+    def test_boxes_lie_in_the_picture_and_no_two_cover_each_other(self, made):
+        from operator_side.score_detectors import overlap
+
+        boxes, scores, labels = self.outputs(made, self.picture())
+        kept = boxes[scores > 0]
+        assert len(kept) > 3 and boxes.min() >= 0 and boxes[:, 2].max() <= WIDTH_PX and boxes[:, 3].max() <= HEIGHT_PX
+        assert set(labels.astype(int)) <= set(range(len(LABELS)))
+        pairs = [(i, j) for i in range(len(kept)) for j in range(i)]
+        assert max((overlap(tuple(kept[i]), tuple(kept[j])) for i, j in pairs), default=0.0) <= 0.5 + 1e-6
+
+    def test_both_engines_agree(self, made):
+        runtime = pytest.importorskip("onnxruntime")
+        session = runtime.InferenceSession(str(made), providers=["CPUExecutionProvider"])
+        image = self.picture(5)
+        theirs = dict(zip(("boxes", "scores", "labels"), session.run(["boxes", "scores", "labels"], {"image": image}),
+                          strict=True))
+        boxes, scores, labels = self.outputs(made, image)
+        assert scores == pytest.approx(theirs["scores"], abs=1e-4) and (labels == theirs["labels"]).all()
+        assert boxes == pytest.approx(theirs["boxes"], abs=0.05)
+
+    def test_brightness_changes_little(self, made):
+        image = (self.picture(6) // 2).astype(np.uint8)
+        _, bright, _ = self.outputs(made, image)
+        _, dim, _ = self.outputs(made, (image // 2).astype(np.uint8))
+        assert dim == pytest.approx(bright, abs=0.2)
+
+    def test_a_black_and_a_white_picture_give_numbers(self, made):
+        for value in (0, 255):
+            boxes, scores, _ = self.outputs(made, np.full((1, HEIGHT_PX, WIDTH_PX, 3), value, np.uint8))
+            assert np.isfinite(boxes).all() and np.isfinite(scores).all()
+
+    def test_a_threshold_becomes_one_half(self, made, tmp_path):
+        from operator_side.train_export import onnx_bytes, shifted
+
+        _, before, labels = self.outputs(made, self.picture())
+        thresholds = [0.2] * len(LABELS)
+        (tmp_path / "shifted.onnx").write_bytes(onnx_bytes(shifted(weights(), thresholds), {}))
+        _, after, _ = self.outputs(tmp_path / "shifted.onnx", self.picture())
+        odds = before / (1 - before) / (0.2 / 0.8)
+        seen = (before > 0.01) & (after > 0.01) & (labels >= 0)
+        assert seen.any() and after[seen] == pytest.approx((odds / (1 + odds))[seen], abs=1e-3)

@@ -1,0 +1,83 @@
+"""Training itself, where PyTorch is: it learns, goes on after a cut, and its weights mean the same in ONNX."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("onnx")
+
+import cv2
+import torch
+
+from operator_side.train_export import onnx_bytes
+from operator_side.train_loop import Training, train
+from operator_side.train_module import Network, folded
+from operator_side.train_samples import CUT_PX
+from operator_side.train_scenes import DrawnScenes
+from protocol.errors import ConfigError
+from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX, Truth
+
+
+def scenes(count=4):
+    """Discs on grey: enough to learn from in a few steps."""
+    pictures, truths = np.full((count, HEIGHT_PX, WIDTH_PX, 3), 90, np.uint8), []
+    draw = np.random.default_rng(2)
+    for picture in pictures:
+        x, y = int(draw.integers(60, 260)), int(draw.integers(60, 180))
+        cv2.circle(picture, (x, y), 20, (240, 200, 20), -1)
+        truths.append((Truth("ball", (x - 20.0, y - 20.0, x + 21.0, y + 21.0), 1.0),))
+    return DrawnScenes(pictures, tuple(truths), ((),) * count)
+
+
+def test_the_loss_falls(tmp_path):
+    said = []
+    train(scenes(), Training(steps=100, batch=2, rate=3e-3, seed=4), "cpu", tmp_path, said.append)
+    losses = [float(line.rsplit(" ", 1)[1]) for line in said if "loss" in line]
+    assert len(losses) == 2 and losses[-1] < 10
+
+
+def test_a_training_that_was_cut_ends_as_if_it_had_not_been(tmp_path, monkeypatch):
+    training = Training(steps=4, batch=2, seed=4)
+    (tmp_path / "whole").mkdir()
+    whole = train(scenes(), training, "cpu", tmp_path / "whole", lambda _: None)
+    monkeypatch.setattr("operator_side.train_loop._CHECKPOINT_EVERY", 2)
+    cut = tmp_path / "cut"
+    cut.mkdir()
+
+    def fall(line):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("operator_side.train_loop._SAY_EVERY", 3)
+    with pytest.raises(KeyboardInterrupt):
+        train(scenes(), training, "cpu", cut, fall)
+    monkeypatch.setattr("operator_side.train_loop._SAY_EVERY", 100)
+    said = []
+    resumed = train(scenes(), training, "cpu", cut, said.append)
+    assert said == ["goes on at step 2 of 4"]
+    assert all(np.array_equal(whole[name], resumed[name]) for name in whole)
+    with pytest.raises(ConfigError, match="other settings"):
+        train(scenes(), Training(steps=5, batch=2, seed=4), "cpu", cut, said.append)
+
+
+def test_the_graph_gives_what_the_module_gives(tmp_path):
+    torch.manual_seed(3)
+    network = Network()
+    with torch.no_grad():
+        network.layer_head.weight.normal_(0, 0.3)
+        network.layer_head.bias.zero_()
+        for _ in range(3):  # so that the normalisation has something to fold in
+            network(torch.randint(0, 256, (2, 3, HEIGHT_PX, WIDTH_PX), dtype=torch.uint8))
+    network.eval()
+    image = np.random.default_rng(4).integers(0, 256, (1, HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
+    with torch.no_grad():
+        heat = torch.sigmoid(network(torch.from_numpy(image).permute(0, 3, 1, 2))[0, : len(LABELS)])
+    path = tmp_path / "model.onnx"
+    path.write_bytes(onnx_bytes(folded(network.state_dict()), {}))
+    net = cv2.dnn.readNetFromONNX(str(path))
+    net.setInput(image, "image")
+    scores = net.forward(["boxes", "scores", "labels"])[1].reshape(-1)
+    assert scores.max() == pytest.approx(float(heat.max()), abs=1e-3)
+
+
+def test_cut_outs_halve_as_evenly_as_pictures():
+    assert all(side % 16 == 0 for side in CUT_PX)
