@@ -8,7 +8,7 @@ from protocol.twist_text import format_twist
 from vision_side.config import VisionConfig
 from vision_side.decode import Picture
 from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.port import Detection, Detector
+from vision_side.detect.port import Detection, PictureDetector
 from vision_side.pipeline import Frame, Pipeline
 
 
@@ -18,7 +18,7 @@ class SlowDetector:
     It works by detecting the same again and again, as the same code on a slower processor.
     """
 
-    def __init__(self, detector: Detector, delay_s: float, busy_s: float) -> None:
+    def __init__(self, detector: PictureDetector, delay_s: float, busy_s: float) -> None:
         self._detector, self._delay_s, self._busy_s = detector, delay_s, busy_s
 
     def detect(self, picture: Picture) -> tuple[Detection, ...]:

@@ -38,7 +38,8 @@ def _about(peer: Peer | None) -> str:
     if peer is None:
         return "  (does not say what it is)"
     said = peer.presence
-    return f"  {said.software} on {said.host or 'an unnamed machine'}, round trip {peer.round_trip_us / 1000:.1f} ms"
+    where = f"  {said.software} on {said.host or 'an unnamed machine'}, round trip {peer.round_trip_us / 1000:.1f} ms"
+    return f"{where}; {said.about}" if said.about else where
 
 
 def _peer_object(peer: Peer) -> dict[str, Any]:
@@ -46,7 +47,7 @@ def _peer_object(peer: Peer) -> dict[str, Any]:
     return {
         "role": said.role, "robot": said.robot, "session": said.session, "software": said.software, "host": said.host,
         "up_s": round(said.up_us / 1e6, 1), "round_trip_ms": round(peer.round_trip_us / 1000, 3),
-        "clock_ahead_ms": round(peer.ahead_us / 1000, 3),
+        "clock_ahead_ms": round(peer.ahead_us / 1000, 3), **({"about": said.about} if said.about else {}),
     }
 
 

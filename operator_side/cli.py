@@ -15,8 +15,10 @@ import typer
 from operator_side import (
     cli_bench,
     cli_calibrate,
+    cli_capture,
     cli_config,
     cli_conform,
+    cli_detector,
     cli_doctor,
     cli_faults,
     cli_install,
@@ -25,9 +27,12 @@ from operator_side import (
     cli_metrics,
     cli_mission,
     cli_people,
+    cli_pick_color,
     cli_scenarios,
     cli_services,
     cli_teleop,
+    cli_train,
+    cli_watch,
 )
 from operator_side.settings_errors import no_such_name
 from protocol.errors import SightlineError
@@ -48,7 +53,8 @@ app = typer.Typer(
 for module in (
     cli_services, cli_judge, cli_people, cli_bench, cli_faults,
     cli_calibrate, cli_keys, cli_install, cli_doctor, cli_metrics, cli_config, cli_conform,
-    cli_teleop, cli_mission, cli_scenarios,
+    cli_detector, cli_teleop, cli_mission, cli_scenarios, cli_watch, cli_capture,
+    cli_pick_color, cli_train,
 ):
     module.register(app)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from operator_side.cli_bench_detector import register_detector
 from operator_side.cli_bench_loop import register_bench
 from operator_side.cli_bench_network import register_network
 from operator_side.cli_judge import CHECK_FAILED, Json, numbers
@@ -28,6 +29,7 @@ def register(app: typer.Typer) -> None:
     group.command(epilog="Example: sightline bench report --section loop --section watchers")(report)
     register_bench(group)
     register_network(group)
+    register_detector(group)
     app.add_typer(group, name="bench")
 
 
@@ -37,7 +39,7 @@ def codec(*, as_json: Json = False) -> int:
     from operator_side.score import Check
 
     costs = measure_codec()
-    return _print_checks([Check(cost.name, cost.median_us, "us", cost.bound_us, cost.ok) for cost in costs], as_json)
+    return print_checks([Check(cost.name, cost.median_us, "us", cost.bound_us, cost.ok) for cost in costs], as_json)
 
 
 def gate(*, as_json: Json = False) -> int:
@@ -46,7 +48,7 @@ def gate(*, as_json: Json = False) -> int:
     from operator_side.score import Check
 
     took_us = measure_gate()
-    return _print_checks([Check("offer and step", took_us, "us", BOUND_US, took_us <= BOUND_US)], as_json)
+    return print_checks([Check("offer and step", took_us, "us", BOUND_US, took_us <= BOUND_US)], as_json)
 
 
 def pipeline(*, as_json: Json = False) -> int:
@@ -60,7 +62,7 @@ def pipeline(*, as_json: Json = False) -> int:
               one.median_us, "us", one.bound_us, one.median_us <= one.bound_us and one.phase == "tracking")
         for one in time_steps()
     ]
-    return _print_checks(checks, as_json)
+    return print_checks(checks, as_json)
 
 
 def odometry(
@@ -77,7 +79,7 @@ def odometry(
 
     errors = measure_odometry(robot_model or ())
     checks = [Check(one.name, one.percent, "%", one.bound_percent, one.percent <= one.bound_percent) for one in errors]
-    return _print_checks(checks, as_json)
+    return print_checks(checks, as_json)
 
 
 def robot(
@@ -96,7 +98,7 @@ def robot(
         Check("memory, network process", seen.network_mb, "MB", NETWORK_BOUND_MB, seen.network_mb <= NETWORK_BOUND_MB),
         Check("memory, driver", seen.driver_mb, "MB", NETWORK_BOUND_MB, seen.driver_mb <= NETWORK_BOUND_MB),
     ]
-    return _print_checks(checks, as_json)
+    return print_checks(checks, as_json)
 
 
 def demo(
@@ -139,7 +141,8 @@ def report(
     return 0 if write_report(out, sections_named(section or ()), typer.echo) else CHECK_FAILED
 
 
-def _print_checks(checks: "list[Check]", as_json: bool) -> int:
+def print_checks(checks: "list[Check]", as_json: bool) -> int:
+    """Print them, and return the exit code."""
     from operator_side.check_text import check_line
 
     ok = all(check.ok for check in checks)

@@ -10,6 +10,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
+from operator_side.cli_score_detectors import detectors
 from operator_side.extras import needs
 from protocol.errors import ConfigError
 
@@ -22,13 +23,19 @@ Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts
 def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline demo --scenario eight --latency-ms 100 --loss 0.1")(demo)
-    app.command(epilog="Example: sightline score --scenario circle,eight --seeds 101,102,103")(score)
+    group = typer.Typer(
+        help=score.__doc__, rich_markup_mode=None, invoke_without_command=True, callback=score,
+        epilog="Example: sightline score --scenario circle,eight --seeds 101,102,103",
+    )
+    group.command(epilog="Example: sightline score detectors hsv onnx --sheet runs/sheet.png")(detectors)
+    app.add_typer(group, name="score")
 
 
 def demo(
     *,
     scenario: Annotated[str, typer.Option(help="A name of `sightline scenarios`, or a .toml.")] = "circle",
     mission: Annotated[str | None, typer.Option(help="In place of the scenario's own, e.g. a baseline law.")] = None,
+    detector: Annotated[str | None, typer.Option(help="Of `sightline detector list` [default: hsv].")] = None,
     seconds: Annotated[
         float | None, typer.Option(help="How long; 0: until Ctrl-C [default: 20, or what the course takes].")
     ] = None,
@@ -49,7 +56,7 @@ def demo(
         from operator_side.demo_report import report, summary
     say = _to_stderr if as_json else typer.echo
     lasting_s = _seconds(scenario, seconds)
-    run = run_demo(DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission), say)
+    run = run_demo(DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission, detector), say)
     say("all three have ended; the run is being scored, replayed and filmed")
     judged = report(run)
     if as_json:
@@ -84,6 +91,7 @@ def _to_stderr(line: str) -> None:
 
 
 def score(
+    context: typer.Context,
     *,
     scenario: Annotated[str, typer.Option(help="`all`, or names separated by commas.")] = "all",
     seeds: Annotated[str, typer.Option(help="Separated by commas; judge with seeds nobody tuned on.")] = "1,2,3",
@@ -100,6 +108,8 @@ def score(
     as_json: Json = False,
 ) -> int:
     """Drive in virtual time, many times, and judge: the services' own logic, world truth, median and worst."""
+    if context.invoked_subcommand is not None:
+        return 0
     with needs("all"):
         from operator_side.score_runs import cases, run_cases
         from operator_side.score_table import progress, score_text

@@ -37,7 +37,7 @@ def _keys() -> ModuleType:
 
 
 def init(folder: Folder, host: Hosts = None, days: Days = 825) -> None:
-    """Make a private authority and certificates for robot, vision, operator and viewer."""
+    """Make a private authority and certificates for robot, vision, operator, detector and viewer."""
     made = _keys()
     for file in made.make(folder, host or [], days):
         print(f"made {file}")
@@ -46,7 +46,7 @@ def init(folder: Folder, host: Hosts = None, days: Days = 825) -> None:
 
 def add(
     folder: Folder,
-    role: Annotated[str, typer.Argument(help="robot, vision, operator or viewer.")],
+    role: Annotated[str, typer.Argument(help="robot, vision, operator, detector or viewer.")],
     host: Hosts = None,
     days: Days = 825,
 ) -> None:

@@ -124,7 +124,14 @@ def vision(
     config: ConfigFile = None,
     sets: Sets = None,
     detector: Annotated[
-        str | None, typer.Option("--detector", metavar="KIND", help="hsv, or boxes that a guest sends [default: hsv].")
+        str | None,
+        typer.Option("--detector", metavar="NAME", help="Of `sightline detector list`, e.g. onnx:PATH [default: hsv]."),
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option("--device", help="Of a model: auto, cpu, cuda or tensorrt [default: auto].")
+    ] = None,
+    shadow: Annotated[
+        str | None, typer.Option("--shadow", metavar="NAME", help="A second detector that looks on and never steers.")
     ] = None,
     mission: Annotated[
         str | None, typer.Option("--mission", metavar="NAME", help="What to do with what is seen [default: follow].")
@@ -152,7 +159,8 @@ def vision(
     if robot is not None and "://" in robot:  # the address of a robot that has one endpoint and no other name
         connect, robot = [*(connect or ()), robot], None
     options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure,
-               "detector.kind": detector, "mission.kind": mission}
+               "detector.kind": detector, "detector.device": device, "detector.shadow": shadow,
+               "mission.kind": mission}
     loaded = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
     with needs("vision"):
         if dry_run:
@@ -190,8 +198,8 @@ def _only_look(config: Any, camera: str | None, camera_sets: list[str]) -> int:
     from operator_side.local_camera import local_camera
     from vision_side.dry_run import watch_camera, watch_robot
 
-    if config.detector.kind != "hsv":
-        raise ConfigError("--dry-run looks with vision's own eyes; leave the detector at hsv")
+    if config.detector.kind == "boxes":
+        raise ConfigError("--dry-run looks with vision's own eyes; name a detector, e.g. --detector hsv")
     if camera is None:
         return watch_robot(config, typer.echo, None)
     with local_camera(camera, camera_sets) as opened:

@@ -55,6 +55,7 @@ class DemoOptions:
     transport: str = "zenoh"
     mission: str | None = None
     """In place of the scenario's own."""
+    detector: str | None = None
 
     def __post_init__(self) -> None:
         """Raise ConfigError for what cannot be run."""
@@ -182,6 +183,8 @@ def _write_configuration(run: DemoRun, sockets: str) -> None:
             **({"camera": model.camera.camera_model().model_dump()} if legacy else {}),
         },
     }
+    if options.detector is not None:
+        files["vision"] = laid_over(files["vision"], {"detector": {"kind": options.detector}})
     for name, table in files.items():
         (run.folder / f"{name}.toml").write_text(toml_text(table), "utf-8")
 

@@ -1,6 +1,6 @@
 """`sightline install`: a service that begins with the machine. Shell.
 
-The units are files that a person can read (`robot_side/systemd`, `vision_side/systemd`); only paths and user change.
+The units are files that a person can read (`robot_side/systemd`, `vision_side/systemd`); paths, user and pins change.
 """
 
 import os
@@ -10,15 +10,21 @@ from importlib.resources import files
 from pathlib import Path
 
 from protocol.errors import ConfigError
+from robot_side.config import RobotConfig
+from robot_side.plugins import configured
 
 SERVICES = ("robot", "vision")
 UNIT_DIR = Path("/etc/systemd/system")
 _PROGRAM = "/opt/sightline/bin/sightline"
+_PYTHON = "/opt/sightline/bin/python"
+_DROP_IN = "gpio-low.conf"
+_DROP_INS_PINS = "gpio_low 10 9 8 7 17"
+"""As the file in `robot_side/systemd` has them: those of the example car."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """One unit file: where it goes and what it says."""
+    """One file of systemd: where it goes and what it says."""
 
     service: str
     path: Path
@@ -37,25 +43,66 @@ def plan(service: str, program: Path, config: Path, user: str, unit_dir: Path = 
             raise ConfigError(f"{what} {text!r} cannot stand in a unit: no spaces, quotes or %")
     name = f"sightline-{service}.service"
     unit = files(f"{service}_side").joinpath("systemd", name).read_text()
+    unit = unit.replace("User=sightline", f"User={user}")
+    return Plan(service, unit_dir / name, _fitted(unit, service, program, config))
+
+
+def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UNIT_DIR) -> Plan | None:
+    """What puts the pins of a robot whose drive is `gpio` low, beside its unit; None for another drive.
+
+    Raises ConfigError where the drive's own options are wrong.
+    """
+    if robot.motors.kind != "gpio":
+        return None
+    _, options = configured("drives", robot.motors)
+    pins = " ".join(str(number) for number in (*options.pins, *options.enable_pins))
+    text = files("robot_side").joinpath("systemd", _DROP_IN).read_text().replace(_DROP_INS_PINS, f"gpio_low {pins}")
+    return Plan("robot", drop_in_path(unit_dir), _fitted(text, "robot", program, config))
+
+
+def drop_in_path(unit_dir: Path = UNIT_DIR) -> Path:
+    """Where it lies, or lay."""
+    return unit_dir / "sightline-robot.service.d" / _DROP_IN
+
+
+def _fitted(unit: str, service: str, program: Path, config: Path) -> str:
+    """With this machine's paths, and without the comments for who reads the file as it comes."""
     fitted = (
-        unit.replace(_PROGRAM, str(program))
+        unit.replace(_PROGRAM, str(program)).replace(_PYTHON, str(program.with_name("python")))
         .replace(f"/etc/sightline/{service}.toml", str(config))
-        .replace("User=sightline", f"User={user}")
     )
-    return Plan(service, unit_dir / name, "\n".join(line for line in fitted.splitlines() if line[:1] != "#") + "\n")
+    return "\n".join(line for line in fitted.splitlines() if line[:1] != "#") + "\n"
 
 
-def write(planned: Plan) -> None:
-    """Put the unit in place and begin it, now and at every start of the machine.
+def write(planned: Plan, beside: Plan | None = None) -> None:
+    """Put the unit in place, and what belongs beside it, and begin it, now and at every start of the machine.
 
     Raises ConfigError, with nothing begun, where it may not be written or systemd does not run.
     """
+    for one in [planned, *([beside] if beside else [])]:
+        _put(one)
+    for command in (["daemon-reload"], ["enable", "--now", planned.path.name]):
+        _systemctl(command)
+
+
+def _put(planned: Plan) -> None:
     try:
+        if planned.path.name == _DROP_IN:
+            planned.path.parent.mkdir(exist_ok=True)
         planned.path.write_text(planned.text)
     except OSError as error:
         raise ConfigError(f"cannot write {planned.path}: {error.strerror}; try with sudo") from None
-    for command in (["daemon-reload"], ["enable", "--now", planned.path.name]):
-        _systemctl(command)
+
+
+def take_away(path: Path) -> bool:
+    """Remove what another drive left beside the unit; whether there was anything. Raises ConfigError."""
+    try:
+        path.unlink()
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise ConfigError(f"cannot remove {path}: {error.strerror}; try with sudo") from None
+    return True
 
 
 def _systemctl(arguments: list[str]) -> None:

@@ -28,6 +28,7 @@ from sim.scenario import Scenario
 from sim.truth import Truth
 from sim.world import World
 from vision_side.config import VisionConfig
+from vision_side.detect.choice import configured_detector
 from vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
 from vision_side.scan import read_scan
 
@@ -81,7 +82,7 @@ class Lockstep:
         self._robot_link.subscribe(ACK, lambda message: self._sending.on_ack(message, self._now_us))
         self._vision_link = self.network.link(robot.robot, role=SOURCE)
         self._frames: LatestSlot[Message] = self._vision_link.latest(FRAME)
-        self._pipeline = Pipeline(vision, world.camera_model)
+        self._pipeline = Pipeline(vision, world.camera_model, eyes=configured_detector(vision))
         self._scanned = self._vision_link.latest(SCAN) if self._pipeline.mission.wants_scan else None
         self._labels = Labels(vision.boxes, world.camera_model) if vision.detector.kind == "boxes" else None
         self._computed: deque[tuple[int, Message]] = deque(maxlen=1)

@@ -18,6 +18,7 @@ from protocol.transports.link import Message
 from protocol.twist_text import format_twist
 from vision_side.config import VisionConfig
 from vision_side.detect.boxes import BoxReader
+from vision_side.detect.choice import configured_detector
 from vision_side.missions.choice import requested
 from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline
 from vision_side.scan import read_scan
@@ -95,7 +96,7 @@ def replay_steps(path: Path) -> Iterator[Step]:
 def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
     """Takes out of `answers` what it uses; what is left cites frames that were not recorded."""
     config = _vision_config(path)
-    camera = _first_camera(path)
+    camera, eyes = _first_camera(path), configured_detector(config)
     pipelines: dict[str, Pipeline] = {}
     for recorded in read_recording(path):
         message = recorded.message
@@ -111,7 +112,7 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
             if sent is None and header.session not in pipelines:
                 continue  # before its first twist vision may not have had the camera's model: it only acknowledged
             if header.session not in pipelines:
-                pipelines[header.session] = Pipeline(config, camera)
+                pipelines[header.session] = Pipeline(config, camera, eyes=eyes)
             pipeline = pipelines[header.session]
             _give(pipeline, header, answers, config)
             if config.detector.kind == "boxes":

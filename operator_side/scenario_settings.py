@@ -3,6 +3,8 @@
 Nothing here is told to the services behind anybody's back: `sightline demo` leaves both files in its run folder.
 """
 
+import array
+import math
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
@@ -10,6 +12,8 @@ from pydantic import BaseModel, ValidationError
 
 from protocol.errors import ConfigError
 from robot_side.config import RobotConfig
+from robot_side.dead_zone import DeadZoneError, check_dead_zone
+from robot_side.ports import Ranges
 from sim.body import outline
 from sim.robot_model import RobotModel, load_robot
 from sim.scenario import Scenario
@@ -87,7 +91,21 @@ def robot_config(model: RobotModel, *, auto_arm: bool = False) -> RobotConfig:
     table = robot_table(model)
     if auto_arm:
         table = laid_over(table, {"safety": {"auto_arm": True}})
-    return _checked(RobotConfig, table, f"robot {model.name}: [settings]")
+    config = _checked(RobotConfig, table, f"robot {model.name}: [settings]")
+    if config.ranging is not None:
+        _check_sight(config, model)
+    return config
+
+
+def _check_sight(config: RobotConfig, model: RobotModel) -> None:
+    """What a robot's driver finds with the first scan, before there is one."""
+    lidar = model.lidar
+    free = array.array("f", [math.inf] * lidar.rays)
+    scan = Ranges(0, math.radians(lidar.first_deg), lidar.increment_rad, lidar.range_min_m, lidar.range_max_m, free)
+    try:
+        check_dead_zone(config.guard, scan)
+    except DeadZoneError as error:
+        raise ConfigError(f"robot {model.name}: [settings] {error}") from None
 
 
 def vision_config(

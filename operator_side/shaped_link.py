@@ -102,6 +102,10 @@ class ShapedLink:
         self.subscribe(channel, slot.put)
         return slot
 
+    def ignore(self, channel: Channel) -> None:
+        """As the link does."""
+        self._link.ignore(channel)
+
     def has_listener(self, channel: Channel) -> bool:
         """As the link says."""
         return self._link.has_listener(channel)

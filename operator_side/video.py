@@ -5,15 +5,14 @@ Made after the run from its recording, so it costs the run nothing: the pipeline
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operator_side.extras import needs
+from operator_side.film import Film
 from operator_side.replay import Step, replay_steps
 from operator_side.top_view import TopView
 from sim.scenario import Scenario
@@ -23,40 +22,18 @@ Image = NDArray[np.uint8]
 
 FPS: Final = 15
 HEIGHT_PX: Final = 480
-_TIME_BASE = Fraction(1, 90_000)
 _BOX, _TEXT, _SHADOW = (60, 220, 60), (255, 255, 255), (0, 0, 0)
 
 
 def film_run(path: Path, recording: Path, samples: Sequence[Truth], scenario: Scenario) -> int:
     """Write the film of a run (at least one sample) and return its frames. Raises ConfigError without PyAV."""
-    with needs("report"):
-        import av
     view = TopView(samples, scenario, HEIGHT_PX)
     times_us = [truth.t_us for truth in samples]
-    frames = 0
-    with av.open(str(path), "w", options={"movflags": "+faststart"}) as container:
-        stream: Any = None
+    with Film(path, FPS) as film:
         for step in _thinned(recording, times_us[0]):
             index = min(bisect_right(times_us, step.frame.header.t_us), len(samples) - 1)
-            picture = np.hstack([_robot_view(step), view.draw(index)])
-            if stream is None:
-                stream = _stream(container, picture)
-            frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
-            frame.pts, frame.time_base = (step.frame.header.t_us - times_us[0]) * 9 // 100, _TIME_BASE
-            container.mux(stream.encode(frame))
-            frames += 1
-        if stream is not None:
-            container.mux(stream.encode(None))
-    return frames
-
-
-def _stream(container: Any, picture: Image) -> Any:
-    stream = container.add_stream("libx264", rate=FPS)
-    stream.height, stream.width = picture.shape[:2]
-    stream.pix_fmt = "yuv420p"
-    stream.time_base = stream.codec_context.time_base = _TIME_BASE
-    stream.options = {"preset": "veryfast", "crf": "23"}
-    return stream
+            film.add(np.hstack([_robot_view(step), view.draw(index)]), step.frame.header.t_us)
+    return film.frames
 
 
 def _thinned(recording: Path, start_us: int) -> Iterator[Step]:

@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
+from typing import Final
 
 from protocol.errors import ConfigError
 from protocol.messages import (
@@ -64,6 +65,8 @@ class Channel:
     """What becomes of a message that cannot leave at once."""
     passed_on: bool = False
     """Whether the robot hands it, as it came, to every other peer that wants it."""
+    while_watched: bool = False
+    """Said, and passed on, only while somebody listens: a picture nobody looks at is not worth its encoding."""
     said_by: tuple[str, ...] = ()
     """Who may say it where links have keys; empty for every source."""
 
@@ -75,13 +78,17 @@ class Channel:
 
 _OUT, _IN = Direction.FROM_ROBOT, Direction.TO_ROBOT
 _JSON = "application/json"
+JPEG: Final = "image/jpeg"
+"""Encoding of every channel whose payload is a picture."""
+DRIVERS: Final = ("vision", "operator", "teleop")
 
-FRAME = Channel("frame", _OUT, FrameHeader, None, "image/jpeg", Priority.DATA, "camera rate, by credit", 1_000_000,
+FRAME = Channel("frame", _OUT, FrameHeader, None, JPEG, Priority.DATA, "camera rate, by credit", 1_000_000,
                 "a picture, JPEG and nothing else", "none is taken without credit; a newer one takes its place")
 TWIST = Channel("twist", _IN, AnswerHeader, None, "text/plain", Priority.REAL_TIME, "one per frame answered",
-                MAX_TWIST_BYTES, "`linear|angular` in m/s and rad/s")
+                MAX_TWIST_BYTES, "`linear|angular` in m/s and rad/s", said_by=DRIVERS)
 ACK = Channel("ack", _IN, AnswerHeader, None, "application/octet-stream", Priority.REAL_TIME,
-              "one per frame seen but not answered by a twist", 0, "returns credit, drives nothing; empty payload")
+              "one per frame seen but not answered by a twist", 0, "returns credit, drives nothing; empty payload",
+              said_by=DRIVERS)
 REQUEST = Channel("request", _IN, RequestHeader, Request, _JSON, Priority.REAL_TIME, "as a person asks", 256,
                   "arm, disarm, stop, reset, acquire, release", "a newer one takes its place; who asks asks again")
 REPLY = Channel("reply", _OUT, Stamp, Reply, _JSON, Priority.INTERACTIVE_HIGH, "one per request", 1024,
@@ -102,10 +109,17 @@ MISSION = Channel("mission", _IN, RequestHeader, MissionRequest, _JSON, Priority
 REPORT = Channel("report", _IN, DetectionsHeader, MissionReport, _JSON, Priority.INTERACTIVE_HIGH,
                  "2 Hz and on a change", 2048, "what vision does; the robot passes it on", passed_on=True,
                  said_by=("vision",))
+OVERLAY = Channel("overlay", _IN, DetectionsHeader, None, JPEG, Priority.DATA_LOW, "15 Hz at most, while watched",
+                  250_000, "the picture with what vision saw in it drawn over it; the robot passes it on",
+                  passed_on=True, while_watched=True, said_by=("vision",))
+PREVIEW = Channel("preview", _IN, DetectionsHeader, None, JPEG, Priority.DATA_LOW, "10 Hz at most, while watched",
+                  100_000, "the picture made small; the robot passes it on", passed_on=True, while_watched=True,
+                  said_by=("vision",))
 
 CHANNELS: dict[str, Channel] = {
     channel.name: channel
-    for channel in (FRAME, TWIST, ACK, REQUEST, REPLY, STATUS, ODOMETRY, SCAN, CAMERA, DETECTIONS, MISSION, REPORT)
+    for channel in (FRAME, TWIST, ACK, REQUEST, REPLY, STATUS, ODOMETRY, SCAN, CAMERA, DETECTIONS, MISSION, REPORT,
+                    OVERLAY, PREVIEW)
 }
 
 _ROBOT_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")

@@ -37,7 +37,7 @@ MEANINGS: Final = {
     "Asked.session": "of who asked",
     "Asked.id": "of the mission",
     "RequestHeader.echo": "the newest `status` seen",
-    "DetectionsHeader.echo": "the frame that was looked at; of a report the newest",
+    "DetectionsHeader.echo": "the frame that was looked at or is shown; of a report the newest",
     "angle_min_rad": "direction of the first ray; 0 is ahead, left positive",
     "angle_increment_rad": "from one ray to the next",
     "range_min_m": "smaller ranges mean nothing",

@@ -15,7 +15,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from protocol.channels import ACK, FRAME, SCAN, TWIST, Channel, parse_key
+from protocol.channels import ACK, JPEG, SCAN, TWIST, Channel, parse_key
 from protocol.codec import check_sizes, decode, decode_ranges
 from protocol.errors import WireError
 from protocol.golden_case import Case
@@ -53,7 +53,7 @@ def _read_header(channel: Channel, source: str, header: bytes) -> Outcome | None
 
 
 def _read_payload(channel: Channel, payload: bytes) -> Any:
-    if channel is FRAME:
+    if channel.encoding == JPEG:
         size = read_jpeg_size(payload)
         return {"width_px": size.width_px, "height_px": size.height_px, "components": size.components}
     if channel is TWIST:

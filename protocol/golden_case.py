@@ -103,4 +103,6 @@ USUAL: dict[str, tuple[str, dict[str, Any], dict[str, Any] | bytes]] = {
     "detections": ("guest", ANSWER | {"source": "guest"}, DETECTIONS),
     "mission": ("operator", ASK | {"source": "operator"}, MISSION),
     "report": ("vision", ANSWER, REPORT),
+    "overlay": ("vision", ANSWER, jpeg(640, 480)),
+    "preview": ("vision", ANSWER, jpeg(320, 240)),
 }

@@ -5,7 +5,7 @@ from typing import Any
 from protocol.channels import CHANNELS
 from protocol.golden_answers import answers, twists
 from protocol.golden_case import MALFORMED, USUAL, VERSION, Case, case, packed, without
-from protocol.golden_frames import frames, pictures
+from protocol.golden_frames import frames, pictures, views
 from protocol.golden_payloads import detections, missions, payloads, reports
 
 
@@ -35,6 +35,6 @@ def _header_cases(channel: str, header: dict[str, Any]) -> list[Case]:
 
 CASES: tuple[Case, ...] = (
     *_usual(), *_stamps(), *frames(), *pictures(), *twists(), *answers(), *payloads(), *detections(), *missions(),
-    *reports(),
+    *reports(), *views(),
 )
 """Every case; the first of a channel is its example in the specification."""

@@ -1,6 +1,7 @@
 """Golden cases of frames: headers and pictures. Pure."""
 
 from protocol.golden_case import (
+    ANSWER,
     FRAME_HEADER,
     INEXACT,
     MALFORMED,
@@ -58,4 +59,18 @@ def pictures() -> list[Case]:
         case("frame", "jpeg_soi_only", "nothing after SOI", MALFORMED, payload=b"\xff\xd8"),
         case("frame", "jpeg_empty", "no bytes", MALFORMED, payload=b""),
         case("frame", "png", "another format", MALFORMED, payload=b"\x89PNG\r\n\x1a\n" + bytes(24)),
+    ]
+
+
+def views() -> list[Case]:
+    """Pictures that vision made for people."""
+    return [
+        case("overlay", "without_echo", "for showing only", header=without(ANSWER, "echo")),
+        case("overlay", "no_role", "a key without its role", INEXACT, key="sightline/r1/overlay"),
+        case("overlay", "jpeg_bomb", "65500 x 65500", MALFORMED, payload=jpeg(65_500, 65_500)),
+        case("overlay", "jpeg_empty", "no bytes", MALFORMED, payload=b""),
+        case("preview", "without_echo", "for showing only", header=without(ANSWER, "echo")),
+        case("preview", "no_role", "a key without its role", INEXACT, key="sightline/r1/preview"),
+        case("preview", "png", "another format", MALFORMED, payload=b"\x89PNG\r\n\x1a\n" + bytes(24)),
+        case("preview", "jpeg_cut_in_sof", "cut in the frame header", MALFORMED, payload=jpeg(320, 240)[:11]),
     ]

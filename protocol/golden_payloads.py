@@ -72,6 +72,8 @@ def detections() -> list[Case]:
         case(name, "of_vision", "another role", header=ANSWER, key="sightline/r1/detections/vision"),
         case(name, "no_role", "a key without its role", "INEXACT_KEY", key="sightline/r1/detections"),
         case(name, "circle_and_track", "what a detector may add", payload=_found(BOX | {"circle": circle, "track": 9})),
+        case(name, "who_looked", "the detector, its device and the hash of its model",
+             payload=_found(BOX) | {"detector": "onnx", "device": "cuda", "model": "9f86d081884c7d65"}),
         case(name, "boxes_64", "as many as may be", payload=_found(*[BOX] * 64)),
         case(name, "boxes_65", "one too many", MALFORMED, payload=_found(*[BOX] * 65)),
         case(name, "label_64", "64 characters", payload=_found(BOX | {"label": "x" * 64})),

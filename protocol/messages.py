@@ -126,7 +126,7 @@ class RequestHeader(Wire):
 
 
 class DetectionsHeader(Wire):
-    """Header of detections and reports: who looked, at which frame; without `echo` they may be shown, not obeyed."""
+    """Header of what vision says beside its twists: who looked, at which frame; without `echo` for showing only."""
 
     v: Version = VERSION
     source: Source
@@ -134,9 +134,6 @@ class DetectionsHeader(Wire):
     seq: Counter
     echo: Echo | None = None
     compute_us: Microseconds = 0
-
-
-# --- payloads ----------------------------------------------------------------------------------------------------
 
 
 class Verb(StrEnum):
@@ -276,6 +273,9 @@ class Detections(Wire):
     width_px: PixelCount
     height_px: PixelCount
     boxes: Annotated[tuple[DetectedBox, ...], Field(max_length=MAX_DETECTED_BOXES)] = ()
+    detector: Annotated[str, Field(max_length=64)] = ""
+    device: Annotated[str, Field(max_length=32)] = ""
+    model: Annotated[str, Field(max_length=64)] = ""
 
 
 class CameraModel(Wire):

@@ -20,6 +20,7 @@ from protocol.messages import LastRefusal, State, StreamStatus
 from robot_side import ipc
 from robot_side.child import NetworkChild
 from robot_side.config import RobotConfig
+from robot_side.dead_zone import DeadZoneError, check_dead_zone
 from robot_side.driving import Driving
 from robot_side.latch import StopLatch
 from robot_side.limits import TICK_US
@@ -86,6 +87,7 @@ class Driver:
         self._manager = ServiceManager()
         self._watchdog_due_us = self._ticked_us = 0
         self._obeyed = False
+        self._sight: tuple[float, ...] = ()
         self._verdicts: list[ipc.Judged] = []
         self._refusals = RefusalLog()
         self._counted: Counter[str] = Counter()
@@ -165,8 +167,10 @@ class Driver:
         self._obeyed = False
         try:
             wheels = self._drive.wheels()
-            scan = self._ranges.read() if self._ranges else None
+            scan = self._scanned()
             speeds = self._driving.tick(now_us, wheels, scan)
+        except DeadZoneError:  # with the first scan, and without one nothing moves
+            raise
         except Exception as error:  # a plug-in is foreign code; a reading may be no number
             self._driving.gate.fault(f"{error or type(error).__name__}")
             speeds = self._driving.tick(now_us, None, None)
@@ -175,6 +179,17 @@ class Driver:
             self._obeyed = True
         except Exception as error:
             self._driving.gate.fault(f"{error or type(error).__name__}")
+
+    def _scanned(self) -> Ranges | None:
+        """The newest scan. Raises DeadZoneError for a sensor that the guard must not rely on."""
+        scan = self._ranges.read() if self._ranges else None
+        if scan is None:
+            return None
+        sight = (scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, float(len(scan.ranges_m)))
+        if sight != self._sight:
+            check_dead_zone(self._driving.config.guard, scan)
+            self._sight = sight
+        return scan
 
     def _show(self, state: State, reason: str) -> None:
         """One line per change of state; the latch is a level that the scribe keeps."""

@@ -13,14 +13,16 @@ import zlib
 from collections import Counter
 from contextlib import ExitStack, suppress
 
-from protocol.channels import ACK, CHANNELS, FRAME, REQUEST, TWIST
+from protocol.channels import ACK, FRAME, REQUEST, TWIST
 from protocol.codec import encode
 from protocol.errors import HardwareError, SightlineError, WireError
 from protocol.log_lines import use_form
 from protocol.transports.link import Link, Message
-from protocol.transports.opening import open_link, pass_on
+from protocol.transports.opening import open_link
+from protocol.transports.relay import Relay
 from protocol.transports.zenoh_log import refusals_told
 from robot_side import ipc
+from robot_side.addresses import reached_at
 from robot_side.adjusting import Adjusting
 from robot_side.child import Setup
 from robot_side.parent import ParentDriver
@@ -58,9 +60,7 @@ class Network:
         self._link.subscribe(TWIST, self._driver.forward)
         self._link.subscribe(REQUEST, self._driver.forward)
         self._link.subscribe(ACK, self._on_ack)
-        for channel in CHANNELS.values():
-            if channel.passed_on:
-                pass_on(self._link, channel)
+        self._relay = Relay(self._link)
         threading.Thread(target=self._read_driver, daemon=True).start()
         while self.running:
             self._stream_one()
@@ -149,6 +149,7 @@ class Network:
             status = self._adjusting.shown_in(status, getattr(self._link, "dropped", {}))
             camera = self._sending.camera_message(self._adjusting.model, now_us)
         self._driver.tell(bytes([ipc.Kind.STREAM]) + encode(status))
+        self._relay.look()
         self._report_refused()
         if camera is not None:
             self._link.publish(camera.channel, camera.header, camera.payload)
@@ -194,6 +195,8 @@ def _run(driver: ParentDriver) -> None:
         where = ", ".join(config.listen) or "no port of its own"
         where += f", connected to {', '.join(config.connect)}" if config.connect else ""
         print(f"robot {config.robot}: on {where}, camera {config.camera.kind}", flush=True)
+        if reached := reached_at(config.listen):
+            _say(config.robot, f"others reach it at {', '.join(reached)}")
         Network(setup, driver, link, camera).run()
 
 

@@ -44,13 +44,18 @@ def test_the_commands_of_this_version_exist():
         "disarm",
         "stop",
         "reset",
-        "score",
         "faults",
+        "watch",
+        "capture",
+        "pick-color",
+        "train",
     }
     assert expected <= {path[0] for path in COMMANDS if len(path) == 1}
     groups = {
         "calibrate": ("camera",),
         "config": ("check", "show", "schema"),
+        "detector": ("list", "check", "promote"),
+        "score": ("detectors",),
         "bench": ("codec", "pipeline", "odometry", "robot", "demo", "report"),
     }
     assert {(group, name) for group, names in groups.items() for name in names} <= set(COMMANDS)

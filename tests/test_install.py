@@ -7,8 +7,19 @@ import pytest
 
 from operator_side import cli, install
 from protocol.errors import ConfigError
+from robot_side.config import PluginChoice, RobotConfig
 
 PROGRAM, CONFIG = Path("/home/pi/.venv/bin/sightline"), Path("/home/pi/robot.toml")
+CAR = """
+[drive]
+kind = "gpio"
+[drive.options]
+left_forward_pin = 5
+left_backward_pin = 6
+right_forward_pin = 13
+right_backward_pin = 19
+enable_pins = [26]
+"""
 
 
 def _parsed(text):
@@ -64,3 +75,77 @@ def test_a_folder_that_cannot_be_written_is_said(tmp_path):
     planned = install.plan("vision", PROGRAM, CONFIG, "pi", tmp_path / "absent")
     with pytest.raises(ConfigError, match=r"cannot write .*: No such file or directory; try with sudo"):
         install.write(planned)
+
+
+# --- a robot on a Raspberry Pi's pins -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def car(monkeypatch, tmp_path):
+    """(its configuration, where units go, what systemctl was told)."""
+    file, units, told = tmp_path / "car.toml", tmp_path / "units", []
+    file.write_text(CAR)
+    units.mkdir()
+    monkeypatch.setattr(install, "UNIT_DIR", units)
+    monkeypatch.setattr(install, "_systemctl", told.append)
+    return file, units, told
+
+
+def stops_with(text):
+    return [line.partition("=")[2] for line in text.splitlines() if line.startswith("ExecStopPost=")]
+
+
+@pytest.mark.parametrize("enable", [(), (17,), (3, 2)])
+def test_a_robot_on_pins_has_its_own_pins_put_low_first_and_then_its_own_command(enable, tmp_path):
+    options = {"left_forward_pin": 20, "right_backward_pin": 21, "enable_pins": enable}
+    robot = RobotConfig(drive=PluginChoice(kind="gpio", options=options))
+    planned = install.drop_in(robot, PROGRAM, CONFIG, tmp_path)
+    first = f"-/home/pi/.venv/bin/python -m robot_side.hardware.gpio_low {' '.join(map(str, (20, 9, 8, 21, *enable)))}"
+    own = stops_with(install.plan("robot", PROGRAM, CONFIG, "pi", tmp_path).text)
+    assert stops_with(planned.text) == ["", first, *own], "emptied, then in this order"
+    assert planned.path == tmp_path / "sightline-robot.service.d" / "gpio-low.conf"
+    assert "#" not in planned.text and "/opt/" not in planned.text
+
+
+def test_another_drive_has_no_pins(tmp_path):
+    assert install.drop_in(RobotConfig(), PROGRAM, CONFIG, tmp_path) is None
+
+
+def test_wrong_pins_are_not_installed(car, capsys):
+    file, units, told = car
+    file.write_text(CAR.replace("= 6", "= 5"))
+    for yes in ([], ["--yes"]):
+        assert cli.run(["install", "robot", "--config", str(file), "--user", "pi", *yes]) == 2
+        assert "pin 5 is named twice" in capsys.readouterr().err
+    assert (list(units.iterdir()), told) == ([], [])
+
+
+def test_both_files_are_shown_first_and_written_when_asked(car, capsys):
+    file, units, told = car
+    command = ["install", "robot", "--config", str(file), "--user", "pi"]
+    assert cli.run(command) == 0
+    shown = capsys.readouterr()
+    assert "gpio_low 5 6 13 19 26" in shown.out and "sightline-robot.service.d/gpio-low.conf" in shown.err
+    assert (list(units.iterdir()), told) == ([], [])
+    assert cli.run([*command, "--yes"]) == 0
+    written = [(units / name).read_text() for name in
+               ("sightline-robot.service", "sightline-robot.service.d/gpio-low.conf")]
+    assert "\n".join(written) == shown.out, "what was shown is what is written"
+    assert told == [["daemon-reload"], ["enable", "--now", "sightline-robot.service"]]
+
+
+def test_the_pins_of_a_drive_that_is_gone_are_left_alone_again(car, capsys):
+    file, units, _told = car
+    command = ["install", "robot", "--config", str(file), "--user", "pi", "--yes"]
+    assert cli.run(command) == 0
+    file.write_text('drive = { kind = "log" }\n')
+    assert cli.run(command) == 0
+    assert not (units / "sightline-robot.service.d/gpio-low.conf").exists()
+    assert "this robot's drive is not gpio" in capsys.readouterr().out
+
+
+def test_a_configuration_that_is_not_there_yet_is_said(car, capsys):
+    file, _units, _told = car
+    file.unlink()
+    assert cli.run(["install", "robot", "--config", str(file), "--user", "pi"]) == 0
+    assert "is not there yet; if its drive is gpio" in capsys.readouterr().err

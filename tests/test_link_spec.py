@@ -160,6 +160,21 @@ def test_has_listener_follows_who_subscribes(rig):
     assert rig.until(lambda: not robot.has_listener(FRAME))
 
 
+def test_what_is_ignored_is_heard_no_more_and_may_be_heard_again(rig):
+    robot, peer, frames, _ = _pair(rig)
+    second = peer.latest(FRAME)
+    peer.ignore(FRAME)
+    peer.ignore(STATUS)  # what was never subscribed to
+    assert rig.until(lambda: not robot.has_listener(FRAME))
+    robot.publish(FRAME, b"", b"1")
+    rig.wait(0.1)
+    assert frames.take() is None and second.take() is None
+    again = peer.latest(FRAME)
+    assert rig.until(lambda: robot.has_listener(FRAME))
+    robot.publish(FRAME, b"", b"2")
+    assert _take(rig, again).payload == b"2" and frames.take() is None
+
+
 def test_a_link_does_not_hear_itself(rig):
     robot, _, frames, _ = _pair(rig)
     own = robot.latest(FRAME)

@@ -167,7 +167,7 @@ def test_a_robot_that_ends_while_its_successor_looks_is_no_namesake(router, monk
 def test_when_secured_each_role_is_listed_as_what_its_certificate_says(tmp_path):
     folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
     keys.make(folder, [])
-    roles = ["vision", "operator", "teleop", "viewer3"]
+    roles = ["vision", "operator", "teleop", "detector", "viewer3"]
     with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)):
         links = [open_zenoh("r1", connect=[endpoint], role=role, secure=str(folder)) for role in roles]
         try:

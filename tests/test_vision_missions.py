@@ -12,6 +12,7 @@ from protocol.errors import ConfigError
 from protocol.messages import STILL, CameraModel, FrameHeader
 from protocol.mission_messages import MissionRequest
 from tests.mission_contract import CAMERA, check_mission
+from vision_side import plugin_choice
 from vision_side.config import VisionConfig
 from vision_side.detect.port import Circle, Detection
 from vision_side.missions import choice
@@ -75,7 +76,7 @@ def test_what_cannot_be_chosen_is_one_line_that_says_why(kind, options, words):
 def test_an_entry_point_gives_a_mission_its_name(monkeypatch):
     shy = EntryPoint("shy", "examples.my_mission:Shy", choice.GROUP)
     broken = EntryPoint("broken", "examples.nothing:There", choice.GROUP)
-    monkeypatch.setattr(choice, "entry_points", lambda group: [shy, broken] if group == choice.GROUP else [])
+    monkeypatch.setattr(plugin_choice, "entry_points", lambda group: [shy, broken] if group == choice.GROUP else [])
     monkeypatch.chdir(ROOT)
     assert requested(MissionRequest(id=1, name="shy", options={"near_px": 12}), CONFIG).config.near_px == 12
     with pytest.raises(ConfigError, match="'broken' cannot be loaded"):

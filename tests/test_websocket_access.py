@@ -214,8 +214,11 @@ def test_a_token_opens_the_door_and_nothing_else_does(keys, capfd):
 # --- roles -----------------------------------------------------------------------------------------------------------
 
 
+_OF_VISION = ("twist", "ack", "detections", "report", "overlay", "preview")
+
+
 def test_a_role_may_publish_what_the_table_of_channels_gives_it():
-    assert grant_of("vision") == {(name, "vision") for name in ("twist", "ack", "detections", "report")}
+    assert grant_of("vision") == {(name, "vision") for name in _OF_VISION}
     said = {("twist", "teleop"), ("request", "operator"), ("request", "teleop"), ("mission", "operator")}
     assert said < grant_of("operator")
     assert ("report", "operator") not in grant_of("operator")

@@ -4,6 +4,7 @@ Times are the robot's: what was asked must cite a status not much older than the
 a network kept back does not start anything.
 """
 
+from dataclasses import dataclass
 from typing import Final
 
 from protocol.channels import MISSION
@@ -21,6 +22,17 @@ MAX_AGE_US: Final = 2_000_000
 _LONGEST: Final = 200
 
 
+SWAP: Final = "detector"
+"""Asked for like a mission, and none: which detector drives, with the option `shadow`, true or false."""
+
+
+@dataclass(frozen=True, slots=True)
+class Swap:
+    """Which detector is to drive: the one that looks on until now, or the first one again."""
+
+    shadow: bool
+
+
 class Desk:
     """Takes up what is asked for, each once. `asked` is the newest, `refused` why it was not taken up."""
 
@@ -29,7 +41,7 @@ class Desk:
         self.asked: Asked | None = None
         self.refused = ""
 
-    def take(self, message: Message, frame: FrameHeader) -> Chosen | None:
+    def take(self, message: Message, frame: FrameHeader) -> Chosen | Swap | None:
         """What to do from `frame` on; None for what was said before and for what is refused.
 
         Raises WireError for what is no message of this channel; `refused` then says it too.
@@ -46,10 +58,18 @@ class Desk:
         self.asked, self.refused = asked, ""
         try:
             _check(header, message.source, frame)
-            return requested(request, self._config)
+            return _swap_of(request) if request.name == SWAP else requested(request, self._config)
         except (WireError, ConfigError) as error:
             self.refused = " ".join(str(error).split())[:_LONGEST]
             return None
+
+
+def _swap_of(request: MissionRequest) -> Swap:
+    """Raises ConfigError for other options than its one."""
+    shadow = request.options.get("shadow")
+    if len(request.options) != 1 or not isinstance(shadow, bool) or request.waypoints:
+        raise ConfigError("which detector drives is said with the option shadow=true or shadow=false alone")
+    return Swap(shadow)
 
 
 def _check(header: RequestHeader, source: str, frame: FrameHeader) -> None:

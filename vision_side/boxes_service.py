@@ -74,6 +74,7 @@ class BoxesService(Service):
         self._heard_s = time.monotonic()
         self._tell("link", f"frames from robot {self._config.robot}, session {header.session}")
         self._publish(header, Answer(None, Seen("no picture", note="somebody else looks")), 0)
+        self._viewing.keep(header, message.payload)
         if self._pipeline is None:
             self._wait_for_camera()
         elif time.monotonic() - self._boxes_heard_s > _BOXES_SILENCE_S:
@@ -100,6 +101,7 @@ class BoxesService(Service):
         self._publish(frame, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._tell_phase(answer)
         self._dispatch.after(time.monotonic(), self._pipeline, frame, answer.seen)
+        self._viewing.show(frame, answer, self._pipeline.mission.name, self._camera, started_ns=started_ns)
 
     def _remember_frames(self) -> None:
         """Also those that newer ones replaced before they were taken up."""

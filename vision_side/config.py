@@ -41,10 +41,31 @@ class HsvConfig(Config):
     """Share of the outline that must lie on the circle; the rest may be cut off by something in front."""
 
 
-class DetectorConfig(Config):
-    """Whose eyes: own ones, or boxes that somebody publishes on the channel `detections`."""
+Device = Literal["auto", "cpu", "cuda", "tensorrt"]
+"""What a model runs on. `auto` takes what there is and says so; the others are kept to, or nothing starts."""
 
-    kind: Literal["hsv", "boxes"] = "hsv"
+
+class DetectorConfig(Config):
+    """Whose eyes: a detector of `sightline detector list`, or `boxes`, which somebody publishes as `detections`."""
+
+    kind: Annotated[str, Field(min_length=1, max_length=256)] = "hsv"
+    """A name, or `package.module:Name`; what follows a colon is the detector's own: onnx:ball.onnx, oip+http://..."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """For the detector's own `Config`."""
+    device: Device = "auto"
+    deadline_s: Annotated[float, Field(ge=0.005, le=1)] = 0.1
+    """A remote detector's answer that takes longer is no answer. Later than this, the robot is slowing down already."""
+    labels: Annotated[tuple[str, ...], Field(max_length=64)] = ()
+    """Only detections with one of these labels count, and `target` of the colour detectors; empty for all."""
+    only_colour: bool = False
+    """Only detections that are mostly of the colours of `hsv.ranges` count: the model says ball, the colour which."""
+    tracked: bool = False
+    """Give what is found in one frame after the other the same `track_id`."""
+    fallback: Annotated[str, Field(max_length=256)] = ""
+    """The detector that drives on while the other does not answer; empty for none, and the robot holds."""
+    shadow: Annotated[str, Field(max_length=256)] = ""
+    """A second detector that looks at the same frames and never steers, until somebody promotes it."""
+    shadow_options: dict[str, Any] = Field(default_factory=dict)
 
 
 class BoxesConfig(Config):
@@ -78,6 +99,8 @@ class TargetConfig(Config):
     stand_off_m: Annotated[float, Field(gt=0.1, le=10)] = 0.8
     """Distance to keep from the lens to the target's centre, over the floor."""
     max_range_m: Annotated[float, Field(gt=0.2, le=50)] = 6.0
+    label: Annotated[str, Field(max_length=64)] = ""
+    """What is followed, by the detector's label; empty for whatever is no traffic light and no pair of legs."""
 
 
 class TrackConfig(Config):
@@ -143,6 +166,18 @@ class SearchConfig(Config):
     """Pictures without the target must last this long before the robot turns for it."""
 
 
+class ViewingConfig(Config):
+    """What people are shown while they watch: the channels `overlay` and `preview`."""
+
+    overlay_hz: Annotated[float, Field(gt=0, le=60)] = 15.0
+    overlay_width_px: Annotated[int, Field(ge=160, le=1920)] = 640
+    """However wide the camera's pictures are: the words drawn into it must be legible."""
+    overlay_quality_percent: Annotated[int, Field(ge=20, le=95)] = 80
+    preview_hz: Annotated[float, Field(gt=0, le=60)] = 10.0
+    preview_width_px: Annotated[int, Field(ge=64, le=640)] = 320
+    preview_quality_percent: Annotated[int, Field(ge=20, le=95)] = 60
+
+
 def _camera_of_file(value: Any) -> Any:
     """A file's lists are as good as the tuples that the wire's strict model asks for."""
     return CameraModel.model_validate(value, strict=False) if isinstance(value, dict) else value
@@ -172,5 +207,6 @@ class VisionConfig(Config):
     steer: SteerConfig = SteerConfig()
     latency: LatencyConfig = LatencyConfig()
     search: SearchConfig = SearchConfig()
+    viewing: ViewingConfig = ViewingConfig()
     camera: Annotated[CameraModel | None, BeforeValidator(_camera_of_file)] = None
     """For robots that do not say what camera they have (the older dialect); one that says is believed."""

@@ -34,7 +34,7 @@ class Decoder:
     """Decodes pictures of one size into one buffer; half scale from 640x480 up."""
 
     def __init__(self, width_px: int, height_px: int, max_pixels: int) -> None:
-        self._size = (width_px, height_px)
+        self.size_px = (width_px, height_px)
         self._max_pixels = max_pixels
         scale = 2 if width_px * height_px >= HALF_SCALE_FROM_PIXELS else 1
         rows, columns = -(-height_px // scale), -(-width_px // scale)
@@ -43,16 +43,21 @@ class Decoder:
 
     def decode(self, jpeg: bytes) -> Picture:
         """The pixels of `jpeg`. Raises WireError MALFORMED for anything that is not a picture of the camera's size."""
-        if self._checked_head is None or not jpeg.startswith(self._checked_head):
-            self._checked_head = self._check(jpeg)
+        self.check(jpeg)
         self._fill(jpeg)
         return self._picture
 
-    def _check(self, jpeg: bytes) -> bytes | None:
+    def check(self, jpeg: bytes) -> None:
+        """Raise WireError MALFORMED unless `jpeg` says that it is a picture of the camera's size, by its head alone."""
+        if self._checked_head is None or not jpeg.startswith(self._checked_head):
+            self._checked_head = self._head_of(jpeg)
+
+    def _head_of(self, jpeg: bytes) -> bytes | None:
         """The head that spares a camera's next pictures this check: they repeat it byte for byte. None if none can."""
         size = read_jpeg_size(jpeg, self._max_pixels)
-        if (size.width_px, size.height_px) != self._size:
-            raise _bad(f"is {size.width_px}x{size.height_px}, the camera model says {self._size[0]}x{self._size[1]}")
+        if (size.width_px, size.height_px) != self.size_px:
+            own = f"{self.size_px[0]}x{self.size_px[1]}"
+            raise _bad(f"is {size.width_px}x{size.height_px}, the camera model says {own}")
         head = _head_of_one_scan(jpeg, size.components)
         if head is None and _count_scans(jpeg) > MAX_SCANS:
             raise _bad(f"has more than {MAX_SCANS} scans")

@@ -6,10 +6,13 @@ from collections.abc import Callable
 from protocol.channels import MISSION, REPORT, SCAN
 from protocol.codec import encode
 from protocol.errors import WireError
-from protocol.messages import DetectionsHeader, Echo, FrameHeader
+from protocol.messages import Asked, DetectionsHeader, Echo, FrameHeader
 from protocol.transports.link import LatestSlot, Link, Message
-from vision_side.asking import Desk
+from vision_side.asking import Desk, Swap
 from vision_side.config import VisionConfig
+from vision_side.detect.around import news_of
+from vision_side.detect.port import Detector
+from vision_side.detect.shadow import Shadowed
 from vision_side.missions.choice import configured
 from vision_side.pipeline import SOURCE, Pipeline, Seen
 from vision_side.reporting import Reporter
@@ -37,6 +40,7 @@ class Dispatch:
         self._reporter = Reporter(config.detector)
         self._session = secrets.token_hex(4)
         self._reports = 0
+        self._swapped: Asked | None = None
 
     def before(self, pipeline: Pipeline, frame: FrameHeader) -> None:
         """Give `pipeline` what it has to know before it answers `frame`."""
@@ -51,9 +55,13 @@ class Dispatch:
         if pipeline is not None:
             self._mission = pipeline.mission.name
         asked, refused = self._desk.asked, self._desk.refused
-        if pipeline is not None and asked is not None and pipeline.asked != asked:
+        if pipeline is not None and asked is not None and asked not in (pipeline.asked, self._swapped):
             refused = refused or _ENDED
-        report = self._reporter.due(now_s, self._mission, seen, asked, refused)
+        eyes, looked = (pipeline.eyes, pipeline.looked) if pipeline else (None, None)
+        for line in news_of(eyes):
+            self._tell("detector", line)
+        beside = eyes.shadow_text(self._link.robot) if isinstance(eyes, Shadowed) else ""
+        report = self._reporter.due(now_s, self._mission, seen, asked, refused, looked=looked, beside=beside)
         if report is None:
             return
         self._reports += 1
@@ -69,12 +77,24 @@ class Dispatch:
         except WireError as error:
             self._refuse(error)
             return
-        if chosen is not None and self._desk.asked is not None:
+        if isinstance(chosen, Swap):
+            self._swap(chosen, pipeline.eyes, message.source)
+        elif chosen is not None and self._desk.asked is not None:
             pipeline.meet(frame.session)
             pipeline.switch(chosen, self._desk.asked)
             self._tell("mission", f"mission {chosen.name}, asked for by {message.source}")
         elif self._desk.refused:
             self._tell("mission", f"a mission of {message.source} is refused: {self._desk.refused}")
+
+    def _swap(self, swap: Swap, eyes: Detector | None, source: str) -> None:
+        """Let the other detector drive."""
+        self._swapped = self._desk.asked
+        refused = "no detector looks on; start vision with --shadow NAME"
+        if isinstance(eyes, Shadowed):
+            refused = eyes.promote(self._link.robot, swap.shadow)
+        self._desk.refused = refused
+        who = "the shadow drives" if swap.shadow else "the shadow looks on"
+        self._tell("swap", f"{source}: {refused or who}")
 
     def _look(self, pipeline: Pipeline) -> None:
         if self._scans is None:

@@ -12,6 +12,7 @@ from protocol.errors import HardwareError
 from protocol.messages import CameraModel, FrameHeader
 from protocol.transports.link import Link
 from vision_side.config import VisionConfig
+from vision_side.detect.choice import configured_detector
 from vision_side.dispatch import Dispatch
 from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, Seen
 from vision_side.service import Service
@@ -106,7 +107,7 @@ class Watching:
 
     def __init__(self, config: VisionConfig, camera: LocalCamera, say: Say) -> None:
         self._camera, self._say = camera, say
-        self._pipeline = Pipeline(config, camera.model)
+        self._pipeline = Pipeline(config, camera.model, eyes=configured_detector(config))
         self._telling = Telling(say)
         self._session = secrets.token_hex(4)
         self._seq = 0

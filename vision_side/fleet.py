@@ -14,6 +14,8 @@ from protocol.channels import Channel
 from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.config import VisionConfig
 from vision_side.counts import Counts
+from vision_side.detect.choice import configured_detector
+from vision_side.detect.port import Detector
 from vision_side.service import Say, Service, open_service
 
 _LONGEST_WAIT_S = 0.2
@@ -57,6 +59,9 @@ class _Belled:
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
         return self._link.publish(channel, header, payload, source)
 
+    def ignore(self, channel: Channel) -> None:
+        self._link.ignore(channel)
+
     def has_listener(self, channel: Channel) -> bool:
         return self._link.has_listener(channel)
 
@@ -75,8 +80,10 @@ class _Belled:
 class Fleet:
     """A service for each robot that is heard. One turn gives every robot with something new its turn."""
 
-    def __init__(self, config: VisionConfig, site: Site, say: Say) -> None:
+    def __init__(self, config: VisionConfig, site: Site, say: Say, eyes: Detector | None = None) -> None:
+        """`eyes` look for every robot; None for those that the configuration names."""
         self._config, self._site, self._say = config, site, say
+        self._eyes = eyes or configured_detector(config)
         self._bell = threading.Event()
         self.services: dict[str, Service] = {}
         site.on_news(self._bell.set)
@@ -104,7 +111,8 @@ class Fleet:
 
     def _welcome(self, robot: str) -> None:
         config = self._config.model_copy(update={"robot": robot})
-        self.services[robot] = open_service(config, _Belled(self._site.link(robot), self._bell), self._of(robot))
+        link = _Belled(self._site.link(robot), self._bell)
+        self.services[robot] = open_service(config, link, self._of(robot), self._eyes)
 
     def _of(self, robot: str) -> Say:
         return lambda line: self._say(line.replace("vision: ", f"vision: {robot}: ", 1))

@@ -8,8 +8,16 @@ from protocol.errors import WireError
 from protocol.messages import AnswerHeader, Asked, CameraModel, Echo, FrameHeader, ScanHeader, Twist
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder, Picture
+from vision_side.detect.checking import checked
 from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.port import Detection, Detector
+from vision_side.detect.port import (
+    NO_DEADLINE,
+    DetectFrame,
+    Detection,
+    DetectionResult,
+    Detector,
+    PictureDetector,
+)
 from vision_side.foretell import Latency
 from vision_side.missions.choice import Chosen, configured
 from vision_side.missions.duty import Duty
@@ -17,15 +25,18 @@ from vision_side.missions.port import Plan, RangeScan, View
 
 Detections = tuple[Detection, ...]
 SOURCE = "vision"
+NO_ANSWER = "NO_ANSWER"
+"""Counted in `skipped`: frames that the detector did not answer, in time or at all."""
 _MAX_DT_S = 0.5  # a longer gap between frames says nothing more about what happened in it
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A frame as it came."""
+    """A frame as it came. `deadline_us`, on this machine's clock, is how long a detector elsewhere may take."""
 
     header: FrameHeader
     jpeg: bytes
+    deadline_us: int = NO_DEADLINE
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +73,11 @@ class Pipeline:
         self,
         config: VisionConfig,
         camera: CameraModel,
-        detector: Detector | None = None,
+        detector: PictureDetector | None = None,
         chosen: Chosen | None = None,
+        eyes: Detector | None = None,
     ) -> None:
-        """`chosen` is the mission to begin with, that of `config` if None.
+        """`chosen` is the mission to begin with, that of `config` if None; `eyes` look in place of `detector`.
 
         Raises ConfigError for a mission that there is not.
         """
@@ -73,6 +85,8 @@ class Pipeline:
         self._camera = camera
         self._own_eyes = detector is None
         self._detector = detector or HsvDetector(config.hsv)
+        self._eyes = eyes
+        self.looked: DetectionResult | None = None
         self._decoder = Decoder(camera.width_px, camera.height_px, config.max_pixels)
         self._first = chosen or configured(config)
         self.skipped: Counter[str] = Counter()
@@ -97,6 +111,11 @@ class Pipeline:
         """Who asked for it; None for the one it began with."""
         return self._asked
 
+    @property
+    def eyes(self) -> Detector | None:
+        """What looks in place of the pipeline's own detector."""
+        return self._eyes
+
     def switch(self, chosen: Chosen, asked: Asked) -> None:
         """From the next frame on come to rest, then carry out `chosen`; a new session of the robot ends it."""
         self._asked = asked
@@ -115,7 +134,7 @@ class Pipeline:
     def with_camera(self, camera: CameraModel) -> "Pipeline":
         """A new pipeline for another camera of the same robot; what somebody asked for goes on."""
         detector = None if self._own_eyes else self._detector
-        after = Pipeline(self._config, camera, detector, self._first)
+        after = Pipeline(self._config, camera, detector, self._first, self._eyes)
         after._scan = self._scan
         if self._asked is not None:
             after._session, after._asked = self._session, self._asked
@@ -130,7 +149,22 @@ class Pipeline:
             picture = self._decoder.decode(frame.jpeg)
         except WireError as error:
             return self._skip(error.reason, error.detail)
-        return self._answer(frame.header, self._detector.detect(picture), picture)
+        if self._eyes is None:
+            return self._answer(frame.header, self._detector.detect(picture), picture)
+        result = self._look(self._eyes, frame, picture)
+        if isinstance(result, str):
+            return self._skip(NO_ANSWER, result, "no answer")
+        self.looked = result
+        return self._answer(frame.header, result.detections, picture)
+
+    def _look(self, eyes: Detector, frame: Frame, picture: Picture) -> DetectionResult | str:
+        """What `eyes` see, or why that is no answer; whatever a plug-in does ends there."""
+        asked = DetectFrame(self._config.robot, frame.header, frame.jpeg, self._decoder, picture)
+        try:
+            (result,) = eyes.detect([asked], frame.deadline_us)
+            return checked(asked, result) if result is not None else "the detector gave no answer in time"
+        except Exception as error:  # a plug-in's own
+            return f"the detector's answer is none: {type(error).__name__}: {error}"[:160]
 
     def follow(self, header: FrameHeader, detections: Detections) -> Answer:
         """Answer the frame of `header`, in which somebody else found `detections`; empty is "saw nothing"."""
@@ -143,9 +177,9 @@ class Pipeline:
         self.meet(header.session)
         return self._last_us is None or header.t_us > self._last_us
 
-    def _skip(self, reason: str, note: str) -> Answer:
+    def _skip(self, reason: str, note: str, phase: str = "no picture") -> Answer:
         self.skipped[reason] += 1
-        return Answer(None, Seen("no picture", note=note))
+        return Answer(None, Seen(phase, note=note))
 
     def _answer(self, header: FrameHeader, detections: Detections, picture: Picture | None) -> Answer:
         dt_s = self._tick(header)

@@ -22,10 +22,14 @@ from protocol.transports.link import LatestSlot, Link, Message
 from protocol.twist_text import format_twist
 from vision_side.config import VisionConfig
 from vision_side.counts import Counts, Observe
+from vision_side.detect.around import attach_detector, close_detector
+from vision_side.detect.choice import configured_detector
+from vision_side.detect.port import Detector
 from vision_side.dispatch import NO_FRAMES, Dispatch
 from vision_side.missions.choice import configured
 from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, Seen, encode_answer
 from vision_side.sessions import Sessions
+from vision_side.viewing import Viewing
 
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 _SILENCE_S = 3.0
@@ -45,28 +49,33 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
     from protocol.transports.zenoh_log import refusals_told
 
     configured(config)  # a mission that there is not is said before anything is opened
-    ending = threading.Event()
-    with refusals_told(config.listen, config.secure, lambda line: _say(f"vision: {line}")):
-        return (_run_fleet if set("*?") & set(config.robot) else _run_one)(config, ending, observe)
+    ending, eyes = threading.Event(), configured_detector(config)
+    run_it = _run_fleet if set("*?") & set(config.robot) else _run_one
+    try:
+        with refusals_told(config.listen, config.secure, lambda line: _say(f"vision: {line}")):
+            return run_it(config, ending, observe, eyes)
+    finally:
+        close_detector(eyes)
 
 
-def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | None) -> int:
+def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | None, eyes: Detector | None) -> int:
     from protocol.transports.opening import open_link
 
     opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                         max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     # Signals are caught only from here on: until the link is open, they end the process by themselves.
-    with opened as link, _ends_on_signal(ending):
+    with opened as link, ends_on_signal(ending):
         _say(f"vision: looking for robot {config.robot} at {_endpoints(config)}")
-        serve(config, link, ending, _say, observe)
+        serve(config, link, ending, _say, observe, eyes=eyes)
     return 0
 
 
 def serve(
-    config: VisionConfig, link: Link, ending: threading.Event, say: Say, observe: Observe | None = None
+    config: VisionConfig, link: Link, ending: threading.Event, say: Say, observe: Observe | None = None, *,
+    eyes: Detector | None = None,
 ) -> None:
     """Answer frames that come over `link` until `ending` is set."""
-    service = open_service(config, link, say)
+    service = open_service(config, link, say, eyes)
     if observe is not None:
         observe(lambda: [service.counts()])
     while not ending.is_set():
@@ -74,35 +83,37 @@ def serve(
     say(f"vision: ended after {service.answered} frames; skipped: {dict(service.skipped) or 'none'}")
 
 
-def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe | None) -> int:
+def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe | None, eyes: Detector | None) -> int:
     from protocol.transports.zenoh_site import open_site
     from vision_side.fleet import Fleet
 
     opened = open_site(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                        max_frame_bytes=config.max_frame_bytes, secure=config.secure)
-    with opened as site, _ends_on_signal(ending):
+    with opened as site, ends_on_signal(ending):
         _say(f"vision: looking for robots {config.robot} at {_endpoints(config)}")
-        fleet = Fleet(config, site, _say)
+        fleet = Fleet(config, site, _say, eyes)
         if observe is not None:
             observe(fleet.counts)
         fleet.serve(ending)
     return 0
 
 
-def open_service(config: VisionConfig, link: Link, say: Say) -> "Service":
-    """The service that fits the configured detector, for one robot."""
+def open_service(config: VisionConfig, link: Link, say: Say, eyes: Detector | None = None) -> "Service":
+    """The service that fits the configured detector, for one robot. `eyes` are that detector, if it is built."""
     if config.detector.kind == "boxes":
         from vision_side.boxes_service import BoxesService
 
         return BoxesService(config, link, say)
-    return Service(config, link, say)
+    return Service(config, link, say, eyes)
 
 
 class Service:
     """What is known of the robot on the other end, and the pipeline that fits it."""
 
-    def __init__(self, config: VisionConfig, link: Link, say: Say) -> None:
+    def __init__(self, config: VisionConfig, link: Link, say: Say, eyes: Detector | None = None) -> None:
         self._config, self._link, self._say = config, link, say
+        self._eyes = eyes or configured_detector(config)
+        attach_detector(self._eyes, link)
         self._cameras: LatestSlot[Message] = link.latest(CAMERA)
         self._frames = self._arrivals(link)
         self._camera: CameraModel | None = None
@@ -120,6 +131,7 @@ class Service:
         self.answered = self.steered = 0
         self.skipped: Counter[str] = Counter()
         self._dispatch = Dispatch(config, link, self._tell, self._refuse)
+        self._viewing = Viewing(config, link, self._tell)
 
     def _arrivals(self, link: Link) -> LatestSlot[Message]:
         """Where what is to be answered arrives."""
@@ -165,7 +177,7 @@ class Service:
     def _use(self, camera: CameraModel) -> None:
         self._camera = camera
         before = self._pipeline
-        self._pipeline = before.with_camera(camera) if before else Pipeline(self._config, camera)
+        self._pipeline = before.with_camera(camera) if before else Pipeline(self._config, camera, eyes=self._eyes)
         self._counted.clear()
         lens = "calibrated" if camera.calibrated else "not calibrated"
         self._tell("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")
@@ -189,12 +201,15 @@ class Service:
             self._publish(header, Answer(None, Seen("no picture", note="no camera model yet")), 0)
             return
         self._dispatch.before(self._pipeline, header)
-        answer = self._pipeline.step(Frame(header, message.payload))
+        deadline_us = time.monotonic_ns() // 1000 + round(self._config.detector.deadline_s * 1e6)
+        answer = self._pipeline.step(Frame(header, message.payload, deadline_us))
         if answer.twist is None:
             self._count_skipped(self._pipeline.skipped)
         self._publish(header, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._tell_phase(answer)
         self._dispatch.after(time.monotonic(), self._pipeline, header, answer.seen)
+        self._viewing.show(header, answer, self._pipeline.mission.name, self._camera,
+                           started_ns=started_ns, jpeg=message.payload)
 
     def _count_skipped(self, skipped: Counter[str]) -> None:
         """Add what this pipeline has skipped since the last time to what earlier ones did."""
@@ -258,7 +273,7 @@ def _say(line: str) -> None:
 
 
 @contextmanager
-def _ends_on_signal(ending: threading.Event) -> Iterator[None]:
+def ends_on_signal(ending: threading.Event) -> Iterator[None]:
     """SIGTERM and SIGINT set `ending` while inside."""
 
     def end(_number: int, _frame: FrameType | None) -> None:

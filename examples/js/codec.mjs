@@ -49,8 +49,11 @@ export const CHANNELS = Object.assign(Object.create(null), {
   detections: channel("detections", true, tables.DetectionsHeader, tables.Detections, 32_768, 1),
   mission: channel("mission", true, tables.RequestHeader, tables.MissionRequest, 4096, 1),
   report: channel("report", true, tables.DetectionsHeader, tables.MissionReport, 2048, 1),
+  overlay: channel("overlay", true, tables.DetectionsHeader, null, 250_000, 3),
+  preview: channel("preview", true, tables.DetectionsHeader, null, 100_000, 3),
 });
 
+const PICTURES = new Set(["frame", "overlay", "preview"]);
 const ROBOT_ID = /^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/;
 const SOURCE = /^[a-z][a-z0-9_]{0,15}$/;
 const UTF8 = new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }); // a byte order mark stays, and is no JSON
@@ -196,7 +199,7 @@ export function readMessage(of, source, header, payload) {
 
 function readPayload(of, payload) {
   if (of.payload !== null) return decode(of.payload, payload);
-  if (of.name === "frame") return readJpegSize(payload);
+  if (PICTURES.has(of.name)) return readJpegSize(payload);
   if (of.name === "twist") return parseTwist(payload);
   return of.name === "scan" ? decodeRanges(payload) : null;
 }

@@ -182,6 +182,7 @@ const DetectedBox = (value, where) => {
 export const DetectionsHeader = { ...asker, echo: [orNull(object(Echo)), null], compute_us: [counter, 0] };
 export const Detections = {
   width_px: [integer(16, 8192)], height_px: [integer(16, 8192)], boxes: [list(DetectedBox, 0, 64), []],
+  detector: [text(64), ""], device: [text(32), ""], model: [text(64), ""],
 };
 const metres = number(-100, 100);
 const option = (value, where) => (typeof value === "boolean" ? value : typeof value === "string" ? text(64)(value, where) : real(value, where));

@@ -47,6 +47,10 @@ class LedgerLink:
         """As `Link` says."""
         return self._link.latest(channel)
 
+    def ignore(self, channel: Channel) -> None:
+        """As `Link` says."""
+        self._link.ignore(channel)
+
     def has_listener(self, channel: Channel) -> bool:
         """As `Link` says."""
         return self._link.has_listener(channel)

@@ -76,6 +76,10 @@ class Link(Protocol):
         """Subscribe with a slot that holds the newest message of `channel`."""
         ...
 
+    def ignore(self, channel: Channel) -> None:
+        """End every subscription of this link to `channel`; the other ends see that nobody listens here."""
+        ...
+
     def has_listener(self, channel: Channel) -> bool:
         """Whether somebody subscribes to what this end publishes on `channel`; display and economy only."""
         ...

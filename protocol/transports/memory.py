@@ -240,6 +240,10 @@ class MemoryLink:
         self.subscribe(channel, slot.put)
         return slot
 
+    def ignore(self, channel: Channel) -> None:
+        """End every subscription to `channel`."""
+        self._callbacks = [one for one in self._callbacks if one[0] is not channel]
+
     def has_listener(self, channel: Channel) -> bool:
         """Whether another link subscribes to what this end publishes on `channel`."""
         key = self._rules.key(channel)

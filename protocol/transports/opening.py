@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from functools import partial
 from types import TracebackType
 from typing import Any, Self
 
@@ -60,21 +59,6 @@ def open_link(
     return links[0] if len(links) == 1 else ManyLinks(links)
 
 
-def pass_on(link: Link, channel: Channel) -> None:
-    """What a peer says on `channel` is said to the peers of `link`'s other transports; those of its own have heard it.
-
-    On Zenoh they meet at the router, and who listens on WebSocket passes it on itself.
-    """
-    links = link.links if isinstance(link, ManyLinks) else (link,)
-    for near in links:
-        near.subscribe(channel, partial(_say, [other for other in links if other is not near]))
-
-
-def _say(links: Sequence[Link], message: Message) -> None:
-    for link in links:
-        link.publish(message.channel, message.header, message.payload, message.source)
-
-
 def _of_kind(ends: Sequence[str], is_web: bool) -> list[str]:
     return [endpoint for endpoint in ends if ("://" in endpoint) == is_web]
 
@@ -104,6 +88,11 @@ class ManyLinks:
         slot: LatestSlot[Message] = LatestSlot()
         self.subscribe(channel, slot.put)
         return slot
+
+    def ignore(self, channel: Channel) -> None:
+        """As `Link` says, on all of them."""
+        for link in self.links:
+            link.ignore(channel)
 
     def has_listener(self, channel: Channel) -> bool:
         """Whether somebody listens on any of them."""

@@ -24,7 +24,9 @@ MAX_PEERS: Final = 256
 ASKS: Final = 3
 """A first answer also pays for routes that nobody used before; the best of a few is the way itself."""
 
-_Words = Annotated[str, Field(max_length=64, pattern=r"^[^\x00-\x1f\x7f-\x9f]*$")]
+_PRINTED: Final = r"^[^\x00-\x1f\x7f-\x9f]*$"
+_Words = Annotated[str, Field(max_length=64, pattern=_PRINTED)]
+MAX_ABOUT: Final = 160
 
 
 class Presence(Wire):
@@ -35,6 +37,8 @@ class Presence(Wire):
     session: SessionId
     software: _Words = ""
     host: _Words = ""
+    about: Annotated[str | None, Field(max_length=MAX_ABOUT, pattern=_PRINTED)] = None
+    """One line of those who serve others: what they run, on what, and how they fare."""
     up_us: Microseconds = 0
     clock_us: Microseconds = 0
 

@@ -19,9 +19,11 @@ ROBOT: Final = "robot"
 SOURCES: Final[dict[str, tuple[str, ...]]] = {
     "vision": ("vision",),
     "operator": ("operator", "teleop"),
+    "detector": ("detector",),
     "viewer": (),
 }
-"""Role of a certificate -> the sources it may speak as towards a robot. A viewer says nothing, not even `ack`."""
+"""Role of a certificate -> the sources it may speak as towards a robot. A detector says what it sees and no more, a
+viewer nothing, not even `ack`."""
 ROLES: Final = (ROBOT, *SOURCES)
 PRESENCE: Final = "sightline-presence"
 """Where peers say that they are there (`protocol.transports.presence`): beside `sightline/`, the keys of channels."""

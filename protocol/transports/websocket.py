@@ -13,14 +13,13 @@ import secrets
 import sys
 import threading
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import TracebackType
 from typing import Final, Self
 
-from protocol.channels import CHANNELS, FRAME, TWIST, Channel, parse_key
-from protocol.codec import encode
+from protocol.channels import FRAME, TWIST, Channel, parse_key
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.link_rules import INEXACT_KEY, LinkRules
@@ -28,12 +27,13 @@ from protocol.transports.websocket_dial import Dialer
 from protocol.transports.websocket_dialects import V1, Dialect
 from protocol.transports.websocket_doorlog import DoorLog
 from protocol.transports.websocket_endpoints import Endpoint, parse_endpoint
-from protocol.transports.websocket_framing import Hello, Packet
+from protocol.transports.websocket_framing import Packet
 from protocol.transports.websocket_legacy import Client, LegacyToRobot, LegacyToVision
 from protocol.transports.websocket_listen import Keys, Listener
 from protocol.transports.websocket_outbox import Post
 from protocol.transports.websocket_peer import Peer, greet
 from protocol.transports.websocket_seat import Seat
+from protocol.transports.websocket_wants import Wants
 from protocol.transports.websocket_wire import Wire
 
 NOT_GRANTED: Final = "NOT_GRANTED"
@@ -91,8 +91,7 @@ class WebSocketLink:
         """Made by `open_websocket`."""
         self.robot = rules.robot
         self._rules = rules
-        self._session = secrets.token_hex(4)
-        self._callbacks: defaultdict[str, list[Callable[[Message], None]]] = defaultdict(list)
+        self._wants = Wants(rules, secrets.token_hex(4))
         # Who drives comes first. Replaced, never changed, so that publishing needs no lock.
         self._peers: tuple[Peer, ...] = ()
         self._joining = threading.Lock()
@@ -139,10 +138,14 @@ class WebSocketLink:
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
         """Call `callback`, on a peer's thread, for every message with the exact key and within bounds."""
         with self._joining:
-            self._callbacks[channel.name].append(callback)
-            for peer in self._peers:
-                peer.limit(self._wanted_bytes())
-                peer.tell(self._hello())
+            self._wants.add(channel, callback)
+            self._retell()
+
+    def ignore(self, channel: Channel) -> None:
+        """End every subscription to `channel`."""
+        with self._joining:
+            self._wants.drop(channel)
+            self._retell()
 
     def latest(self, channel: Channel) -> LatestSlot[Message]:
         """Subscribe with a slot that holds the newest message of `channel`."""
@@ -207,26 +210,26 @@ class WebSocketLink:
         """Speak with one peer until it is gone. Raises PeerError or ConnectionClosed if it says no proper hello."""
         dialect = self._dialect(end, listening, "{}:{}".format(*wire.address))
         with self._joining:
-            hello, wanted_bytes = self._hello(), self._wanted_bytes()
-        peer = Peer(wire, dialect)
+            told, hello, wanted_bytes = self._wants.told, self._wants.hello(), self._wants.bound()
+        peer = Peer(wire, dialect, self._heed)
         peer.limit(wanted_bytes)
         if isinstance(dialect, V1):
             greet(wire, dialect, hello, listening)
-        if self._join(peer, hello):
+        if self._join(peer, told):
             try:
                 peer.run(self._deliver, self._rules.refuse)
             finally:
                 self._leave(peer)
                 dialect.note_gone()
 
-    def _join(self, peer: Peer, told: str) -> bool:
+    def _join(self, peer: Peer, told: tuple[str, ...]) -> bool:
         with self._joining:
             if self._closed:
                 return False
             self._peers = (*self._peers, peer)
-            peer.limit(self._wanted_bytes())
-            if told != self._hello():
-                peer.tell(self._hello())
+            if told != self._wants.told:
+                self._wants.tell(peer)
+            self._retell()
         self._joined.set()
         return True
 
@@ -234,6 +237,16 @@ class WebSocketLink:
         with self._joining:
             self._peers = tuple(other for other in self._peers if other is not peer)
             self._dropped += peer.outbox.dropped
+            self._retell()
+
+    def _heed(self) -> None:
+        """A peer wants something else now, which may be what another says only while it is watched."""
+        with self._joining:
+            self._retell()
+
+    def _retell(self) -> None:
+        """With the lock held."""
+        self._wants.retell(self._peers, bool(self._listeners))
 
     def _put_first(self, peer: Peer) -> None:
         """Who drives is sent everything before those who watch."""
@@ -262,14 +275,6 @@ class WebSocketLink:
         if line:
             print(line, file=sys.stderr, flush=True)
 
-    def _hello(self) -> str:
-        wants, role = tuple(self._callbacks), self._rules.role
-        return encode(Hello(robot=self.robot, role=role, session=self._session, wants=wants)).decode("utf-8")
-
-    def _wanted_bytes(self) -> int:
-        """The largest payload that this end has asked for."""
-        return max((self._rules.payload_bound(CHANNELS[name]) for name in self._callbacks), default=0)
-
     def _deliver(self, peer: Peer, packet: Packet) -> None:
         parsed = parse_key(packet.key)
         if parsed is None:
@@ -280,7 +285,7 @@ class WebSocketLink:
             return
         if parsed[1] is TWIST and self._peers[0] is not peer:
             self._put_first(peer)
-        callbacks = tuple(self._callbacks.get(parsed[1].name, ()))
+        callbacks = self._wants.of(parsed[1])
         if parsed[1].passed_on and self._listeners:
             callbacks = (partial(self._pass_on, peer), *callbacks)
         self._in_callback.now = True

@@ -41,6 +41,11 @@ class Dialect(Protocol):
     text: bool
     """Whether `write` gives text."""
 
+    @property
+    def wants(self) -> tuple[str, ...]:
+        """Channels that the peer said it wants; of a dialect without words for it none."""
+        ...
+
     def hears(self, channel: Channel) -> bool:
         """Whether the peer wants `channel`."""
         ...
@@ -79,14 +84,14 @@ class V1:
     def __init__(self, robot: str, role: str) -> None:
         self._robot, self._role = robot, role
         self._peer_role = ""
-        self._wants: tuple[str, ...] = ()
+        self.wants: tuple[str, ...] = ()
 
     @property
     def form(self) -> Hashable:
         return V1
 
     def hears(self, channel: Channel) -> bool:
-        return channel.name in self._wants
+        return channel.name in self.wants
 
     def write(self, message: Message) -> tuple[bytes, ...]:
         return pack_pieces(message.channel, message.source, self._role, message.header, message.payload)
@@ -117,4 +122,4 @@ class V1:
             raise PeerError(BAD_HELLO, 1008, f"this text is no hello: {error.detail}") from None
         if hello.robot != self._robot:
             raise PeerError(OTHER_ROBOT, 1008, f"this is robot {self._robot}, not {hello.robot}")
-        self._peer_role, self._wants = hello.role, hello.wants
+        self._peer_role, self.wants = hello.role, hello.wants

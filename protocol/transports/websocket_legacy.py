@@ -62,6 +62,7 @@ class LegacyToVision:
     """
 
     text = True
+    wants: tuple[str, ...] = ()
 
     def __init__(self, robot: str, options: LegacyOptions, now_us: Callable[[], int], client: Client) -> None:
         """`now_us` reads a monotonic clock."""
@@ -160,6 +161,7 @@ class LegacyToRobot:
     """
 
     text = True
+    wants: tuple[str, ...] = ()
 
     def __init__(
         self, robot: str, options: LegacyOptions, now_us: Callable[[], int], session: str, max_frame_bytes: int

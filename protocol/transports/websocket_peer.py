@@ -36,8 +36,10 @@ _COUNTED_FOR_CODE: Final = {1002: BAD_FRAMING, 1007: BAD_FRAMING, 1009: OVERSIZE
 class Peer:
     """An open connection whose other end is known, and the dialect that it speaks."""
 
-    def __init__(self, wire: Wire, dialect: Dialect) -> None:
+    def __init__(self, wire: Wire, dialect: Dialect, heed: Callable[[], None] = lambda: None) -> None:
+        """`heed` is called on the reading thread when the peer says that it wants something else."""
         self.outbox = Outbox()
+        self._heed = heed
         self._wire, self._dialect = wire, dialect
         self._reader = threading.current_thread()
         self._gone = threading.Event()
@@ -105,11 +107,14 @@ class Peer:
         return not life.is_over(now_us, self._wire.way_out)
 
     def _read(self, message: Any, deliver: Callable[[Peer, Packet], None], refuse: Callable[[str], None]) -> None:
+        before = self._dialect.wants
         try:
             packets = self._dialect.read(message)
         except WireError as error:
             refuse(error.reason)
             return
+        if self._dialect.wants != before:
+            self._heed()
         for packet in packets:
             deliver(self, packet)
 

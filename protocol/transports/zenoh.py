@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from types import TracebackType
@@ -79,9 +79,11 @@ class ZenohLink:
         self._session = session
         self._rules = rules
         self._outlets: dict[str, _Outlet] = {}
+        self._subscribers: defaultdict[str, list[zenoh.Subscriber[None]]] = defaultdict(list)
         self._ending = ExitStack()
         if not shared:
             self._ending.callback(session.close)  # first in, so last to run
+        self._ending.callback(lambda: self._undeclare([one for some in self._subscribers.values() for one in some]))
         self._declaring = threading.Lock()
         self._closed = False
         self._in_callback = threading.local()
@@ -131,13 +133,19 @@ class ZenohLink:
         with self._declaring:
             if not self._closed:
                 subscriber = self._session.declare_subscriber(pattern_for(self.robot, channel), handler)
-                self._ending.callback(subscriber.undeclare)
+                self._subscribers[channel.name].append(subscriber)
 
     def latest(self, channel: Channel) -> LatestSlot[Message]:
         """Subscribe with a slot that holds the newest message of `channel`."""
         slot: LatestSlot[Message] = LatestSlot()
         self.subscribe(channel, slot.put)
         return slot
+
+    def ignore(self, channel: Channel) -> None:
+        """End every subscription to `channel`."""
+        with self._declaring:
+            ended = self._subscribers.pop(channel.name, [])
+        self._undeclare(ended)
 
     def has_listener(self, channel: Channel) -> bool:
         """Whether a peer subscribes to what this end publishes on `channel`; never blocks on the network."""
@@ -201,6 +209,14 @@ class ZenohLink:
             if key not in self._outlets:
                 self._outlets[key] = _Outlet(self._session, key, channel, self._ending)
             return self._outlets[key]
+
+    @staticmethod
+    def _undeclare(subscribers: Sequence[zenoh.Subscriber[None]]) -> None:
+        import zenoh
+
+        for one in subscribers:
+            with suppress(zenoh.ZError):  # gone with its session
+                one.undeclare()  # type: ignore[no-untyped-call]
 
     def _end(self) -> None:
         import zenoh

@@ -19,6 +19,7 @@ from protocol.codec import encode
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.presence import (
     EVERYBODY,
+    MAX_ABOUT,
     MAX_PEERS,
     Peer,
     Presence,
@@ -40,8 +41,10 @@ _HOST_CHARACTERS: Final = 64
 class Here:
     """This end of a session: what it answers when it is asked. Raises ConfigError for a role that is none."""
 
-    def __init__(self, role: str, robot: str, session: str) -> None:
+    def __init__(self, role: str, robot: str, session: str, about: Callable[[], str] | None = None) -> None:
+        """`about` is asked for its line each time, on Zenoh's thread."""
         self.role = role
+        self._about = about
         self._began_ns = time.monotonic_ns()
         try:
             self._fixed = Presence(role=role, robot=robot, session=session, software=software(), host=_host())
@@ -52,7 +55,8 @@ class Here:
     def now(self) -> Presence:
         """Of this moment."""
         up_us = (time.monotonic_ns() - self._began_ns) // 1000
-        return self._fixed.model_copy(update={"up_us": up_us, "clock_us": time.time_ns() // 1000})
+        said = {"about": _printed(self._about())[:MAX_ABOUT]} if self._about else {}
+        return self._fixed.model_copy(update={"up_us": up_us, "clock_us": time.time_ns() // 1000, **said})
 
     def answer_in(self, session: zenoh.Session) -> Callable[[], None]:
         """Answer whoever asks, until what this returns is called."""
@@ -111,7 +115,11 @@ def software() -> str:
 
 
 def _host() -> str:
-    return "".join(letter for letter in socket.gethostname() if letter.isprintable())[:_HOST_CHARACTERS]
+    return _printed(socket.gethostname())[:_HOST_CHARACTERS]
+
+
+def _printed(text: str) -> str:
+    return "".join(letter for letter in text if letter.isprintable())
 
 
 def _now_us() -> int:

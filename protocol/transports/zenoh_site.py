@@ -39,16 +39,18 @@ def open_site(
     timeout_s: float = 5.0,
     max_frame_bytes: int = FRAME.max_payload_bytes,
     secure: str = "",
+    about: Callable[[], str] | None = None,
 ) -> ZenohSite:
     """Open a session for every robot whose id fits `pattern` (`*` any text, `?` any letter); use it in a `with`.
 
+    `about` gives the line that who asks who is there is told of this end, besides its role.
     Raises ConfigError for an endpoint or pattern that is none or not of Zenoh, LinkError as `open_zenoh` does.
     """
     for endpoint in (*listen, *connect):
         if "://" in endpoint:
             raise ConfigError(f"{endpoint}: several robots (--robot {pattern!r}) need Zenoh; write tcp/<host>:<port>")
     check_endpoints(listen, connect)
-    here = Here(role, pattern, secrets.token_hex(4)) if role else None
+    here = Here(role, pattern, secrets.token_hex(4), about) if role else None
     session = open_session(listen, connect, timeout_s, secured_for(secure, role))
     site = ZenohSite(session, pattern, role, max_frame_bytes)
     if here is not None:

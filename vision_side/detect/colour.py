@@ -36,27 +36,32 @@ class ColourMask:
 
     def region(self, bgr: NDArray[np.uint8]) -> Region | None:
         """Where the colour is, speckle removed; None if nowhere."""
-        coarse = _codes(bgr[COARSE // 2 :: COARSE])[:, COARSE // 2 :: COARSE].copy()
+        coarse = codes_565(bgr[COARSE // 2 :: COARSE])[:, COARSE // 2 :: COARSE].copy()
         x, y, width, height = cv2.boundingRect(cv2.LUT(coarse, self._table))
         if not width:
             return None
         x1, y1 = max(0, x * COARSE - MARGIN_PX), max(0, y * COARSE - MARGIN_PX)
         part = bgr[y1 : (y + height) * COARSE + MARGIN_PX, x1 : (x + width) * COARSE + MARGIN_PX]
         # Speckle would cost findContours a hundredfold; a 3x3 opening removes it and keeps discs.
-        mask = cv2.morphologyEx(cv2.LUT(_codes(part), self._table), cv2.MORPH_OPEN, _KERNEL)
+        mask = cv2.morphologyEx(cv2.LUT(codes_565(part), self._table), cv2.MORPH_OPEN, _KERNEL)
         return Region(part, mask, (x1, y1))
 
 
-def _codes(bgr: NDArray[np.uint8]) -> NDArray[np.uint16]:
+def codes_565(bgr: NDArray[np.uint8]) -> NDArray[np.uint16]:
     """BGR565 of each pixel."""
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
 
 
-def colour_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
-    """255 for every BGR565 code whose colour is within one of `ranges`, 0 elsewhere; 65536 entries."""
+def colours_565() -> NDArray[np.float64]:
+    """The colour (65536, 3) in the middle of each BGR565 code: blue, green, red, 0..255."""
     codes = np.arange(65536, dtype=np.uint32)
     blue, green, red = (codes & 31) * 8 + 3.5, (codes >> 5 & 63) * 4 + 1.5, (codes >> 11) * 8 + 3.5
-    bgr = (np.stack([blue, green, red], axis=-1) / 255).astype(np.float32)[None]
+    return np.stack([blue, green, red], axis=-1)
+
+
+def colour_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
+    """255 for every BGR565 code whose colour is within one of `ranges`, 0 elsewhere; 65536 entries."""
+    bgr = (colours_565() / 255).astype(np.float32)[None]
     hue, saturation, value = cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV)[0].T
     inside = np.zeros(65536, bool)
     for one in ranges:

@@ -34,8 +34,17 @@ def sharp_outline(bgr: NDArray[np.uint8], mask: NDArray[Any], box: Box) -> NDArr
 
 def _blob(bgr: NDArray[np.uint8], inside: NDArray[Any]) -> NDArray[Any] | None:
     """Not zero where a pixel is more like the colour inside the mask than like the one outside, brightness left out."""
-    rows, inside = bgr[::2], inside[::2]  # every second row tells a mean as well as every row
-    outside = cv2.bitwise_not(cv2.dilate(inside, _AROUND))
+    inside = inside[::2]  # every second row tells a mean as well as every row
+    return blob_between(bgr, bgr[::2], inside, cv2.bitwise_not(cv2.dilate(inside, _AROUND)))
+
+
+def blob_between(
+    bgr: NDArray[np.uint8], rows: NDArray[np.uint8], inside: NDArray[Any], outside: NDArray[Any]
+) -> NDArray[Any] | None:
+    """Not zero where a pixel of `bgr` is more like those of `rows` that are `inside` than like those `outside`.
+
+    None where the two differ too little.
+    """
     blue, green, red, _ = cv2.mean(rows, inside)
     other_blue, other_green, other_red, _ = cv2.mean(rows, outside)
     blue, green, red = blue - other_blue, green - other_green, red - other_red

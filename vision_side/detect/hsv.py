@@ -29,8 +29,10 @@ class HsvDetector:
     def detect(self, picture: Picture) -> tuple[Detection, ...]:
         """What has the colour, and the shape if one is asked for, largest first."""
         region = self._mask.region(picture.bgr)
-        if region is None:
-            return ()
+        return () if region is None else self.measure(picture, region)
+
+    def measure(self, picture: Picture, region: Region) -> tuple[Detection, ...]:
+        """What is in `region` of `picture`, whoever marked it, and has the shape; largest first."""
         outlines, _ = cv2.findContours(region.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         longest = sorted(outlines, key=len, reverse=True)[: self._config.max_contours]
         look = self._disc if self._config.shape == "disc" else self._thing
@@ -56,28 +58,30 @@ class HsvDetector:
         sharp = sharp_outline(region.bgr, region.mask, box)
         if sharp is not None:
             outline, box = sharp, cv2.boundingRect(sharp)
-        edge = _own_edge(outline, box, region.origin_px, picture.bgr.shape)
+        edge = own_edge(outline, box, region.origin_px, picture.bgr.shape)
         fit = round_part(edge, self._config.min_radius_px, self._config.max_roughness)
         if fit is None or len(fit[1]) < self._config.min_outline_kept * len(edge):
             return None
-        return self._detection((box, *fit), len(fit[1]) / len(outline), region.origin_px, picture.scale)
+        whose = (len(fit[1]) / len(outline), self._label)
+        return disc_detection((box, *fit), whose, region.origin_px, picture.scale)
 
-    def _detection(self, shape: tuple[Box, Fit, Outline], score: float, origin_px: tuple[int, int],
+
+def disc_detection(shape: tuple[Box, Fit, Outline], whose: tuple[float, str], origin_px: tuple[int, int],
                    scale: int) -> Detection:
-        """In pixels of the encoded picture. The shape's circle and edge go by the centres of the region's pixels."""
-        box, circle, edge = shape
-        x, y = origin_px[0] + box[0], origin_px[1] + box[1]
-        cx, cy = origin_px[0] + 0.5 + circle[0], origin_px[1] + 0.5 + circle[1]
-        radius = circle[2] + _EDGE_PX
-        outwards = radius / circle[2]
-        ring = edge.T * (outwards * scale)
-        ring[0] += (cx - outwards * circle[0]) * scale
-        ring[1] += (cy - outwards * circle[1]) * scale
-        return Detection(x * scale, y * scale, (x + box[2]) * scale, (y + box[3]) * scale, score, self._label,
-                         Circle(cx * scale, cy * scale, radius * scale), ring.T)
+    """In pixels of the encoded picture. The shape's circle and edge go by the centres of the region's pixels."""
+    box, circle, edge = shape
+    x, y = origin_px[0] + box[0], origin_px[1] + box[1]
+    cx, cy = origin_px[0] + 0.5 + circle[0], origin_px[1] + 0.5 + circle[1]
+    radius = circle[2] + _EDGE_PX
+    outwards = radius / circle[2]
+    ring = edge.T * (outwards * scale)
+    ring[0] += (cx - outwards * circle[0]) * scale
+    ring[1] += (cy - outwards * circle[1]) * scale
+    return Detection(x * scale, y * scale, (x + box[2]) * scale, (y + box[3]) * scale, *whose,
+                     Circle(cx * scale, cy * scale, radius * scale), ring.T)
 
 
-def _own_edge(pixels: Pixels, box: Box, origin_px: tuple[int, int], shape: tuple[int, ...]) -> Pixels:
+def own_edge(pixels: Pixels, box: Box, origin_px: tuple[int, int], shape: tuple[int, ...]) -> Pixels:
     """The outline's pixels (N, 2), less those that the picture's border made."""
     flat = pixels[:, 0]
     left, top = -origin_px[0], -origin_px[1]  # where the picture begins, in the region's pixels

@@ -1,12 +1,21 @@
-"""The detector port: `Detector`, and what it returns. Pure."""
+"""The detector port: `Detector`, the frames it is given and what it returns. Pure.
 
-from dataclasses import dataclass, field
-from typing import Protocol
+"Saw nothing" is a `DetectionResult` without detections; "no answer" is None in its place. Only the first may start a
+search; the second goes the way of silence: the robot is not steered by it and holds.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vision_side.decode import Picture
+from protocol.messages import FrameHeader
+from vision_side.decode import Decoder, Picture
+
+NO_DEADLINE: Final = 2**63 - 1
+"""For who has all the time there is: replays, judges, tests."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +33,8 @@ class Detection:
 
     `x2_px` and `y2_px` are exclusive. `score` (0..1) is how sure the detector is; of an outline, the share that is the
     object's own. `outline_px` (N, 2) is the part of its edge that is in view, where the detector knows it: edges that
-    the picture's border or another object made are left out.
+    the picture's border or another object made are left out. `track_id` is the same from frame to frame for one
+    object, from detectors that tell.
     """
 
     x1_px: float
@@ -35,11 +45,104 @@ class Detection:
     label: str
     circle: Circle | None = None
     outline_px: NDArray[np.float64] | None = field(default=None, compare=False, repr=False)
+    track_id: int | None = None
+
+
+class DetectFrame:
+    """One frame to look at: the JPEG as it came, and its pixels for who asks, decoded once for all who share it."""
+
+    __slots__ = ("_decoder", "_picture", "header", "height_px", "jpeg", "robot", "width_px")
+
+    def __init__(
+        self, robot: str, header: FrameHeader, jpeg: bytes, decoder: Decoder, picture: Picture | None = None
+    ) -> None:
+        """`decoder` is the robot's, and `picture` what it made of `jpeg`, if it did; valid until it decodes another."""
+        self.robot = robot
+        self.header = header
+        self.jpeg = jpeg
+        self.width_px, self.height_px = decoder.size_px
+        self._decoder = decoder
+        self._picture = picture
+
+    def picture(self) -> Picture:
+        """The pixels. Raises WireError MALFORMED for what is no picture of the camera's size."""
+        if self._picture is None:
+            self._picture = self._decoder.decode(self.jpeg)
+        return self._picture
+
+    @property
+    def decoded(self) -> Picture | None:
+        """The pixels, if somebody asked for them already."""
+        return self._picture
+
+
+@dataclass(frozen=True, slots=True)
+class Maker:
+    """Who made a result: the detector's name, the first 16 digits of its model's SHA-256, and what it ran on."""
+
+    detector: str
+    model_hash: str = ""
+    device: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionResult:
+    """What was seen in one frame, best first; it names that frame field for field."""
+
+    robot: str
+    session: str
+    seq: int
+    t_us: int
+    width_px: int
+    height_px: int
+    detections: tuple[Detection, ...]
+    detector: str
+    model_hash: str = ""
+    device: str = ""
+    compute_us: int = 0
 
 
 class Detector(Protocol):
-    """Finds objects in one picture."""
+    """Finds objects in frames, of one robot or of several.
+
+    A class of this kind has a pydantic `Config` and is built as `Plugin(config)`. It may have `news()`, which returns
+    lines for a person that were not returned before, few and short; `attach(link)`, called with each robot's link
+    before its first frame, for who hears something else of it; and `close()`, called once, when nobody will ask again.
+    """
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        """One result for each frame, in their order; None is "no answer", never "saw nothing".
+
+        `deadline_us` is on this machine's monotonic clock: who waits for somebody else gives up by then. Boxes lie in
+        the picture. Raises nothing for any frame whatever: bytes that do not decode get no answer.
+        """
+        ...
+
+
+class PictureDetector(Protocol):
+    """Finds objects in one picture that is decoded already: what most detectors are inside."""
 
     def detect(self, picture: Picture) -> tuple[Detection, ...]:
         """What is in `picture`, best first. Empty means "saw nothing"; raises nothing for any picture."""
         ...
+
+
+def result_of(
+    frame: DetectFrame, detections: Sequence[Detection], maker: Maker, compute_us: int = 0
+) -> DetectionResult:
+    """`detections` as the result for `frame`."""
+    header = frame.header
+    return DetectionResult(frame.robot, header.session, header.seq, header.t_us, frame.width_px, frame.height_px,
+                           tuple(detections), maker.detector, maker.model_hash, maker.device, compute_us)
+
+
+def clipped(one: Detection, width_px: int, height_px: int) -> Detection | None:
+    """The part of `one` that is in the picture, or None if there is none; for boxes that a model drew beyond it."""
+    # In this order of arguments, what is no number stays none, and fails the comparison.
+    x1, y1 = max(one.x1_px, 0.0), max(one.y1_px, 0.0)
+    x2, y2 = min(one.x2_px, float(width_px)), min(one.y2_px, float(height_px))
+    if not (x1 < x2 and y1 < y2):
+        return None
+    if (x1, y1, x2, y2) == (one.x1_px, one.y1_px, one.x2_px, one.y2_px):
+        return one
+    return replace(one, x1_px=x1, y1_px=y1, x2_px=x2, y2_px=y2)

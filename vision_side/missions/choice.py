@@ -5,22 +5,16 @@ Names are those below, those of the entry points `sightline.missions`, or, from 
 `track`, `steer`, `latency`, `search`, `boxes`) begins with that section; its options lie over it.
 """
 
-import difflib
-import importlib
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Any, Final
-
-from pydantic import BaseModel, ValidationError
 
 from protocol.errors import ConfigError
 from protocol.messages import CameraModel
 from protocol.mission_messages import MissionRequest
 from vision_side.config import VisionConfig
 from vision_side.missions.port import Mission
+from vision_side.plugin_choice import Family
 
 BUILT_IN: Final = {
     "follow": "vision_side.missions.follow:Follow",
@@ -36,7 +30,7 @@ BUILT_IN: Final = {
 }
 """Here and not as entry points, so that a checkout that nobody installed has them too."""
 GROUP: Final = "sightline.missions"
-_LONGEST_DETAIL: Final = 160
+_FAMILY: Final = Family("mission", BUILT_IN, GROUP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,58 +96,5 @@ def choose(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Chose
 
     Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option.
     """
-    plugin = _load(kind)
-    settings = getattr(plugin, "Config", None)
-    if not (isinstance(settings, type) and issubclass(settings, BaseModel)):
-        raise ConfigError(f"mission {kind!r}: {plugin!r} has no pydantic model called Config; see docs/missions.md")
-    try:
-        return Chosen(kind, plugin, settings.model_validate(_merged(settings, options, config)))
-    except ValidationError as error:
-        raise ConfigError(f"mission {kind!r}: {_problem(settings, error)}"[:_LONGEST_DETAIL]) from None
-
-
-def _merged(settings: type[BaseModel], options: Mapping[str, Any], config: VisionConfig) -> dict[str, Any]:
-    """The sections of vision's configuration that the mission shares, with its options laid over them."""
-    merged: dict[str, Any] = dict(options)
-    for name, field in settings.model_fields.items():
-        section = getattr(config, name, None)
-        if not isinstance(section, BaseModel) or field.annotation is not type(section):
-            continue
-        given = options.get(name, {})
-        merged[name] = section.model_dump() | dict(given) if isinstance(given, Mapping) else given
-    return merged
-
-
-def _problem(settings: type[BaseModel], error: ValidationError) -> str:
-    """A misspelt option before a missing one: it is usually both."""
-    problems = sorted(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden")
-    first = problems[0]
-    where = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        return f"unknown option {where!r}; it takes {', '.join(settings.model_fields) or 'none'}"
-    if first["type"] == "missing":
-        return f"option {where!r} is missing"
-    return f"option {where!r}: {first['msg']}"
-
-
-def _load(kind: str) -> Any:
-    where = BUILT_IN.get(kind)
-    others = {} if where else {entry.name: entry for entry in entry_points(group=GROUP)}
-    try:
-        if kind in others:
-            return others[kind].load()
-        if where is not None or ":" in kind:
-            return _imported(where or kind)
-    except Exception as error:  # whatever a plug-in's own import raises
-        raise ConfigError(f"mission {kind!r} cannot be loaded: {error}"[:_LONGEST_DETAIL]) from None
-    names = sorted({*BUILT_IN, *others})
-    nearest = difflib.get_close_matches(kind, names, n=1)
-    hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-    raise ConfigError(f"no mission called {kind!r}{hint}; there are {', '.join(names)}, or package.module:Name")
-
-
-def _imported(path: str) -> Any:
-    if str(Path.cwd()) not in sys.path:  # a class of one's own lies where vision is started
-        sys.path.insert(0, str(Path.cwd()))
-    module, _, name = path.partition(":")
-    return getattr(importlib.import_module(module), name)
+    plugin = _FAMILY.load(kind)
+    return Chosen(kind, plugin, _FAMILY.settings(kind, plugin, options, config))

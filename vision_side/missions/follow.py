@@ -18,6 +18,8 @@ from vision_side.sphere import Sighting, locate
 from vision_side.steer import Aim, Steer
 from vision_side.track import Target, Track, from_odometry
 
+_NO_TARGETS = ("legs", "light")  # what other missions are for; a model that knows balls may know these too
+
 
 class Follow:
     """Follows one target. `phase` is tracking, coasting, searching or lost.
@@ -66,7 +68,7 @@ class Follow:
         return [
             locate_box(one, self._camera, sizes, otherwise_m) if self._is_box(one, view)
             else locate(one, self._camera, self._config.target.radius_m)
-            for one in view.detections
+            for one in view.detections if self._is_meant(one, view)
         ]
 
     def _is_box(self, one: Detection, view: View) -> bool:
@@ -74,6 +76,13 @@ class Follow:
         sizes = self._config.boxes
         sized = sizes.height_m is not None or sizes.width_m is not None
         return view.picture is None or (sized and one.outline_px is None)
+
+    def _is_meant(self, one: Detection, view: View) -> bool:
+        """By its label. Somebody else's boxes were chosen when they came."""
+        label = self._config.target.label
+        if label:
+            return one.label == label
+        return view.picture is None or not one.label.startswith(_NO_TARGETS)
 
     def _sightings(self, places: list[Sighting | None]) -> list[Sighting]:
         target = self._config.target

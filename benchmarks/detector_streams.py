@@ -1,0 +1,161 @@
+"""Many streams at one detector service, more than it can look at: age, fairness, memory. Shell (processes, the clock).
+
+The service is the real one, in a process of its own; robots are links of this process, which is where they all meet.
+"""
+
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from benchmarks.loop_pictures import write_pictures
+from protocol.channels import DETECTIONS, FRAME, STATUS
+from protocol.codec import decode, encode
+from protocol.errors import SightlineError, WireError
+from protocol.messages import DetectionsHeader, FrameHeader, Stamp, State, Status
+from protocol.transports.link import Message
+from protocol.transports.link_rules import LinkRules
+from protocol.transports.zenoh import ZenohLink
+from protocol.transports.zenoh_session import open_session
+
+DEADLINE_MS: Final = 100.0
+FAIRNESS_PERCENT: Final = 10.0
+MEMORY_MB: Final = 5.0
+OVERLOAD: Final = 2.0
+_FPS: Final = 30
+_WARM_S: Final = 5.0
+_STATUS_S: Final = 0.1
+_READY_S: Final = 30.0
+
+
+@dataclass
+class Load:
+    """What came of one run."""
+
+    offered: int = 0
+    answered: Counter[str] = field(default_factory=Counter)
+    ages_ms: list[float] = field(default_factory=list)
+    memory_mb: list[float] = field(default_factory=list)
+    """Of the service, once a second."""
+
+    @property
+    def p95_ms(self) -> float:
+        """From a frame's publication to its boxes here."""
+        return sorted(self.ages_ms)[int(len(self.ages_ms) * 0.95)] if self.ages_ms else float("inf")
+
+    @property
+    def unfair_percent(self) -> float:
+        """How far the robot that is furthest from the mean is from it."""
+        mean = sum(self.answered.values()) / len(self.answered) if self.answered else 0.0
+        return max(abs(count - mean) for count in self.answered.values()) / mean * 100 if mean else 100.0
+
+    @property
+    def growth_mb(self) -> float:
+        """Of the second half's mean over the first's."""
+        half = len(self.memory_mb) // 2
+        first, second = self.memory_mb[:half], self.memory_mb[half:]
+        return sum(second) / len(second) - sum(first) / len(first) if first else float("inf")
+
+    @property
+    def overload(self) -> float:
+        """Frames offered for each that was answered."""
+        return self.offered / max(1, sum(self.answered.values()))
+
+
+class _Streams:
+    """The robots."""
+
+    def __init__(self, links: list[ZenohLink], jpeg: bytes) -> None:
+        self._links, self._jpeg, self.load = links, jpeg, Load()
+        self._seq = 0
+        self.counting = False
+        for link in links:
+            link.subscribe(DETECTIONS, self._heard(link.robot))
+
+    def _heard(self, robot: str) -> Callable[[Message], None]:
+        def note(message: Message) -> None:
+            try:
+                echo = decode(DetectionsHeader, message.header).echo
+            except WireError:
+                return
+            if echo is not None and self.counting:
+                self.load.answered[robot] += 1
+                self.load.ages_ms.append((_now_us() - echo.t_us) / 1000)
+
+        return note
+
+    def say(self) -> None:
+        stamp = encode(Stamp(session="0000abcd", seq=self._seq, t_us=_now_us()))
+        for link in self._links:
+            link.publish(STATUS, stamp, encode(Status(state=State.HOLD, reason="bench")))
+
+    def frame(self, index: int) -> None:
+        self._seq += 1
+        header = FrameHeader(session="0000abcd", seq=self._seq, t_us=_now_us())
+        self._links[index].publish(FRAME, encode(header), self._jpeg)
+        self.load.offered += self.counting
+
+
+def measure_streams(endpoint: str, folder: Path, streams: int = 40, seconds: float = 60.0) -> Load:
+    """Offer `streams` streams at twice what the service can look at. Raises SightlineError if it does not start."""
+    each_us = round(OVERLOAD * 1e6 / (streams * _FPS))
+    write_pictures(folder, 320, 240)
+    jpeg = sorted(folder.glob("*.jpg"))[0].read_bytes()
+    with ExitStack() as ending:
+        session = ending.enter_context(closing(open_session([endpoint], (), 5.0)))
+        links = [ZenohLink(session, LinkRules(f"s{index}", "robot"), shared=True) for index in range(streams)]
+        for link in links:
+            ending.callback(link.close)
+        service = _service(endpoint, each_us, folder / "detector.log")
+        ending.callback(service.wait, 10)
+        ending.callback(service.terminate)
+        robots = _Streams(links, jpeg)
+        _wait_ready(robots, folder / "detector.log", streams, service)
+        _offer(robots, streams, _WARM_S, service.pid)
+        robots.load.memory_mb.clear()
+        robots.counting = True
+        _offer(robots, streams, seconds, service.pid)
+    return robots.load
+
+
+def _service(endpoint: str, each_us: int, log: Path) -> "subprocess.Popen[bytes]":
+    command = [sys.executable, "-u", "-m", "operator_side.cli", "detector", "--serve", "benchmarks.slow_eyes:SlowEyes",
+               "--connect", endpoint, "--set", f"detector.options.each_us={each_us}"]
+    with log.open("wb") as out:
+        return subprocess.Popen(command, stdout=out, stderr=out)
+
+
+def _wait_ready(robots: _Streams, log: Path, streams: int, service: "subprocess.Popen[bytes]") -> None:
+    deadline_s = time.monotonic() + _READY_S
+    while log.read_text("utf-8", "replace").count("looks at the pictures") < streams:
+        if time.monotonic() > deadline_s or service.poll() is not None:
+            raise SightlineError(f"the detector service did not start: {log.read_text('utf-8', 'replace')[-300:]}")
+        robots.say()
+        time.sleep(_STATUS_S)
+
+
+def _offer(robots: _Streams, streams: int, seconds: float, pid: int) -> None:
+    """Frames of one stream after the other, evenly spaced; the newest of each, as robots send them."""
+    began_s = time.monotonic()
+    for count in range(round(seconds * streams * _FPS)):
+        due_s = began_s + count / (streams * _FPS)
+        left_s = due_s - time.monotonic()
+        if left_s > 0:
+            time.sleep(left_s)
+        if count % (streams * _FPS) == 0:
+            robots.load.memory_mb.append(_memory_mb(pid))
+        robots.frame(count % streams)
+
+
+def _memory_mb(pid: int) -> float:
+    text = Path(f"/proc/{pid}/status").read_text()
+    return int(text.partition("VmRSS:")[2].split()[0]) / 1024
+
+
+def _now_us() -> int:
+    return time.monotonic_ns() // 1000

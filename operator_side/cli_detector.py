@@ -1,0 +1,165 @@
+"""The commands `detector list | check | promote`, and `detector --serve`. Shell; heavy imports inside the commands."""
+
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from operator_side import cli_detector_serve as serving
+from operator_side.cli_people import DEFAULT_CONNECT, REFUSED_EXIT, Connect, Json, Robot, Secure
+from operator_side.cli_services import ConfigFile, LogForm, MaybeSecure, Sets
+from operator_side.cli_services import Connect as MaybeConnect
+from operator_side.cli_services import Listen as MaybeListen
+from operator_side.extras import needs
+from operator_side.service_settings import load_service
+from protocol.errors import ConfigError
+
+if TYPE_CHECKING:
+    from vision_side.detect.contract import Times, Verdict
+    from vision_side.detect.port import Detector
+
+CHECK_FAILED = 5
+Device = Annotated[str | None, typer.Option("--device", help="auto, cpu, cuda or tensorrt [default: auto].")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    group = typer.Typer(
+        help="Detectors: what there is, whether one keeps its promises, and one that serves many robots.",
+        no_args_is_help=False, rich_markup_mode=None, invoke_without_command=True, callback=_serve,
+        epilog="Example: sightline detector --serve onnx:ball.onnx --listen tcp/0.0.0.0:7447",
+    )  # fmt: skip
+    group.command(name="list", epilog="Example: sightline detector list --json")(list_detectors)
+    group.command(epilog="Example: sightline detector check my_eyes:Eyes --set min_score=0.5")(check)
+    group.command(epilog="Example: sightline detector promote r1")(promote)
+    app.add_typer(group, name="detector")
+
+
+def _serve(
+    context: typer.Context,
+    *,
+    name: Annotated[str, typer.Option("--serve", metavar="NAME", help="Look for every robot that is heard.")] = "",
+    robot: serving.Robots = None,
+    listen: MaybeListen = None,
+    connect: MaybeConnect = None,
+    secure: MaybeSecure = None,
+    device: Device = None,
+    deadline_ms: serving.DeadlineMs = 100.0,
+    max_batch: serving.MaxBatch = 16,
+    config: ConfigFile = None,
+    sets: Sets = None,
+    log: LogForm = None,
+) -> int:
+    if context.invoked_subcommand is not None:
+        if name:
+            raise ConfigError(f"--serve {name} runs by itself; leave out {context.invoked_subcommand!r}")
+        return 0
+    if not name:
+        typer.echo(context.get_help())
+        return 0
+    return serving.serve(name, robot=robot, listen=listen, connect=connect, secure=secure, device=device,
+                         deadline_ms=deadline_ms, max_batch=max_batch, config=config, sets=sets, log=log)
+
+
+def list_detectors(as_json: Json = False) -> int:
+    """Name every detector, and say whether it can be used here."""
+    with needs("vision"):
+        from vision_side.detect.choice import FAMILY
+    rows = [(name, _problem(lambda name=name: FAMILY.load(name))) for name in FAMILY.names()]  # type: ignore[misc]
+    if as_json:
+        typer.echo(json.dumps({"detectors": [{"name": name, "usable": not why, "why": why} for name, why in rows]}))
+    else:
+        for name, why in rows:
+            typer.echo(f"{name:<12} {why or 'ok'}")
+        typer.echo("or package.module:Name; boxes: what somebody else publishes, see docs/detectors.md")
+    return 0
+
+
+def _problem(load: Callable[[], Any]) -> str:
+    try:
+        load()
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+def check(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="hsv, onnx:PATH, package.module:Name ...")],
+    *,
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option of the detector's own Config.")
+    ] = None,
+    device: Device = None,
+    seed: Annotated[int, typer.Option(help="Draws the pictures.")] = 1,
+    config: ConfigFile = None,
+    as_json: Json = False,
+) -> int:
+    """Hold a detector to what the port promises, with drawn pictures, and time it. Exit code 5 if it breaks it."""
+    from operator_side.cli_mission import options_of
+
+    options: dict[str, Any] = {"detector.device": device}
+    given: Any = load_service("vision", file=config, sets=(), options=options, environ=os.environ).config
+    with needs("vision"):
+        from vision_side.detect.choice import check_device, choose_detector
+        from vision_side.detect.contract import check_detector, time_detector
+    settings = given.model_copy(update={"detector": given.detector.model_copy(update={"kind": name})})
+    check_device(settings)
+    own = options_of(sets or ())
+
+    def make() -> "Detector":
+        return choose_detector(name, own, settings)
+
+    verdicts = check_detector(make, seed)
+    ok = not any(one.wrong for one in verdicts)
+    times = time_detector(make, seed=seed) if ok else []
+    typer.echo(json.dumps(_as_json(name, ok, verdicts, times)) if as_json else _as_text(name, verdicts, times))
+    return 0 if ok else CHECK_FAILED
+
+
+def promote(
+    robot: Robot = "r1",
+    *,
+    back: Annotated[bool, typer.Option("--back", help="The first detector drives again.")] = False,
+    connect: Connect = DEFAULT_CONNECT,
+    secure: Secure = "",
+    as_json: Json = False,
+) -> int:
+    """Let the detector of `vision --shadow NAME` drive from the next frame on, and the other one look on."""
+    from operator_side.mission_asking import MissionDesk
+    from operator_side.mission_text import detector_line
+    from operator_side.requests import SOURCE
+    from protocol.transports.opening import open_link
+
+    with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
+        report = MissionDesk(link).ask("detector", options={"shadow": not back})
+    if as_json:
+        typer.echo(json.dumps({"robot": robot, "ok": not report.refused, **report.model_dump(mode="json")}))
+    elif report.refused:
+        typer.echo(f"error: vision of {robot} refused: {report.refused}", err=True)
+    else:
+        typer.echo(f"{robot}: {detector_line(report)}")
+    return REFUSED_EXIT if report.refused else 0
+
+
+def _as_json(name: str, ok: bool, verdicts: Sequence["Verdict"], times: Sequence["Times"]) -> dict[str, Any]:
+    checks = [{"name": one.name, "value": one.wrong or "kept", "unit": "", "bound": one.promise, "ok": not one.wrong}
+              for one in verdicts]
+    took = [{"size": f"{one.width_px}x{one.height_px}", "p50_ms": _or_none(one.p50_ms), "p95_ms": _or_none(one.p95_ms)}
+            for one in times]
+    return {"ok": ok, "detector": name, "checks": checks, "times": took}
+
+
+def _or_none(value: float) -> float | None:
+    return None if math.isnan(value) else round(value, 3)
+
+
+def _as_text(name: str, verdicts: Sequence["Verdict"], times: Sequence["Times"]) -> str:
+    lines = [f"{name}:"]
+    for one in verdicts:
+        lines.append(f"  {'FAIL' if one.wrong else 'ok':<5} {one.promise}" + (f": {one.wrong}" if one.wrong else ""))
+    for took in times:
+        lines.append(f"  {took.width_px}x{took.height_px}: {took.p50_ms:.2f} ms p50, {took.p95_ms:.2f} ms p95")
+    return "\n".join(lines)

@@ -1,0 +1,59 @@
+"""`sightline detector --serve NAME`: one detector for many robots. Shell; heavy imports inside the command."""
+
+import os
+from typing import Annotated, Any
+
+import typer
+
+from operator_side.cli_services import ConfigFile, Connect, Listen, LogForm, MaybeSecure, Sets
+from operator_side.extras import needs
+from operator_side.service_settings import load_service
+from protocol.errors import ConfigError
+from protocol.log_lines import use_form
+
+Robots = Annotated[
+    str | None, typer.Option("--robot", metavar="ID", help="A robot's id, or several by * and ? [default: *].")
+]
+Device = Annotated[str | None, typer.Option("--device", help="auto, cpu, cuda or tensorrt [default: auto].")]
+DeadlineMs = Annotated[
+    float, typer.Option("--deadline-ms", min=5, max=1000, help="From a frame's arrival to its boxes, at most.")
+]
+MaxBatch = Annotated[int, typer.Option("--max-batch", min=1, max=256, help="Frames looked at together, at most.")]
+_ELSEWHERE = ("zenoh", "boxes")
+
+
+def serve(
+    name: str,
+    *,
+    robot: Robots = None,
+    listen: Listen = None,
+    connect: Connect = None,
+    secure: MaybeSecure = None,
+    device: Device = None,
+    deadline_ms: DeadlineMs = 100.0,
+    max_batch: MaxBatch = 16,
+    config: ConfigFile = None,
+    sets: Sets = None,
+    log: LogForm = None,
+) -> int:
+    """Look at the newest frames of every robot that is heard and say what is in them, until Ctrl-C.
+
+    Raises ConfigError for a detector that looks nowhere itself, and as `sightline vision` does.
+    """
+    use_form(log, "detector")
+    if name in _ELSEWHERE:
+        raise ConfigError(f"detector {name!r} is boxes that somebody else finds: serve one that looks itself, e.g. hsv")
+    options = {"robot": robot or "*", "listen": tuple(listen) if listen else None,
+               "connect": tuple(connect) if connect else None, "secure": secure, "detector.kind": name,
+               "detector.device": device}
+    loaded: Any = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ).config
+    with needs("vision"):
+        from vision_side.detect.around import close_detector
+        from vision_side.detect.choice import choose_detector, configured_detector
+        from vision_side.detector_service import Serving, run
+
+        detector = configured_detector(loaded) or choose_detector("hsv", {}, loaded)
+        try:
+            return run(loaded, detector, Serving(name, round(deadline_ms * 1000), max_batch, loaded.max_pixels))
+        finally:
+            close_detector(detector)

@@ -1,0 +1,69 @@
+"""Command `train`: make the learned detector again, or one's own. Shell."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from operator_side.extras import needs
+from protocol.errors import ConfigError, HardwareError
+
+STEPS = 6000
+SCENES = 10_000
+OUT = Path("runs/train")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command(epilog="Example: sightline train --out runs/eyes")(train)
+
+
+def train(
+    *,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Scenes, checkpoint, model and card go here.")] = OUT,
+    scenes: Annotated[int, typer.Option(min=8, max=800_000, help="Drawn once, seeds from 0 up.")] = SCENES,
+    steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Of the optimiser.")] = STEPS,
+    batch: Annotated[int, typer.Option(min=2, max=1024, help="Cut-outs of scenes in each step.")] = 24,
+    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Draws weights, cuts and defects.")] = 1,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What trains.")] = "cpu",
+    jobs: Annotated[int | None, typer.Option(min=1, max=256, help="That draw scenes [default: one per core].")] = None,
+    validated: Annotated[int, typer.Option(min=5, help="Scenes of each column that choose thresholds.")] = 200,
+    judged: Annotated[int, typer.Option(min=5, help="Scenes of each column for the card's table.")] = 500,
+) -> None:
+    """Draw labelled scenes, train the detector, write sightline.onnx and its card. Cut off, it goes on where it was."""
+    with needs("train"):
+        import torch
+
+        from operator_side.train_loop import Training
+        from operator_side.train_run import TrainOptions, run_training
+    if device == "cuda" and not torch.cuda.is_available():
+        raise HardwareError("--device cuda: this PyTorch sees no GPU; check `nvidia-smi` and that PyTorch is a CUDA "
+                            "build, or take --device cpu")
+    training, processes = Training(steps, batch, seed=seed), jobs or os.cpu_count() or 1
+    options = TrainOptions(out, scenes, training, device, processes, validated, judged)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        model = run_training(options, _say, _progress)
+    except OSError as error:
+        raise ConfigError(f"--out {out}: {error.strerror or error}") from None
+    _say(f"{model}, {model.with_suffix('.md').name}: try it with `sightline score detectors onnx:{model}`")
+
+
+def _say(line: str) -> None:
+    typer.echo(line)
+
+
+@contextmanager
+def _progress(total: int, what: str) -> Iterator[Callable[[int], None]]:
+    """A bar where there is a terminal; silent elsewhere."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda done: bar.advance(task, done)

@@ -1,0 +1,86 @@
+/**
+ * @file Shows one robot's pictures and state. Shell.
+ *
+ * The next picture is asked for when the last was drawn, so nothing queues between the robot's vision and this page.
+ */
+
+const OLD_MS = 500; // what is older than this must not look like the present
+const STATE_MS = 250;
+const AGE_MS = 100;
+const RETRY_MS = 500;
+const part = (id) => document.getElementById(id);
+const canvas = part("picture");
+const drawnAt_ms = []; // of the last second
+let newest = { number: 0, channel: "", size: "", age_ms: null };
+
+const pause = (time_ms) => new Promise((resolve) => setTimeout(resolve, time_ms));
+
+function tell(link) {
+  part("link").textContent = link;
+  part("link").className = link === "connected" ? "" : "lost";
+}
+
+async function draw(answer) {
+  const bitmap = await createImageBitmap(await answer.blob());
+  if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) Object.assign(canvas, { width: bitmap.width, height: bitmap.height });
+  canvas.getContext("2d").drawImage(bitmap, 0, 0);
+  const age_us = answer.headers.get("X-Age-Us");
+  newest = {
+    number: Number(answer.headers.get("X-Number")), channel: answer.headers.get("X-Channel"),
+    size: `${bitmap.width}x${bitmap.height}`, age_ms: age_us === "" ? null : Number(age_us) / 1000,
+  };
+  bitmap.close();
+  drawnAt_ms.push(performance.now());
+}
+
+async function showPictures() {
+  for (;;) {
+    try {
+      const answer = await fetch(`picture?after=${newest.number}`);
+      if (answer.status === 200) await draw(answer);
+    } catch {
+      await pause(RETRY_MS);
+    }
+  }
+}
+
+function showState({ robot, heard, state, reason, lines }) {
+  tell(heard ? "connected" : `nothing is heard from ${robot}`);
+  part("state").textContent = state;
+  part("state").className = state;
+  part("reason").textContent = reason;
+  part("lines").replaceChildren(...lines.flatMap(([name, text]) => [["dt", name], ["dd", text]]).map(([tag, text]) => {
+    const element = document.createElement(tag);
+    element.textContent = text;
+    return element;
+  }));
+}
+
+async function showStates() {
+  for (;;) {
+    try {
+      showState(await (await fetch("state")).json());
+    } catch {
+      tell("`sightline watch` has ended");
+    }
+    await pause(STATE_MS);
+  }
+}
+
+/** What stands still must be seen to stand still: the age grows while nothing comes. */
+function showAge() {
+  const now_ms = performance.now();
+  while (drawnAt_ms.length > 1 && drawnAt_ms[0] < now_ms - 1000) drawnAt_ms.shift();
+  if (drawnAt_ms.length === 0) return;
+  const since_ms = now_ms - drawnAt_ms.at(-1);
+  const old = since_ms > OLD_MS;
+  part("figure").className = old ? "old" : "";
+  const age = newest.age_ms === null ? "" : `, at least ${Math.round(newest.age_ms + since_ms)} ms old`;
+  part("age").textContent = old
+    ? `no picture for ${(since_ms / 1000).toFixed(1)} s`
+    : `${newest.channel} ${newest.size}, ${drawnAt_ms.length} pictures/s${age}`;
+}
+
+setInterval(showAge, AGE_MS);
+showPictures();
+showStates();

@@ -1,0 +1,104 @@
+"""The last pictures of a robot, numbered, for a page that asks for them: none is fetched that nobody asks for. Shell.
+
+A page asks for the next one when it has drawn the last: so a slow page gets fewer pictures, never older ones.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from operator_side.loopback_page import Answer, Ask
+from operator_side.pictures import Pictures, Shot
+
+IDLE_S: Final = 3.0
+"""A page that asks for nothing for this long is closed: nobody watches."""
+WAIT_S: Final = 1.0
+"""How long a page waits for one picture before it asks again."""
+_TAKE_S: Final = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Numbered:
+    """One picture of the reel."""
+
+    number: int
+    shot: Shot
+
+
+class Reel:
+    """The newest `kept` pictures."""
+
+    def __init__(self, kept: int, age_us: Callable[[Shot], int | None] = lambda _shot: None) -> None:
+        self._shots: deque[Numbered] = deque(maxlen=kept)
+        self._age_us = age_us
+        self._news = threading.Condition()
+        self._wanted = -1
+        self._asked_s = 0.0
+
+    def add(self, shot: Shot) -> None:
+        """One more."""
+        with self._news:
+            self._shots.append(Numbered(self._number + 1, shot))
+            self._news.notify_all()
+
+    @property
+    def shots(self) -> Sequence[Numbered]:
+        """All that are kept, the oldest first."""
+        with self._news:
+            return tuple(self._shots)
+
+    def of(self, number: int) -> Shot | None:
+        """The picture of that number, if it is still kept."""
+        return next((one.shot for one in self.shots if one.number == number), None)
+
+    def is_wanted(self, timeout_s: float) -> bool:
+        """Wait until somebody wants a picture that is not there yet; False if nobody does."""
+        with self._news:
+            return bool(self._news.wait_for(lambda: self._wanted >= self._number and not self.is_idle, timeout_s))
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nobody asked for a while."""
+        return time.monotonic() - self._asked_s > IDLE_S
+
+    def next(self, after: int, timeout_s: float = WAIT_S) -> Numbered | None:
+        """The newest, if its number is above `after` or comes to be in time."""
+        with self._news:
+            after = after if after <= self._number else 0  # a page of an earlier run
+            self._wanted, self._asked_s = max(self._wanted, after), time.monotonic()
+            self._news.notify_all()
+            self._news.wait_for(lambda: self._number > after, timeout_s)
+            return self._shots[-1] if self._number > after else None
+
+    def route(self, ask: Ask, _body: bytes) -> Answer:
+        """`GET /picture?after=N`, the next one, or `?number=N`, that one; 204 if there is none."""
+        if "number" in ask:
+            shot = self.of(int(ask["number"]))
+            found = Numbered(int(ask["number"]), shot) if shot else None
+        else:
+            found = self.next(int(ask.get("after", "0")))
+        if found is None:
+            return Answer(status=204)
+        age_us = self._age_us(found.shot)
+        about = {"X-Number": str(found.number), "X-Channel": found.shot.channel.name, "X-Seq": str(found.shot.seq),
+                 "X-Age-Us": "" if age_us is None else str(age_us)}
+        return Answer(found.shot.jpeg, "image/jpeg", headers=about)
+
+    @property
+    def _number(self) -> int:
+        return self._shots[-1].number if self._shots else 0
+
+
+def fill(reel: Reel, pictures: Pictures, ending: threading.Event) -> None:
+    """Take pictures as they are wanted, until `ending`; while nobody looks, nothing is subscribed to."""
+    while not ending.is_set():
+        if not reel.is_wanted(_TAKE_S):
+            if reel.is_idle:
+                pictures.pause()
+            continue
+        shot = pictures.take(_TAKE_S)
+        if shot is not None:
+            reel.add(shot)

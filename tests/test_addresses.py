@@ -1,0 +1,31 @@
+"""What a robot that listens everywhere says of where others reach it."""
+
+import socket
+
+import pytest
+
+from robot_side import addresses
+from robot_side.addresses import own_addresses, reached_at
+
+
+@pytest.mark.parametrize(("endpoints", "said"), [
+    (["tcp/0.0.0.0:7447"], ["tcp/10.0.0.7:7447", "tcp/192.168.1.20:7447"]),
+    (["tls/[::]:7447"], ["tls/10.0.0.7:7447", "tls/192.168.1.20:7447"]),
+    (["tcp/127.0.0.1:7447", "ws://0.0.0.0:9091"], ["ws://10.0.0.7:9091", "ws://192.168.1.20:9091"]),
+    (["tcp/127.0.0.1:7447", "tcp/10.0.0.7:7447"], []), ([], []),
+])  # fmt: skip
+def test_only_what_listens_everywhere_is_told_address_by_address(endpoints, said, monkeypatch):
+    monkeypatch.setattr(addresses, "own_addresses", lambda: ["10.0.0.7", "192.168.1.20"])
+    assert reached_at(endpoints) == said
+
+
+def test_they_are_this_machines_own():
+    for address in own_addresses():
+        assert not address.startswith("127.")
+        with socket.socket() as probe:
+            probe.bind((address, 0))  # only an address of this machine can be bound
+
+
+def test_a_machine_with_loopback_alone_says_nothing(monkeypatch):
+    monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo"), (2, "nothing0")])
+    assert own_addresses() == [] == reached_at(["tcp/0.0.0.0:7447"])

@@ -1,0 +1,83 @@
+"""Any message of any channel as text: nothing is lost as JSON; no bytes whatever raise or reach the terminal raw."""
+
+import json
+import math
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from operator_side.channel_text import message_line, message_object
+from protocol.channels import CHANNELS, SCAN, STATUS, TWIST
+from protocol.golden_case import USUAL, packed
+from protocol.golden_cases import CASES
+from protocol.transports.link import Message
+
+
+def usual(name, **changed):
+    source, header, payload = USUAL[name]
+    parts = {"header": packed(header), "payload": payload if isinstance(payload, bytes) else packed(payload)}
+    return Message(CHANNELS[name], source, **{**parts, **changed})
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_every_channel_is_one_line_and_one_object(name):
+    message = usual(name)
+    line, read = message_line(message), message_object(message)
+    assert line.startswith(name) and "\n" not in line and "refused" not in line.partition("[")[0].partition(":")[0]
+    assert "error" not in read and read["channel"] == name
+    assert read["header"]["session"] == USUAL[name][1]["session"]
+    assert json.loads(json.dumps(read, allow_nan=False)) == read
+
+
+def test_pictures_are_their_size_and_twists_their_numbers():
+    assert message_object(usual("overlay"))["payload"] == {"width_px": 640, "height_px": 480, "bytes": 21}
+    assert "640x480 JPEG, 21 bytes" in message_line(usual("frame"))
+    assert message_line(usual("twist")).startswith("twist/vision #7: +0.2000 m/s -0.3500 rad/s   [")
+
+
+def test_a_scan_is_summed_up_and_in_full_as_json():
+    message = usual("scan", payload=struct.pack("<4f", 0.5, 1.25, math.inf, 8.0))
+    assert "4 rays, 3 see something, nearest 0.50 m" in message_line(message)
+    assert message_object(message)["payload"]["ranges_m"] == [0.5, 1.25, None, 8.0]
+    assert "nothing near" in message_line(usual("scan", payload=struct.pack("<2f", math.inf, math.inf)))
+
+
+def test_a_guest_without_a_header_is_shown():
+    message = Message(TWIST, "guest", b"", b"0.1|0")
+    assert message_line(message) == "twist/guest (no header): +0.1000 m/s +0.0000 rad/s"
+    assert message_object(message)["header"] is None
+
+
+def test_what_is_refused_says_why():
+    message = Message(TWIST, "vision", b"", b"nan|0")
+    assert message_line(message) == "twist/vision: refused: NOT_FINITE: " + message_object(message)["error"][12:]
+    assert message_object(message)["payload_bytes"] == 5
+
+
+@pytest.mark.parametrize(
+    "case", [one for one in CASES if one.refuse is None], ids=lambda one: f"{one.channel}/{one.name}"
+)
+def test_what_the_specification_accepts_is_shown(case):
+    _, _, name, *source = case.key.split("/")
+    read = message_object(Message(CHANNELS[name], source[0] if source else "", case.header, case.payload))
+    assert "error" not in read
+    json.dumps(read, allow_nan=False)
+
+
+def test_what_a_stranger_says_cannot_command_the_terminal():
+    payload = packed({"state": "HOLD", "reason": "\x1b[2J\x07 gone\u202e"})
+    line = message_line(Message(STATUS, "", packed(USUAL["status"][1]), payload))
+    assert line.isprintable() and "gone" in line
+
+
+@given(st.sampled_from(list(CHANNELS.values())), st.binary(max_size=80), st.binary(max_size=80))
+def test_any_bytes_give_a_line(channel, header, payload):
+    message = Message(channel, "vision" if channel.has_source else "", header, payload)
+    assert message_line(message).isprintable()
+    json.dumps(message_object(message), allow_nan=False)
+
+
+def test_ranges_in_scans_that_are_none_are_refused():
+    assert "NOT_FINITE" in message_line(usual(SCAN.name, payload=struct.pack("<f", math.nan)))

@@ -1,0 +1,122 @@
+"""Detectors by name: what is built in, addresses, options, what goes around them, and every mistake as one line."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from protocol.config import Config as Settings
+from protocol.errors import ConfigError, HardwareError
+from tests.onnx_rig import brightness_model
+from vision_side.config import DetectorConfig, VisionConfig
+from vision_side.detect.choice import FAMILY, choose_detector, configured_detector, is_plain, split
+from vision_side.detect.colour_filter import ColourFilter
+from vision_side.detect.label_filter import LabelFilter
+from vision_side.detect.local import Adaptive, Hsv
+from vision_side.detect.onnx_detector import OnnxDetector
+from vision_side.detect.port import result_of
+from vision_side.detect.shadow import Shadowed
+from vision_side.detect.tracked import Tracked
+
+
+class Mine:
+    """A plug-in in a test, as a person's own file would have it."""
+
+    class Config(Settings):
+        address: str = ""
+        robot: str = ""
+        deadline_s: float = 0.0
+        sure: bool = False
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+
+    def detect(self, frames, deadline_us):
+        return [result_of(one, (), None) for one in frames]
+
+
+class NoConfig:
+    """Looks like a detector."""
+
+
+MINE = f"{__name__}:Mine"
+
+
+def config(**detector: object) -> VisionConfig:
+    return VisionConfig(robot="r7", detector=DetectorConfig(**detector))
+
+
+def test_every_built_in_name_can_be_imported() -> None:
+    assert {"hsv", "adaptive", "onnx", "zenoh", "oip+http", "oip+grpc", "http+jpeg"} <= set(FAMILY.names())
+    for name in FAMILY.built_in:
+        assert hasattr(FAMILY.load(name), "detect") and hasattr(FAMILY.load(name), "Config")
+
+
+@pytest.mark.parametrize(
+    ("kind", "parts"),
+    [("hsv", ("hsv", "")), ("onnx:my/ball.onnx", ("onnx", "my/ball.onnx")),
+     ("onnx:C:/ball.onnx", ("onnx", "C:/ball.onnx")),
+     ("oip+http://box:8000/ball", ("oip+http", "oip+http://box:8000/ball")), ("my_eyes:Eyes", ("my_eyes:Eyes", "")),
+     ("zenoh:operator", ("zenoh", "operator"))],
+)
+def test_a_name_and_what_stands_after_it(kind: str, parts: tuple[str, str]) -> None:
+    assert split(kind) == parts
+
+
+def test_the_plain_colour_detector_needs_nothing_around_it() -> None:
+    assert configured_detector(VisionConfig()) is None
+    assert is_plain(VisionConfig())
+    assert isinstance(configured_detector(config(options={"label": "ball"})), Hsv)
+    assert isinstance(configured_detector(config(kind="adaptive")), Adaptive)
+    assert configured_detector(config(kind="boxes")) is None
+
+
+def test_a_class_of_ones_own_gets_its_options_and_what_vision_knows() -> None:
+    made = choose_detector(MINE, {"sure": True}, config(deadline_s=0.2))
+    assert isinstance(made, Mine)
+    assert made.config == Mine.Config(robot="r7", deadline_s=0.2, sure=True)
+    assert choose_detector(MINE, {"robot": "other"}, config()).config.robot == "other"
+
+
+def test_hsv_takes_the_section_of_its_name_with_its_options_over_it() -> None:
+    settings = VisionConfig.model_validate({"hsv": {"min_radius_px": 9.0}})
+    made = choose_detector("hsv", {"hsv": {"max_contours": 2}}, settings)
+    assert (made._eye._config.min_radius_px, made._eye._config.max_contours) == (9.0, 2)
+
+
+def test_what_is_around_it_is_built_from_the_inside_out() -> None:
+    made = configured_detector(config(labels=("ball",), only_colour=True, tracked=True, shadow="adaptive"))
+    assert isinstance(made, Shadowed)
+    made.close()
+    tracked = made._eyes[0]
+    assert isinstance(tracked, Tracked) and isinstance(tracked.inner, ColourFilter)
+    assert isinstance(tracked.inner.inner, LabelFilter) and isinstance(tracked.inner.inner.inner, Hsv)
+
+
+@pytest.mark.parametrize(
+    ("detector", "words"),
+    [
+        ({"kind": "hsw"}, "no detector called 'hsw'; did you mean 'hsv'"),
+        ({"kind": "nowhere:Eyes"}, "'nowhere:Eyes' cannot be loaded"),
+        ({"kind": f"{__name__}:Gone"}, "cannot be loaded"),
+        ({"kind": f"{__name__}:NoConfig"}, "no pydantic model called Config"),
+        ({"kind": "hsv:red"}, "takes nothing after its name, not 'red'"),
+        ({"kind": "hsv", "options": {"hue": 3}}, "unknown option 'hue'; it takes hsv, label"),
+        ({"kind": "onnx:/nowhere/ball.onnx"}, "No such file"),
+        ({"kind": "adaptive", "options": {"confirm": 0}}, "option 'confirm'"),
+        ({"kind": "hsv", "device": "cuda"}, "no device to choose"),
+        ({"kind": "boxes", "shadow": "hsv"}, "detector.shadow goes with a detector that runs here"),
+        ({"kind": "hsv", "shadow": "hsw"}, "did you mean 'hsv'"),
+    ],
+)
+def test_every_mistake_is_one_line(detector: dict, words: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(words)) as refused:
+        configured_detector(config(**detector))
+    assert "\n" not in str(refused.value) and len(str(refused.value)) < 300
+
+
+def test_a_device_is_handed_to_who_can_have_one(tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0])
+    assert isinstance(configured_detector(config(kind=f"onnx:{path}", device="cpu")), OnnxDetector)
+    with pytest.raises(HardwareError, match="--device cuda"):
+        configured_detector(config(kind=f"onnx:{path}", device="cuda"))

@@ -1,0 +1,103 @@
+"""`sightline detector list | check | promote`, `vision --detector`: what is printed and the exit codes."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from operator_side import cli
+from tests.onnx_rig import brightness_model
+
+BROKEN = '''
+from vision_side.detect.local import Hsv
+
+
+class Late(Hsv):
+    def detect(self, frames, deadline_us):
+        return super().detect(frames, deadline_us)[:-1]
+'''
+
+
+def run(capsys, *arguments: str) -> tuple[int, str, str]:
+    code = cli.run(arguments)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_every_detector_is_listed_with_whether_it_can_be_used(capsys) -> None:
+    code, out, _ = run(capsys, "detector", "list", "--json")
+    listed = {one["name"]: one for one in json.loads(out)["detectors"]}
+    assert code == 0 and {"hsv", "adaptive", "onnx", "zenoh"} <= set(listed)
+    assert listed["hsv"] == {"name": "hsv", "usable": True, "why": ""}
+    code, out, _ = run(capsys, "detector", "list")
+    assert code == 0 and "adaptive     ok" in out
+
+
+def test_a_detector_that_keeps_its_promises_passes(capsys) -> None:
+    code, out, _ = run(capsys, "detector", "check", "hsv", "--json")
+    report = json.loads(out)
+    assert code == 0 and report["ok"] and len(report["checks"]) >= 8
+    assert [one["size"] for one in report["times"]] == ["320x240", "640x480"]
+    assert all(0 < one["p50_ms"] <= one["p95_ms"] for one in report["times"])
+
+
+def test_a_plug_in_of_ones_own_that_does_not_is_told_where(capsys, tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "late_eyes.py").write_text(BROKEN)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    code, out, _ = run(capsys, "detector", "check", "late_eyes:Late")
+    assert code == 5
+    assert "FAIL  A batch gets as many results" in out
+
+
+def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0])
+    code, out, _ = run(capsys, "detector", "check", f"onnx:{path}", "--set", "min_score=0.9", "--device", "cpu")
+    assert code == 0 and "320x240:" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("detector", "check", "hsw"), 2, "did you mean 'hsv'"),
+        (("detector", "check", "hsv", "--device", "cuda"), 2, "no device to choose"),
+        (("detector", "check", "hsv", "--device", "gpu"), 2, "device"),
+        (("detector", "check", "onnx:/nowhere.onnx"), 2, "No such file"),
+        (("detector", "--serve", "hsv", "list"), 2, "runs by itself"),
+        (("vision", "--detector", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
+        (("vision", "--shadow", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
+        (("vision", "--dry-run", "--detector", "boxes"), 2, "own eyes"),
+    ],
+)
+def test_every_mistake_is_one_line(capsys, arguments: tuple[str, ...], code: int, words: str) -> None:
+    found, out, err = run(capsys, *arguments)
+    assert (found, out) == (code, "")
+    assert words in err and err.count("\n") == 1
+
+
+def test_a_device_that_is_not_there_ends_vision_with_3(capsys, tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0])
+    code, out, err = run(capsys, "vision", "--detector", f"onnx:{path}", "--device", "cuda",
+                         "--connect", "tcp/127.0.0.1:1")
+    assert (code, out) == (3, "") and "--device auto" in err and err.count("\n") == 1
+
+
+def test_the_group_alone_shows_its_help(capsys) -> None:
+    code, out, _ = run(capsys, "detector")
+    assert code == 0 and "--serve NAME" in out and "promote" in out
+
+
+def test_listing_imports_nothing_heavy_before_it_is_needed() -> None:
+    """`detector --help` answers without OpenCV."""
+    code = "import sys; from operator_side import cli; cli.run(['detector', '--help']); print('cv2' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.rstrip().endswith("False")
+
+
+def test_the_example_of_a_detector_keeps_the_promises(capsys, monkeypatch) -> None:
+    monkeypatch.chdir(Path(__file__).parent.parent / "examples")
+    monkeypatch.syspath_prepend(str(Path.cwd()))
+    code, out, _ = run(capsys, "detector", "check", "my_detector:BrightestSpot", "--set", "least=150", "--json")
+    assert code == 0, out

@@ -1,0 +1,158 @@
+"""Other eyes in the pipeline and the service: "saw nothing" searches, "no answer" holds, nonsense is refused."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from protocol.messages import FrameHeader
+from tests.detector_rig import Bench, Told, box
+from tests.vision_rig import camera, jpeg_of, scene
+from vision_side.config import DetectorConfig, TargetConfig, VisionConfig
+from vision_side.decode import Decoder
+from vision_side.detect.checking import MAX_DETECTIONS, checked
+from vision_side.detect.local import Hsv
+from vision_side.detect.port import DetectFrame, Maker, result_of
+from vision_side.pipeline import NO_ANSWER, Frame, Pipeline
+
+MODEL = camera()
+BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
+EMPTY = jpeg_of(np.full((240, 320, 3), 140, np.uint8))
+
+
+def frame(seq: int, jpeg: bytes = BALL) -> Frame:
+    return Frame(FrameHeader(session="0000abcd", seq=seq, t_us=seq * 33_333), jpeg)
+
+
+def pipeline(eyes, **config: object) -> Pipeline:
+    return Pipeline(VisionConfig(**config), MODEL, eyes=eyes)
+
+
+def test_the_same_detector_behind_the_port_gives_the_same_twists() -> None:
+    own, other = Pipeline(VisionConfig(), MODEL), pipeline(Hsv(Hsv.Config()))
+    for seq in range(1, 30):
+        jpeg = jpeg_of(scene(MODEL, 1.0 + 0.01 * seq, 0.2, seed=seq))
+        assert own.step(frame(seq, jpeg)).twist == other.step(frame(seq, jpeg)).twist
+    assert other.looked is not None and other.looked.seq == 29 and own.looked is None
+
+
+def test_saw_nothing_searches_and_no_answer_does_not() -> None:
+    nothing, silent = pipeline(Told(*[()] * 40)), pipeline(Told(*[None] * 40))
+    for seq in range(1, 40):
+        answers = nothing.step(frame(seq)), silent.step(frame(seq))
+    assert answers[0].twist is not None and answers[0].seen.phase == "searching"
+    assert answers[1].twist is None and answers[1].seen.phase == "no answer"
+    assert silent.skipped == {NO_ANSWER: 39}
+
+
+def test_after_no_answer_it_goes_on_where_it_was() -> None:
+    good = [box(140, 100)]
+    eyes = pipeline(Told(*[good] * 5, None, None, *[good] * 3))
+    phases = [eyes.step(frame(seq)).seen.phase for seq in range(1, 11)]
+    assert phases == ["tracking"] * 5 + ["no answer"] * 2 + ["tracking"] * 3
+
+
+class Strange:
+    """A detector whose answer is changed on its way."""
+
+    def __init__(self, change) -> None:
+        self.change = change
+
+    def detect(self, frames, deadline_us):
+        return self.change(result_of(frames[0], (box(140, 100),), Maker("strange", "", "cpu")))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda one: [replace(one, seq=99)],
+        lambda one: [replace(one, robot="r2")],
+        lambda one: [replace(one, session="0000beef")],
+        lambda one: [replace(one, width_px=640)],
+        lambda one: [replace(one, detections=(box(math.nan),))],
+        lambda one: [replace(one, detections=(replace(box(1), score=math.inf),))],
+        lambda one: [replace(one, detections=(replace(box(1), score=1.2),))],
+        lambda one: [replace(one, detections=(replace(box(1), label="x" * 65),))],
+        lambda one: [replace(one, detections=(box(1),) * (MAX_DETECTIONS + 1))],
+        lambda one: [], lambda one: [one, one], lambda one: None, lambda one: ["boxes"], lambda one: 1 / 0,
+    ],
+)  # fmt: skip
+def test_nonsense_is_no_answer_and_counted(change) -> None:
+    strange = pipeline(Strange(change))
+    answer = strange.step(frame(1))
+    assert answer.twist is None and answer.seen.phase == "no answer" and answer.seen.note
+    assert strange.skipped == {NO_ANSWER: 1}
+
+
+def test_boxes_beyond_the_picture_are_cut_and_those_outside_left_out() -> None:
+    asked = DetectFrame("r1", frame(1).header, BALL, Decoder(320, 240, 10**6))
+    found = result_of(asked, (box(-20), box(500), box(100)), Maker("x"))
+    inside = checked(asked, found).detections
+    assert [(one.x1_px, one.x2_px) for one in inside] == [(0, 20), (100, 140)]
+    whole = result_of(asked, (box(100),), Maker("x"))
+    assert checked(asked, whole) is whole
+
+
+def test_a_picture_is_decoded_once_for_all_who_share_it() -> None:
+    class Counting(Decoder):
+        count = 0
+
+        def decode(self, jpeg):
+            Counting.count += 1
+            return super().decode(jpeg)
+
+    asked = DetectFrame("r1", frame(1).header, BALL, Counting(320, 240, 10**6))
+    assert asked.decoded is None
+    assert asked.picture() is asked.picture() is asked.decoded
+    assert Counting.count == 1
+
+
+def test_what_is_followed_is_neither_a_light_nor_legs_unless_asked_for() -> None:
+    seen = [box(20, 100, label="legs"), box(260, 100, label="light red")]
+    assert pipeline(Told(seen)).step(frame(1)).seen.target is None
+    asked = pipeline(Told(seen), target=TargetConfig(label="legs")).step(frame(1)).seen
+    assert asked.target is not None and asked.target.label == "legs"
+    both = pipeline(Told([*seen, box(140, 100)])).step(frame(1)).seen
+    assert both.target is not None and both.target.label == "ball"
+
+
+def test_the_service_gives_credit_back_where_there_is_no_answer() -> None:
+    bench = Bench(VisionConfig(), Told(None, [box(140, 100)], None))
+    bench.frame()
+    assert bench.acks.take() is not None and bench.twists.take() is None
+    bench.frame()
+    assert bench.twists.take() is not None
+    bench.frame()
+    assert bench.acks.take() is not None and bench.service.skipped[NO_ANSWER] == 2
+    assert any("no answer" in line for line in bench.said)
+
+
+def test_the_report_says_who_looks_on_what_and_how_fast() -> None:
+    class Timed(Told):
+        def detect(self, frames, deadline_us):
+            return [replace(one, detector="onnx:ball.onnx", model_hash="ab12", device="cuda", compute_us=1234)
+                    for one in super().detect(frames, deadline_us)]
+
+    bench = Bench(VisionConfig(detector=DetectorConfig(kind="hsv")), Timed(*[[box(140, 100)]] * 3))
+    bench.frame()
+    report = bench.report()
+    said = (report.detector, report.model, report.device, report.inference_us)
+    assert said == ("onnx:ball.onnx", "ab12", "cuda", 1234)
+
+
+def test_until_when_a_detector_may_take_is_said() -> None:
+    heard: list[int] = []
+
+    class Listening(Told):
+        def detect(self, frames, deadline_us):
+            heard.append(deadline_us)
+            return super().detect(frames, deadline_us)
+
+    bench = Bench(VisionConfig(detector=DetectorConfig(deadline_s=0.25)), Listening([], []))
+    import time
+
+    before_us = time.monotonic_ns() // 1000
+    bench.frame()
+    after_us = time.monotonic_ns() // 1000
+    assert before_us + 250_000 <= heard[0] <= after_us + 250_000

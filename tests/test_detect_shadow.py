@@ -1,0 +1,174 @@
+"""The shadow: it sees what the driving detector sees, never steers, and takes over when it is told to."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from protocol.messages import FrameHeader
+from tests.detector_rig import BALL, Bench
+from tests.link_rigs import until
+from vision_side.config import DetectorConfig, VisionConfig
+from vision_side.decode import Decoder
+from vision_side.detect.agreement import TELL_US, Agreement, differs
+from vision_side.detect.local import Hsv
+from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Maker, result_of
+from vision_side.detect.shadow import Shadowed
+
+
+def result(t_us: int, *boxes: tuple[float, float, float, float], name: str = "hsv") -> DetectionResult:
+    found = tuple(Detection(*box, 0.9, "ball") for box in boxes)
+    return DetectionResult("r1", "0000abcd", 1, t_us, 320, 240, found, name)
+
+
+HERE, NEAR, AWAY = (10, 10, 50, 50), (14, 8, 52, 50), (200, 10, 240, 50)
+
+
+@pytest.mark.parametrize(
+    ("mine", "other", "words"),
+    [((), (), ""), ((HERE,), (NEAR,), ""), ((HERE,), (NEAR, AWAY), ""), ((HERE,), (AWAY, NEAR), "ball at (220, 30)"),
+     ((HERE,), (), "onnx nothing"), ((), (HERE,), "hsv nothing")],
+)
+def test_what_counts_is_what_would_be_steered_by(mine: tuple, other: tuple, words: str) -> None:
+    what = differs(result(1, *mine), result(1, *other, name="onnx"))
+    assert words in what if words else not what
+
+
+def test_disagreement_is_told_now_and_then_only() -> None:
+    agreement, lines = Agreement(), []
+    for index in range(600):  # 20 s
+        other = () if index % 2 else (HERE,)
+        lines.append(agreement.add(result(index * 33_333, HERE), result(index * 33_333, *other, name="onnx")))
+    told = [line for line in lines if line]
+    assert len(told) == 1 + 600 * 33_333 // TELL_US
+    assert "50%" in told[-1]
+    assert (agreement.compared, agreement.differed, agreement.share) == (600, 300, 0.5)
+
+
+class Eye:
+    """Sees one box, always, and counts; `gate` holds it up."""
+
+    def __init__(self, x: float, name: str) -> None:
+        self.x, self.name, self.seen = x, name, []
+        self.gate = threading.Event()
+        self.gate.set()
+        self.answers = True
+
+    def detect(self, frames, deadline_us):
+        assert self.gate.wait(10)
+        self.seen += [(one.robot, one.header.seq) for one in frames]
+        box = Detection(self.x, 10, self.x + 40, 50, 0.9, "target")
+        return [result_of(one, (box,), Maker(self.name, "", "cpu"), 5) if self.answers else None for one in frames]
+
+
+def frame(seq: int, robot: str = "r1") -> DetectFrame:
+    header = FrameHeader(session="0000abcd", seq=seq, t_us=seq * 33_333)
+    return DetectFrame(robot, header, BALL, Decoder(320, 240, 10**7))
+
+
+@pytest.fixture
+def pair():
+    driving, shadow = Eye(10, "one"), Eye(200, "two")
+    both = Shadowed(driving, shadow, "two", 10**7)
+    yield driving, shadow, both
+    shadow.gate.set()
+    both.close()
+
+
+def names(results) -> list[str]:
+    return [one.detector if one else "" for one in results]
+
+
+def test_the_shadow_sees_the_frames_and_never_answers_them(pair) -> None:
+    _, shadow, both = pair
+    for seq in range(1, 6):
+        assert names(both.detect([frame(seq)], NO_DEADLINE)) == ["one"]
+        assert until(lambda seq=seq: ("r1", seq) in shadow.seen)
+    assert until(lambda: both.shadow_text("r1") == "shadow 0% agree")
+    assert any("two" in line and "one" in line for line in both.news())
+
+
+def test_a_shadow_that_hangs_delays_nothing_and_then_sees_the_newest(pair) -> None:
+    _, shadow, both = pair
+    shadow.gate.clear()
+    for seq in range(1, 50):
+        assert names(both.detect([frame(seq)], NO_DEADLINE)) == ["one"]
+    shadow.gate.set()
+    assert until(lambda: ("r1", 49) in shadow.seen)
+    assert len(shadow.seen) <= 2
+
+
+def test_it_takes_over_when_told_for_that_robot_only_and_gives_back(pair) -> None:
+    _, _, both = pair
+    assert "no frame" in both.promote("r1", True)
+    both.detect([frame(1), frame(1, "r2")], NO_DEADLINE)
+    assert until(lambda: both.promote("r1", True) == "")
+    assert names(both.detect([frame(2, "r2"), frame(2), frame(3, "r2")], NO_DEADLINE)) == ["one", "two", "one"]
+    assert "promoted" in both.shadow_text("r1") and "promoted" not in both.shadow_text("r2")
+    assert both.promote("r1", False) == ""
+    assert names(both.detect([frame(3)], NO_DEADLINE)) == ["one"]
+
+
+def test_who_does_not_answer_is_not_promoted(pair) -> None:
+    _, shadow, both = pair
+    shadow.answers = False
+    both.detect([frame(1)], NO_DEADLINE)
+    assert until(lambda: shadow.seen == [("r1", 1)])
+    assert "does not answer" in both.promote("r1", True)
+    assert names(both.detect([frame(2)], NO_DEADLINE)) == ["one"]
+
+
+def test_a_shadow_can_be_promoted_when_the_driving_one_fell_silent(pair) -> None:
+    driving, _, both = pair
+    driving.answers = False
+    assert both.detect([frame(1)], NO_DEADLINE) == [None]
+    assert until(lambda: both.promote("r1", True) == "")
+    assert names(both.detect([frame(2)], NO_DEADLINE)) == ["two"]
+
+
+def test_a_shadow_that_raises_is_told_and_goes_on(pair) -> None:
+    _, shadow, both = pair
+    shadow.detect, good = None, shadow.detect  # calling None raises
+    both.detect([frame(1)], NO_DEADLINE)
+    assert until(lambda: any("failed" in line for line in both.news()))
+    shadow.detect = good
+    both.detect([frame(2)], NO_DEADLINE)
+    assert until(lambda: ("r1", 2) in shadow.seen)
+
+
+def test_a_person_promotes_it_live_and_the_report_says_who_looks() -> None:
+    eyes = Shadowed(Hsv(Hsv.Config()), Eye(200, "two"), "two", 10**7)
+    bench = Bench(VisionConfig(), eyes)
+    try:
+        bench.frame()
+        report = bench.report()
+        assert (report.detector.split(",")[0], report.device) == ("hsv", "cpu")
+        assert until(lambda: eyes.shadow_text("r1") == "shadow 0% agree")
+        report = bench.ask(1, shadow=True)
+        assert report.refused == "" and report.detector.startswith("two, promoted; shadow")
+        assert report.inference_us == 5 and report.mission == "follow"
+        assert "alone" in bench.ask(2, shadow=1.5).refused
+        assert bench.ask(3, shadow=False).detector.startswith("hsv")
+    finally:
+        eyes.close()
+
+
+def test_without_a_shadow_there_is_nobody_to_promote() -> None:
+    bench = Bench(VisionConfig())
+    bench.frame()
+    assert "--shadow" in bench.ask(1, shadow=True).refused
+
+
+def test_the_configuration_builds_it() -> None:
+    bench = Bench(VisionConfig(detector=DetectorConfig(kind="hsv", shadow="adaptive")))
+    try:
+        for _ in range(8):
+            bench.frame()
+        assert until(lambda: "% agree" in bench.service._eyes.shadow_text("r1") or bench.frame())
+    finally:
+        bench.service._eyes.close()
+
+
+def test_grey_pictures_agree_on_nothing() -> None:
+    assert differs(result(1), result(1, name="onnx")) == ""
+    assert np.isfinite(Agreement().share)

@@ -1,0 +1,77 @@
+"""Whose frame is looked at next: newest only, fair, never too old, and a batch that fits into the deadline."""
+
+import random
+
+import pytest
+
+from vision_side.detector_turns import Turns
+
+DEADLINE_US = 100_000
+
+
+def test_the_newest_takes_the_place_of_the_one_before_and_is_counted():
+    turns = Turns(8, DEADLINE_US)
+    for item in range(5):
+        turns.offer("r1", item, item)
+    assert [(turn.robot, turn.item) for turn in turns.take(5)] == [("r1", 4)] and turns.take(6) == []
+    tally = turns.tallies["r1"]
+    assert (tally.offered, tally.overtaken, tally.dropped) == (5, 4, 4)
+
+
+def test_whatever_waits_is_one_batch_up_to_its_bound():
+    turns = Turns(3, DEADLINE_US)
+    for name in "abcde":
+        turns.offer(name, name, 0)
+    assert [turn.robot for turn in turns.take(1)] == ["a", "b", "c"]
+    assert [turn.robot for turn in turns.take(1)] == ["d", "e"]
+
+
+def test_whoever_was_served_last_is_last_however_much_it_sends():
+    turns = Turns(1, DEADLINE_US)
+    served = []
+    for step in range(30):
+        for name in "abc":
+            for _ in range(20 if name == "a" else 1):
+                turns.offer(name, step, step)
+        served.extend(turn.robot for turn in turns.take(step))
+    assert served == ["a", "b", "c"] * 10
+
+
+def test_what_is_too_old_to_be_answered_in_time_is_not_looked_at():
+    turns = Turns(8, DEADLINE_US)
+    turns.offer("old", 1, 0)
+    turns.offer("young", 2, 60_000)
+    assert [turn.robot for turn in turns.take(95_000, each_us=10_000)] == ["young"]
+    assert turns.tallies["old"].stale == 1
+    turns.offer("edge", 3, 0)
+    assert [turn.robot for turn in turns.take(DEADLINE_US)] == ["edge"]
+
+
+@pytest.mark.parametrize(("each_us", "batch"), [(0, 16), (1_000, 16), (5_000, 10), (20_000, 2), (80_000, 1)])
+def test_a_batch_takes_half_a_deadline_at_most(each_us, batch):
+    turns = Turns(16, DEADLINE_US)
+    for robot in range(20):
+        turns.offer(f"r{robot}", 0, 0)
+    assert len(turns.take(0, each_us)) == batch
+
+
+@pytest.mark.parametrize("seed", [21, 22, 23])
+def test_twice_the_load_is_shared_fairly_and_nothing_is_answered_late(seed):
+    """40 streams at 30 per second, each picture 1.7 ms: half of them must go, of everybody the same share."""
+    rng, turns, now_us, each_us = random.Random(seed), Turns(16, DEADLINE_US), 0, 1_667
+    due = {f"r{robot}": rng.randrange(33_333) for robot in range(40)}
+    served, ages = dict.fromkeys(due, 0), []
+    while now_us < 20_000_000:
+        for robot in sorted(due):
+            while due[robot] <= now_us:
+                turns.offer(robot, None, due[robot])
+                due[robot] += 33_333 + rng.randint(-5_000, 5_000)
+        batch = turns.take(now_us, each_us)
+        now_us += each_us * len(batch) if batch else 500
+        for turn in batch:
+            served[turn.robot] += 1
+            ages.append(now_us - turn.arrived_us)
+    mean = sum(served.values()) / len(served)
+    assert max(abs(count - mean) for count in served.values()) <= 0.1 * mean
+    assert 0.45 < sum(served.values()) / sum(tally.offered for tally in turns.tallies.values()) < 0.55
+    assert sorted(ages)[int(len(ages) * 0.95)] <= DEADLINE_US

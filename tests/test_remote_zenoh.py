@@ -1,0 +1,237 @@
+"""The detector service and `--detector zenoh`, over real Zenoh sessions: frames to one, boxes to the other."""
+
+import threading
+import time
+from collections import Counter
+from contextlib import ExitStack
+
+import pytest
+
+from operator_side.around_text import as_object, lines
+from protocol.channels import DETECTIONS, FRAME, STATUS
+from protocol.codec import encode
+from protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader, Stamp, State, Status
+from protocol.transports.zenoh import open_zenoh
+from protocol.transports.zenoh_around import peers_at
+from protocol.transports.zenoh_site import open_site
+from tests.link_rigs import free_endpoint, until
+from tests.remote_rig import BALL_JPEG, GREY_JPEG, frame, within
+from vision_side.config import HsvConfig
+from vision_side.decode import Decoder
+from vision_side.detect.local import Hsv
+from vision_side.detect.port import DetectFrame
+from vision_side.detect.remote.zenoh_detector import ZenohDetector
+from vision_side.detector_service import ROLE, DetectorService, Serving
+
+CORNERS = ("x1_px", "y1_px", "x2_px", "y2_px")
+HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
+
+
+class Robot:
+    """A robot that listens, says that it is there, and sends what it is told to."""
+
+    def __init__(self, name, endpoint, listens=False):
+        ends = {"listen": [endpoint]} if listens else {"connect": [endpoint]}
+        self.name, self.link, self.seq = name, open_zenoh(name, role="robot", **ends), 0
+        self.session = f"{sum(name.encode()):08x}"
+        self.said = self.link.latest(DETECTIONS)
+
+    def here(self):
+        stamp = Stamp(session=self.session, seq=1, t_us=1)
+        self.link.publish(STATUS, encode(stamp), encode(Status(state=State.HOLD, reason="test")))
+
+    def frame(self, jpeg=BALL_JPEG, header=None):
+        """Send one; the frame as a vision would ask about it."""
+        self.seq += 1
+        stamp = FrameHeader(session=self.session, seq=self.seq, t_us=self.seq * 33_333)
+        self.link.publish(FRAME, encode(stamp) if header is None else header, jpeg)
+        return DetectFrame(self.name, stamp, jpeg, Decoder(320, 240, 1920 * 1080))
+
+    def say(self, asked, *boxes, source=ROLE, width_px=320, **changes):
+        """Boxes as a service says them, or as a hostile one does."""
+        echo = Echo(channel="frame", session=asked.header.session, seq=asked.header.seq, t_us=asked.header.t_us)
+        header = DetectionsHeader(source=ROLE, session="00000009", seq=1, echo=echo.model_copy(update=changes))
+        said = Detections(width_px=width_px, height_px=240, boxes=boxes)
+        self.link.publish(DETECTIONS, encode(header), encode(said), source)
+
+
+class Bench:
+    """A detector service that is the router, and robots that connect to it."""
+
+    def __init__(self, ending, detector=HSV, **serving):
+        self.endpoint, self.words = free_endpoint(), []
+        site = ending.enter_context(open_site("*", listen=[self.endpoint], role=ROLE, about=self._about))
+        self.service = DetectorService(site, detector, Serving("hsv", **serving), self.words.append)
+        self._over = threading.Event()
+        thread = threading.Thread(target=self.service.serve, args=(self._over,))
+        thread.start()
+        ending.callback(thread.join, 5)
+        ending.callback(self._over.set)
+        self._ending = ending
+
+    def _about(self):
+        return self.service.about()
+
+    def robot(self, name):
+        robot = Robot(name, self.endpoint)
+        self._ending.callback(robot.link.close)
+        assert until(lambda: (robot.here(), f"detector: looks at the pictures of {name}" in self.words)[1])
+        return robot
+
+    def detector(self, *robots):
+        """As a vision has it: attached to a link of each robot."""
+        one = ZenohDetector(ZenohDetector.Config())
+        for name in robots:
+            one.attach(self._ending.enter_context(open_zenoh(name, connect=[self.endpoint])))
+        return one
+
+
+@pytest.fixture
+def bench():
+    with ExitStack() as ending:
+        yield Bench(ending)
+
+
+def _result(robot, detector, jpeg=BALL_JPEG, seconds=0.3):
+    return detector.detect([robot.frame(jpeg)], within(seconds))[0]
+
+
+def test_a_robots_frames_come_back_as_boxes_that_name_them(bench):
+    robot = bench.robot("r1")
+    detector = bench.detector("r1")
+    assert until(lambda: _result(robot, detector))
+    result = _result(robot, detector)
+    expected = HSV.detect([frame()], 0)[0].detections[0]
+    found = result.detections[0]
+    assert [getattr(found, name) for name in CORNERS] == [getattr(expected, name) for name in CORNERS]
+    assert found.circle.radius_px == pytest.approx(expected.circle.radius_px)
+    assert (result.robot, result.session, result.seq) == ("r1", robot.session, robot.seq)
+    assert (result.detector, result.device) == ("hsv", "cpu"), "who looked is said by who looked"
+    assert _result(robot, detector, GREY_JPEG).detections == (), "saw nothing is an answer"
+
+
+def test_one_detector_serves_every_robot_of_a_fleet(bench):
+    robots = [bench.robot(name) for name in ("r1", "r2", "r3")]
+    detector = bench.detector("r1", "r2", "r3")
+    assert until(lambda: all(_result(robot, detector) for robot in robots))
+    for robot in robots:
+        assert (result := _result(robot, detector)).robot == robot.name and result.session == robot.session
+
+
+def test_without_a_link_it_says_so():
+    alone = ZenohDetector(ZenohDetector.Config())
+    assert alone.detect([frame()], within(0.1)) == [None] and alone.refused == {"UNREACHABLE": 1}
+    assert "no link to robot r1" in alone.news()[0]
+
+
+def test_a_bad_picture_and_a_bad_header_get_no_answer_and_are_counted(bench):
+    robot = bench.robot("r1")
+    detector = bench.detector("r1")
+    assert until(lambda: _result(robot, detector))
+    before = bench.service.tallies()["r1"].refused
+    for jpeg in (b"", BALL_JPEG[:300], b"GIF89a"):
+        assert _result(robot, detector, jpeg, seconds=0.05) is None
+    robot.frame(header=b"{}")
+    assert until(lambda: bench.service.tallies()["r1"].refused == before + 4)
+    assert _result(robot, detector) is not None
+
+
+def test_it_is_seen_by_who_asks_who_is_there_with_its_model_device_and_health(bench):
+    robot = bench.robot("r1")
+    detector = bench.detector("r1")
+    assert until(lambda: _result(robot, detector))
+    peers = peers_at([bench.endpoint], 2.0)
+    said = next(line for line in lines({}, peers) if line.startswith("detector"))
+    assert "of *" in said and "hsv on cpu: 1 robots" in said and "p95 age" in said
+    assert "hsv on cpu" in next(one["about"] for one in as_object({}, peers)["peers"] if one["role"] == "detector")
+
+
+def test_a_service_that_is_gone_is_no_answer_by_the_deadline_and_back_by_itself():
+    endpoint = free_endpoint()
+    with ExitStack() as ending:
+        robot = Robot("r1", endpoint, listens=True)
+        ending.callback(robot.link.close)
+        detector = ZenohDetector(ZenohDetector.Config())
+        detector.attach(ending.enter_context(open_zenoh("r1", connect=[endpoint])))
+        for _ in range(2):
+            assert not _result(robot, detector, seconds=0.05)
+            with open_site("*", connect=[endpoint], role=ROLE) as site:
+                service, over = DetectorService(site, HSV, Serving("hsv"), lambda line: None), threading.Event()
+                thread = threading.Thread(target=service.serve, args=(over,))
+                thread.start()
+                assert until(lambda: (robot.here(), _result(robot, detector, seconds=0.05))[1], 3.0)
+                over.set()
+                thread.join()
+        assert "LATE" in detector.refused and any("answers again" in line for line in detector.news())
+
+
+# --- hostile answers -------------------------------------------------------------------------------------------------
+
+BOX = DetectedBox(label="ball", score=0.9, x1_px=10.0, y1_px=10.0, x2_px=30.0, y2_px=30.0)
+
+
+@pytest.fixture
+def pair():
+    """A robot, and who waits for boxes over a link of its own."""
+    endpoint = free_endpoint()
+    with ExitStack() as ending:
+        robot = Robot("r1", endpoint, listens=True)
+        service = open_zenoh("r1", connect=[endpoint], role=ROLE)
+        link = open_zenoh("r1", connect=[endpoint])
+        for one in (robot.link, service, link):
+            ending.callback(one.close)
+        waiting = ZenohDetector(ZenohDetector.Config())
+        waiting.attach(link)
+        robot.link = service
+        assert until(lambda: service.has_listener(DETECTIONS))
+        yield robot, waiting
+
+
+@pytest.mark.parametrize(("changes", "reason"), [
+    ({"session": "0000ffff"}, "OTHER_FRAME"), ({"t_us": 1}, "OTHER_FRAME"), ({"seq": 0, "t_us": 0}, "LATE"),
+    ({"seq": 9, "t_us": 1}, "OTHER_FRAME"), ({"channel": "status"}, "OTHER_FRAME"), ({"width_px": 640}, "OTHER_SIZE"),
+])  # fmt: skip
+def test_boxes_of_another_frame_or_size_are_refused_and_counted(pair, changes, reason):
+    robot, waiting = pair
+    asked = frame(3)
+    robot.say(asked, BOX, **changes)
+    waited = Counter()
+
+    def is_refused():
+        """Every wait that ends without an answer is itself LATE."""
+        waited["LATE"] += 1
+        assert waiting.detect([asked], within(0.05)) == [None]
+        return waiting.refused - waited
+
+    assert until(is_refused) and waiting.refused - waited == {reason: 1}
+    robot.say(asked, BOX)
+    assert until(lambda: waiting.detect([asked], within(0.05))[0])
+
+
+@pytest.mark.parametrize("payload", [
+    b"", b"{", b"<html>", b"[" * 9_000, b'{"width_px":320,"height_px":240,"boxes":[{}]}', b"\xff" * 32_768,
+    b'{"width_px":320,"height_px":240,"boxes":[NaN]}',
+])  # fmt: skip
+def test_what_is_no_detections_message_is_refused_and_counted(pair, payload):
+    robot, waiting = pair
+    asked = frame(3)
+    echo = Echo(channel="frame", session=asked.header.session, seq=3, t_us=asked.header.t_us)
+    robot.link.publish(DETECTIONS, encode(DetectionsHeader(source=ROLE, session="00000009", seq=1, echo=echo)), payload)
+    assert until(lambda: waiting.detect([asked], within(0.05)) == [None] and waiting.refused["MALFORMED"])
+
+
+def test_anothers_boxes_are_not_even_looked_at(pair):
+    robot, waiting = pair
+    asked = frame(3)
+    robot.say(asked, BOX, source="guest")
+    assert waiting.detect([asked], within(0.1)) == [None] and waiting.refused == {"LATE": 1}
+
+
+def test_boxes_of_a_newer_frame_end_the_waiting_and_are_kept_for_it(pair):
+    robot, waiting = pair
+    asked, newer = frame(3), frame(4)
+    robot.say(newer, BOX)
+    began_s = time.monotonic()
+    assert waiting.detect([asked], within(2.0)) == [None] and waiting.refused == {"OTHER_FRAME": 1}
+    assert time.monotonic() - began_s < 1.0
+    assert waiting.detect([newer], within(0.5))[0].detections[0].x2_px == BOX.x2_px

@@ -1,0 +1,156 @@
+"""The judge of detectors: verdicts, figures, average precision, and the command on real scenes."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pybullet")
+
+import cv2
+
+from operator_side import cli, cli_score_detectors
+from operator_side.score_detectors import Found, Judged, figures, judged, overlap
+from operator_side.score_detectors_text import markdown, text
+from operator_side.score_scenes import score_scenes, subjects
+from operator_side.score_sheet import Sheet
+from operator_side.train_choice import ball_threshold, label_threshold
+from sim.scene_plan import plan_scene
+from sim.scenes import COLUMNS, JUDGED_FROM, Scene, Truth
+from vision_side.detect.port import Circle, Detection
+
+BALL = Truth("ball", (100.0, 100.0, 140.0, 140.0), 1.0, (100.0, 100.0, 140.0, 140.0))
+OTHER = (200.0, 100.0, 240.0, 160.0)
+
+
+def scene(truths=(BALL,), others=(OTHER,), unclear=()):
+    plan = plan_scene(JUDGED_FROM + 1, COLUMNS["nominal"])
+    return Scene(plan, np.zeros((240, 320, 3), np.uint8), tuple(truths), tuple(others), tuple(unclear))
+
+
+def found(x1, y1, x2, y2, score=0.9, label="ball", circle=None):
+    return Detection(x1, y1, x2, y2, score, label, circle)
+
+
+def test_overlap_is_intersection_by_union():
+    assert overlap((0, 0, 2, 2), (1, 0, 3, 2)) == pytest.approx(1 / 3)
+    assert overlap((0, 0, 2, 2), (2, 0, 3, 2)) == 0 and overlap((0, 0, 2, 2), (0, 0, 2, 2)) == 1
+
+
+@pytest.mark.parametrize(("detections", "verdict"), [
+    ([found(100, 100, 140, 140)], "hit"),
+    ([found(100, 100, 140, 121)], "hit"),  # just more than half of it
+    ([found(100, 100, 140, 119)], "nowhere"),
+    ([found(*OTHER)], "wrong object"),
+    ([found(10, 10, 30, 30)], "nowhere"),
+    ([], "none"),
+    (None, "none"),
+    ([found(*OTHER, label="legs")], "none"),  # nobody follows what is called otherwise
+    ([found(*OTHER), found(100, 100, 140, 140)], "wrong object"),  # the first is the answer
+    ([found(100, 100, 140, 140, label="target")], "hit"),  # what the colour detectors call it
+])
+def test_the_first_answer_gives_the_verdict(detections, verdict):
+    assert judged(detections, scene()).verdict == verdict
+
+
+def test_a_half_hidden_ball_is_hit_by_its_visible_part_or_by_its_circle():
+    half = replace(BALL, box=(120.0, 100.0, 140.0, 140.0), seen=0.5)
+    assert judged([found(120, 100, 140, 140)], scene([half])).verdict == "hit"
+    assert judged([found(130, 100, 140, 140, circle=Circle(120, 120, 20))], scene([half])).verdict == "hit"
+
+
+def test_the_centre_counts_only_where_all_of_the_ball_is_in_view():
+    assert judged([found(103, 104, 143, 144)], scene()).off_px == pytest.approx(5.0)
+    assert judged([found(103, 104, 143, 144, circle=Circle(121, 120, 20))], scene()).off_px == pytest.approx(1.0)
+    assert judged([found(100, 100, 140, 140)], scene([replace(BALL, seen=0.9)])).off_px is None
+
+
+def test_legs_and_lights_are_wrong_objects_too():
+    legs = Truth("legs", (10.0, 100.0, 60.0, 200.0), 1.0)
+    assert judged([found(20, 110, 40, 150)], scene([BALL, legs])).verdict == "wrong object"
+
+
+def test_figures_count_each_frame_where_it_belongs():
+    frames = [
+        Judged(True, "hit", 0.9, 1.0, 900), Judged(True, "hit", 0.9, 3.0, 1100), Judged(True, "wrong object", 0.6),
+        Judged(True, "none"), Judged(False, "none"), Judged(False, "nowhere", 0.5), Judged(False, "wrong object", 0.5),
+        Judged(False, "none"),
+    ]
+    one = figures(frames)
+    assert (one.frames, one.balls, one.hits, one.missed) == (8, 4, 0.5, 0.25)
+    assert (one.wrong_object, one.false_alarms) == (0.25, 0.5)
+    assert (one.centre_p50_px, one.centre_p95_px, one.compute_p50_us) == (3.0, 3.0, 1100.0)
+    assert figures([]).hits == 0.0
+
+
+def test_average_precision_knows_the_simple_cases():
+    def of(objects, marks):
+        return Found(objects, list(marks)).average_precision()
+
+    assert of(2, [(0.9, True), (0.8, True)]) == 1.0
+    assert of(2, [(0.9, True)]) == 0.5
+    assert of(1, [(0.9, False), (0.8, True)]) == 0.5
+    assert of(2, [(0.9, True), (0.8, False), (0.7, True)]) == pytest.approx(0.5 + 0.5 * 2 / 3)
+    assert of(3, []) == 0.0 and of(0, [(0.5, False)]) is None
+
+
+def test_each_object_is_found_once_and_what_is_unclear_counts_for_nothing():
+    legs = Truth("legs", (10.0, 100.0, 60.0, 200.0), 1.0)
+    one = Found()
+    detections = [found(10, 100, 60, 200, 0.9, "legs"), found(12, 100, 60, 200, 0.8, "legs"),
+                  found(200, 50, 230, 150, 0.7, "legs"), found(*OTHER, label="ball")]
+    one.add("legs", detections, scene([legs], unclear=[(195.0, 50.0, 225.0, 120.0)]))
+    assert one.objects == 1 and one.marks == [(0.9, True), (0.8, False)]
+
+
+def test_thresholds_hold_false_alarms_and_wrong_objects_down():
+    alarms = [Judged(False, "nowhere", 0.30)] * 2 + [Judged(False, "none")] * 8
+    wrong = [Judged(True, "wrong object", 0.50)] + [Judged(True, "hit", 0.9)] * 9
+    assert ball_threshold({"one": alarms}) == pytest.approx(0.31)
+    assert ball_threshold({"one": alarms, "two": wrong}) == pytest.approx(0.51)
+    assert ball_threshold({"one": [Judged(True, "hit", 0.9)]}) == pytest.approx(0.06)
+
+
+def test_a_labels_threshold_balances_what_is_found_and_what_is_right():
+    assert label_threshold(Found(2, [(0.9, True), (0.4, True), (0.3, False)])) == pytest.approx(0.4)
+    assert label_threshold(Found(2, [(0.9, True), (0.2, False), (0.19, False), (0.1, False)])) == pytest.approx(0.9)
+    assert label_threshold(Found()) == pytest.approx(0.3)
+
+
+def test_the_command_line_begins_where_judging_begins():
+    assert cli_score_detectors.FROM == JUDGED_FROM
+
+
+def test_detectors_are_judged_on_the_same_pictures():
+    asked = subjects(["hsv", "adaptive"])
+    sheet = Sheet(asked)
+    report = score_scenes(asked, 10, looks=4, columns=["nominal", "same-colour boxes"], each=sheet.add)
+    assert set(report.columns) == {"nominal", "same-colour boxes"}
+    hsv = report.columns["nominal"]["hsv"]
+    assert (hsv.frames, hsv.balls) == (10, 8) and hsv.hits >= 0.25 and hsv.compute_p50_us
+    assert report.columns["nominal"]["adaptive"].hits > 0  # four looks are enough to be sure
+    assert report.made_by["hsv"]["device"] == "cpu"
+    assert sheet.picture().shape == (3 * (240 + 18), 6 * 320, 3)
+    assert "same-colour boxes" in text(report) and markdown(report).count("| nominal |") == 2
+
+
+def test_the_command_gives_json_and_a_sheet(tmp_path, capsys):
+    sheet = tmp_path / "sheet.png"
+    code = cli.run(["score", "detectors", "hsv", "--frames", "2", "--column", "blur", "--json", "--sheet", str(sheet)])
+    told = json.loads(capsys.readouterr().out)
+    assert code == 0 and told["frames"] == 2 and set(told["columns"]) == {"blur"}
+    assert cv2.imread(str(sheet)).shape[1] == 6 * 320
+
+
+@pytest.mark.parametrize(("arguments", "says"), [
+    (["hvs"], "did you mean"),
+    (["hsv", "--column", "blurr"], "did you mean 'blur'"),
+    (["hsv", "--frames", "0"], "--frames"),
+    (["onnx:nowhere.onnx"], "nowhere.onnx"),
+    (["hsv", "--frames", "1", "--column", "blur", "--sheet", "/nowhere/sheet.png"], "--sheet"),
+])
+def test_a_bad_argument_is_one_line(arguments, says, capsys):
+    assert cli.run(["score", "detectors", *arguments]) == 2
+    error = capsys.readouterr().err.strip()
+    assert says in error and "\n" not in error

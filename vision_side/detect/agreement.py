@@ -1,0 +1,63 @@
+"""Do two detectors see the same? Counted frame by frame, told in one line now and then. Pure.
+
+The clock is the frames' capture time. What counts is what would be steered by: the surest detection of each.
+"""
+
+from collections import deque
+from typing import Final
+
+from vision_side.detect.port import Detection, DetectionResult
+from vision_side.detect.tracked import overlap
+
+WINDOW: Final = 300
+"""Frames: ten seconds at 30 a second."""
+TELL_US: Final = 5_000_000
+"""Between two lines, however much the two disagree."""
+LEAST_OVERLAP: Final = 0.3
+"""Boxes of one thing by two detectors: one draws the ball, the other its shadow too."""
+
+
+class Agreement:
+    """Of one robot's frames, in one session."""
+
+    def __init__(self) -> None:
+        self.compared = self.differed = 0
+        self._window: deque[bool] = deque(maxlen=WINDOW)
+        self._told_us: int | None = None
+
+    @property
+    def share(self) -> float:
+        """Of the newest frames, those in which both saw the same; 1 before there are any."""
+        return sum(self._window) / len(self._window) if self._window else 1.0
+
+    def add(self, driving: DetectionResult, shadow: DetectionResult) -> str:
+        """One frame. Returns the line that tells how they differ, where it is time for one."""
+        what = differs(driving, shadow)
+        self.compared += 1
+        self.differed += bool(what)
+        self._window.append(not what)
+        if not what or (self._told_us is not None and 0 <= driving.t_us - self._told_us < TELL_US):
+            return ""
+        self._told_us = driving.t_us
+        return (f"{what}; {shadow.detector} agreed with {driving.detector} in {self.share:.0%} of the last "
+                f"{len(self._window)} frames")
+
+
+def differs(driving: DetectionResult, shadow: DetectionResult) -> str:
+    """What the surest detections of two results of one frame disagree on; empty if they do not. Labels do not count."""
+    mine, other = next(iter(driving.detections), None), next(iter(shadow.detections), None)
+    if mine is None and other is None:
+        return ""
+    if mine is None:
+        return f"{shadow.detector} sees {_where(other)}, {driving.detector} nothing"
+    if other is None:
+        return f"{driving.detector} sees {_where(mine)}, {shadow.detector} nothing"
+    if overlap(mine, other) >= LEAST_OVERLAP:
+        return ""
+    return f"{driving.detector} sees {_where(mine)}, {shadow.detector} {_where(other)}"
+
+
+def _where(one: Detection | None) -> str:
+    if one is None:
+        return "nothing"
+    return f"{one.label} at ({(one.x1_px + one.x2_px) / 2:.0f}, {(one.y1_px + one.y2_px) / 2:.0f})"

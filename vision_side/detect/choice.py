@@ -1,0 +1,127 @@
+"""Finds a detector by its name and builds it with its own `Config`. Shell (imports plug-ins).
+
+Names are those below, those of the entry points `sightline.detectors`, or, from a configuration or a command line only,
+`package.module:Name`. What stands after the name is the option `address`: `onnx:ball.onnx` gives "ball.onnx",
+`oip+http://box/ball` all of it. A `Config` is filled in from vision's where it has sections or fields of the same name.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from protocol.errors import ConfigError
+from vision_side.config import VisionConfig
+from vision_side.detect.colour_filter import ColourFilter
+from vision_side.detect.label_filter import LabelFilter
+from vision_side.detect.port import Detector
+from vision_side.detect.tracked import Tracked
+from vision_side.plugin_choice import Family, settings_model
+
+BUILT_IN: Final = {
+    "hsv": "vision_side.detect.local:Hsv",
+    "adaptive": "vision_side.detect.local:Adaptive",
+    "onnx": "vision_side.detect.onnx_detector:OnnxDetector",
+    "zenoh": "vision_side.detect.remote.zenoh_detector:ZenohDetector",
+    "oip+http": "vision_side.detect.remote.oip_http:OipHttp",
+    "oip+grpc": "vision_side.detect.remote.oip_grpc:OipGrpc",
+    "http+jpeg": "vision_side.detect.remote.http_jpeg:HttpJpeg",
+}
+"""Here and not as entry points, so that a checkout that nobody installed has them too."""
+GROUP: Final = "sightline.detectors"
+BOXES: Final = "boxes"
+"""No detector here: boxes that somebody else publishes, see vision_side/boxes_service.py."""
+FAMILY: Final = Family("detector", BUILT_IN, GROUP)
+_FILLED: Final = ("robot", "connect", "listen", "secure", "max_frame_bytes", "max_pixels")
+_OF_DETECTOR: Final = ("device", "deadline_s")
+
+
+def is_plain(config: VisionConfig) -> bool:
+    """Whether the colour detector alone looks, which needs nothing around it."""
+    one = config.detector
+    return one.kind == "hsv" and not (one.options or one.labels or one.only_colour or one.tracked or one.fallback
+                                      or one.shadow)
+
+
+def configured_detector(config: VisionConfig) -> Detector | None:
+    """The detector of `config.detector` with all that is around it; None where the pipeline's own or nobody looks.
+
+    Raises ConfigError for an unknown one or a wrong option, HardwareError for a device that is not there.
+    """
+    one = config.detector
+    if one.kind == BOXES:
+        _check_no_eyes(config)
+        return None
+    check_device(config)
+    if is_plain(config):
+        return None
+    detector = choose_detector(one.kind, one.options, config)
+    if one.fallback:
+        from vision_side.detect.remote.fallback import Fallback
+
+        detector = Fallback(detector, choose_detector(one.fallback, {}, config))
+    detector = _narrowed(detector, config)
+    if one.shadow:
+        from vision_side.detect.shadow import Shadowed
+
+        second = _narrowed(choose_detector(one.shadow, one.shadow_options, config), config)
+        detector = Shadowed(detector, second, one.shadow, config.max_pixels)
+    return detector
+
+
+def _check_no_eyes(config: VisionConfig) -> None:
+    """Raise ConfigError for what only a detector of one's own can have."""
+    one = config.detector
+    given = [name for name in ("fallback", "shadow", "labels", "only_colour", "tracked") if getattr(one, name)]
+    if given:
+        raise ConfigError(f"detector.{given[0]} goes with a detector that runs here; {BOXES!r} are somebody else's")
+
+
+def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
+    one = config.detector
+    if one.labels:
+        detector = LabelFilter(detector, one.labels)
+    if one.only_colour:
+        detector = ColourFilter(detector, config.hsv.ranges)
+    return Tracked(detector) if one.tracked else detector
+
+
+def check_device(config: VisionConfig) -> None:
+    """Raise ConfigError where a device is asked for that nothing configured can run on."""
+    one = config.detector
+    if one.device == "auto":
+        return
+    kinds = [kind for kind in (one.kind, one.fallback, one.shadow) if kind]
+    if not any(_has_field(kind, "device") for kind in kinds):
+        raise ConfigError(f"detector {one.kind!r} has no device to choose: --device {one.device} is for detectors "
+                          "that run a model here, e.g. --detector onnx")
+
+
+def _has_field(kind: str, field: str) -> bool:
+    settings = settings_model(FAMILY.load(split(kind)[0]))
+    return settings is not None and field in settings.model_fields
+
+
+def split(kind: str) -> tuple[str, str]:
+    """A detector's name and its address; the name is all of it for `package.module:Name`."""
+    name, _, rest = kind.partition(":")
+    if name not in FAMILY.names():
+        return kind, ""
+    return name, kind if rest.startswith("//") else rest
+
+
+def choose_detector(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Detector:
+    """The detector called `kind`, by itself.
+
+    Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option, and
+    HardwareError for a device that is not there.
+    """
+    name, address = split(kind)
+    plugin = FAMILY.load(name)
+    settings = settings_model(plugin)
+    fields = settings.model_fields if settings else {}
+    if address and "address" not in fields:
+        raise ConfigError(f"detector {name!r} takes nothing after its name, not {address!r}")
+    given: dict[str, Any] = {one: getattr(config, one) for one in _FILLED if one in fields}
+    given |= {one: getattr(config.detector, one) for one in _OF_DETECTOR if one in fields}
+    given |= {"address": address} if address else {}
+    detector: Detector = plugin(FAMILY.settings(name, plugin, given | dict(options), config))
+    return detector

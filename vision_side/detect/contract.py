@@ -1,0 +1,258 @@
+"""What every detector promises, as checks that any plug-in can run: `sightline detector check NAME`. Shell (a clock).
+
+The pictures are drawn from a seed: discs and boxes in all colours, noise, black, odd sizes, and bytes that are none.
+"""
+
+import math
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from random import Random
+from statistics import median
+from typing import Final
+
+import cv2
+import numpy as np
+
+from protocol.messages import FrameHeader
+from vision_side.decode import Decoder
+from vision_side.detect.around import close_detector
+from vision_side.detect.checking import MAX_DETECTIONS
+from vision_side.detect.golden import difference
+from vision_side.detect.port import NO_DEADLINE, DetectFrame, DetectionResult, Detector
+
+SIZES: Final = ((320, 240), (640, 480), (97, 61), (16, 16), (1280, 720))
+LATE_S: Final = 0.25
+"""For an answer to a frame whose deadline is over: nobody waits for it any longer."""
+_MAX_PIXELS: Final = 1920 * 1080
+_FRAME_US: Final = 33_333
+_QUALITY: Final = 80
+_HASH = re.compile(r"[0-9a-f]{0,64}")
+_SAME_SCORE: Final = 0.5  # what is less sure may come and go on a device that rounds
+
+Make = Callable[[], Detector]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One promise: what it is called, what it says, and what is wrong; empty if it is kept."""
+
+    name: str
+    promise: str
+    wrong: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """How long one picture takes, by the detector's own account, in milliseconds."""
+
+    width_px: int
+    height_px: int
+    p50_ms: float
+    p95_ms: float
+
+
+def check_detector(make: Make, seed: int = 1) -> list[Verdict]:
+    """Every promise in turn; `make` builds a detector that has seen nothing yet."""
+    verdicts = []
+    for check in _CHECKS:
+        promise = (check.__doc__ or "").split("\n")[0].rstrip(".")
+        detector = make()
+        try:
+            wrong = check(detector, make, seed)
+        except Exception as error:  # whatever a plug-in raises: it promised not to
+            wrong = f"it raises {type(error).__name__}: {' '.join(str(error).split())}"[:160]
+        finally:
+            close_detector(detector)
+        verdicts.append(Verdict(check.__name__.removeprefix("_keeps_"), promise, wrong))
+    return verdicts
+
+
+def time_detector(make: Make, frames: int = 60, seed: int = 1) -> list[Times]:
+    """At the two usual sizes, hot."""
+    return [_time_size(make, size, frames, seed) for size in SIZES[:2]]
+
+
+def _time_size(make: Make, size: tuple[int, int], frames: int, seed: int) -> Times:
+    detector, took = make(), []
+    for frame in drawn_frames(seed, frames, size):
+        result = detector.detect([frame], NO_DEADLINE)[0]
+        took.append(result.compute_us / 1000 if result else math.nan)
+    close_detector(detector)
+    told = sorted(one for one in took[frames // 4 :] if not math.isnan(one))
+    if not told:
+        return Times(*size, math.nan, math.nan)
+    return Times(*size, median(told), told[min(len(told) - 1, round(0.95 * len(told)))])
+
+
+# --- the promises ----------------------------------------------------------------------------------------------------
+
+
+def _keeps_order(detector: Detector, _make: Make, seed: int) -> str:
+    """A batch gets as many results, in its order, each naming its frame."""
+    if detector.detect([], NO_DEADLINE) != []:
+        return "an empty batch gets something"
+    frames = [*drawn_frames(seed, 3, SIZES[0], "r1"), *drawn_frames(seed + 1, 3, SIZES[2], "r2")]
+    results = detector.detect(frames, NO_DEADLINE)
+    if len(results) != len(frames):
+        return f"{len(frames)} frames get {len(results)} results"
+    pairs = zip(frames, results, strict=True)
+    return next((wrong for frame, one in pairs if one and (wrong := _unlike(frame, one))), "")
+
+
+def _keeps_answering(detector: Detector, _make: Make, seed: int) -> str:
+    """Every picture gets an answer, of any size, black, noise or full."""
+    for size in SIZES:
+        for index, frame in enumerate(drawn_frames(seed, 6, size)):
+            if detector.detect([frame], NO_DEADLINE) == [None]:
+                return f"no answer to picture {index} of {size[0]}x{size[1]}"
+    return ""
+
+
+def _keeps_bounds(detector: Detector, _make: Make, seed: int) -> str:
+    """Boxes lie in the picture, of finite numbers, with scores from 0 to 1 and a word each."""
+    for size in SIZES:
+        for frame in drawn_frames(seed, 8, size):
+            for result in detector.detect([frame], NO_DEADLINE):
+                wrong = result and _out_of_bounds(result)
+                if wrong:
+                    return wrong
+    return ""
+
+
+def _keeps_silence(detector: Detector, _make: Make, seed: int) -> str:
+    """Bytes that are no picture get no answer, and the next frame gets its own."""
+    good = list(drawn_frames(seed, 2, SIZES[0]))
+    decoder = Decoder(*SIZES[0], _MAX_PIXELS)
+    cut, other = good[0].jpeg[: len(good[0].jpeg) // 3], _jpeg(Random(seed), (64, 48))
+    for jpeg in (b"", b"\xff\xd8\xff", cut, other, b"\0" * 500):
+        bad = DetectFrame("r1", good[0].header, jpeg, decoder)
+        if detector.detect([bad], NO_DEADLINE) != [None] and _is_bad(bad):
+            return f"{len(jpeg)} bytes that are no picture get an answer"
+        if detector.detect([good[1]], NO_DEADLINE) == [None]:
+            return "no answer to a good frame after a bad one"
+    return ""
+
+
+def _keeps_deadline(detector: Detector, _make: Make, seed: int) -> str:
+    """A frame whose deadline is over holds nobody up."""
+    (frame,) = drawn_frames(seed, 1, SIZES[0])
+    detector.detect([frame], NO_DEADLINE)
+    began_s = time.monotonic()
+    detector.detect([frame], int(began_s * 1e6) - 1)
+    took_s = time.monotonic() - began_s
+    return f"it takes {took_s:.2f} s; {LATE_S} s is the most" if took_s > LATE_S else ""
+
+
+def _keeps_the_same(detector: Detector, make: Make, seed: int) -> str:
+    """The same frames get the same answers."""
+    other = make()
+    try:
+        return _first_difference(_seen(detector, drawn_frames(seed, 12, SIZES[0])),
+                                 _seen(other, drawn_frames(seed, 12, SIZES[0])))
+    finally:
+        close_detector(other)
+
+
+def _keeps_robots_apart(detector: Detector, make: Make, seed: int) -> str:
+    """What one robot's frames get does not depend on another robot's."""
+    alone = make()
+    try:
+        expected = _seen(alone, drawn_frames(seed, 8, SIZES[0]))
+    finally:
+        close_detector(alone)
+    found = []
+    for mine, others in zip(drawn_frames(seed, 8, SIZES[0]), drawn_frames(seed + 9, 8, SIZES[0], "r2"), strict=True):
+        found.append(detector.detect([others, mine], NO_DEADLINE)[1])
+    return _first_difference(expected, found)
+
+
+def _keeps_its_name(detector: Detector, _make: Make, seed: int) -> str:
+    """Every result says who looked, with which model, on what, and for how long."""
+    for result in _seen(detector, drawn_frames(seed, 2, SIZES[0])):
+        if result is None:
+            continue
+        if not 0 < len(result.detector) <= 64 or not 0 < len(result.device) <= 32:
+            return f"detector {result.detector!r} on {result.device!r}"
+        if not _HASH.fullmatch(result.model_hash):
+            return f"model hash {result.model_hash!r} is not hexadecimal"
+        if result.compute_us < 0:
+            return f"it took {result.compute_us} us"
+    return ""
+
+
+_CHECKS: Final = (_keeps_order, _keeps_answering, _keeps_bounds, _keeps_silence, _keeps_deadline, _keeps_the_same,
+                  _keeps_robots_apart, _keeps_its_name)
+
+
+# --- what they are made of -------------------------------------------------------------------------------------------
+
+
+def _seen(detector: Detector, frames: Iterator[DetectFrame]) -> list[DetectionResult | None]:
+    return [detector.detect([frame], NO_DEADLINE)[0] for frame in frames]
+
+
+def _unlike(frame: DetectFrame, one: DetectionResult) -> str:
+    header = frame.header
+    expected = (frame.robot, header.session, header.seq, header.t_us, frame.width_px, frame.height_px)
+    named = (one.robot, one.session, one.seq, one.t_us, one.width_px, one.height_px)
+    return "" if named == expected else f"the answer to {expected} names {named}"
+
+
+def _out_of_bounds(result: DetectionResult) -> str:
+    if len(result.detections) > MAX_DETECTIONS:
+        return f"{len(result.detections)} boxes; {MAX_DETECTIONS} is the most"
+    for one in result.detections:
+        if not (0 <= one.x1_px < one.x2_px <= result.width_px and 0 <= one.y1_px < one.y2_px <= result.height_px):
+            return f"a box {one.x1_px:g}, {one.y1_px:g}, {one.x2_px:g}, {one.y2_px:g}"
+        if not 0 <= one.score <= 1:
+            return f"a score of {one.score:g}"
+        if not 0 < len(one.label) <= 64 or not one.label.isprintable():
+            return f"a label {one.label[:80]!r}"
+    return ""
+
+
+def _first_difference(expected: list[DetectionResult | None], found: list[DetectionResult | None]) -> str:
+    for index, (one, other) in enumerate(zip(expected, found, strict=True)):
+        if (one is None) is not (other is None):
+            return f"frame {index} is answered once and once not"
+        if one and other and (what := difference(one.detections, other.detections, _SAME_SCORE)):
+            return f"frame {index}: {what}"
+    return ""
+
+
+def _is_bad(frame: DetectFrame) -> bool:
+    try:
+        frame.picture()
+    except Exception:
+        return True
+    return False  # a decoder fills up what is cut off at the end: that is a picture
+
+
+def drawn_frames(seed: int, count: int, size: tuple[int, int], robot: str = "r1") -> Iterator[DetectFrame]:
+    """Frames of one robot, 33 ms apart, each with a decoder of its own so that all stay valid."""
+    random = Random(seed)
+    for index in range(count):
+        header = FrameHeader(session="0000abcd", seq=index + 1, t_us=5_000_000 + index * _FRAME_US)
+        yield DetectFrame(robot, header, _jpeg(random, size, index), Decoder(*size, _MAX_PIXELS))
+
+
+def _jpeg(random: Random, size: tuple[int, int], index: int = 0) -> bytes:
+    picture = np.full((size[1], size[0], 3), random.randrange(40, 200), np.uint8)
+    if index % 4 == 1:
+        picture = np.random.default_rng(random.randrange(2**31)).integers(0, 256, picture.shape, np.uint8)
+    if index % 4 != 3:
+        _draw(picture, random, (13, 199, 242))
+    for _ in range(random.randrange(4)):
+        _draw(picture, random, tuple(random.randrange(256) for _ in range(3)))
+    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
+
+
+def _draw(picture: np.ndarray, random: Random, colour: tuple[int, ...]) -> None:
+    height, width = picture.shape[:2]
+    x, y, radius = random.randrange(width), random.randrange(height), random.randrange(2, max(3, height // 4))
+    if random.random() < 0.6:
+        cv2.circle(picture, (x, y), radius, colour, -1, cv2.LINE_AA)
+    else:
+        cv2.rectangle(picture, (x - radius, y - radius), (x + radius, y + radius), colour, -1)

@@ -1,0 +1,76 @@
+"""Detectors of one decoded picture, behind the port: who made the result, and how long it took. Shell (a clock)."""
+
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from protocol.config import Config as Settings
+from protocol.errors import WireError
+from vision_side.config import HsvConfig
+from vision_side.decode import Picture
+from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveEye
+from vision_side.detect.hsv import HsvDetector
+from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
+
+MAX_ROBOTS: Final = 64
+"""Whose memory is kept; the robot that was not seen for the longest is forgotten first."""
+_CPU: Final = "cpu"
+
+
+class Hsv:
+    """The colour detector; it remembers nothing from frame to frame."""
+
+    class Config(Settings):
+        """The section `hsv` of vision's configuration, and what its detections are called."""
+
+        hsv: HsvConfig = HsvConfig()
+        label: str = "target"
+
+    def __init__(self, config: Config) -> None:
+        self._eye = HsvDetector(config.hsv, config.label)
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
+        """A result for each; it takes well under a millisecond, whatever the deadline."""
+        return [timed(frame, Maker("hsv", device=_CPU), self._eye.detect) for frame in frames]
+
+
+class Adaptive:
+    """The colour detector that learns the target's colour as it goes, one memory for each robot."""
+
+    Config = AdaptiveConfig
+
+    def __init__(self, config: AdaptiveConfig) -> None:
+        self._config = config
+        self._eyes: OrderedDict[str, tuple[str, AdaptiveEye]] = OrderedDict()
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
+        """A result for each; one takes two or three times as long as by plain colour, whatever the deadline."""
+        return [self._look(frame) for frame in frames]
+
+    def _look(self, frame: DetectFrame) -> DetectionResult | None:
+        eye, t_us = self._eye_of(frame), frame.header.t_us
+        return timed(frame, Maker("adaptive", device=_CPU), lambda picture: eye.detect(picture, t_us))
+
+    def _eye_of(self, frame: DetectFrame) -> AdaptiveEye:
+        session, eye = self._eyes.get(frame.robot, ("", None))
+        if eye is None or session != frame.header.session:
+            eye = AdaptiveEye(self._config)
+        self._eyes[frame.robot] = (frame.header.session, eye)
+        self._eyes.move_to_end(frame.robot)
+        if len(self._eyes) > MAX_ROBOTS:
+            self._eyes.popitem(last=False)
+        return eye
+
+
+def timed(
+    frame: DetectFrame, maker: Maker, look: Callable[[Picture], Sequence[Detection]]
+) -> DetectionResult | None:
+    """What `look` finds in the picture of `frame`, and how long it looked; None for what is no picture."""
+    try:
+        picture = frame.picture()
+    except WireError:
+        return None
+    started_ns = time.perf_counter_ns()
+    found = look(picture)
+    return result_of(frame, found, maker, (time.perf_counter_ns() - started_ns) // 1000)

@@ -1,0 +1,135 @@
+"""The detector `onnx:PATH`: any model that gives boxes, on the CPU or a GPU of this machine. Shell (files, a clock).
+
+Without a path it is the model that comes with Sightline. Before the first frame it has run warm, and shown on a known
+picture that it gives here what it should.
+"""
+
+import hashlib
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+from pydantic import Field
+
+from protocol.config import Config as Settings
+from protocol.errors import ConfigError, HardwareError
+from vision_side.config import Device
+from vision_side.decode import Picture
+from vision_side.detect.golden import KEY, difference, golden_picture, read_golden
+from vision_side.detect.local import timed
+from vision_side.detect.onnx_engine import Engine, open_engine
+from vision_side.detect.onnx_header import OnnxHeader, read_onnx_header
+from vision_side.detect.onnx_reading import fit_picture, form_of, read_outputs
+from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
+from vision_side.detect.refine import refined
+
+SHIPPED: Final = Path(__file__).parent.parent / "models" / "sightline.onnx"
+HASH_DIGITS: Final = 16
+MAX_BYTES: Final = 2**31
+"""A protocol buffer can be no larger."""
+_WARM_UP: Final = 3
+_OTHERWISE: Final = 0.25  # the least score that counts, for a model that does not say
+_NAME_LENGTH: Final = 48
+
+
+class OnnxDetector:
+    """One model."""
+
+    class Config(Settings):
+        """What to run, on what, and what of its answers counts."""
+
+        address: str = ""
+        """The file; empty for the model that comes with Sightline."""
+        device: Device = "auto"
+        threads: Annotated[int, Field(ge=1, le=64)] = 1
+        """Of the CPU. A small picture only loses by being split."""
+        min_score: Annotated[float | None, Field(ge=0, le=1)] = None
+        """None: what the model's metadata say as `min_score`, or else 0.25."""
+        names: Annotated[tuple[str, ...], Field(max_length=1000)] = ()
+        """The labels, in order; empty for those of the model's metadata."""
+        colour: Literal["auto", "bgr", "rgb"] = "auto"
+        """The order of an input's channels; `auto`: bytes are BGR, floats RGB."""
+        refine: Annotated[tuple[str, ...], Field(max_length=64)] = ("ball",)
+        """Things with these labels are round: their edge is looked for in the picture."""
+
+    def __init__(self, config: Config) -> None:
+        """Raises ConfigError for a file that is no such model, HardwareError for a device that is not there."""
+        path = Path(config.address).expanduser() if config.address else SHIPPED
+        data = _bytes_of(path)
+        try:
+            header = read_onnx_header(data)
+            self._form = form_of(header, config.names, config.colour)
+            self._min_score = _least(config.min_score, header)
+            expected = read_golden(header.metadata[KEY]) if KEY in header.metadata else None
+        except ValueError as error:
+            raise ConfigError(f"model {path}: {error}; see docs/detectors.md") from None
+        self._refine = frozenset(config.refine)
+        self._engine = open_engine(path, header, config.device, config.threads)
+        self._news = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
+        digest = hashlib.sha256(data).hexdigest()[:HASH_DIGITS]
+        self.maker = Maker(f"onnx:{path.name}"[:_NAME_LENGTH], digest, self._engine.device)
+        self._failed = False
+        self._warm_up(path, header, config, expected)
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        """A result for each frame for which there is still time."""
+        return [None if time.monotonic_ns() // 1000 > deadline_us else self._look(one) for one in frames]
+
+    def news(self) -> list[str]:
+        """What it runs on, where that is not what one may think; the first failure."""
+        news, self._news = self._news, []
+        return news
+
+    def _look(self, frame: DetectFrame) -> DetectionResult | None:
+        try:
+            return timed(frame, self.maker, self._seen)
+        except Exception as error:  # an engine that fails on a picture gives no answer, and says so once
+            if not self._failed:
+                self._news.append(f"{self.maker.detector} gives no answer: {str(error)[:160]}")
+            self._failed = True
+            return None
+
+    def _seen(self, picture: Picture) -> tuple[Detection, ...]:
+        found = self._run(self._engine, picture)
+        return tuple(refined(picture, one) if one.label in self._refine else one for one in found)
+
+    def _run(self, engine: Engine, picture: Picture) -> tuple[Detection, ...]:
+        pixels, fitting = fit_picture(picture, self._form)
+        return read_outputs(engine.run(pixels), self._form, fitting, picture, self._min_score)
+
+    def _warm_up(self, path: Path, header: OnnxHeader, config: Config, expected: list[Detection] | None) -> None:
+        """Run warm, on the known picture, and compare: with what the model brought, or with itself on the CPU."""
+        picture = Picture(golden_picture(), 1)
+        try:
+            for _ in range(_WARM_UP):
+                found = self._run(self._engine, picture)
+            if expected is None and self._engine.device != "cpu":
+                expected = list(self._run(open_engine(path, header, "cpu", config.threads), picture))
+        except Exception as error:  # whatever an engine raises
+            raise ConfigError(f"model {path} does not run: {' '.join(str(error).split())}"[:200]) from None
+        wrong = difference(expected, found, self._min_score) if expected is not None else ""
+        if wrong:
+            where = f"{self._engine.device} ({self._engine.name})"
+            raise HardwareError(f"model {path.name} on {where} does not give what it should for its test picture: "
+                                f"{wrong}; try --device cpu, or fetch the file again")
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        size = path.stat().st_size
+        if not 0 < size < MAX_BYTES:
+            raise ConfigError(f"model {path} has {size} bytes; an ONNX file has between 1 and {MAX_BYTES}")
+        return path.read_bytes()
+    except OSError as error:
+        why = error.strerror or "it cannot be read"
+        raise ConfigError(f"model {path}: {why}; name an ONNX file, e.g. --detector onnx:ball.onnx") from None
+
+
+def _least(given: float | None, header: OnnxHeader) -> float:
+    if given is not None:
+        return given
+    least = float(header.metadata.get("min_score", _OTHERWISE))
+    if not 0 <= least <= 1:
+        raise ValueError(f"its metadata want a least score of {least:g}; it is between 0 and 1")
+    return least

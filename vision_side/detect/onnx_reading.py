@@ -1,0 +1,195 @@
+"""Pixels into the form that a model takes, and what it gives out into detections. Pure.
+
+Inputs: uint8 rows of pixels (1, H, W, 3), BGR unless told otherwise, or float (1, 3, H, W), RGB as 0..1. Outputs:
+`boxes` (K, 4), `scores` (K), `labels` (K), as Sightline's own; one (N, 6) of x1, y1, x2, y2, score, class; or one
+(4 + classes, N) of cx, cy, w, h and a score for each class, as YOLO gives it, with overlaps still to be removed.
+"""
+
+import ast
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision_side.decode import Picture
+from vision_side.detect.onnx_header import OnnxHeader, Tensor
+from vision_side.detect.port import Detection, clipped
+
+Arrays = Mapping[str, NDArray[Any]]
+MAX_BOXES: Final = 64
+"""The surest so many count."""
+_MAX_ROWS: Final = 100_000
+_MAX_OVERLAP: Final = 0.5
+_GREY: Final = 114  # beside a picture that is narrower or lower than the input; what YOLO was trained with
+_STEP_PX: Final = 32  # an input of any size is rounded up to this
+_TRIPLE: Final = {"boxes", "scores", "labels"}
+_MAX_LABELS: Final = 1000
+_LONGEST_LABEL: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Fitting:
+    """Where the picture lies in the input: `scale` input pixels for each of its own, from (`left`, `top`)."""
+
+    scale: float
+    left: int
+    top: int
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """How one model takes and gives."""
+
+    floats: bool
+    rgb: bool
+    size: tuple[int, int] | None
+    """(rows, columns); None where any will do."""
+    kind: str
+    """triple, rows or yolo."""
+    labels: tuple[str, ...]
+    dtype: str = "uint8"
+
+
+def form_of(header: OnnxHeader, names: Sequence[str], colour: str) -> Form:
+    """Raises ValueError for a model that takes or gives something else."""
+    if len(header.inputs) != 1:
+        raise ValueError(f"it takes {len(header.inputs)} inputs; one picture is what there is")
+    one = header.inputs[0]
+    rows_first, channels_first = one.shape[3:] == (3,), len(one.shape) == 4 and one.shape[1] == 3
+    floats = one.type in ("float32", "float16")
+    if len(one.shape) != 4 or not ((one.type == "uint8" and rows_first) or (floats and channels_first)):
+        raise ValueError(f"its input is {one.type} {_shape_text(one)}; it should be uint8 (1, H, W, 3) or float "
+                         "(1, 3, H, W)")
+    rows, columns = one.shape[1:3] if rows_first and not floats else one.shape[2:4]
+    size = (rows, columns) if rows and columns else None
+    labels = tuple(names) or _labels(header.metadata)
+    return Form(floats, floats if colour == "auto" else colour == "rgb", size, _kind(header.outputs, labels), labels,
+                one.type)
+
+
+def _shape_text(one: Tensor) -> str:
+    return "(" + ", ".join("?" if part is None else str(part) for part in one.shape) + ")"
+
+
+def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> str:
+    if {one.name for one in outputs} >= _TRIPLE:
+        return "triple"
+    if len(outputs) == 1:
+        shape = outputs[0].shape
+        if shape and shape[-1] == 6:
+            return "rows"
+        if len(shape) == 3 and shape[1] is not None and shape[1] > 4 and (not labels or shape[1] == 4 + len(labels)):
+            return "yolo"
+    given = ", ".join(f"{one.name} {_shape_text(one)}" for one in outputs)
+    raise ValueError(f"it gives {given}; it should be boxes, scores and labels, or one (N, 6), or one (4 + classes, N)")
+
+
+def _labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
+    """`labels` is a JSON list; `names`, as others write it, a Python dictionary of numbers."""
+    try:
+        if "labels" in metadata:
+            found = json.loads(metadata["labels"])
+        else:
+            names = ast.literal_eval(metadata.get("names", "{}"))
+            found = [names[index] for index in range(len(names))]
+    except (ValueError, SyntaxError, KeyError, TypeError, RecursionError, MemoryError):
+        raise ValueError("its metadata names no labels: `labels` is a JSON list of words") from None
+    if not isinstance(found, list) or len(found) > _MAX_LABELS:
+        raise ValueError(f"its metadata names no labels: `labels` is a JSON list of at most {_MAX_LABELS} words")
+    return tuple(str(one)[:_LONGEST_LABEL] for one in found)
+
+
+def fit_picture(picture: Picture, form: Form) -> tuple[NDArray[Any], Fitting]:
+    """The input, the picture in its middle, and where it lies there."""
+    bgr: NDArray[Any] = picture.bgr
+    rows, columns = form.size or tuple(-(-one // _STEP_PX) * _STEP_PX for one in bgr.shape[:2])
+    scale = min(rows / bgr.shape[0], columns / bgr.shape[1]) if form.size else 1.0
+    height, width = min(rows, round(bgr.shape[0] * scale)), min(columns, round(bgr.shape[1] * scale))
+    top, left = (rows - height) // 2, (columns - width) // 2
+    if (height, width) != bgr.shape[:2]:
+        bgr = cv2.resize(bgr, (width, height), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    if (height, width) != (rows, columns):
+        bgr = cv2.copyMakeBorder(bgr, top, rows - height - top, left, columns - width - left, cv2.BORDER_CONSTANT,
+                                 value=(_GREY, _GREY, _GREY))
+    if form.rgb:
+        bgr = bgr[..., ::-1]
+    if not form.floats:
+        return np.ascontiguousarray(bgr)[None], Fitting(scale, left, top)
+    planes = np.ascontiguousarray(bgr.transpose(2, 0, 1), dtype=form.dtype)[None]
+    planes /= 255
+    return planes, Fitting(scale, left, top)
+
+
+def read_outputs(
+    outputs: Arrays, form: Form, fitting: Fitting, picture: Picture, min_score: float
+) -> tuple[Detection, ...]:
+    """What the model saw, surest first, in pixels of the encoded picture.
+
+    Raises ValueError for outputs of another shape than the model said. Numbers that are none are no detections.
+    """
+    boxes, scores, labels = _READERS[form.kind](outputs)
+    count = len(boxes)
+    if boxes.shape != (count, 4) or scores.shape != (count,) or labels.shape != (count,):
+        raise ValueError(f"boxes {boxes.shape}, scores {scores.shape}, labels {labels.shape}")
+    good = np.isfinite(boxes).all(axis=1) & np.isfinite(labels) & (scores >= min_score) & (scores <= 1)
+    boxes, scores, labels = boxes[good], scores[good], labels[good]
+    first = np.argsort(-scores, kind="stable")
+    if form.kind == "yolo":
+        first = first[_apart(boxes[first], scores[first])]
+    first = first[:MAX_BOXES]
+    placed = (boxes[first] - [fitting.left, fitting.top] * 2) / fitting.scale * picture.scale
+    height, width = (one * picture.scale for one in picture.bgr.shape[:2])
+    found = (Detection(x1, y1, x2, y2, score, _word(form.labels, label)) for (x1, y1, x2, y2), score, label in
+             zip(placed.tolist(), scores[first].tolist(), labels[first].tolist(), strict=True))
+    return tuple(one for one in (clipped(one, width, height) for one in found) if one is not None)
+
+
+def _word(labels: Sequence[str], label: float) -> str:
+    index = int(label)
+    return labels[index] if 0 <= index < len(labels) else str(index)[:_LONGEST_LABEL]
+
+
+def _triple(outputs: Arrays) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    boxes, scores, labels = (np.asarray(outputs[name], np.float64) for name in ("boxes", "scores", "labels"))
+    boxes = boxes.reshape(-1, 4) if boxes.size % 4 == 0 else boxes
+    return _bounded(boxes), scores.reshape(-1), labels.reshape(-1)
+
+
+def _rows(outputs: Arrays) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    (rows,) = outputs.values()
+    if rows.ndim < 2 or rows.shape[-1] != 6:
+        raise ValueError(f"an output of {rows.shape}")
+    rows = _bounded(rows.reshape(-1, 6).astype(np.float64))
+    return rows[:, :4], rows[:, 4], rows[:, 5]
+
+
+def _yolo(outputs: Arrays) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    (columns,) = outputs.values()
+    if columns.ndim != 3 or columns.shape[0] != 1 or columns.shape[1] <= 4:
+        raise ValueError(f"an output of {columns.shape}")
+    rows = _bounded(columns[0].T).astype(np.float64)
+    half, classes = rows[:, 2:4] / 2, rows[:, 4:]
+    labels = classes.argmax(axis=1)
+    boxes = np.column_stack([rows[:, :2] - half, rows[:, :2] + half])
+    return boxes, classes[np.arange(len(rows)), labels], labels.astype(np.float64)
+
+
+def _bounded(rows: NDArray[Any]) -> NDArray[Any]:
+    if len(rows) > _MAX_ROWS:
+        raise ValueError(f"{len(rows)} boxes; {_MAX_ROWS} is the most")
+    return rows
+
+
+_READERS: Final = {"triple": _triple, "rows": _rows, "yolo": _yolo}
+
+
+def _apart(boxes: NDArray[Any], scores: NDArray[Any]) -> NDArray[np.intp]:
+    """Indices of the boxes that no surer one overlaps."""
+    if not len(boxes):
+        return np.zeros(0, np.intp)
+    corners = np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]])
+    return np.array(cv2.dnn.NMSBoxes(corners.tolist(), scores.tolist(), 0.0, _MAX_OVERLAP), np.intp).reshape(-1)

@@ -1,0 +1,92 @@
+"""Where exactly a ball is that a model drew a box around: its edge, by its own colour, and a circle through it. Pure.
+
+A model's box is a pixel or two off, which is 5 % of a ball's distance; the edge in the picture is not.
+"""
+
+from dataclasses import replace
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision_side.decode import Picture
+from vision_side.detect.disc import Fit, Outline, round_part
+from vision_side.detect.edge import Box, blob_between
+from vision_side.detect.hsv import disc_detection, own_edge
+from vision_side.detect.port import Circle, Detection
+
+_WITHIN: Final = 0.7  # of the box: surely the ball, even where the box is a little off
+_BEYOND: Final = 1.2  # of the box: surely not
+_MARGIN: Final = 0.35  # of the box, around it: where what is not the ball is looked at
+_MARGIN_PX: Final = 5
+_LEAST_RADIUS_PX: Final = 3.0
+_ROUGHNESS: Final = 0.09
+_LEAST_EDGE: Final = 0.4  # of the outline on the circle; the rest may be hidden
+_OFF: Final = 0.4  # radii: a circle further from the box's middle, or so much larger or smaller, is another thing's
+
+
+def refined(picture: Picture, one: Detection) -> Detection:
+    """`one` with the circle and the outline that the picture shows; `one` itself where it shows none."""
+    scale = picture.scale
+    box = np.array([one.x1_px, one.y1_px, one.x2_px, one.y2_px]) / scale
+    around = _around(box, picture.bgr.shape)
+    if around is None:
+        return one
+    rows, columns = around
+    part = picture.bgr[rows, columns]
+    found = _disc(part, box - [columns.start, rows.start] * 2, (columns.start, rows.start), picture.bgr.shape)
+    if found is None:
+        return one
+    exact = disc_detection(found, (one.score, one.label), (columns.start, rows.start), scale)
+    return replace(exact, track_id=one.track_id) if exact.circle and _fits(exact.circle, one) else one
+
+
+def _around(box: NDArray[np.float64], shape: tuple[int, ...]) -> tuple[slice, slice] | None:
+    """Rows and columns of the box with its margin; None for a box with hardly a pixel in it."""
+    x1, y1, x2, y2 = box.tolist()
+    if x2 - x1 < 2 * _LEAST_RADIUS_PX or y2 - y1 < 2 * _LEAST_RADIUS_PX:
+        return None
+    margin = max(_MARGIN_PX, _MARGIN * max(x2 - x1, y2 - y1))
+    rows = slice(max(0, int(y1 - margin)), min(shape[0], int(y2 + margin) + 1))
+    columns = slice(max(0, int(x1 - margin)), min(shape[1], int(x2 + margin) + 1))
+    return rows, columns
+
+
+def _disc(
+    part: NDArray[np.uint8], box: NDArray[np.float64], origin_px: tuple[int, int], shape: tuple[int, ...]
+) -> tuple[Box, Fit, Outline] | None:
+    """Box, circle and edge of the ball, in pixels of `part`."""
+    inside = _ellipse(part, box, _WITHIN)
+    outside = cv2.bitwise_not(_ellipse(part, box, _BEYOND))
+    if not inside.any() or not outside.any():
+        return None
+    blob = blob_between(part, part, inside, outside)
+    if blob is None:
+        return None
+    outlines, _ = cv2.findContours(blob, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline = max(outlines, key=len, default=None)
+    if outline is None:
+        return None
+    bounds = cv2.boundingRect(outline)
+    edge = own_edge(outline, bounds, origin_px, shape)
+    fit = round_part(edge, _LEAST_RADIUS_PX, _ROUGHNESS)
+    return (bounds, *fit) if fit is not None and len(fit[1]) >= _LEAST_EDGE * len(edge) else None
+
+
+def _ellipse(part: NDArray[np.uint8], box: NDArray[np.float64], share: float) -> NDArray[Any]:
+    """255 in the ellipse that fills `share` of the box, to an eighth of a pixel."""
+    x1, y1, x2, y2 = (box * 8).tolist()
+    mask = np.zeros(part.shape[:2], np.uint8)
+    middle = round((x1 + x2) / 2 - 4), round((y1 + y2) / 2 - 4)
+    axes = max(1, round((x2 - x1) / 2 * share)), max(1, round((y2 - y1) / 2 * share))
+    cv2.ellipse(mask, middle, axes, 0, 0, 360, 255, -1, cv2.LINE_8, 3)
+    return mask
+
+
+def _fits(circle: Circle, one: Detection) -> bool:
+    """Whether the circle is of what the model drew its box around."""
+    radius = max(one.x2_px - one.x1_px, one.y2_px - one.y1_px) / 2
+    limit = _OFF * radius
+    return (abs(circle.cx_px - (one.x1_px + one.x2_px) / 2) <= limit
+            and abs(circle.cy_px - (one.y1_px + one.y2_px) / 2) <= limit and abs(circle.radius_px - radius) <= limit)

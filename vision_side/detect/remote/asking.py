@@ -1,0 +1,99 @@
+"""A detector that asks a server about one frame after the other. Shell (the clock, for how long it took)."""
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from protocol.errors import WireError
+from protocol.jpeg import read_jpeg_size
+from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
+from vision_side.detect.remote.refusing import NoAnswerError, Reason, Tally
+
+REMOTE: Final = "remote"
+"""What a result was made on, where the server does not say."""
+LONGEST_WAIT_S: Final = 2.0
+"""For an answer, whatever the deadline: twice the longest that can be configured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a server said of one frame, checked, and who said it."""
+
+    detections: tuple[Detection, ...]
+    maker: Maker
+
+
+class Server(Protocol):
+    """How one kind of server is asked."""
+
+    def ask(self, frame: DetectFrame, until_us: int) -> Answer:
+        """Its answer; blocks until about `until_us`. Raises NoAnswerError for everything else."""
+        ...
+
+    def close(self) -> None:
+        """Let go of its connection."""
+        ...
+
+
+class Asking:
+    """A `Detector`, over one server. It may block for longer than the deadline: see `ByDeadline` for who must not."""
+
+    def __init__(self, name: str, server: Server) -> None:
+        self._server = server
+        self._tally = Tally(name)
+
+    @property
+    def refused(self) -> Counter[str]:
+        """What was refused so far, by reason."""
+        return self._tally.refused
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        """As the port says."""
+        return [self._one(frame, deadline_us) for frame in frames]
+
+    def news(self) -> list[str]:
+        """What a person may want to know, since the last time."""
+        return self._tally.news.take()
+
+    def close(self) -> None:
+        """Let go of the server."""
+        self._server.close()
+
+    def _one(self, frame: DetectFrame, deadline_us: int) -> DetectionResult | None:
+        began_us = now_us()
+        try:
+            _check_picture(frame)
+            answer = self._server.ask(frame, deadline_us)
+            ended_us = now_us()
+            if ended_us > deadline_us:
+                raise NoAnswerError(Reason.LATE, f"{(ended_us - deadline_us) / 1000:.0f} ms after the deadline")
+        except WireError as error:  # of pixels that were asked for
+            self._tally.refuse(NoAnswerError(Reason.BAD_PICTURE, error.detail))
+            return None
+        except NoAnswerError as error:
+            self._tally.refuse(error)
+            return None
+        self._tally.good()
+        return result_of(frame, answer.detections, answer.maker, ended_us - began_us)
+
+
+def _check_picture(frame: DetectFrame) -> None:
+    """Bytes go on undecoded, so that they are a picture of the right size is seen from their head alone."""
+    try:
+        size = read_jpeg_size(frame.jpeg, frame.width_px * frame.height_px)
+    except WireError as error:
+        raise NoAnswerError(Reason.BAD_PICTURE, error.detail) from None
+    if (size.width_px, size.height_px) != (frame.width_px, frame.height_px):
+        raise NoAnswerError(Reason.BAD_PICTURE, f"the frame is {size.width_px}x{size.height_px}")
+
+
+def left_s(until_us: int) -> float:
+    """What is left until then, 0 if nothing is; bounded for who has no deadline."""
+    return min(max(0, until_us - now_us()) / 1e6, LONGEST_WAIT_S)
+
+
+def now_us() -> int:
+    """This machine's monotonic clock, that of deadlines."""
+    return time.monotonic_ns() // 1000

@@ -1,0 +1,125 @@
+"""Newest only, by the deadline: any detector asked on a thread of its own, and not waited for any longer. Shell.
+
+Whatever hangs in there (a name server, a socket, a model) hangs alone. While it is busy, newer frames replace each
+other in one place; an answer that comes too late is nobody's.
+"""
+
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from typing import Annotated, Final
+
+from pydantic import Field
+
+from protocol.transports.link import LatestSlot, Link
+from vision_side.decode import Decoder
+from vision_side.detect.around import attach_detector, close_detector, news_of
+from vision_side.detect.port import DetectFrame, DetectionResult, Detector
+from vision_side.detect.remote.asking import LONGEST_WAIT_S, left_s, now_us
+
+Results = list[DetectionResult | None]
+PixelBound = Annotated[int, Field(ge=256, le=4096 * 4096)]
+MAX_PIXELS: Final = 1920 * 1080
+RAISED: Final = "RAISED"
+"""Counted beside what the inner detector refuses: it raised, which no detector should."""
+MAX_DECODERS: Final = 256
+"""Security limit: of decoders kept, one for each robot and place in a batch."""
+_CLOSE_S: Final = 1.0
+
+
+class Pending:
+    """Frames that were asked about, and the place where their results will be."""
+
+    def __init__(self, frames: Sequence[DetectFrame], deadline_us: int) -> None:
+        self.frames, self.deadline_us = frames, deadline_us
+        self._place: LatestSlot[Results] = LatestSlot()
+
+    def answer(self, results: Results) -> None:
+        """They are there."""
+        self._place.put(results)
+
+    def take(self, wait: bool) -> Results | None:
+        """The results, once; None if they are not there, with `wait` by the deadline."""
+        return self._place.take(left_s(self.deadline_us) if wait else 0.0)
+
+    @property
+    def over(self) -> bool:
+        """Whether the deadline has passed."""
+        return now_us() > self.deadline_us
+
+
+class ByDeadline:
+    """A `Detector` over another one, which is used on one thread only and closed there."""
+
+    def __init__(self, inner: Detector, max_pixels: int = MAX_PIXELS) -> None:
+        """Security limit: pictures of more than `max_pixels` are not decoded."""
+        self._inner = inner
+        self._max_pixels = max_pixels
+        self._decoders: dict[tuple[str, int], Decoder] = {}
+        self._raised: Counter[str] = Counter()
+        self._asked: LatestSlot[Pending | None] = LatestSlot()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="detector", daemon=True)
+        self._thread.start()
+
+    @property
+    def refused(self) -> Counter[str]:
+        """What the inner one refused, if it counts that, and how often it raised."""
+        return Counter(getattr(self._inner, "refused", Counter())) + self._raised
+
+    @property
+    def overtaken(self) -> int:
+        """How often newer frames took the place of older ones that nobody had looked at."""
+        return self._asked.dropped
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
+        """As the port says."""
+        results = self.ask(frames, deadline_us).take(wait=True) if frames else []
+        return [None for _ in frames] if results is None else results
+
+    def ask(self, frames: Sequence[DetectFrame], deadline_us: int) -> Pending:
+        """Begin to ask about `frames`, in place of any that wait."""
+        pending = Pending(frames, deadline_us)
+        self._asked.put(pending)
+        return pending
+
+    def attach(self, link: Link) -> None:
+        """Give the inner one a robot's link."""
+        attach_detector(self._inner, link)
+
+    def news(self) -> list[str]:
+        """What the inner one has to say."""
+        return news_of(self._inner)
+
+    def close(self) -> None:
+        """End the thread; one that hangs is left behind."""
+        self._ending.set()
+        self._asked.put(None)
+        self._thread.join(_CLOSE_S)
+
+    def _work(self) -> None:
+        while not self._ending.is_set():
+            pending = self._asked.take(LONGEST_WAIT_S)
+            if pending is not None and not pending.over:
+                self._answer(pending)
+        close_detector(self._inner)
+
+    def _answer(self, pending: Pending) -> None:
+        try:
+            frames = [self._own(one, at) for at, one in enumerate(pending.frames)]
+            results = self._inner.detect(frames, pending.deadline_us)
+        except Exception:  # a plug-in's fault must not end the thread: nobody would ever be answered again
+            self._raised[RAISED] += 1
+            results = [None] * len(pending.frames)
+        if not pending.over:
+            pending.answer(results)
+
+    def _own(self, frame: DetectFrame, at: int) -> DetectFrame:
+        """The same frame with a decoder of this thread: pixels of the other one may be replaced while it looks."""
+        decoder = self._decoders.get((frame.robot, at))
+        if decoder is None or decoder.size_px != (frame.width_px, frame.height_px):
+            if len(self._decoders) >= MAX_DECODERS:
+                self._decoders.clear()
+            decoder = Decoder(frame.width_px, frame.height_px, self._max_pixels)
+            self._decoders[frame.robot, at] = decoder
+        return DetectFrame(frame.robot, frame.header, frame.jpeg, decoder)

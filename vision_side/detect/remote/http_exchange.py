@@ -1,0 +1,152 @@
+"""HTTP/1.1 to one server over one kept connection: bounded in time and bytes. Shell.
+
+Nothing is unpacked, nothing is followed: a redirect, a compressed body and a body over the limit are refused. The
+standard library's own client waits anew for every byte that drips in; here one deadline holds for the whole exchange.
+"""
+
+import http.client
+import io
+import socket
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final
+
+from vision_side.detect.remote.asking import left_s, now_us
+from vision_side.detect.remote.refusing import NoAnswerError, Reason
+
+MAX_ANSWER_BYTES: Final = 1 << 20
+"""Security limit: 1024 rows of boxes as JSON are a tenth of it."""
+RETRY_US: Final = 200_000
+"""A server that could not be reached is tried again this much later: often enough to be back well within a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """A status of 200 with these headers (names in lower case) and this body."""
+
+    headers: Mapping[str, str]
+    body: bytes
+
+
+class HttpExchange:
+    """One server. Not for several threads."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._host, self._port = host, port
+        self._socket: socket.socket | None = None
+        self._not_before_us = 0
+        self.connections = 0
+        """How often a connection was made: who counts them knows when the server may have become another."""
+
+    def get(self, path: str, until_us: int) -> Reply:
+        """Raises NoAnswerError as `post` does."""
+        return self._exchange("GET", self._head("GET", path, {}, 0), b"", until_us)
+
+    def post(self, path: str, headers: Mapping[str, str], body: bytes, until_us: int) -> Reply:
+        """Raises NoAnswerError: LATE, UNREACHABLE, REFUSED (any status but 200), TOO_LARGE, ENCODED, MALFORMED."""
+        return self._exchange("POST", self._head("POST", path, headers, len(body)), body, until_us)
+
+    def close(self) -> None:
+        """Let go of the connection; the next exchange makes another."""
+        if self._socket is not None:
+            with suppress(OSError):
+                self._socket.close()
+        self._socket = None
+
+    def _head(self, method: str, path: str, headers: Mapping[str, str], length: int) -> bytes:
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        lines = [f"{method} {path} HTTP/1.1", f"Host: {host}:{self._port}", "Accept-Encoding: identity",
+                 f"Content-Length: {length}", *(f"{name}: {value}" for name, value in headers.items())]
+        return ("\r\n".join(lines) + "\r\n\r\n").encode("ascii")
+
+    def _exchange(self, method: str, head: bytes, body: bytes, until_us: int) -> Reply:
+        """Over the kept connection; once more over a new one if the server had let go of that meanwhile."""
+        kept = self._socket is not None
+        try:
+            return self._once(method, head, body, until_us)
+        except NoAnswerError as error:
+            self.close()
+            if not kept or error.reason is not Reason.UNREACHABLE:
+                raise
+        try:
+            return self._once(method, head, body, until_us)
+        except NoAnswerError:
+            self.close()
+            raise
+
+    def _once(self, method: str, head: bytes, body: bytes, until_us: int) -> Reply:
+        try:
+            connection = self._socket or self._connect(until_us)
+            connection.settimeout(_left_s(until_us))
+            connection.sendall(head + body)
+            return self._read(connection, method, until_us)
+        except TimeoutError:
+            raise NoAnswerError(Reason.LATE, "nothing, or not all of it, by the deadline") from None
+        except http.client.RemoteDisconnected:
+            raise NoAnswerError(Reason.UNREACHABLE, "it ended the connection") from None
+        except OSError as error:
+            raise self._unreachable(error) from None
+        except (http.client.HTTPException, ValueError) as error:
+            raise NoAnswerError(Reason.MALFORMED, f"not HTTP: {type(error).__name__}: {error}") from None
+
+    def _connect(self, until_us: int) -> socket.socket:
+        if now_us() < self._not_before_us:
+            raise NoAnswerError(Reason.UNREACHABLE, f"{self._host}:{self._port} is tried again in a moment")
+        connection = socket.create_connection((self._host, self._port), _left_s(until_us))
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = connection
+        self.connections += 1
+        return connection
+
+    def _unreachable(self, error: OSError) -> NoAnswerError:
+        if self._socket is None:
+            self._not_before_us = now_us() + RETRY_US
+        why = error.strerror or str(error) or type(error).__name__
+        return NoAnswerError(Reason.UNREACHABLE, f"{self._host}:{self._port}: {why}; does the server run there?")
+
+    def _read(self, connection: socket.socket, method: str, until_us: int) -> Reply:
+        source: Any = _Timed(connection, until_us)
+        with http.client.HTTPResponse(source, method=method) as response:
+            response.begin()
+            encoding = response.headers.get("Content-Encoding", "identity").strip().lower()
+            if encoding not in ("", "identity"):
+                raise NoAnswerError(Reason.ENCODED, f"Content-Encoding {encoding[:20]!r}, where none was asked for")
+            if (response.length or 0) > MAX_ANSWER_BYTES:
+                raise NoAnswerError(Reason.TOO_LARGE, f"{response.length} bytes, at most {MAX_ANSWER_BYTES}")
+            body = response.read(MAX_ANSWER_BYTES + 1)
+            if len(body) > MAX_ANSWER_BYTES:
+                raise NoAnswerError(Reason.TOO_LARGE, f"an answer of more than {MAX_ANSWER_BYTES} bytes")
+            if response.length:
+                raise NoAnswerError(Reason.UNREACHABLE, f"it went away {response.length} bytes before the end")
+            if response.status != http.client.OK:
+                raise NoAnswerError(Reason.REFUSED, f"status {response.status}: {body[:80].decode('utf-8', 'replace')}")
+            if response.will_close or not response.isclosed():
+                self.close()
+            return Reply({name.lower(): value for name, value in response.headers.items()}, body)
+
+
+class _Timed(io.RawIOBase):
+    """What a response reads from: each read waits no longer than is left for the whole."""
+
+    def __init__(self, connection: socket.socket, until_us: int) -> None:
+        self._connection, self._until_us = connection, until_us
+
+    def makefile(self, _mode: str) -> io.BufferedReader:
+        """As a socket does."""
+        return io.BufferedReader(self)
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any, /) -> int:
+        self._connection.settimeout(_left_s(self._until_us))
+        return int(self._connection.recv_into(buffer))
+
+
+def _left_s(until_us: int) -> float:
+    """Raises TimeoutError when nothing is left: a timeout of 0 would mean something else to a socket."""
+    left = left_s(until_us)
+    if left <= 0:
+        raise TimeoutError
+    return left

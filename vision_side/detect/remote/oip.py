@@ -1,0 +1,210 @@
+"""The Open Inference Protocol, version 2, without a network: models, tensors, and what is made of an answer. Pure.
+
+Specification: https://github.com/kserve/open-inference-protocol (JSON over HTTP, gRPC), with Triton's binary tensors. A
+model that can be used here takes one input, a JPEG (datatype BYTES) or its pixels (UINT8, three channels), and gives
+`boxes` (K, 4) xyxy in pixels of what it was given, `scores` (K) and, if it knows several things, `labels` (K).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision_side.detect.port import DetectFrame, Detection
+from vision_side.detect.remote.boxes_read import MIN_SCORE, read_columns
+from vision_side.detect.remote.refusing import NoAnswerError, Reason
+
+NUMBERS: Final = {"FP16": "<f2", "FP32": "<f4", "FP64": "<f8", "UINT8": "u1", "INT8": "i1", "INT16": "<i2",
+                  "UINT16": "<u2", "INT32": "<i4", "UINT32": "<u4", "INT64": "<i8", "UINT64": "<u8", "BOOL": "?"}
+MAX_DIMENSIONS: Final = 6
+MAX_ELEMENTS: Final = 1 << 20
+"""Security limit: of one tensor; the answer as a whole is bounded in bytes before it is read."""
+MAX_TENSORS: Final = 16
+BOXES, SCORES, LABELS = "boxes", "scores", "labels"
+_CHANNELS: Final = 3
+_MAX_SIDE: Final = 8192
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """One input or output of a model, as its metadata says: -1 is any size."""
+
+    name: str
+    datatype: str
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """What is known of a model: how it is asked, and which outputs it is asked for."""
+
+    name: str
+    version: str
+    input: Slot
+    outputs: tuple[str, ...]
+
+    def title(self, scheme: str) -> str:
+        """What its results say that they are of: servers tell a version, and no hash."""
+        return f"{scheme}:{self.name[:40]}" + (f" {self.version[:8]}" if self.version else "")
+
+    @property
+    def takes_jpeg(self) -> bool:
+        """Whether it decodes by itself."""
+        return self.input.datatype == "BYTES"
+
+
+@dataclass(frozen=True, slots=True)
+class Tensor:
+    """One tensor to send: little-endian bytes, as the binary extension and gRPC's raw contents have it."""
+
+    name: str
+    datatype: str
+    shape: tuple[int, ...]
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Looking:
+    """How an answer is read: names of labels that are numbers, the least score; and in which order colours go."""
+
+    labels: tuple[str, ...] = ()
+    min_score: float = MIN_SCORE
+    rgb: bool = False
+
+
+def model_of(name: str, version: str, inputs: Sequence[Slot], outputs: Sequence[Slot]) -> Model:
+    """The model, if it can be used here. Raises NoAnswerError UNFIT with what it lacks."""
+    if len(inputs) != 1:
+        raise _unfit(name, f"it takes {len(inputs)} inputs, one picture is given")
+    one, given = inputs[0], {slot.name for slot in outputs}
+    if one.datatype not in ("BYTES", "UINT8"):
+        raise _unfit(name, f"its input is {one.datatype}; BYTES (a JPEG) or UINT8 (pixels) is given")
+    if one.datatype == "UINT8" and (len(one.shape) not in (3, 4) or _layout(one.shape) is None):
+        raise _unfit(name, f"its input of shape {list(one.shape)} is no picture of three channels")
+    if one.datatype == "BYTES" and len(one.shape) not in (1, 2):
+        raise _unfit(name, f"its input of shape {list(one.shape)} is not one JPEG")
+    missing = {BOXES, SCORES} - given
+    if missing:
+        raise _unfit(name, f"it gives {', '.join(sorted(given)) or 'nothing'}; {' and '.join(sorted(missing))} missing")
+    wanted = (BOXES, SCORES, LABELS) if LABELS in given else (BOXES, SCORES)
+    return Model(name, version, one, wanted)
+
+
+def _unfit(name: str, why: str) -> NoAnswerError:
+    return NoAnswerError(Reason.UNFIT, f"model {name!r}: {why}; see docs/remote-detectors.md")
+
+
+def _layout(shape: tuple[int, ...]) -> tuple[int, int, bool] | None:
+    """(rows, columns, channels first) of one picture; None if nothing of it is three channels."""
+    last = shape[-3:]
+    if last[2] == _CHANNELS:
+        return last[0], last[1], False
+    return (last[1], last[2], True) if last[0] == _CHANNELS else None
+
+
+def tensor_of(model: Model, frame: DetectFrame, rgb: bool) -> tuple[Tensor, tuple[float, float]]:
+    """What is sent for `frame`, and what turns the answer's pixels into those of the encoded picture.
+
+    Raises WireError where pixels are asked for and the JPEG has none.
+    """
+    one = model.input
+    if model.takes_jpeg:
+        data = len(frame.jpeg).to_bytes(4, "little") + frame.jpeg
+        return Tensor(one.name, one.datatype, (1,) * len(one.shape), data), (1.0, 1.0)
+    pixels = _fitted(frame.picture().bgr, one.shape, rgb)
+    rows, columns = pixels.shape[:2]
+    stretch = frame.width_px / columns, frame.height_px / rows
+    laid = pixels.transpose(2, 0, 1) if (_layout(one.shape) or (0, 0, False))[2] else pixels
+    shape = (1,) * (len(one.shape) - 3) + laid.shape
+    return Tensor(one.name, one.datatype, shape, laid.tobytes()), stretch
+
+
+def _fitted(bgr: NDArray[np.uint8], shape: tuple[int, ...], rgb: bool) -> NDArray[Any]:
+    """The pixels at the size that the model takes, if it takes only one."""
+    rows, columns, _ = _layout(shape) or (-1, -1, False)
+    rows, columns = (rows if rows > 0 else bgr.shape[0]), (columns if columns > 0 else bgr.shape[1])
+    if max(rows, columns) > _MAX_SIDE:
+        raise NoAnswerError(Reason.UNFIT, f"its input is {columns}x{rows} pixels, at most {_MAX_SIDE} a side")
+    fitted: NDArray[Any] = bgr
+    if fitted.shape[:2] != (rows, columns):
+        fitted = cv2.resize(bgr, (columns, rows), interpolation=cv2.INTER_AREA)
+    return fitted[:, :, ::-1] if rgb else fitted
+
+
+# --- answers -----------------------------------------------------------------------------------------------------
+
+
+def read_number_tensor(datatype: str, shape: Sequence[int], data: bytes) -> NDArray[Any]:
+    """A tensor of numbers from its bytes. Raises NoAnswerError if they do not fit together."""
+    kind = NUMBERS.get(datatype)
+    if kind is None:
+        raise NoAnswerError(Reason.MALFORMED, f"a tensor of datatype {datatype[:20]!r}")
+    count = elements_of(shape)
+    if len(data) != count * np.dtype(kind).itemsize:
+        raise NoAnswerError(Reason.MALFORMED, f"{len(data)} bytes for a {datatype} tensor of shape {list(shape)}")
+    return np.frombuffer(data, kind).reshape(tuple(shape))
+
+
+def read_text_tensor(shape: Sequence[int], data: bytes) -> list[str]:
+    """A tensor of BYTES: for each element its length as four little-endian bytes, then itself."""
+    texts, at = [], 0
+    for _ in range(elements_of(shape)):
+        end = at + 4 + int.from_bytes(data[at : at + 4], "little")
+        if at + 4 > len(data) or end > len(data):
+            raise NoAnswerError(Reason.MALFORMED, "a BYTES tensor is cut short")
+        texts.append(data[at + 4 : end].decode("utf-8", "replace"))
+        at = end
+    if at != len(data):
+        raise NoAnswerError(Reason.MALFORMED, f"{len(data) - at} bytes too many in a BYTES tensor")
+    return texts
+
+
+def elements_of(shape: Sequence[int]) -> int:
+    """How many there are in a tensor of `shape`. Raises NoAnswerError for a shape that none has, or of too many."""
+    if len(shape) > MAX_DIMENSIONS or any(not 0 <= size <= MAX_ELEMENTS for size in shape):
+        raise NoAnswerError(Reason.MALFORMED, f"a tensor of shape {list(shape)[:MAX_DIMENSIONS]}")
+    count = math.prod(shape)
+    if count > MAX_ELEMENTS:
+        raise NoAnswerError(Reason.TOO_MANY, f"a tensor of {count} elements, at most {MAX_ELEMENTS}")
+    return count
+
+
+def detections_of(
+    outputs: Mapping[str, NDArray[Any] | list[str]], looking: Looking, stretch: tuple[float, float],
+    size_px: tuple[int, int],
+) -> tuple[Detection, ...]:
+    """What an answer's tensors say. Raises NoAnswerError for a missing or misshapen one."""
+    boxes, scores = (_numbers(outputs, name) for name in (BOXES, SCORES))
+    boxes = boxes.reshape(boxes.shape[-2:]) if boxes.ndim > 2 and math.prod(boxes.shape[:-2]) == 1 else boxes
+    scores = _flat(scores)
+    labels = _labels(outputs.get(LABELS), len(scores) if scores.ndim else 0, looking.labels)
+    return read_columns(boxes.astype(np.float64), scores.astype(np.float64), labels, stretch=stretch, size_px=size_px,
+                        min_score=looking.min_score)
+
+
+def _numbers(outputs: Mapping[str, NDArray[Any] | list[str]], name: str) -> NDArray[Any]:
+    found = outputs.get(name)
+    if not isinstance(found, np.ndarray):
+        raise NoAnswerError(Reason.MALFORMED, f"no numbers called {name!r} in the answer")
+    return found
+
+
+def _flat(column: NDArray[Any]) -> NDArray[Any]:
+    """(1, K) and (K, 1) as (K)."""
+    return column.reshape(-1) if column.ndim > 1 and sum(size != 1 for size in column.shape) < 2 else column
+
+
+def _labels(found: NDArray[Any] | list[str] | None, rows: int, names: tuple[str, ...]) -> list[str]:
+    """Texts as they are, numbers by their names; one that has no name is named by its number."""
+    if found is None:
+        return [names[0] if names else "target"] * rows
+    if isinstance(found, list):
+        return found
+    numbers = _flat(found)
+    if numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer):
+        raise NoAnswerError(Reason.MALFORMED, f"labels of shape {numbers.shape} and type {numbers.dtype}")
+    return [names[number] if 0 <= number < len(names) else str(number) for number in numbers.tolist()]

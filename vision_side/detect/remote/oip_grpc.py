@@ -1,0 +1,95 @@
+"""`oip+grpc://HOST/MODEL`: a model of an inference server over gRPC; needs the extra `grpc`. Shell."""
+
+from typing import Any, Final
+
+from protocol.errors import ConfigError
+from vision_side.detect.port import DetectFrame, Maker
+from vision_side.detect.remote.address import Address, parse_address
+from vision_side.detect.remote.asking import REMOTE, Answer, Asking, left_s
+from vision_side.detect.remote.by_deadline import ByDeadline
+from vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES
+from vision_side.detect.remote.oip import Looking, Model, detections_of, tensor_of
+from vision_side.detect.remote.oip_messages import (
+    INFER,
+    METADATA,
+    infer_request,
+    metadata_request,
+    read_infer,
+    read_metadata,
+)
+from vision_side.detect.remote.oip_settings import OipSettings
+from vision_side.detect.remote.refusing import NoAnswerError, Reason
+
+_OPTIONS: Final = (
+    ("grpc.max_receive_message_length", MAX_ANSWER_BYTES),  # security limit, of what is unpacked too
+    ("grpc.initial_reconnect_backoff_ms", 100),
+    ("grpc.min_reconnect_backoff_ms", 100),
+    ("grpc.max_reconnect_backoff_ms", 500),  # its own default waits up to two minutes for a server that is back
+    ("grpc.enable_http_proxy", 0),
+    ("grpc.enable_retries", 0),
+)
+_REASONS: Final = {"DEADLINE_EXCEEDED": Reason.LATE, "UNAVAILABLE": Reason.UNREACHABLE,
+                   "RESOURCE_EXHAUSTED": Reason.TOO_LARGE, "INTERNAL": Reason.MALFORMED}
+
+
+class GrpcServer:
+    """A `Server`. What the model is like is asked again after every call that failed."""
+
+    def __init__(self, address: Address, looking: Looking) -> None:
+        """Raises ConfigError without grpcio."""
+        try:
+            import grpc
+        except ImportError:
+            raise ConfigError("grpcio is not installed: pip install 'sightline[grpc]', or use oip+http://") from None
+        host = f"[{address.host}]" if ":" in address.host else address.host
+        self._failed = grpc.RpcError
+        self._channel = grpc.insecure_channel(f"{host}:{address.port}", options=_OPTIONS)
+        self._calls = {path: self._channel.unary_unary(path) for path in (METADATA, INFER)}
+        self._address, self._looking = address, looking
+        self._model: Model | None = None
+
+    def ask(self, frame: DetectFrame, until_us: int) -> Answer:
+        """As `Server` says."""
+        model = self._known_model(until_us)
+        tensor, stretch = tensor_of(model, frame, self._looking.rgb)
+        number = f"{frame.header.session}-{frame.header.seq}"
+        data = self._call(INFER, infer_request(model, self._address.version, tensor, number), until_us)
+        found = detections_of(read_infer(data, number), self._looking, stretch, (frame.width_px, frame.height_px))
+        return Answer(found, Maker(model.title(self._address.scheme), device=REMOTE))
+
+    def close(self) -> None:
+        """End the channel."""
+        self._channel.close()
+
+    def _known_model(self, until_us: int) -> Model:
+        if self._model is None:
+            request = metadata_request(self._address.model, self._address.version)
+            self._model = read_metadata(self._call(METADATA, request, until_us))
+        return self._model
+
+    def _call(self, path: str, request: bytes, until_us: int) -> bytes:
+        left = left_s(until_us)
+        if left <= 0:
+            raise NoAnswerError(Reason.LATE, "nothing is left of the deadline")
+        try:
+            answer: bytes = self._calls[path](request, timeout=left)
+        except self._failed as error:
+            self._model = None
+            raise _no_answer(error) from None
+        return answer
+
+
+def _no_answer(error: Any) -> NoAnswerError:
+    code = getattr(error.code(), "name", "UNKNOWN")
+    return NoAnswerError(_REASONS.get(code, Reason.REFUSED), f"{code}: {error.details()}")
+
+
+class OipGrpc(ByDeadline):
+    """The detector `oip+grpc://HOST[:PORT]/MODEL[/VERSION]`."""
+
+    Config = OipSettings
+
+    def __init__(self, config: OipSettings) -> None:
+        """Raises ConfigError for an address that is none, or without grpcio. Connects with the first frame."""
+        server = GrpcServer(parse_address(config.address), config.looking())
+        super().__init__(Asking(config.address, server), config.max_pixels)

@@ -1,0 +1,57 @@
+"""`oip+http://HOST/MODEL`: a model of an inference server (Triton, OpenVINO Model Server) over HTTP. Shell."""
+
+from vision_side.detect.port import DetectFrame, Maker
+from vision_side.detect.remote.address import Address, parse_address
+from vision_side.detect.remote.asking import REMOTE, Answer, Asking
+from vision_side.detect.remote.by_deadline import ByDeadline
+from vision_side.detect.remote.http_exchange import HttpExchange
+from vision_side.detect.remote.oip import Looking, Model, detections_of, tensor_of
+from vision_side.detect.remote.oip_json import HEADER_LENGTH, infer_body, read_infer, read_metadata
+from vision_side.detect.remote.oip_settings import OipSettings
+
+
+class HttpServer:
+    """A `Server`. What the model is like is asked again over each new connection: it may have become another."""
+
+    def __init__(self, address: Address, looking: Looking) -> None:
+        self._http = HttpExchange(address.host, address.port)
+        version = f"/versions/{address.version}" if address.version else ""
+        self._path = f"/v2/models/{address.model}{version}"
+        self._looking = looking
+        self._scheme = address.scheme
+        self._model: Model | None = None
+        self._asked_at = 0
+        """The connection over which the model was asked for."""
+
+    def ask(self, frame: DetectFrame, until_us: int) -> Answer:
+        """As `Server` says."""
+        model = self._known_model(until_us)
+        tensor, stretch = tensor_of(model, frame, self._looking.rgb)
+        number = f"{frame.header.session}-{frame.header.seq}"
+        length, body = infer_body(model, tensor, number)
+        reply = self._http.post(f"{self._path}/infer", {HEADER_LENGTH: str(length)}, body, until_us)
+        outputs = read_infer(reply.body, reply.headers.get(HEADER_LENGTH.lower()), number)
+        found = detections_of(outputs, self._looking, stretch, (frame.width_px, frame.height_px))
+        return Answer(found, Maker(model.title(self._scheme), device=REMOTE))
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        self._http.close()
+
+    def _known_model(self, until_us: int) -> Model:
+        if self._model is None or self._asked_at != self._http.connections:
+            self._model = None
+            self._model = read_metadata(self._http.get(self._path, until_us).body)
+            self._asked_at = self._http.connections
+        return self._model
+
+
+class OipHttp(ByDeadline):
+    """The detector `oip+http://HOST[:PORT]/MODEL[/VERSION]`."""
+
+    Config = OipSettings
+
+    def __init__(self, config: OipSettings) -> None:
+        """Raises ConfigError for an address that is none. Nothing is connected before the first frame."""
+        server = HttpServer(parse_address(config.address), config.looking())
+        super().__init__(Asking(config.address, server), config.max_pixels)

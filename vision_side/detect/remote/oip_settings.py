@@ -1,0 +1,29 @@
+"""What is configured of a model that is asked by the Open Inference Protocol, over HTTP and gRPC alike. Pure."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from protocol.config import Config as Settings
+from vision_side.config import Fraction
+from vision_side.detect.remote.boxes_read import MAX_LABEL, MIN_SCORE
+from vision_side.detect.remote.by_deadline import MAX_PIXELS, PixelBound
+from vision_side.detect.remote.oip import Looking
+
+Label = Annotated[str, Field(min_length=1, max_length=MAX_LABEL)]
+
+
+class OipSettings(Settings):
+    """The detectors `oip+http` and `oip+grpc`."""
+
+    address: str
+    labels: Annotated[tuple[Label, ...], Field(max_length=1024)] = ()
+    """Names of labels that the model gives as numbers, from 0 on."""
+    min_score: Fraction = MIN_SCORE
+    order: Literal["bgr", "rgb"] = "bgr"
+    """Of the colours, where the model takes pixels."""
+    max_pixels: PixelBound = MAX_PIXELS
+
+    def looking(self) -> Looking:
+        """How its answers are read."""
+        return Looking(self.labels, self.min_score, self.order == "rgb")

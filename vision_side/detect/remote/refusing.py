@@ -1,0 +1,79 @@
+"""Why a remote detector gave no answer that counts: one list, one exception, one tally. Pure."""
+
+from collections import Counter, deque
+from enum import StrEnum
+from typing import Final
+
+_LONGEST: Final = 160
+MAX_NEWS: Final = 16
+"""Lines kept for who asks for them seldom; the oldest go first."""
+_TOLD_AT: Final = frozenset(10**power for power in range(10))
+"""A server gone bad is told at the 1st, 10th, 100th ... refusal of a kind, and when it is good again."""
+
+
+class Reason(StrEnum):
+    """What is counted. All of them mean "no answer": none of them moves the robot."""
+
+    LATE = "LATE"  # not there by the deadline
+    UNREACHABLE = "UNREACHABLE"  # nobody there, or gone in the middle of it
+    REFUSED = "REFUSED"  # it answered with an error of its own
+    TOO_LARGE = "TOO_LARGE"  # more bytes than any answer needs
+    ENCODED = "ENCODED"  # compressed, which was not asked for; never unpacked
+    MALFORMED = "MALFORMED"  # not the protocol: grammar, type, shape
+    NOT_FINITE = "NOT_FINITE"  # a box or score that is no number
+    TOO_MANY = "TOO_MANY"  # more boxes than any scene has
+    OTHER_FRAME = "OTHER_FRAME"  # it names another frame than the one it was asked about
+    OTHER_SIZE = "OTHER_SIZE"  # it looked at a picture of another size
+    UNFIT = "UNFIT"  # its model takes or gives what this end does not speak
+    BAD_PICTURE = "BAD_PICTURE"  # the robot's own frame is none: nobody was asked
+
+
+class NoAnswerError(Exception):
+    """There is no answer that counts; `detail` is one line for a person."""
+
+    def __init__(self, reason: Reason, detail: str) -> None:
+        self.reason = reason
+        self.detail = " ".join(detail.split())[:_LONGEST]
+        super().__init__(f"{reason}: {self.detail}")
+
+
+class News:
+    """Lines for a person, until somebody takes them; may be added to on another thread."""
+
+    def __init__(self) -> None:
+        self._lines: deque[str] = deque(maxlen=MAX_NEWS)
+
+    def add(self, line: str) -> None:
+        """One line."""
+        self._lines.append(line)
+
+    def take(self) -> list[str]:
+        """All since the last time."""
+        lines = []
+        while self._lines:
+            lines.append(self._lines.popleft())
+        return lines
+
+
+class Tally:
+    """Counts what was refused of one remote, and says so where that is news."""
+
+    def __init__(self, name: str) -> None:
+        self.refused: Counter[str] = Counter()
+        self.news = News()
+        self._name = name
+        self._said = ""
+
+    def refuse(self, error: NoAnswerError) -> None:
+        """Count it."""
+        self.refused[error.reason] += 1
+        count = self.refused[error.reason]
+        if self._said != error.reason and (self._said in ("", "good") or count in _TOLD_AT):
+            self._said = error.reason
+            self.news.add(f"detector {self._name}: no answer: {error.reason}: {error.detail} ({count} so far)")
+
+    def good(self) -> None:
+        """An answer that counts."""
+        if self._said != "good":
+            before, self._said = self._said, "good"
+            self.news.add(f"detector {self._name} answers" + (" again" if before else ""))

@@ -1,0 +1,182 @@
+"""A second detector beside the driving one: it looks at the same frames and never steers, until it is promoted. Shell.
+
+It has a thread and a decoder of its own and sees the newest frame only, so it delays no answer: only while a promotion
+takes effect may one frame wait for what it is looking at.
+"""
+
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from protocol.transports.link import Link
+from vision_side.decode import Decoder
+from vision_side.detect.agreement import Agreement
+from vision_side.detect.around import attach_detector, close_detector, news_of
+from vision_side.detect.checking import checked
+from vision_side.detect.port import DetectFrame, DetectionResult, Detector
+
+MAX_ROBOTS: Final = 64
+_PATIENCE_US: Final = 1_000_000
+"""The shadow's own deadline: it holds nobody up."""
+_FRESH_US: Final = 3_000_000
+"""Who has not answered for longer is not fit to drive."""
+_MAX_NEWS: Final = 16
+_MAX_DECODERS: Final = 8
+_END_S: Final = 2.0
+
+
+@dataclass(slots=True)
+class _Pair:
+    """What is known of one robot."""
+
+    session: str
+    agreement: Agreement
+    promoted: bool = False
+    answered_us: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """A frame, and what the driving detector answered."""
+
+    frame: DetectFrame
+    result: DetectionResult | None
+    promoted: bool
+
+
+class Shadowed:
+    """A detector that drives, and one that could."""
+
+    def __init__(self, driving: Detector, shadow: Detector, name: str, max_pixels: int) -> None:
+        self._eyes = (driving, shadow)
+        self._locks = (threading.Lock(), threading.Lock())  # one caller at a time, also while they change places
+        self._name = name
+        self._max_pixels = max_pixels
+        self._pairs: OrderedDict[str, _Pair] = OrderedDict()
+        self._decoders: OrderedDict[tuple[int, int], Decoder] = OrderedDict()
+        self._news: deque[str] = deque(maxlen=_MAX_NEWS)
+        self._tasks: OrderedDict[str, _Task] = OrderedDict()
+        self._bell = threading.Condition()
+        self._ending = False
+        self._thread = threading.Thread(target=self._work, name="shadow detector", daemon=True)
+        self._thread.start()
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        """What the driving detector of each frame's robot sees; the other one gets the frames afterwards."""
+        results: list[DetectionResult | None] = [None] * len(frames)
+        for promoted in (False, True):
+            mine = [index for index, one in enumerate(frames) if self._pair(one).promoted is promoted]
+            if mine:
+                answers = self._ask(promoted, [frames[index] for index in mine], deadline_us)
+                for index, answer in zip(mine, answers, strict=True):
+                    results[index] = answer
+        for frame, result in zip(frames, results, strict=True):
+            self._put(_Task(frame, result, self._pair(frame).promoted))
+        return results
+
+    def attach(self, link: Link) -> None:
+        """Give both a robot's link."""
+        for one in self._eyes:
+            attach_detector(one, link)
+
+    def promote(self, robot: str, shadow: bool) -> str:
+        """Let the shadow drive, or no longer; returns why it may not, empty if it does from the next frame on."""
+        pair = self._pairs.get(robot)
+        if pair is None:
+            return "no frame of this robot came yet"
+        if shadow and not pair.promoted and not self._is_fit(pair):
+            return f"{self._name} does not answer, so it cannot drive"
+        if pair.promoted is not shadow:
+            pair.promoted = shadow
+            pair.agreement, pair.answered_us = Agreement(), None
+        return ""
+
+    def shadow_text(self, robot: str) -> str:
+        """Who looks on, and how often it sees the same."""
+        pair = self._pairs.get(robot)
+        agreement = pair.agreement if pair else Agreement()
+        share = f"{agreement.share:.0%} agree" if agreement.compared else "no answer yet"
+        return f"{'promoted; ' if pair and pair.promoted else ''}shadow {share}"
+
+    def news(self) -> list[str]:
+        """Where the two disagree, at most every few seconds, and what both have to say."""
+        lines = [line for eye in self._eyes for line in news_of(eye)]
+        while self._news:
+            lines.append(self._news.popleft())
+        return lines
+
+    def close(self) -> None:
+        """End the thread, then close both."""
+        with self._bell:
+            self._ending = True
+            self._bell.notify()
+        self._thread.join(_END_S)
+        for eye in self._eyes:
+            close_detector(eye)
+
+    def _ask(self, shadow: bool, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        with self._locks[shadow]:
+            return self._eyes[shadow].detect(frames, deadline_us)
+
+    def _pair(self, frame: DetectFrame) -> _Pair:
+        """A robot that starts anew keeps who drives it; what was counted begins anew."""
+        pair = self._pairs.get(frame.robot)
+        if pair is None:
+            pair = _Pair(frame.header.session, Agreement())
+        elif pair.session != frame.header.session:
+            pair.session, pair.agreement = frame.header.session, Agreement()
+        self._pairs[frame.robot] = pair
+        self._pairs.move_to_end(frame.robot)
+        if len(self._pairs) > MAX_ROBOTS:
+            self._pairs.popitem(last=False)
+        return pair
+
+    def _is_fit(self, pair: _Pair) -> bool:
+        return pair.answered_us is not None and _now_us() - pair.answered_us <= _FRESH_US
+
+    def _put(self, task: _Task) -> None:
+        """The newest frame of each robot waits; an older one that was not looked at yet is left out."""
+        with self._bell:
+            self._tasks[task.frame.robot] = task
+            if len(self._tasks) > MAX_ROBOTS:
+                self._tasks.popitem(last=False)
+            self._bell.notify()
+
+    def _work(self) -> None:
+        while True:
+            with self._bell:
+                self._bell.wait_for(lambda: self._tasks or self._ending)
+                if self._ending:
+                    return
+                _, task = self._tasks.popitem(last=False)
+            try:
+                self._compare(task)
+            except Exception as error:  # a plug-in's own fault, which must not end the shadow for good
+                self._news.append(f"{self._name} failed: {type(error).__name__}: {error}"[:160])
+
+    def _compare(self, task: _Task) -> None:
+        frame = self._own(task.frame)
+        answer = self._ask(not task.promoted, [frame], _now_us() + _PATIENCE_US)[0]
+        pair = self._pairs.get(frame.robot)
+        if answer is None or pair is None or pair.promoted is not task.promoted:
+            return
+        answer, pair.answered_us = checked(frame, answer), _now_us()
+        line = pair.agreement.add(task.result, answer) if task.result is not None else ""
+        if line:
+            self._news.append(f"shadow: {line}")
+
+    def _own(self, frame: DetectFrame) -> DetectFrame:
+        """The frame with a decoder of this thread's, since the other's pixels are being replaced."""
+        size = (frame.width_px, frame.height_px)
+        decoder = self._decoders.pop(size, None) or Decoder(*size, self._max_pixels)
+        self._decoders[size] = decoder
+        if len(self._decoders) > _MAX_DECODERS:
+            self._decoders.popitem(last=False)
+        return DetectFrame(frame.robot, frame.header, frame.jpeg, decoder)
+
+
+def _now_us() -> int:
+    return time.monotonic_ns() // 1000

@@ -1,0 +1,256 @@
+"""A detector for many robots: their newest frames in, boxes out, as one batch for whatever is waiting. Shell.
+
+    sightline detector --serve onnx:ball.onnx --device cuda --connect tcp/192.168.1.20:7447
+
+It drives nothing and returns no credit: boxes name the frame in which they were found, and a vision that steers by
+them (`--detector zenoh`) answers that frame. What it is and how it fares is told to whoever asks (`sightline robots`).
+"""
+
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from pydantic import ValidationError
+
+from protocol.channels import DETECTIONS, FRAME
+from protocol.codec import decode, encode
+from protocol.errors import WireError
+from protocol.jpeg import read_jpeg_size
+from protocol.messages import (
+    MAX_DETECTED_BOXES,
+    DetectedBox,
+    DetectedCircle,
+    Detections,
+    DetectionsHeader,
+    Echo,
+    FrameHeader,
+)
+from protocol.transports.link import LatestSlot, Link, Message
+from vision_side.config import VisionConfig
+from vision_side.decode import Decoder
+from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
+from vision_side.detector_turns import Tally, Turn, Turns
+from vision_side.service import ends_on_signal
+
+ROLE: Final = "detector"
+_WAIT_S: Final = 0.2
+_AGES: Final = 512
+"""Ages kept for the percentile; some seconds of a busy service."""
+_SMOOTHING: Final = 0.2
+_LOOK_AT_LOAD_S: Final = 5.0
+_OVERLOAD: Final = 0.1
+"""Share of frames that go unanswered, from which on it is said that there are too many."""
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Serving:
+    """How it serves."""
+
+    name: str
+    deadline_us: int = 100_000
+    """From a frame's arrival to its boxes; later they are of no use, so they are not sent."""
+    max_batch: int = 16
+    max_pixels: int = 1920 * 1080
+
+
+class Site(Protocol):
+    """Where robots are met."""
+
+    def robots(self) -> list[str]:
+        """Ids of all heard so far."""
+        ...
+
+    def on_news(self, callback: Callable[[], None]) -> None:
+        """Call `callback` when another one is heard."""
+        ...
+
+    def link(self, robot: str) -> Link:
+        """A link to one of them."""
+        ...
+
+
+def run(config: VisionConfig, detector: Detector, serving: Serving) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code 0. Raises ConfigError, LinkError as `open_site` does."""
+    from protocol.transports.zenoh_log import refusals_told
+    from protocol.transports.zenoh_site import open_site
+
+    ending, services = threading.Event(), list[DetectorService]()
+    with refusals_told(config.listen, config.secure, lambda line: _say(f"detector: {line}")):
+        opened = open_site(
+            config.robot, listen=config.listen, connect=config.connect, role=ROLE, secure=config.secure,
+            max_frame_bytes=config.max_frame_bytes,
+            about=lambda: services[0].about() if services else f"{serving.name}: starts",
+        )
+        with opened as site, ends_on_signal(ending):
+            services.append(DetectorService(site, detector, serving, _say))
+            where = ", ".join([*config.connect, *(f"{one} (listening)" for one in config.listen)])
+            _say(f"detector: {serving.name} for robots {config.robot} at {where}")
+            services[0].serve(ending)
+    return 0
+
+
+class DetectorService:
+    """One detector, a place for the newest frame of each robot, and turns. Frames arrive on the site's threads."""
+
+    def __init__(self, site: Site, detector: Detector, serving: Serving, say: Say) -> None:
+        self._site, self._detector, self._serving, self._say = site, detector, serving, say
+        self._turns: Turns[Message] = Turns(serving.max_batch, serving.deadline_us)
+        self._guard = threading.Lock()
+        self._bell: LatestSlot[bool] = LatestSlot()
+        self._links: dict[str, Link] = {}
+        self._decoders: dict[str, Decoder] = {}
+        self._session = secrets.token_hex(4)
+        self._said = 0
+        self._each_us = 0.0
+        self._ages_us: deque[int] = deque(maxlen=_AGES)
+        self._maker = ("", "")
+        self._looked_at_load_s = time.monotonic()
+        self._load_before = (0, 0)
+        self._overloaded = False
+        site.on_news(lambda: self._bell.put(True))
+
+    def serve(self, ending: threading.Event) -> None:
+        """Until `ending` is set."""
+        while not ending.is_set():
+            if not self.turn():
+                self._bell.take(_WAIT_S)
+            self._look_at_load(time.monotonic())
+        self._say(f"detector: ended; {self.about()}")
+
+    def turn(self) -> bool:
+        """Welcome who is new, then look at one batch; False if nothing waited."""
+        for robot in self._site.robots():
+            if robot not in self._links:
+                self._welcome(robot)
+        with self._guard:
+            batch = self._turns.take(_now_us(), int(self._each_us))
+        if batch:
+            self._look(batch)
+        return bool(batch)
+
+    def tallies(self) -> dict[str, Tally]:
+        """What became of each robot's frames."""
+        with self._guard:
+            return dict(self._turns.tallies)
+
+    def about(self) -> str:
+        """Model, device and health in one line, for whoever asks."""
+        served, dropped = self._totals()
+        ages = sorted(self._ages_us.copy())
+        age = f", p95 age {ages[int(len(ages) * 0.95)] / 1000:.0f} ms" if ages else ""
+        model, device = self._maker
+        what = self._serving.name + (f" {model}" if model else "") + (f" on {device}" if device else "")
+        state = "overloaded, " if self._overloaded else ""
+        return f"{what}: {state}{len(self._links)} robots, {served} frames answered, {dropped} dropped{age}"
+
+    def _totals(self) -> tuple[int, int]:
+        tallies = self.tallies().values()
+        return sum(one.served for one in tallies), sum(one.dropped for one in tallies)
+
+    def _welcome(self, robot: str) -> None:
+        link = self._links[robot] = self._site.link(robot)
+
+        def heard(message: Message) -> None:
+            with self._guard:
+                self._turns.offer(robot, message, _now_us())
+            self._bell.put(True)
+
+        link.subscribe(FRAME, heard)
+        self._say(f"detector: looks at the pictures of {robot}")
+
+    def _look(self, batch: list[Turn[Message]]) -> None:
+        began_us = _now_us()
+        frames = [(turn, frame) for turn in batch if (frame := self._frame(turn)) is not None]
+        if not frames:
+            return
+        deadline_us = min(turn.arrived_us for turn, _ in frames) + self._serving.deadline_us
+        results = self._detector.detect([frame for _, frame in frames], deadline_us)
+        ended_us = _now_us()
+        each_us = (ended_us - began_us) / len(frames)
+        self._each_us += (each_us - self._each_us) * (_SMOOTHING if self._each_us else 1.0)
+        for (turn, frame), result in zip(frames, results, strict=True):
+            self._answer(turn, frame, result, ended_us - began_us)
+
+    def _frame(self, turn: Turn[Message]) -> DetectFrame | None:
+        """What the detector is given; None, counted, for what is no frame."""
+        jpeg = turn.item.payload
+        try:
+            header = decode(FrameHeader, turn.item.header)
+            size = read_jpeg_size(jpeg, self._serving.max_pixels)
+        except WireError:
+            self._tally(turn).refused += 1
+            return None
+        decoder = self._decoders.get(turn.robot)
+        if decoder is None or decoder.size_px != (size.width_px, size.height_px):
+            decoder = self._decoders[turn.robot] = Decoder(size.width_px, size.height_px, self._serving.max_pixels)
+        return DetectFrame(turn.robot, header, jpeg, decoder)
+
+    def _answer(self, turn: Turn[Message], frame: DetectFrame, result: DetectionResult | None, took_us: int) -> None:
+        tally, age_us = self._tally(turn), _now_us() - turn.arrived_us
+        payload = _payload(result)
+        if payload is None or result is None:
+            tally.refused += 1
+            return
+        if age_us > self._serving.deadline_us:
+            tally.late += 1
+            return
+        self._said += 1
+        stamp = _stamp(frame.header, self._session, self._said, took_us)
+        self._links[turn.robot].publish(DETECTIONS, stamp, payload, ROLE)
+        tally.served += 1
+        self._ages_us.append(age_us)
+        self._maker = (result.model_hash[:8], result.device)
+
+    def _tally(self, turn: Turn[Message]) -> Tally:
+        return self._turns.tallies[turn.robot]
+
+    def _look_at_load(self, now_s: float) -> None:
+        """Say so when more comes than it can look at, and when that is over."""
+        if now_s - self._looked_at_load_s < _LOOK_AT_LOAD_S:
+            return
+        now, before = self._totals(), self._load_before
+        self._looked_at_load_s, self._load_before = now_s, now
+        served, dropped = now[0] - before[0], now[1] - before[1]
+        overloaded = dropped > _OVERLOAD * (served + dropped)
+        if overloaded != self._overloaded:
+            self._overloaded = overloaded
+            self._say(f"detector: {'more frames than it can look at' if overloaded else 'keeps up again'}: {served} "
+                      f"answered, {dropped} dropped in {_LOOK_AT_LOAD_S:.0f} s")
+
+
+def _payload(result: DetectionResult | None) -> bytes | None:
+    """The boxes as the wire has them; None for no answer, and for a plug-in's that cannot be said."""
+    if result is None:
+        return None
+    try:
+        boxes = tuple(_box(one) for one in result.detections[:MAX_DETECTED_BOXES])
+        said = Detections(width_px=result.width_px, height_px=result.height_px, boxes=boxes, detector=result.detector,
+                          device=result.device, model=result.model_hash)
+    except ValidationError:
+        return None
+    return encode(said)
+
+
+def _box(one: Detection) -> DetectedBox:
+    circle = one.circle
+    ring = DetectedCircle(cx_px=circle.cx_px, cy_px=circle.cy_px, radius_px=circle.radius_px) if circle else None
+    return DetectedBox(label=one.label, score=one.score, x1_px=one.x1_px, y1_px=one.y1_px, x2_px=one.x2_px,
+                       y2_px=one.y2_px, circle=ring, track=one.track_id)
+
+
+def _stamp(frame: FrameHeader, session: str, seq: int, compute_us: int) -> bytes:
+    echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
+    return encode(DetectionsHeader(source=ROLE, session=session, seq=seq, echo=echo, compute_us=compute_us))
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+def _now_us() -> int:
+    return time.monotonic_ns() // 1000

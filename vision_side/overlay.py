@@ -1,0 +1,225 @@
+"""Draws what vision saw over the picture it saw it in: axes, outline, raw and filtered centroid, words. Pure."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.messages import CameraModel, FrameHeader, Twist
+from vision_side.detect.port import Detection
+from vision_side.pipeline import Seen
+
+Image = NDArray[np.uint8]
+Point = tuple[float, float]
+Colour = tuple[int, int, int]
+
+AXES: Final = (210, 210, 210)
+OUTLINE: Final = (255, 230, 0)
+TARGET: Final = (80, 235, 80)
+OTHER: Final = (170, 170, 60)
+RAW: Final = (70, 110, 255)
+FILTERED: Final = (255, 120, 255)
+WORDS: Final = (255, 255, 255)
+_FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
+_FONT_PER_WIDTH: Final = 0.48 / 640  # about sixty letters from edge to edge
+_STRIP_SHADE: Final = 0.35  # what is left of the picture under words, so that they can be read on anything
+_LINE_PER_FONT: Final = 40  # pixels from line to line where letters have the size 1
+_GAP: Final = "    "
+_FAR_PX: Final = 9e3  # OpenCV draws in 16 bits
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What is told of one frame.
+
+    `radius_m` is the target's, for where the track says that its middle is; `age_us` is the least that the frame's age
+    can be, where the robot has not measured one.
+    """
+
+    header: FrameHeader
+    seen: Seen
+    twist: Twist | None
+    mission: str
+    camera: CameraModel
+    radius_m: float
+    age_us: int | None = None
+
+
+def draw_overlay(picture: Image, shown: Shown, width_px: int) -> Image:
+    """`picture`, of any size, made `width_px` wide, with everything drawn over it."""
+    camera = shown.camera
+    height_px = max(1, round(width_px * camera.height_px / camera.width_px))
+    canvas = _resized(picture, width_px, height_px)
+    scale = width_px / camera.width_px
+    cv2.line(canvas, (width_px // 2, 0), (width_px // 2, height_px - 1), AXES, 1)
+    cv2.line(canvas, (0, height_px // 2), (width_px - 1, height_px // 2), AXES, 1)
+    target = shown.seen.target
+    for one in shown.seen.detections:
+        if one is not target:
+            _draw_other(canvas, one, scale)
+    if target is not None:
+        _draw_target(canvas, target, scale)
+    filtered = filtered_px(shown)
+    if filtered is not None:
+        cv2.drawMarker(canvas, _at(filtered, scale), FILTERED, cv2.MARKER_DIAMOND, 31, 2, cv2.LINE_AA)
+    font = width_px * _FONT_PER_WIDTH
+    _write_strip(canvas, [_what_it_does(shown)], font, top=True)
+    _write_strip(canvas, [_where_it_is(target, filtered), _what_it_commands(shown)], font, top=False)
+    return canvas
+
+
+def draw_preview(picture: Image, width_px: int) -> Image:
+    """`picture` made `width_px` wide, or left as it is where it is smaller."""
+    height, width = picture.shape[:2]
+    if width <= width_px:
+        return picture
+    return _resized(picture, width_px, max(1, round(width_px * height / width)))
+
+
+def raw_px(target: Detection) -> Point:
+    """The middle of what was found: of its circle, else of its box."""
+    if target.circle is not None:
+        return target.circle.cx_px, target.circle.cy_px
+    return (target.x1_px + target.x2_px) / 2, (target.y1_px + target.y2_px) / 2
+
+
+def radius_px(target: Detection) -> float:
+    """Of the circle; of what has none, that of a disc of the box's area."""
+    if target.circle is not None:
+        return target.circle.radius_px
+    return math.sqrt(max(0.0, (target.x2_px - target.x1_px) * (target.y2_px - target.y1_px)) / math.pi)
+
+
+def filtered_px(shown: Shown) -> Point | None:
+    """Where the track says that the target's middle is, in pixels of the encoded picture; None if not in front."""
+    seen, camera = shown.seen, shown.camera
+    if seen.bearing_rad is None or seen.distance_m is None:
+        return None
+    forward, left = (seen.distance_m * part for part in (math.cos(seen.bearing_rad), math.sin(seen.bearing_rad)))
+    up = shown.radius_m - camera.z_m
+    tilt_cos, tilt_sin = math.cos(camera.pitch_rad), math.sin(camera.pitch_rad)
+    ahead, down = forward * tilt_cos + up * tilt_sin, forward * tilt_sin - up * tilt_cos
+    if not (math.isfinite(ahead) and ahead > 0.01):  # behind the lens there are no pixels
+        return None
+    across_px, down_px = camera.cx_px - camera.fx_px * left / ahead, camera.cy_px + camera.fy_px * down / ahead
+    # A mission that says no height goes by floor things of any: in sight, what was found says how high it is.
+    return across_px, raw_px(seen.target)[1] if seen.target is not None else down_px
+
+
+def _resized(picture: Image, width_px: int, height_px: int) -> Image:
+    shrinks = picture.shape[1] > width_px
+    way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.ascontiguousarray(cv2.resize(picture, (width_px, height_px), interpolation=way), np.uint8)
+
+
+def _draw_other(canvas: Image, one: Detection, scale: float) -> None:
+    first, second = _at((one.x1_px, one.y1_px), scale), _at((one.x2_px, one.y2_px), scale)
+    cv2.rectangle(canvas, first, second, OTHER, 1)
+    _outlined(canvas, f"{_plain(one.label)} {one.score:.2f}", (first[0] + 3, first[1] + 13), 0.4, OTHER)
+
+
+def _draw_target(canvas: Image, target: Detection, scale: float) -> None:
+    if target.outline_px is not None and len(target.outline_px):
+        points = np.round(np.asarray(target.outline_px) * scale).astype(np.int32)
+        for point in points.reshape(-1, 2):
+            cv2.circle(canvas, (int(point[0]), int(point[1])), 1, OUTLINE, -1)
+    if target.circle is not None:
+        cv2.circle(canvas, _at(raw_px(target), scale), max(1, round(radius_px(target) * scale)), TARGET, 1, cv2.LINE_AA)
+    else:
+        corners = (target.x1_px, target.y1_px), (target.x2_px, target.y2_px)
+        cv2.rectangle(canvas, _at(corners[0], scale), _at(corners[1], scale), TARGET, 2)
+    cv2.drawMarker(canvas, _at(raw_px(target), scale), RAW, cv2.MARKER_CROSS, 19, 2, cv2.LINE_AA)
+
+
+def _at(point: Point, scale: float) -> tuple[int, int]:
+    """A place on the canvas; what is far outside or no number stays where drawing it costs nothing."""
+    across, down = (-_FAR_PX if math.isnan(value) else min(max(value * scale, -_FAR_PX), _FAR_PX) for value in point)
+    return round(across), round(down)
+
+
+# --- words -------------------------------------------------------------------------------------------------------
+
+Words = Sequence[tuple[str, Colour]]
+
+
+def _what_it_does(shown: Shown) -> Words:
+    seen, header = shown.seen, shown.header
+    told = [f"{shown.mission}: {seen.phase}" if shown.mission else seen.phase]
+    told += [f"{seen.distance_m:.2f} m"] if seen.distance_m is not None else []
+    told += [f"{math.degrees(seen.bearing_rad):+.1f} deg"] if seen.bearing_rad is not None else []
+    told += [seen.note] if seen.note else []
+    return [(f"frame {header.seq}  age {_age_text(shown)}", WORDS), (_GAP.join(told), WORDS)]
+
+
+def _age_text(shown: Shown) -> str:
+    """From capture to accepted command, the robot's own measure; while it obeys nothing, what is known here."""
+    if shown.header.latency_us is not None:
+        return f"{shown.header.latency_us / 1000:.0f} ms"
+    return "?" if shown.age_us is None else f">= {shown.age_us / 1000:.0f} ms"
+
+
+def _where_it_is(target: Detection | None, filtered: Point | None) -> Words:
+    parts: list[tuple[str, Colour]] = []
+    if target is not None:
+        x, y = raw_px(target)
+        parts.append((f"raw {x:.1f}, {y:.1f}", RAW))
+    if filtered is not None:
+        parts.append((f"filtered {filtered[0]:.1f}, {filtered[1]:.1f}", FILTERED))
+    if target is not None:
+        parts.append((f"radius {radius_px(target):.1f} px", TARGET))
+    return parts or [("nothing found", WORDS)]
+
+
+def _what_it_commands(shown: Shown) -> Words:
+    twist, applied = shown.twist, shown.header.applied
+    command = "no command" if twist is None else f"twist {_twist_text((twist.linear_mps, twist.angular_rad_s))}"
+    return [(command, WORDS), (f"wheels {_twist_text(applied)}", WORDS)]
+
+
+def _twist_text(twist: tuple[float, float]) -> str:
+    return f"{twist[0]:+.2f} m/s {twist[1]:+.2f} rad/s"
+
+
+def _write_strip(canvas: Image, lines: Sequence[Words], font: float, *, top: bool) -> None:
+    height = round(_LINE_PER_FONT * font)
+    band = canvas[: height + 6] if top else canvas[-(height * len(lines) + 6) :]
+    band[:] = cv2.convertScaleAbs(band, alpha=_STRIP_SHADE)
+    start = 0 if top else canvas.shape[0] - len(band)
+    for number, words in enumerate(lines):
+        _write_line(canvas, words, start + height * (number + 1) - 2, font)
+
+
+def _write_line(canvas: Image, words: Words, y_px: int, font: float) -> None:
+    x_px, end_px = 8, canvas.shape[1] - 8
+    for text, colour in words:
+        plain = _fitting(_plain(text), end_px - x_px, font)
+        cv2.putText(canvas, plain, (x_px, y_px), _FONT, font, colour, 1, cv2.LINE_AA)
+        x_px += _width(plain + _GAP, font)
+
+
+def _fitting(text: str, room_px: int, font: float) -> str:
+    """As much of `text` as there is room for."""
+    if _width(text, font) <= room_px:
+        return text
+    while text and _width(text + "...", font) > room_px:
+        text = text[:-1]
+    return text + "..." if text else ""
+
+
+def _width(text: str, font: float) -> int:
+    size: Any = cv2.getTextSize(text, _FONT, font, 1)[0]
+    return int(size[0])
+
+
+def _plain(text: str) -> str:
+    """The font has ASCII only."""
+    return "".join(letter if " " <= letter <= "~" else "?" for letter in text)
+
+
+def _outlined(canvas: Image, text: str, at: tuple[int, int], font: float, colour: Colour) -> None:
+    for shade, thickness in (((0, 0, 0), 3), (colour, 1)):
+        cv2.putText(canvas, text, at, _FONT, font, shade, thickness, cv2.LINE_AA)

@@ -1,0 +1,99 @@
+"""Finds a plug-in by its name and checks what it is configured with: missions and detectors alike. Shell (imports).
+
+Names are those of a built-in table, those of a group of entry points, or, from a configuration or a command line only,
+`package.module:Name`. A plug-in's `Config` that has a section of vision's configuration by name and type (`target`,
+`hsv`, `boxes`) begins with that section; its options lie over it.
+"""
+
+import difflib
+import importlib
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import BaseModel, ValidationError
+
+from protocol.errors import ConfigError
+from vision_side.config import VisionConfig
+
+LONGEST_DETAIL: Final = 160
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """One kind of plug-in: what it is called, what is built in, who else may be installed."""
+
+    noun: str
+    built_in: Mapping[str, str]
+    group: str
+
+    def names(self) -> list[str]:
+        """Every name that `load` knows here."""
+        return sorted({*self.built_in, *(entry.name for entry in entry_points(group=self.group))})
+
+    def load(self, kind: str) -> Any:
+        """What is called `kind`. Raises ConfigError, one line, for an unknown one (nearest named) and a broken one."""
+        where = self.built_in.get(kind)
+        others = {} if where else {entry.name: entry for entry in entry_points(group=self.group)}
+        try:
+            if kind in others:
+                return others[kind].load()
+            if where is not None or ":" in kind:
+                return _imported(where or kind)
+        except Exception as error:  # whatever a plug-in's own import raises
+            raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {error}"[:LONGEST_DETAIL]) from None
+        names = self.names()
+        nearest = difflib.get_close_matches(kind, names, n=1)
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        raise ConfigError(f"no {self.noun} called {kind!r}{hint}; there are {', '.join(names)}, or package.module:Name")
+
+    def settings(self, kind: str, plugin: Any, options: Mapping[str, Any], config: VisionConfig) -> Any:
+        """The checked `Config` of `plugin`. Raises ConfigError, one line, for a wrong option."""
+        settings = settings_model(plugin)
+        if settings is None:
+            raise ConfigError(f"{self.noun} {kind!r}: {plugin!r} has no pydantic model called Config; see "
+                              f"docs/{self.noun}s.md")
+        try:
+            return settings.model_validate(_merged(settings, options, config))
+        except ValidationError as error:
+            raise ConfigError(f"{self.noun} {kind!r}: {_problem(settings, error)}"[:LONGEST_DETAIL]) from None
+
+
+def settings_model(plugin: Any) -> type[BaseModel] | None:
+    """The class's own `Config`."""
+    settings = getattr(plugin, "Config", None)
+    return settings if isinstance(settings, type) and issubclass(settings, BaseModel) else None
+
+
+def _merged(settings: type[BaseModel], options: Mapping[str, Any], config: VisionConfig) -> dict[str, Any]:
+    """The sections of vision's configuration that the plug-in shares, with its options laid over them."""
+    merged: dict[str, Any] = dict(options)
+    for name, field in settings.model_fields.items():
+        section = getattr(config, name, None)
+        if not isinstance(section, BaseModel) or field.annotation is not type(section):
+            continue
+        given = options.get(name, {})
+        merged[name] = section.model_dump() | dict(given) if isinstance(given, Mapping) else given
+    return merged
+
+
+def _problem(settings: type[BaseModel], error: ValidationError) -> str:
+    """A misspelt option before a missing one: it is usually both."""
+    problems = sorted(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden")
+    first = problems[0]
+    where = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"unknown option {where!r}; it takes {', '.join(settings.model_fields) or 'none'}"
+    if first["type"] == "missing":
+        return f"option {where!r} is missing"
+    return f"option {where!r}: {first['msg']}"
+
+
+def _imported(path: str) -> Any:
+    if str(Path.cwd()) not in sys.path:  # a class of one's own lies where vision is started
+        sys.path.insert(0, str(Path.cwd()))
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)

@@ -1,0 +1,171 @@
+"""Shows people what vision sees: `overlay` and `preview`, only while somebody watches, newest only. Shell (a thread).
+
+The twist never waits for it: a frame is handed over after its answer is out, as the JPEG that came, and a thread of low
+priority decodes, draws and encodes. Nobody watches: one question to the link a frame, and no thread.
+"""
+
+import os
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import simplejpeg
+from numpy.typing import NDArray
+
+from protocol.channels import OVERLAY, PREVIEW, Channel
+from protocol.codec import encode
+from protocol.messages import CameraModel, DetectionsHeader, Echo, FrameHeader
+from protocol.robot_clock import RobotClock
+from protocol.transports.link import LatestSlot, Link
+from vision_side.config import VisionConfig
+from vision_side.decode import Decoder
+from vision_side.overlay import Shown, draw_overlay, draw_preview
+from vision_side.pace import Pace
+from vision_side.pipeline import SOURCE, Answer
+
+IDLE_S: Final = 2.0
+"""Without anything to show for this long the thread ends; the next frame that is watched starts another."""
+KEPT: Final = 4
+"""Frames whose answer comes later, from somebody else's eyes: a detector that is further behind is not shown."""
+NO_PICTURE: Final = "no picture"
+"""The phase of what vision refused to decode; it is not decoded here either."""
+_NICE: Final = 10  # of this thread: answering the next frame comes first
+_QUALITIES_BELOW: Final = (50, 30)
+"""Tried where a picture is over the channel's bound, before it is left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """One frame to show, and where."""
+
+    shown: Shown
+    jpeg: bytes
+    channels: tuple[Channel, ...]
+    started_ns: int
+
+
+class Viewing:
+    """What one vision shows of one robot."""
+
+    def __init__(self, config: VisionConfig, link: Link, tell: Callable[[str, str], None]) -> None:
+        """`tell` prints a line (about what, the line) if it changed."""
+        self._config, self._link, self._tell = config, link, tell
+        self._paces = {OVERLAY: Pace(config.viewing.overlay_hz), PREVIEW: Pace(config.viewing.preview_hz)}
+        self._kept: deque[tuple[FrameHeader, bytes]] = deque(maxlen=KEPT)
+        self._jobs: LatestSlot[_Job] = LatestSlot()
+        self._starting = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._session = secrets.token_hex(4)
+        self._seqs = {OVERLAY: 0, PREVIEW: 0}
+        self._decoder: Decoder | None = None
+        self._clock = RobotClock()
+
+    def keep(self, header: FrameHeader, jpeg: bytes) -> None:
+        """Remember a frame whose answer comes later."""
+        if any(self._link.has_listener(channel) for channel in self._paces):
+            self._kept.append((header, jpeg))
+        else:
+            self._kept.clear()
+
+    def show(
+        self, header: FrameHeader, answer: Answer, mission: str, camera: CameraModel | None, *, started_ns: int,
+        jpeg: bytes | None = None,
+    ) -> None:
+        """Show an answered frame to who watches, if it is time; without `jpeg` one that was kept."""
+        now_us = time.monotonic_ns() // 1000
+        self._clock.hear(header.session, header.t_us, now_us)
+        channels = tuple(
+            channel for channel, pace in self._paces.items() if self._link.has_listener(channel) and pace.is_due(now_us)
+        )
+        if not channels:
+            return
+        jpeg = jpeg if jpeg is not None else self._kept_of(header)
+        if jpeg is None or camera is None or answer.seen.phase == NO_PICTURE:
+            return
+        shown = Shown(header, answer.seen, answer.twist, mission, camera, self._config.target.radius_m,
+                      self._clock.age_us(header.session, header.t_us, now_us))
+        self._jobs.put(_Job(shown, jpeg, channels, started_ns))
+        self._wake()
+
+    def _kept_of(self, header: FrameHeader) -> bytes | None:
+        return next((jpeg for kept, jpeg in self._kept if kept == header), None)
+
+    def _wake(self) -> None:
+        with self._starting:
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="viewing", daemon=True)
+                self._thread.start()
+
+    # --- on the thread -----------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        with suppress(OSError, AttributeError):  # of this thread alone, where the system can
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        while (job := self._next()) is not None:
+            try:
+                self._say(job)
+            except Exception as error:  # whatever a plug-in's detections hold: people see less, the robot drives on
+                self._tell("viewing", f"a picture cannot be shown: {type(error).__name__}: {error}")
+
+    def _next(self) -> _Job | None:
+        job = self._jobs.take(IDLE_S)
+        if job is not None:
+            return job
+        with self._starting:
+            job = self._jobs.take()  # one that came just now would find a thread that is about to end
+            if job is None:
+                self._thread = None
+            return job
+
+    def _say(self, job: _Job) -> None:
+        picture = self._decoded(job)
+        for channel, drawn, quality in self._views(picture, job):
+            jpeg = _encoded(drawn, quality, channel.max_payload_bytes)
+            if jpeg is not None:
+                self._link.publish(channel, self._header(channel, job), jpeg, SOURCE)
+
+    def _views(self, picture: NDArray[np.uint8], job: _Job) -> Iterator[tuple[Channel, NDArray[np.uint8], int]]:
+        config = self._config.viewing
+        if OVERLAY in job.channels:
+            yield OVERLAY, draw_overlay(picture, job.shown, config.overlay_width_px), config.overlay_quality_percent
+        if PREVIEW in job.channels:
+            yield PREVIEW, draw_preview(picture, config.preview_width_px), config.preview_quality_percent
+
+    def _decoded(self, job: _Job) -> NDArray[np.uint8]:
+        """The picture, no larger than it has to be. Raises WireError for one that is not of the camera's size."""
+        camera, config = job.shown.camera, self._config
+        if self._decoder is None or self._decoder.size_px != (camera.width_px, camera.height_px):
+            self._decoder = Decoder(camera.width_px, camera.height_px, config.max_pixels)
+        self._decoder.check(job.jpeg)
+        widest = config.viewing.overlay_width_px if OVERLAY in job.channels else config.viewing.preview_width_px
+        wanted = min(widest, camera.width_px)
+        pixels: NDArray[np.uint8] = simplejpeg.decode_jpeg(
+            job.jpeg, "BGR", fastdct=True, fastupsample=True, min_width=wanted,
+            min_height=wanted * camera.height_px // camera.width_px,
+        )
+        return pixels
+
+    def _header(self, channel: Channel, job: _Job) -> bytes:
+        frame = job.shown.header
+        echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
+        self._seqs[channel] += 1
+        compute_us = (time.perf_counter_ns() - job.started_ns) // 1000
+        return encode(DetectionsHeader(source=SOURCE, session=self._session, seq=self._seqs[channel], echo=echo,
+                                       compute_us=max(0, compute_us)))
+
+
+def _encoded(picture: NDArray[np.uint8], quality: int, most_bytes: int) -> bytes | None:
+    """As JPEG within the bound, at the best quality that fits; None if none does."""
+    for percent in (quality, *(one for one in _QUALITIES_BELOW if one < quality)):
+        jpeg: bytes = simplejpeg.encode_jpeg(
+            np.ascontiguousarray(picture), quality=percent, colorspace="BGR", colorsubsampling="420", fastdct=True
+        )
+        if len(jpeg) <= most_bytes:
+            return jpeg
+    return None
