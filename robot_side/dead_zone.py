@@ -18,10 +18,13 @@ class DeadZoneError(ConfigError):
 def check_dead_zone(guard: GuardConfig, scan: Ranges) -> None:
     """Raise DeadZoneError unless whatever this sensor cannot see is nearer to the robot than `guard.stop_m`.
 
-    Of `scan`, what counts is where the sensor looks and its minimum, not what it saw.
+    Of `scan`, what counts is where the sensor looks and its minimum, not what it saw. Raises ValueError where one of
+    these is no number: a bad reading, which a later one may mend.
     """
     said = (scan.range_min_m, scan.angle_min_rad, scan.angle_increment_rad)
-    reach_m = max(_blind(guard, scan), default=0.0) if all(map(math.isfinite, said)) else math.inf
+    if not all(map(math.isfinite, said)):
+        raise ValueError(f"the range sensor's least range and angles are {said}: no numbers")
+    reach_m = max(_blind(guard, scan), default=0.0)
     if reach_m >= guard.stop_m:
         raise DeadZoneError(
             f"guard.stop_m = {guard.stop_m:g}: the range sensor sees nothing nearer than {scan.range_min_m:.3g} m, "

@@ -63,8 +63,10 @@ def test_it_is_judged_only_where_the_sensor_looks(first_rad, each_rad, refused):
 
 
 @pytest.mark.parametrize("least_m", [math.nan, math.inf])
-def test_a_minimum_that_is_no_number_is_no_minimum(least_m):
-    assert is_refused(scan(least_m))
+def test_a_minimum_that_is_no_number_is_a_bad_reading(least_m):
+    with pytest.raises(ValueError, match="no numbers") as caught:
+        check_dead_zone(GuardConfig(**BOX), scan(least_m))
+    assert not isinstance(caught.value, DeadZoneError)
 
 
 def test_the_words_say_what_to_set():
