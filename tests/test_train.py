@@ -19,6 +19,9 @@ from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX, Truth
 BALL = Truth("ball", (100.0, 60.0, 141.0, 99.0), 1.0)
 
 
+HEAD = 0.02
+
+
 def one_scene(truths=(BALL,), unclear=()):
     return DrawnScenes(np.full((1, HEIGHT_PX, WIDTH_PX, 3), 120, np.uint8), (tuple(truths),), (tuple(unclear),))
 
@@ -32,6 +35,8 @@ def weights(seed=1):
             each = 1 if layer.kind == "depthwise" else channels[layer.takes[0]]
             shape = (layer.channels, each, layer.kernel, layer.kernel)
             made[f"{layer.name}.weight"] = draw.normal(0, (2 / np.prod(shape[1:])) ** 0.5, shape).astype(np.float32)
+            if layer.kind == "head":  # what is added up on the way is large, and scores near 1 are all alike
+                made[f"{layer.name}.weight"] *= np.float32(HEAD)
             made[f"{layer.name}.bias"] = draw.normal(0, 0.1, layer.channels).astype(np.float32)
     return made
 
@@ -69,7 +74,7 @@ def test_the_cells_about_an_objects_middle_learn_its_box():
             assert decoded(one, row, column) == pytest.approx(box, abs=1e-3)
             ones += 1
         assert one.counts.min() == 1.0
-    assert ones >= 100 and 4 <= mirrored <= 16
+    assert ones >= 3 * 20 and 4 <= mirrored <= 16
 
 
 def test_the_same_numbers_give_the_same_sample():
