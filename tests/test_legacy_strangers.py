@@ -111,7 +111,7 @@ def _rate_fps(log: Path, seconds: float) -> float:
 
 def test_the_older_vision_sees_the_pictures_and_is_obeyed_within_a_guests_limits(tmp_path, pictures):
     with old_vision_drives(tmp_path, pictures) as (robot, _, log, _):
-        assert best_rate_fps(log, 0.5 * FPS) >= 0.5 * FPS, "on any machine; on a quiet one see below"
+        assert best_rate_fps(log, 0.4 * FPS) >= 0.4 * FPS, "on any machine; on a quiet one see below"
         size = statistics.mean(path.stat().st_size for path in pictures.glob("*.jpg"))
         assert 1.33 < statistics.mean(int(characters) for _, characters, _ in rows_of(log)) / size < 1.36
         asked = [re.split(r"\|", twist) for *_, twist in rows_of(log)]
