@@ -5,11 +5,12 @@ Going for another object is the unsafe failure, and is counted by itself.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from sim.scenes import Box, Scene, Truth
+from sim.scenes import Scene, Truth
+from vision_side.detect.overlap import corners, overlap
 from vision_side.detect.port import Detection
 
 ASKED: Final = ("ball", "target")
@@ -30,24 +31,6 @@ class Judged:
     score: float = 0.0
     off_px: float | None = None
     compute_us: int | None = None
-
-
-def overlap(one: Box, other: Box) -> float:
-    """Intersection by union."""
-    wide = min(one[2], other[2]) - max(one[0], other[0])
-    high = min(one[3], other[3]) - max(one[1], other[1])
-    if wide <= 0 or high <= 0:
-        return 0.0
-    return wide * high / (_area(one) + _area(other) - wide * high)
-
-
-def _area(box: Box) -> float:
-    return (box[2] - box[0]) * (box[3] - box[1])
-
-
-def box_of(one: Detection) -> Box:
-    """Its corners."""
-    return one.x1_px, one.y1_px, one.x2_px, one.y2_px
 
 
 def ball_of(scene: Scene) -> Truth | None:
@@ -71,7 +54,7 @@ def judged(detections: Sequence[Detection] | None, scene: Scene, compute_us: int
 def is_hit(one: Detection, ball: Truth) -> bool:
     """Whether the detection is that ball."""
     boxes = [ball.box] if ball.whole is None else [ball.box, ball.whole]
-    drawn = [box_of(one)]
+    drawn = [corners(one)]
     if one.circle is not None:
         x, y, radius = one.circle.cx_px, one.circle.cy_px, one.circle.radius_px
         drawn.append((x - radius, y - radius, x + radius, y + radius))
@@ -151,7 +134,7 @@ class Found:
         left = [one.box for one in scene.truths if one.label == label]
         self.objects += len(left)
         for one in sorted((one for one in detections if one.label == label), key=lambda one: -one.score):
-            own = box_of(one)
+            own = corners(one)
             best = max(left, key=lambda box: overlap(own, box), default=None)
             if best is not None and overlap(own, best) >= HIT_OVERLAP:
                 left.remove(best)
@@ -172,3 +155,10 @@ class Found:
             area += best * (last - recall)
             best, last = max(best, precision), recall
         return area + best * last
+
+
+def precisions(found: Mapping[str, Found]) -> dict[str, tuple[int, float | None]]:
+    """Objects and AP50 of each label; of a label that was never found too, but nothing of who finds none of them."""
+    if not any(one.marks for one in found.values()):
+        return {}
+    return {label: (one.objects, one.average_precision()) for label, one in found.items()}

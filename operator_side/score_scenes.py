@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from operator_side.score_detectors import Figures, Found, Judged, figures, judged
+from operator_side.score_detectors import Figures, Found, Judged, figures, judged, precisions
 from protocol.messages import FrameHeader
 from sim.scene_defects import as_seen
 from sim.scene_render import SceneRenderer
@@ -101,8 +101,7 @@ def score_scenes(
             for label, marks in found[subject.name].items():
                 marks.add(label, detections(result), seen.scene)
     counted = {name: {who: figures(all_of) for who, all_of in own.items()} for name, own in verdicts.items()}
-    precision = {who: {label: (one.objects, one.average_precision()) for label, one in own.items() if one.marks}
-                 for who, own in found.items()}
+    precision = {who: precisions(own) for who, own in found.items()}
     return Report(first_seed, frames, counted, precision, made_by)
 
 

@@ -11,8 +11,8 @@ from protocol.messages import FrameHeader
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.decode import Decoder
 from vision_side.detect.port import DetectFrame
+from vision_side.detect.protobuf import put, put_integers
 from vision_side.detect.remote.oip import Slot
-from vision_side.detect.remote.protobuf import put, put_integers
 
 SESSION = "0000abcd"
 MODEL = camera()

@@ -14,6 +14,7 @@ from vision_side.decode import Decoder
 from vision_side.detect.colour_filter import ColourFilter
 from vision_side.detect.formats import foxglove_annotations, supervision_fields, vision_msgs_fields
 from vision_side.detect.label_filter import LabelFilter
+from vision_side.detect.overlap import corners, overlap
 from vision_side.detect.port import (
     NO_DEADLINE,
     Circle,
@@ -22,7 +23,7 @@ from vision_side.detect.port import (
     DetectionResult,
     clipped,
 )
-from vision_side.detect.tracked import KEPT_US, MAX_TRACKS, Tracked, overlap
+from vision_side.detect.tracked import KEPT_US, MAX_TRACKS, Tracked
 
 GREY = np.full((240, 320, 3), 140, np.uint8)
 
@@ -105,7 +106,7 @@ def test_ever_more_things_cost_no_more_memory() -> None:
 
 @given(x=st.floats(-100, 100), y=st.floats(-100, 100), size=st.floats(1, 100))
 def test_overlap_is_a_share_and_the_same_both_ways(x: float, y: float, size: float) -> None:
-    one, other = box(0, 0), box(x, y, size)
+    one, other = corners(box(0, 0)), corners(box(x, y, size))
     assert overlap(one, one) == pytest.approx(1)
     assert overlap(one, other) == pytest.approx(overlap(other, one))
     assert 0 <= overlap(one, other) <= 1 + 1e-9

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from tests.remote_rig import ASKED, BALL_JPEG, COLUMNS, JPEG_INPUT, OUTPUTS, frame, grpc_answer
+from vision_side.detect.protobuf import fields, put, put_integers, varint
 from vision_side.detect.remote.oip import Looking, Model, Slot, Tensor, detections_of, model_of, tensor_of
 from vision_side.detect.remote.oip_json import read_infer, read_metadata
 from vision_side.detect.remote.oip_messages import infer_request, metadata_request
 from vision_side.detect.remote.oip_messages import read_infer as read_grpc
 from vision_side.detect.remote.oip_messages import read_metadata as read_grpc_metadata
-from vision_side.detect.remote.protobuf import fields, put, put_integers, varint
 from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
 PIXELS = Slot("image", "UINT8", (-1, 240, 320, 3))
@@ -184,7 +184,7 @@ def test_a_grpc_request_names_frame_tensor_and_outputs():
 
 @pytest.mark.parametrize("value", [0, 1, 127, 128, 300, 2**53, -1, -(2**63)])
 def test_integers_come_back_as_they_went(value):
-    from vision_side.detect.remote.protobuf import integers
+    from vision_side.detect.protobuf import integers
 
     assert integers(varint(value)) == [value]
 

@@ -106,7 +106,7 @@ def _grpc_server(infer, metadata=None):
     grpc = pytest.importorskip("grpc")
     from concurrent.futures import ThreadPoolExecutor
 
-    from vision_side.detect.remote.protobuf import put, put_integers
+    from vision_side.detect.protobuf import put, put_integers
 
     slots = [put(1, one.name) + put(2, one.datatype) + put_integers(3, one.shape) for one in (JPEG_INPUT, *OUTPUTS)]
     usual = put(1, "ball") + put(4, slots[0]) + b"".join(put(5, one) for one in slots[1:])

@@ -4,6 +4,7 @@ import threading
 import time
 from collections import Counter
 from contextlib import ExitStack
+from dataclasses import replace
 
 import pytest
 
@@ -134,6 +135,35 @@ def test_a_bad_picture_and_a_bad_header_get_no_answer_and_are_counted(bench):
     robot.frame(header=b"{}")
     assert until(lambda: bench.service.tallies()["r1"].refused == before + 4)
     assert _result(robot, detector) is not None
+
+
+class Faulty:
+    """Does what a plug-in should not, one thing for each frame; then it looks."""
+
+    def __init__(self):
+        self.asked = 0
+
+    def detect(self, frames, deadline_us):
+        self.asked += 1
+        if self.asked == 1:
+            raise RuntimeError("out of memory")
+        if self.asked == 2:
+            return []
+        seen = HSV.detect(frames, deadline_us)
+        return [replace(one, seq=one.seq + 1) for one in seen] if self.asked == 3 else seen
+
+
+def test_a_detector_that_fails_gives_no_answer_and_the_service_goes_on():
+    with ExitStack() as ending:
+        faulty = Faulty()
+        bench = Bench(ending, faulty)
+        robot = bench.robot("r1")
+        for asked in (1, 2, 3):
+            robot.frame()
+            assert until(lambda asked=asked: getattr(bench.service.tallies().get("r1"), "refused", 0) == asked)
+        detector = bench.detector("r1")
+        assert until(lambda: _result(robot, detector)), "and then it looks"
+        assert [line for line in bench.words if "out of memory" in line] and len(bench.words) == 2, bench.words
 
 
 def test_it_is_seen_by_who_asks_who_is_there_with_its_model_device_and_health(bench):

@@ -11,13 +11,14 @@ pytest.importorskip("pybullet")
 import cv2
 
 from operator_side import cli, cli_score_detectors
-from operator_side.score_detectors import Found, Judged, figures, judged, overlap
+from operator_side.score_detectors import Found, Judged, figures, judged, precisions
 from operator_side.score_detectors_text import markdown, text
 from operator_side.score_scenes import score_scenes, subjects
 from operator_side.score_sheet import Sheet
 from operator_side.train_choice import ball_threshold, label_threshold
 from sim.scene_plan import plan_scene
 from sim.scenes import COLUMNS, JUDGED_FROM, Scene, Truth
+from vision_side.detect.overlap import overlap
 from vision_side.detect.port import Circle, Detection
 
 BALL = Truth("ball", (100.0, 100.0, 140.0, 140.0), 1.0, (100.0, 100.0, 140.0, 140.0))
@@ -102,6 +103,16 @@ def test_each_object_is_found_once_and_what_is_unclear_counts_for_nothing():
                   found(200, 50, 230, 150, 0.7, "legs"), found(*OTHER, label="ball")]
     one.add("legs", detections, scene([legs], unclear=[(195.0, 50.0, 225.0, 120.0)]))
     assert one.objects == 1 and one.marks == [(0.9, True), (0.8, False)]
+
+
+def test_what_is_never_found_is_said_to_be_never_found():
+    legs = Truth("legs", (10.0, 100.0, 60.0, 200.0), 1.0)
+    seen = [found(10, 100, 60, 200, 0.9, "light-red")]
+    marks = {label: Found() for label in ("legs", "light-red")}
+    for label, one in marks.items():
+        one.add(label, seen, scene([legs]))
+    assert precisions(marks) == {"legs": (1, 0.0), "light-red": (0, None)}
+    assert precisions({"legs": Found(3)}) == {}, "who looks for balls alone is not asked for legs"
 
 
 def test_thresholds_hold_false_alarms_and_wrong_objects_down():

@@ -167,7 +167,7 @@ class TestGraph:
         assert made.stat().st_size < 1_000_000
 
     def test_boxes_lie_in_the_picture_and_no_two_cover_each_other(self, made):
-        from operator_side.score_detectors import overlap
+        from vision_side.detect.overlap import overlap
 
         boxes, scores, labels = self.outputs(made, self.picture())
         kept = boxes[scores > 0]

@@ -30,8 +30,10 @@ from protocol.messages import (
     FrameHeader,
 )
 from protocol.transports.link import LatestSlot, Link, Message
+from vision_side.clock import now_us
 from vision_side.config import VisionConfig
-from vision_side.decode import Decoder
+from vision_side.detect.checking import asked
+from vision_side.detect.own_decoders import OwnDecoders
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
 from vision_side.detector_turns import Tally, Turn, Turns
 from vision_side.service import ends_on_signal
@@ -103,7 +105,7 @@ class DetectorService:
         self._guard = threading.Lock()
         self._bell: LatestSlot[bool] = LatestSlot()
         self._links: dict[str, Link] = {}
-        self._decoders: dict[str, Decoder] = {}
+        self._decoders = OwnDecoders(serving.max_pixels)
         self._session = secrets.token_hex(4)
         self._said = 0
         self._each_us = 0.0
@@ -111,7 +113,7 @@ class DetectorService:
         self._maker = ("", "")
         self._looked_at_load_s = time.monotonic()
         self._load_before = (0, 0)
-        self._overloaded = False
+        self._overloaded = self._failed = False
         site.on_news(lambda: self._bell.put(True))
 
     def serve(self, ending: threading.Event) -> None:
@@ -128,7 +130,7 @@ class DetectorService:
             if robot not in self._links:
                 self._welcome(robot)
         with self._guard:
-            batch = self._turns.take(_now_us(), int(self._each_us))
+            batch = self._turns.take(now_us(), int(self._each_us))
         if batch:
             self._look(batch)
         return bool(batch)
@@ -157,24 +159,27 @@ class DetectorService:
 
         def heard(message: Message) -> None:
             with self._guard:
-                self._turns.offer(robot, message, _now_us())
+                self._turns.offer(robot, message, now_us())
             self._bell.put(True)
 
         link.subscribe(FRAME, heard)
         self._say(f"detector: looks at the pictures of {robot}")
 
     def _look(self, batch: list[Turn[Message]]) -> None:
-        began_us = _now_us()
+        began_us = now_us()
         frames = [(turn, frame) for turn in batch if (frame := self._frame(turn)) is not None]
         if not frames:
             return
         deadline_us = min(turn.arrived_us for turn, _ in frames) + self._serving.deadline_us
-        results = self._detector.detect([frame for _, frame in frames], deadline_us)
-        ended_us = _now_us()
+        results = asked(self._detector, [frame for _, frame in frames], deadline_us)
+        ended_us = now_us()
         each_us = (ended_us - began_us) / len(frames)
         self._each_us += (each_us - self._each_us) * (_SMOOTHING if self._each_us else 1.0)
         for (turn, frame), result in zip(frames, results, strict=True):
-            self._answer(turn, frame, result, ended_us - began_us)
+            if isinstance(result, str):
+                self._refuse(turn, result)
+            else:
+                self._answer(turn, frame, result, ended_us - began_us)
 
     def _frame(self, turn: Turn[Message]) -> DetectFrame | None:
         """What the detector is given; None, counted, for what is no frame."""
@@ -185,15 +190,19 @@ class DetectorService:
         except WireError:
             self._tally(turn).refused += 1
             return None
-        decoder = self._decoders.get(turn.robot)
-        if decoder is None or decoder.size_px != (size.width_px, size.height_px):
-            decoder = self._decoders[turn.robot] = Decoder(size.width_px, size.height_px, self._serving.max_pixels)
-        return DetectFrame(turn.robot, header, jpeg, decoder)
+        return self._decoders.frame(turn.robot, header, jpeg, (size.width_px, size.height_px))
 
-    def _answer(self, turn: Turn[Message], frame: DetectFrame, result: DetectionResult | None, took_us: int) -> None:
-        tally, age_us = self._tally(turn), _now_us() - turn.arrived_us
+    def _refuse(self, turn: Turn[Message], why: str) -> None:
+        """Count it; the first is told: the others are in the tallies."""
+        self._tally(turn).refused += 1
+        if not self._failed:
+            self._failed = True
+            self._say(f"detector: {why}")
+
+    def _answer(self, turn: Turn[Message], frame: DetectFrame, result: DetectionResult, took_us: int) -> None:
+        tally, age_us = self._tally(turn), now_us() - turn.arrived_us
         payload = _payload(result)
-        if payload is None or result is None:
+        if payload is None:
             tally.refused += 1
             return
         if age_us > self._serving.deadline_us:
@@ -223,10 +232,8 @@ class DetectorService:
                       f"answered, {dropped} dropped in {_LOOK_AT_LOAD_S:.0f} s")
 
 
-def _payload(result: DetectionResult | None) -> bytes | None:
-    """The boxes as the wire has them; None for no answer, and for a plug-in's that cannot be said."""
-    if result is None:
-        return None
+def _payload(result: DetectionResult) -> bytes | None:
+    """The boxes as the wire has them; None for a plug-in's that cannot be said."""
     try:
         boxes = tuple(_box(one) for one in result.detections[:MAX_DETECTED_BOXES])
         said = Detections(width_px=result.width_px, height_px=result.height_px, boxes=boxes, detector=result.detector,
@@ -250,7 +257,3 @@ def _stamp(frame: FrameHeader, session: str, seq: int, compute_us: int) -> bytes
 
 def _say(line: str) -> None:
     print(line, flush=True)
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000

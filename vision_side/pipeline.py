@@ -8,7 +8,7 @@ from protocol.errors import WireError
 from protocol.messages import AnswerHeader, Asked, CameraModel, Echo, FrameHeader, ScanHeader, Twist
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder, Picture
-from vision_side.detect.checking import checked
+from vision_side.detect.checking import asked
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.port import (
     NO_DEADLINE,
@@ -151,20 +151,12 @@ class Pipeline:
             return self._skip(error.reason, error.detail)
         if self._eyes is None:
             return self._answer(frame.header, self._detector.detect(picture), picture)
-        result = self._look(self._eyes, frame, picture)
+        shown = DetectFrame(self._config.robot, frame.header, frame.jpeg, self._decoder, picture)
+        (result,) = asked(self._eyes, [shown], frame.deadline_us)
         if isinstance(result, str):
             return self._skip(NO_ANSWER, result, "no answer")
         self.looked = result
         return self._answer(frame.header, result.detections, picture)
-
-    def _look(self, eyes: Detector, frame: Frame, picture: Picture) -> DetectionResult | str:
-        """What `eyes` see, or why that is no answer; whatever a plug-in does ends there."""
-        asked = DetectFrame(self._config.robot, frame.header, frame.jpeg, self._decoder, picture)
-        try:
-            (result,) = eyes.detect([asked], frame.deadline_us)
-            return checked(asked, result) if result is not None else "the detector gave no answer in time"
-        except Exception as error:  # a plug-in's own
-            return f"the detector's answer is none: {type(error).__name__}: {error}"[:160]
 
     def follow(self, header: FrameHeader, detections: Detections) -> Answer:
         """Answer the frame of `header`, in which somebody else found `detections`; empty is "saw nothing"."""

@@ -6,8 +6,8 @@ The clock is the frames' capture time. What counts is what would be steered by: 
 from collections import deque
 from typing import Final
 
+from vision_side.detect.overlap import corners, overlap
 from vision_side.detect.port import Detection, DetectionResult
-from vision_side.detect.tracked import overlap
 
 WINDOW: Final = 300
 """Frames: ten seconds at 30 a second."""
@@ -52,7 +52,7 @@ def differs(driving: DetectionResult, shadow: DetectionResult) -> str:
         return f"{shadow.detector} sees {_where(other)}, {driving.detector} nothing"
     if other is None:
         return f"{driving.detector} sees {_where(mine)}, {shadow.detector} nothing"
-    if overlap(mine, other) >= LEAST_OVERLAP:
+    if overlap(corners(mine), corners(other)) >= LEAST_OVERLAP:
         return ""
     return f"{driving.detector} sees {_where(mine)}, {shadow.detector} {_where(other)}"
 

@@ -4,14 +4,38 @@ The detector may be a plug-in or another machine; whatever it says, no more than
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, clipped
+from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector, clipped
 
 MAX_DETECTIONS: Final = 256
 """Security limit: as many as the channel `detections` takes; more is no answer."""
 _LONGEST_LABEL: Final = 64
+_LONGEST_WHY: Final = 160
+
+
+def asked(detector: Detector, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | str]:
+    """What `detector` sees in each frame, or why that is no answer; whatever a plug-in does ends here."""
+    try:
+        results = detector.detect(frames, deadline_us)
+        if len(results) != len(frames):
+            raise ValueError(f"{len(results)} results for {len(frames)} frames")
+    except Exception as error:  # a plug-in's own
+        return [_why(error)] * len(frames)
+    return [_answer(frame, result) for frame, result in zip(frames, results, strict=True)]
+
+
+def _answer(frame: DetectFrame, result: DetectionResult | None) -> DetectionResult | str:
+    try:
+        return checked(frame, result) if result is not None else "the detector gave no answer in time"
+    except Exception as error:  # of what may be no result at all
+        return _why(error)
+
+
+def _why(error: Exception) -> str:
+    return f"the detector's answer is none: {type(error).__name__}: {error}"[:_LONGEST_WHY]
 
 
 def checked(frame: DetectFrame, result: DetectionResult) -> DetectionResult:

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from vision_side.detect.overlap import corners, overlap
 from vision_side.detect.port import Detection
-from vision_side.detect.tracked import overlap
 
 KEY: Final = "golden"
 SIZE_PX: Final = (320, 240)
@@ -67,5 +67,5 @@ def difference(expected: Sequence[Detection], found: Sequence[Detection], min_sc
 
 
 def _is_same(one: Detection, other: Detection) -> bool:
-    return (one.label == other.label and overlap(one, other) >= LEAST_OVERLAP
+    return (one.label == other.label and overlap(corners(one), corners(other)) >= LEAST_OVERLAP
             and abs(one.score - other.score) <= MOST_SCORE_APART)

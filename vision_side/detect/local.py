@@ -1,7 +1,6 @@
 """Detectors of one decoded picture, behind the port: who made the result, and how long it took. Shell (a clock)."""
 
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -10,11 +9,10 @@ from protocol.errors import WireError
 from vision_side.config import HsvConfig
 from vision_side.decode import Picture
 from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveEye
+from vision_side.detect.by_session import BySession
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
 
-MAX_ROBOTS: Final = 64
-"""Whose memory is kept; the robot that was not seen for the longest is forgotten first."""
 _CPU: Final = "cpu"
 
 
@@ -41,26 +39,15 @@ class Adaptive:
     Config = AdaptiveConfig
 
     def __init__(self, config: AdaptiveConfig) -> None:
-        self._config = config
-        self._eyes: OrderedDict[str, tuple[str, AdaptiveEye]] = OrderedDict()
+        self._eyes = BySession(lambda: AdaptiveEye(config))
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
         """A result for each; one takes two or three times as long as by plain colour, whatever the deadline."""
         return [self._look(frame) for frame in frames]
 
     def _look(self, frame: DetectFrame) -> DetectionResult | None:
-        eye, t_us = self._eye_of(frame), frame.header.t_us
+        eye, t_us = self._eyes.of(frame.robot, frame.header.session), frame.header.t_us
         return timed(frame, Maker("adaptive", device=_CPU), lambda picture: eye.detect(picture, t_us))
-
-    def _eye_of(self, frame: DetectFrame) -> AdaptiveEye:
-        session, eye = self._eyes.get(frame.robot, ("", None))
-        if eye is None or session != frame.header.session:
-            eye = AdaptiveEye(self._config)
-        self._eyes[frame.robot] = (frame.header.session, eye)
-        self._eyes.move_to_end(frame.robot)
-        if len(self._eyes) > MAX_ROBOTS:
-            self._eyes.popitem(last=False)
-        return eye
 
 
 def timed(

@@ -7,13 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
-Bytes = memoryview | bytes
+from vision_side.detect.protobuf import Bytes, Field, as_bytes, fields, text
 
 _GRAPH, _METADATA = 7, 14  # of a model
 _INITIALIZER, _INPUT, _OUTPUT = 5, 11, 12  # of a graph
 _TENSOR_NAME: Final = 8
-_VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
-_LONGEST_VARINT: Final = 10
 _MAX_METADATA: Final = 64
 _TYPES: Final = {1: "float32", 2: "uint8", 7: "int64", 10: "float16"}
 
@@ -45,7 +43,7 @@ def read_onnx_header(data: Bytes) -> OnnxHeader:
             graph = value
         elif number == _METADATA and not isinstance(value, int) and len(metadata) < _MAX_METADATA:
             entry = dict(_fields(value))
-            metadata[_text(entry.get(1, b""))] = _text(entry.get(2, b""))
+            metadata[text(entry.get(1, b""))] = text(entry.get(2, b""))
     if graph is None:
         raise ValueError("it holds no graph")
     inputs, outputs, constant = [], [], set()
@@ -57,58 +55,27 @@ def read_onnx_header(data: Bytes) -> OnnxHeader:
         elif number == _OUTPUT:
             outputs.append(_tensor(value))
         elif number == _INITIALIZER:
-            constant.add(_text(dict(_fields(value)).get(_TENSOR_NAME, b"")))
+            constant.add(text(dict(_fields(value)).get(_TENSOR_NAME, b"")))
     return OnnxHeader(tuple(one for one in inputs if one.name not in constant), tuple(outputs), metadata)
 
 
 def _tensor(value: Bytes) -> Tensor:
-    fields = dict(_fields(value))
-    kind = dict(_fields(_part(fields.get(2, b""))))
-    tensor = dict(_fields(_part(kind.get(1, b""))))
+    own = dict(_fields(value))
+    kind = dict(_fields(as_bytes(own.get(2, b""))))
+    tensor = dict(_fields(as_bytes(kind.get(1, b""))))
     element = tensor.get(1, 0)
-    dimensions = [one for number, one in _fields(_part(tensor.get(2, b""))) if number == 1]
-    shape = tuple(_size(dict(_fields(_part(one))).get(1)) for one in dimensions)
-    return Tensor(_text(fields.get(1, b"")), _TYPES.get(element if isinstance(element, int) else 0, "other"), shape)
+    dimensions = [one for number, one in _fields(as_bytes(tensor.get(2, b""))) if number == 1]
+    shape = tuple(_size(dict(_fields(as_bytes(one))).get(1)) for one in dimensions)
+    return Tensor(text(own.get(1, b"")), _TYPES.get(element if isinstance(element, int) else 0, "other"), shape)
 
 
 def _size(value: int | Bytes | None) -> int | None:
     return value if isinstance(value, int) and value > 0 else None
 
 
-def _part(value: int | Bytes) -> Bytes:
-    if isinstance(value, int):
-        raise ValueError("a number where a part should be")
-    return value
-
-
-def _text(value: int | Bytes) -> str:
-    return bytes(_part(value)).decode("utf-8", "replace")
-
-
-def _fields(data: Bytes) -> Iterator[tuple[int, int | Bytes]]:
-    """Every field of one message: its number, and its number or bytes."""
-    at = 0
-    while at < len(data):
-        key, at = _varint(data, at)
-        number, kind = key >> 3, key & 7
-        if kind == _VARINT:
-            value, at = _varint(data, at)
-            yield number, value
-            continue
-        size, at = _varint(data, at) if kind == _LENGTH else ({_FIXED64: 8, _FIXED32: 4}.get(kind, -1), at)
-        if size < 0 or at + size > len(data):
-            raise ValueError("it is cut short, or no ONNX model")
-        yield number, data[at : at + size]
-        at += size
-
-
-def _varint(data: Bytes, at: int) -> tuple[int, int]:
-    value = 0
-    for index in range(_LONGEST_VARINT):
-        if at + index >= len(data):
-            break
-        byte = data[at + index]
-        value |= (byte & 127) << (7 * index)
-        if byte < 128:
-            return value, at + index + 1
-    raise ValueError("it is cut short, or no ONNX model")
+def _fields(data: Bytes) -> Iterator[Field]:
+    """Of a part of any size: large models have many."""
+    try:
+        yield from fields(data, most=len(data) + 1)
+    except ValueError:
+        raise ValueError("it is cut short, or no ONNX model") from None

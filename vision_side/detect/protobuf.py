@@ -1,4 +1,4 @@
-"""As much of Protocol Buffers as the Open Inference Protocol's gRPC needs: fields of bytes and integers. Pure.
+"""As much of Protocol Buffers as ONNX files and the Open Inference Protocol's gRPC need: bytes and integers. Pure.
 
 Encoding: https://protobuf.dev/programming-guides/encoding. Generated code would bring a package that must fit the
 one that other programs in the same environment have; this needs none.
@@ -7,14 +7,13 @@ one that other programs in the same environment have; this needs none.
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from vision_side.detect.remote.refusing import NoAnswerError, Reason
-
+Bytes = memoryview | bytes
+Field = tuple[int, int | Bytes]
 _VARINT, _I64, _LEN, _I32 = 0, 1, 2, 5
 _FIXED: Final = {_I64: 8, _I32: 4}
 _MAX_VARINT_BYTES: Final = 10
 MAX_FIELDS: Final = 4096
-"""Security limit: of one message; ours have some dozens."""
-Field = tuple[int, int | bytes]
+"""Security limit: of one message of a server; ours have some dozens."""
 
 
 def varint(value: int) -> bytes:
@@ -34,20 +33,15 @@ def put(number: int, value: bytes | str) -> bytes:
     return varint(number << 3 | _LEN) + varint(len(data)) + data
 
 
-def put_flag(number: int) -> bytes:
-    """A field that is true."""
-    return varint(number << 3 | _VARINT) + b"\x01"
-
-
 def put_integers(number: int, values: Sequence[int]) -> bytes:
     """A packed repeated int64."""
     return put(number, b"".join(varint(value) for value in values))
 
 
-def fields(data: bytes) -> Iterator[Field]:
-    """(number, value) of each field in turn. Raises NoAnswerError MALFORMED for what is no message."""
+def fields(data: Bytes, most: int = MAX_FIELDS) -> Iterator[Field]:
+    """(number, value) of each field in turn, bytes as parts of `data`. Raises ValueError for what is no message."""
     at = 0
-    for _ in range(MAX_FIELDS):
+    for _ in range(most):
         if at == len(data):
             return
         tag, at = _varint_at(data, at)
@@ -58,13 +52,13 @@ def fields(data: bytes) -> Iterator[Field]:
             continue
         length, at = _varint_at(data, at) if kind == _LEN else (_FIXED.get(kind, len(data) + 1), at)
         if at + length > len(data):
-            raise _bad(f"field {number} at byte {at} ends behind the end")
+            raise ValueError(f"field {number} at byte {at} ends behind the end")
         yield number, data[at : at + length]
         at += length
-    raise _bad(f"more than {MAX_FIELDS} fields")
+    raise ValueError(f"more than {most} fields")
 
 
-def integers(value: int | bytes) -> list[int]:
+def integers(value: int | Bytes) -> list[int]:
     """A repeated int64, packed or one by one."""
     if isinstance(value, int):
         return [_signed(value)]
@@ -73,34 +67,30 @@ def integers(value: int | bytes) -> list[int]:
         one, at = _varint_at(value, at)
         found.append(_signed(one))
         if len(found) > MAX_FIELDS:
-            raise _bad(f"more than {MAX_FIELDS} integers")
+            raise ValueError(f"more than {MAX_FIELDS} integers")
     return found
 
 
-def text(value: int | bytes) -> str:
+def text(value: int | Bytes) -> str:
     """A string."""
-    return as_bytes(value).decode("utf-8", "replace")
+    return bytes(as_bytes(value)).decode("utf-8", "replace")
 
 
-def as_bytes(value: int | bytes) -> bytes:
-    """Bytes or a message. Raises NoAnswerError if the field is an integer."""
+def as_bytes(value: int | Bytes) -> Bytes:
+    """Bytes or a message. Raises ValueError if the field is an integer."""
     if isinstance(value, int):
-        raise _bad("an integer where bytes belong")
+        raise ValueError("an integer where bytes belong")
     return value
 
 
-def _varint_at(data: bytes, at: int) -> tuple[int, int]:
+def _varint_at(data: Bytes, at: int) -> tuple[int, int]:
     value = 0
     for place, byte in enumerate(data[at : at + _MAX_VARINT_BYTES]):
         value |= (byte & 0x7F) << 7 * place
         if byte < 0x80:
             return value & (1 << 64) - 1, at + place + 1
-    raise _bad(f"no integer at byte {at}")
+    raise ValueError(f"no integer at byte {at}")
 
 
 def _signed(value: int) -> int:
     return value - (1 << 64) if value >> 63 else value
-
-
-def _bad(why: str) -> NoAnswerError:
-    return NoAnswerError(Reason.MALFORMED, f"not Protocol Buffers: {why}")

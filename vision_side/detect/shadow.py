@@ -5,26 +5,25 @@ takes effect may one frame wait for what it is looking at.
 """
 
 import threading
-import time
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from protocol.transports.link import Link
-from vision_side.decode import Decoder
+from vision_side.clock import now_us
 from vision_side.detect.agreement import Agreement
 from vision_side.detect.around import attach_detector, close_detector, news_of
+from vision_side.detect.by_session import MAX_ROBOTS
 from vision_side.detect.checking import checked
+from vision_side.detect.news import News
+from vision_side.detect.own_decoders import OwnDecoders
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
 
-MAX_ROBOTS: Final = 64
 _PATIENCE_US: Final = 1_000_000
 """The shadow's own deadline: it holds nobody up."""
 _FRESH_US: Final = 3_000_000
 """Who has not answered for longer is not fit to drive."""
-_MAX_NEWS: Final = 16
-_MAX_DECODERS: Final = 8
 _END_S: Final = 2.0
 
 
@@ -54,10 +53,9 @@ class Shadowed:
         self._eyes = (driving, shadow)
         self._locks = (threading.Lock(), threading.Lock())  # one caller at a time, also while they change places
         self._name = name
-        self._max_pixels = max_pixels
         self._pairs: OrderedDict[str, _Pair] = OrderedDict()
-        self._decoders: OrderedDict[tuple[int, int], Decoder] = OrderedDict()
-        self._news: deque[str] = deque(maxlen=_MAX_NEWS)
+        self._decoders = OwnDecoders(max_pixels)
+        self._news = News()
         self._tasks: OrderedDict[str, _Task] = OrderedDict()
         self._bell = threading.Condition()
         self._ending = False
@@ -103,10 +101,7 @@ class Shadowed:
 
     def news(self) -> list[str]:
         """Where the two disagree, at most every few seconds, and what both have to say."""
-        lines = [line for eye in self._eyes for line in news_of(eye)]
-        while self._news:
-            lines.append(self._news.popleft())
-        return lines
+        return [*(line for eye in self._eyes for line in news_of(eye)), *self._news.take()]
 
     def close(self) -> None:
         """End the thread, then close both."""
@@ -135,7 +130,7 @@ class Shadowed:
         return pair
 
     def _is_fit(self, pair: _Pair) -> bool:
-        return pair.answered_us is not None and _now_us() - pair.answered_us <= _FRESH_US
+        return pair.answered_us is not None and now_us() - pair.answered_us <= _FRESH_US
 
     def _put(self, task: _Task) -> None:
         """The newest frame of each robot waits; an older one that was not looked at yet is left out."""
@@ -155,28 +150,15 @@ class Shadowed:
             try:
                 self._compare(task)
             except Exception as error:  # a plug-in's own fault, which must not end the shadow for good
-                self._news.append(f"{self._name} failed: {type(error).__name__}: {error}"[:160])
+                self._news.add(f"{self._name} failed: {type(error).__name__}: {error}"[:160])
 
     def _compare(self, task: _Task) -> None:
-        frame = self._own(task.frame)
-        answer = self._ask(not task.promoted, [frame], _now_us() + _PATIENCE_US)[0]
+        frame = self._decoders.again(task.frame)
+        answer = self._ask(not task.promoted, [frame], now_us() + _PATIENCE_US)[0]
         pair = self._pairs.get(frame.robot)
         if answer is None or pair is None or pair.promoted is not task.promoted:
             return
-        answer, pair.answered_us = checked(frame, answer), _now_us()
+        answer, pair.answered_us = checked(frame, answer), now_us()
         line = pair.agreement.add(task.result, answer) if task.result is not None else ""
         if line:
-            self._news.append(f"shadow: {line}")
-
-    def _own(self, frame: DetectFrame) -> DetectFrame:
-        """The frame with a decoder of this thread's, since the other's pixels are being replaced."""
-        size = (frame.width_px, frame.height_px)
-        decoder = self._decoders.pop(size, None) or Decoder(*size, self._max_pixels)
-        self._decoders[size] = decoder
-        if len(self._decoders) > _MAX_DECODERS:
-            self._decoders.popitem(last=False)
-        return DetectFrame(frame.robot, frame.header, frame.jpeg, decoder)
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000
+            self._news.add(f"shadow: {line}")

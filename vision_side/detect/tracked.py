@@ -4,12 +4,13 @@ The clock is the frames' capture time. An id is never given twice in a session, 
 second comes back as another one: better two ids for one thing than one id for two.
 """
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 from vision_side.detect.around import Around
+from vision_side.detect.by_session import BySession
+from vision_side.detect.overlap import corners, overlap
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
 
 KEPT_US: Final = 1_000_000
@@ -17,7 +18,6 @@ LEAST_OVERLAP: Final = 0.2
 """Intersection over union; a thing that moves by half its width from frame to frame still has 0.33."""
 MAX_TRACKS: Final = 64
 """Of one robot; every pair is compared. The best so many detections of a frame get ids, the rest none."""
-MAX_ROBOTS: Final = 64
 
 
 @dataclass(slots=True)
@@ -32,28 +32,21 @@ class Tracked(Around):
 
     def __init__(self, detector: Detector) -> None:
         super().__init__(detector)
-        self._robots: OrderedDict[str, _Memory] = OrderedDict()
+        self._memories = BySession(_Memory)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """What the other finds, with ids."""
         return [one and self._named(one) for one in self.inner.detect(frames, deadline_us)]
 
     def _named(self, result: DetectionResult) -> DetectionResult:
-        memory = self._robots.get(result.robot)
-        if memory is None or memory.session != result.session:
-            memory = _Memory(result.session)
-        self._robots[result.robot] = memory
-        self._robots.move_to_end(result.robot)
-        if len(self._robots) > MAX_ROBOTS:
-            self._robots.popitem(last=False)
+        memory = self._memories.of(result.robot, result.session)
         return replace(result, detections=memory.named(result.detections, result.t_us))
 
 
 class _Memory:
     """The tracks of one robot's session."""
 
-    def __init__(self, session: str) -> None:
-        self.session = session
+    def __init__(self) -> None:
         self._tracks: list[_Track] = []
         self._given = 0
 
@@ -63,7 +56,7 @@ class _Memory:
         self._tracks = [one for one in self._tracks if t_us - one.t_us <= KEPT_US]
         pairs = sorted(
             ((share, index, track.number) for index, one in enumerate(found) for track in self._tracks
-             if (share := overlap(one, track.box)) >= LEAST_OVERLAP and one.label == track.box.label),
+             if (share := overlap(corners(one), corners(track.box))) >= LEAST_OVERLAP and one.label == track.box.label),
             key=lambda pair: -pair[0],
         )
         numbers: dict[int, int] = {}
@@ -79,17 +72,3 @@ class _Memory:
         self._tracks = [track for track in self._tracks if track.number != number][-(MAX_TRACKS - 1) :]
         self._tracks.append(_Track(number, one, t_us))
         return replace(one, track_id=number)
-
-
-def overlap(one: Detection, other: Detection) -> float:
-    """Intersection over union of two boxes."""
-    width = min(one.x2_px, other.x2_px) - max(one.x1_px, other.x1_px)
-    height = min(one.y2_px, other.y2_px) - max(one.y1_px, other.y1_px)
-    if width <= 0 or height <= 0:
-        return 0.0
-    common = width * height
-    return common / (_area(one) + _area(other) - common)
-
-
-def _area(one: Detection) -> float:
-    return (one.x2_px - one.x1_px) * (one.y2_px - one.y1_px)

@@ -1,6 +1,6 @@
 """A detector that asks a server about one frame after the other. Shell (the clock, for how long it took)."""
 
-import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ from typing import Final, Protocol
 
 from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
+from vision_side.clock import now_us
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
 from vision_side.detect.remote.refusing import NoAnswerError, Reason, Tally
 
@@ -37,11 +38,10 @@ class Server(Protocol):
         ...
 
 
-class Asking:
-    """A `Detector`, over one server. It may block for longer than the deadline: see `ByDeadline` for who must not."""
+class FrameByFrame(ABC):
+    """A `Detector` that asks elsewhere about one frame after the other, and counts what it refused."""
 
-    def __init__(self, name: str, server: Server) -> None:
-        self._server = server
+    def __init__(self, name: str) -> None:
         self._tally = Tally(name)
 
     @property
@@ -53,29 +53,45 @@ class Asking:
         """As the port says."""
         return [self._one(frame, deadline_us) for frame in frames]
 
+    def _one(self, frame: DetectFrame, deadline_us: int) -> DetectionResult | None:
+        try:
+            result = self._ask(frame, deadline_us)
+        except NoAnswerError as error:
+            self._tally.refuse(error)
+            return None
+        self._tally.good()
+        return result
+
+    @abstractmethod
+    def _ask(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
+        """What is seen in `frame`. Raises NoAnswerError."""
+
     def news(self) -> list[str]:
         """What a person may want to know, since the last time."""
         return self._tally.news.take()
+
+
+class Asking(FrameByFrame):
+    """Over one server. It may block for longer than the deadline: see `ByDeadline` for who must not."""
+
+    def __init__(self, name: str, server: Server) -> None:
+        super().__init__(name)
+        self._server = server
 
     def close(self) -> None:
         """Let go of the server."""
         self._server.close()
 
-    def _one(self, frame: DetectFrame, deadline_us: int) -> DetectionResult | None:
+    def _ask(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
         began_us = now_us()
+        _check_picture(frame)
         try:
-            _check_picture(frame)
             answer = self._server.ask(frame, deadline_us)
-            ended_us = now_us()
-            if ended_us > deadline_us:
-                raise NoAnswerError(Reason.LATE, f"{(ended_us - deadline_us) / 1000:.0f} ms after the deadline")
         except WireError as error:  # of pixels that were asked for
-            self._tally.refuse(NoAnswerError(Reason.BAD_PICTURE, error.detail))
-            return None
-        except NoAnswerError as error:
-            self._tally.refuse(error)
-            return None
-        self._tally.good()
+            raise NoAnswerError(Reason.BAD_PICTURE, error.detail) from None
+        ended_us = now_us()
+        if ended_us > deadline_us:
+            raise NoAnswerError(Reason.LATE, f"{(ended_us - deadline_us) / 1000:.0f} ms after the deadline")
         return result_of(frame, answer.detections, answer.maker, ended_us - began_us)
 
 
@@ -92,8 +108,3 @@ def _check_picture(frame: DetectFrame) -> None:
 def left_s(until_us: int) -> float:
     """What is left until then, 0 if nothing is; bounded for who has no deadline."""
     return min(max(0, until_us - now_us()) / 1e6, LONGEST_WAIT_S)
-
-
-def now_us() -> int:
-    """This machine's monotonic clock, that of deadlines."""
-    return time.monotonic_ns() // 1000

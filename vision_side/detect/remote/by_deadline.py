@@ -12,18 +12,17 @@ from typing import Annotated, Final
 from pydantic import Field
 
 from protocol.transports.link import LatestSlot, Link
-from vision_side.decode import Decoder
+from vision_side.clock import now_us
 from vision_side.detect.around import attach_detector, close_detector, news_of
+from vision_side.detect.own_decoders import OwnDecoders
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
-from vision_side.detect.remote.asking import LONGEST_WAIT_S, left_s, now_us
+from vision_side.detect.remote.asking import LONGEST_WAIT_S, left_s
 
 Results = list[DetectionResult | None]
 PixelBound = Annotated[int, Field(ge=256, le=4096 * 4096)]
 MAX_PIXELS: Final = 1920 * 1080
 RAISED: Final = "RAISED"
 """Counted beside what the inner detector refuses: it raised, which no detector should."""
-MAX_DECODERS: Final = 256
-"""Security limit: of decoders kept, one for each robot and place in a batch."""
 _CLOSE_S: Final = 1.0
 
 
@@ -54,8 +53,7 @@ class ByDeadline:
     def __init__(self, inner: Detector, max_pixels: int = MAX_PIXELS) -> None:
         """Security limit: pictures of more than `max_pixels` are not decoded."""
         self._inner = inner
-        self._max_pixels = max_pixels
-        self._decoders: dict[tuple[str, int], Decoder] = {}
+        self._decoders = OwnDecoders(max_pixels)
         self._raised: Counter[str] = Counter()
         self._asked: LatestSlot[Pending | None] = LatestSlot()
         self._ending = threading.Event()
@@ -106,20 +104,10 @@ class ByDeadline:
 
     def _answer(self, pending: Pending) -> None:
         try:
-            frames = [self._own(one, at) for at, one in enumerate(pending.frames)]
+            frames = [self._decoders.again(one, at) for at, one in enumerate(pending.frames)]
             results = self._inner.detect(frames, pending.deadline_us)
         except Exception:  # a plug-in's fault must not end the thread: nobody would ever be answered again
             self._raised[RAISED] += 1
             results = [None] * len(pending.frames)
         if not pending.over:
             pending.answer(results)
-
-    def _own(self, frame: DetectFrame, at: int) -> DetectFrame:
-        """The same frame with a decoder of this thread: pixels of the other one may be replaced while it looks."""
-        decoder = self._decoders.get((frame.robot, at))
-        if decoder is None or decoder.size_px != (frame.width_px, frame.height_px):
-            if len(self._decoders) >= MAX_DECODERS:
-                self._decoders.clear()
-            decoder = Decoder(frame.width_px, frame.height_px, self._max_pixels)
-            self._decoders[frame.robot, at] = decoder
-        return DetectFrame(frame.robot, frame.header, frame.jpeg, decoder)

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from typing import Final, Protocol, runtime_checkable
 
 from protocol.transports.link import Link
+from vision_side.clock import now_us
 from vision_side.detect.around import attach_detector, close_detector, news_of
+from vision_side.detect.news import News
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
-from vision_side.detect.remote.asking import now_us
 from vision_side.detect.remote.by_deadline import ByDeadline
-from vision_side.detect.remote.refusing import News
 
 GOOD_ANSWERS: Final = 10
 """In a row; a third of a second at 30 fps."""

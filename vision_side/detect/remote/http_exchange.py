@@ -12,7 +12,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
-from vision_side.detect.remote.asking import left_s, now_us
+from vision_side.clock import now_us
+from vision_side.detect.remote.asking import left_s
 from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
 MAX_ANSWER_BYTES: Final = 1 << 20

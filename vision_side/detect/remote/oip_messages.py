@@ -4,10 +4,13 @@ Numbers of fields: grpc_service.proto of https://github.com/kserve/open-inferenc
 `inference.GRPCInferenceService`).
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Final
 
 from numpy.typing import NDArray
 
+from vision_side.detect.protobuf import Bytes, as_bytes, fields, integers, put, put_integers, text
 from vision_side.detect.remote.oip import (
     MAX_TENSORS,
     Model,
@@ -17,11 +20,19 @@ from vision_side.detect.remote.oip import (
     read_number_tensor,
     read_text_tensor,
 )
-from vision_side.detect.remote.protobuf import as_bytes, fields, integers, put, put_integers, text
 from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
 METADATA: Final = "/inference.GRPCInferenceService/ModelMetadata"
 INFER: Final = "/inference.GRPCInferenceService/ModelInfer"
+
+
+@contextmanager
+def _malformed() -> Iterator[None]:
+    """What is no message is no answer."""
+    try:
+        yield
+    except ValueError as error:
+        raise NoAnswerError(Reason.MALFORMED, f"not Protocol Buffers: {error}") from None
 
 
 def metadata_request(model: str, version: str) -> bytes:
@@ -29,6 +40,7 @@ def metadata_request(model: str, version: str) -> bytes:
     return put(1, model) + (put(2, version) if version else b"")
 
 
+@_malformed()
 def read_metadata(data: bytes) -> Model:
     """ModelMetadataResponse. Raises NoAnswerError."""
     name, versions, slots = "", [""], {4: list[Slot](), 5: list[Slot]()}
@@ -53,6 +65,7 @@ def infer_request(model: Model, asked_version: str, tensor: Tensor, number: str)
     ))
 
 
+@_malformed()
 def read_infer(data: bytes, number: str) -> dict[str, NDArray[Any] | list[str]]:
     """The tensors of a ModelInferResponse, by name. Raises NoAnswerError, also if it answers something else."""
     slots: list[Slot] = []
@@ -63,7 +76,7 @@ def read_infer(data: bytes, number: str) -> dict[str, NDArray[Any] | list[str]]:
         if which == 5:
             slots.append(_slot(as_bytes(value)))
         elif which == 6:
-            contents.append(as_bytes(value))
+            contents.append(bytes(as_bytes(value)))
     if len(slots) != len(contents) or len(slots) > MAX_TENSORS:
         raise NoAnswerError(Reason.MALFORMED, f"{len(slots)} outputs, {len(contents)} raw contents; they go together")
     return {slot.name: _tensor(slot, raw) for slot, raw in zip(slots, contents, strict=True)}
@@ -75,7 +88,7 @@ def _tensor(slot: Slot, raw: bytes) -> NDArray[Any] | list[str]:
     return read_number_tensor(slot.datatype, slot.shape, raw)
 
 
-def _slot(data: bytes) -> Slot:
+def _slot(data: Bytes) -> Slot:
     """TensorMetadata and InferOutputTensor alike: name, datatype, shape."""
     name, datatype, shape = "", "", list[int]()
     for number, value in fields(data):

@@ -1,12 +1,12 @@
 """Why a remote detector gave no answer that counts: one list, one exception, one tally. Pure."""
 
-from collections import Counter, deque
+from collections import Counter
 from enum import StrEnum
 from typing import Final
 
+from vision_side.detect.news import News
+
 _LONGEST: Final = 160
-MAX_NEWS: Final = 16
-"""Lines kept for who asks for them seldom; the oldest go first."""
 _TOLD_AT: Final = frozenset(10**power for power in range(10))
 """A server gone bad is told at the 1st, 10th, 100th ... refusal of a kind, and when it is good again."""
 
@@ -35,24 +35,6 @@ class NoAnswerError(Exception):
         self.reason = reason
         self.detail = " ".join(detail.split())[:_LONGEST]
         super().__init__(f"{reason}: {self.detail}")
-
-
-class News:
-    """Lines for a person, until somebody takes them; may be added to on another thread."""
-
-    def __init__(self) -> None:
-        self._lines: deque[str] = deque(maxlen=MAX_NEWS)
-
-    def add(self, line: str) -> None:
-        """One line."""
-        self._lines.append(line)
-
-    def take(self) -> list[str]:
-        """All since the last time."""
-        lines = []
-        while self._lines:
-            lines.append(self._lines.popleft())
-        return lines
 
 
 class Tally:

@@ -6,8 +6,6 @@
 Nothing is sent: robot and service meet by themselves. Here it is waited, by the deadline, for what cites the frame.
 """
 
-from collections import Counter
-from collections.abc import Sequence
 from typing import Final
 
 from protocol.channels import DETECTIONS, FRAME
@@ -18,9 +16,9 @@ from protocol.messages import Detections, DetectionsHeader, Source
 from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.config import Fraction
 from vision_side.detect.port import DetectFrame, DetectionResult, Maker, result_of
-from vision_side.detect.remote.asking import REMOTE, left_s
+from vision_side.detect.remote.asking import REMOTE, FrameByFrame, left_s
 from vision_side.detect.remote.boxes_read import MIN_SCORE, clean_label, hash_of, read_boxes
-from vision_side.detect.remote.refusing import NoAnswerError, Reason, Tally
+from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
 ROLE: Final = "detector"
 """The source under which a detector service speaks."""
@@ -54,7 +52,7 @@ class _Heard:
         return message
 
 
-class ZenohDetector:
+class ZenohDetector(FrameByFrame):
     """The detector `zenoh`: waits for one source's boxes on the links that vision has to its robots."""
 
     class Config(Settings):
@@ -64,35 +62,16 @@ class ZenohDetector:
         min_score: Fraction = MIN_SCORE
 
     def __init__(self, config: Config) -> None:
+        super().__init__(f"zenoh ({config.source})")
         self._config = config
-        self._tally = Tally(f"zenoh ({config.source})")
         self._heard: dict[str, _Heard] = {}
 
     def attach(self, link: Link) -> None:
         """Hear what is said of its robot."""
         self._heard[link.robot] = _Heard(link, self._config.source)
 
-    @property
-    def refused(self) -> Counter[str]:
-        """What was refused so far, by reason."""
-        return self._tally.refused
-
-    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
-        """As the port says."""
-        return [self._one(frame, deadline_us) for frame in frames]
-
-    def news(self) -> list[str]:
-        """What a person may want to know, since the last time."""
-        return self._tally.news.take()
-
-    def _one(self, frame: DetectFrame, deadline_us: int) -> DetectionResult | None:
-        try:
-            result = self._wait(self._of(frame.robot), frame, deadline_us)
-        except NoAnswerError as error:
-            self._tally.refuse(error)
-            return None
-        self._tally.good()
-        return result
+    def _ask(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
+        return self._wait(self._of(frame.robot), frame, deadline_us)
 
     def _of(self, robot: str) -> _Heard:
         if robot not in self._heard:
