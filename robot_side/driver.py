@@ -138,7 +138,7 @@ class Driver:
 
     def _tick(self, now_us: int, *, punctual: bool) -> None:
         self._ticked_us = now_us
-        self._move(now_us)
+        self._move()
         self._answer()
         if punctual:
             for message in self._driving.messages(now_us):
@@ -160,20 +160,23 @@ class Driver:
             self._manager.tell("READY=1\nWATCHDOG=1")
             self._watchdog_due_us = now_us + _WATCHDOG_PERIOD_US
 
-    def _move(self, now_us: int) -> None:
-        """Sensors, gate, motors. Whatever a device raises stops the robot, never the loop that stops it."""
+    def _move(self) -> None:
+        """Sensors, gate, motors. Whatever a device raises stops the robot, never the loop that stops it.
+
+        The gate's time is taken after the sensors': a scan that is stamped when it is read is not from the future.
+        """
         wheels: WheelAngles | None = None
         scan: Ranges | None = None
         self._obeyed = False
         try:
             wheels = self._drive.wheels()
             scan = self._scanned()
-            speeds = self._driving.tick(now_us, wheels, scan)
+            speeds = self._driving.tick(_now_us(), wheels, scan)
         except DeadZoneError:  # with the first scan, and without one nothing moves
             raise
         except Exception as error:  # a plug-in is foreign code; a reading may be no number
             self._driving.gate.fault(f"{error or type(error).__name__}")
-            speeds = self._driving.tick(now_us, None, None)
+            speeds = self._driving.tick(_now_us(), None, None)
         try:
             self._drive.set(*speeds)
             self._obeyed = True
