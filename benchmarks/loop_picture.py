@@ -1,10 +1,12 @@
 """The distributions of `bench loop` as a picture: share of answers by age, and age over time. Shell (a file)."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from benchmarks.loop import Race
 from benchmarks.loop_setting import FLOOR, OUR_EYES, OURS, TCP, LoopSetting
@@ -17,6 +19,7 @@ LABELS: Final = {
     "lekiwi": "ZeroMQ as LeKiwi", "openpi": "WebSocket as openpi", "callback": "zenoh, plain callback",
     "openpi" + OUR_EYES: "openpi's transport alone", "callback" + OUR_EYES: "callback's transport alone",
 }
+_PAUSE_US: Final = 2_000_000
 
 
 def draw_race(path: Path, race: Race) -> None:
@@ -31,6 +34,10 @@ def draw_race(path: Path, race: Race) -> None:
     _finish(times, "seconds", "age at the verdict, ms")
     shares.set_xscale("log")
     times.set_yscale("log")
+    for axis in (shares.xaxis, times.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     shares.legend(loc="lower right")
     setting = race.setting
     figure.suptitle(
@@ -52,9 +59,21 @@ def _draw_one(shares: "Axes", times: "Axes", name: str, ages_us: tuple[tuple[int
     style = ":" if name.endswith(OUR_EYES) else "--" if name in (FLOOR, TCP) else "-"
     percents = [100 * (at + 1) / len(ages_ms) for at in range(len(ages_ms))]
     shares.plot(ages_ms, percents, label=LABELS[name], linewidth=width, linestyle=style)
-    begin_us = ages_us[0][0]
-    times.plot([(at_us - begin_us) / 1e6 for at_us, _ in ages_us], [age_us / 1000 for _, age_us in ages_us],
-               linewidth=width, linestyle=style)
+    times.plot(*_over_time(ages_us), linewidth=width, linestyle=style)
+
+
+def _over_time(ages_us: tuple[tuple[int, int], ...]) -> tuple[list[float], list[float]]:
+    """Seconds and milliseconds; the line is broken where others had their turn."""
+    seconds, ages_ms = [], []
+    before_us = begin_us = ages_us[0][0]
+    for at_us, age_us in ages_us:
+        if at_us - before_us > _PAUSE_US:
+            seconds.append((at_us - begin_us) / 1e6)
+            ages_ms.append(math.nan)
+        seconds.append((at_us - begin_us) / 1e6)
+        ages_ms.append(age_us / 1000)
+        before_us = at_us
+    return seconds, ages_ms
 
 
 def _finish(axes: "Axes", across: str, up: str) -> None:
