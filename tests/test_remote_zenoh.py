@@ -17,7 +17,7 @@ from protocol.transports.zenoh_around import peers_at
 from protocol.transports.zenoh_site import open_site
 from tests.link_rigs import free_endpoint, until
 from tests.remote_rig import BALL_JPEG, GREY_JPEG, frame, within
-from vision_side.config import HsvConfig
+from vision_side.config import DetectorConfig, HsvConfig
 from vision_side.decode import Decoder
 from vision_side.detect.local import Hsv
 from vision_side.detect.port import DetectFrame
@@ -25,6 +25,7 @@ from vision_side.detect.remote.zenoh_detector import ZenohDetector
 from vision_side.detector_service import ROLE, DetectorService, Serving
 
 CORNERS = ("x1_px", "y1_px", "x2_px", "y2_px")
+DEADLINE_S = DetectorConfig().deadline_s
 HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
 
 
@@ -189,7 +190,7 @@ def test_a_service_that_is_gone_is_no_answer_by_the_deadline_and_back_by_itself(
                 service, over = DetectorService(site, HSV, Serving("hsv"), lambda line: None), threading.Event()
                 thread = threading.Thread(target=service.serve, args=(over,))
                 thread.start()
-                assert until(lambda: (robot.here(), _result(robot, detector, seconds=0.05))[1], 3.0)
+                assert until(lambda: (robot.here(), _result(robot, detector, seconds=DEADLINE_S))[1], 3.0)
                 over.set()
                 thread.join()
         assert "LATE" in detector.refused and any("answers again" in line for line in detector.news())
