@@ -57,9 +57,11 @@ class Turns(Generic[Item]):
 
     def take(self, now_us: int, each_us: int = 0) -> list[Turn[Item]]:
         """What waits, as one batch that fits in half a deadline if a frame takes `each_us`; empty if nothing waits."""
-        most = self._max_batch
+        most, share_us = self._max_batch, int(self._deadline_us * _BATCH_SHARE)
         if each_us > 0:
-            most = max(1, min(most, int(self._deadline_us * _BATCH_SHARE) // each_us))
+            most = max(1, min(most, share_us // each_us))
+        # One slow frame (the first, on a device that warms up) must not rule out every later one: nothing would be measured.
+        each_us = min(each_us, share_us)
         batch: list[Turn[Item]] = []
         for robot in [name for name, turn in self._waiting.items() if turn is not None]:
             if len(batch) == most:
