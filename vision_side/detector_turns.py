@@ -60,7 +60,7 @@ class Turns(Generic[Item]):
         most, share_us = self._max_batch, int(self._deadline_us * _BATCH_SHARE)
         if each_us > 0:
             most = max(1, min(most, share_us // each_us))
-        # One slow frame (the first, on a device that warms up) must not rule out every later one: nothing would be measured.
+        # One slow frame (a device that warms up) must not rule out all later ones: nothing would be measured again.
         each_us = min(each_us, share_us)
         batch: list[Turn[Item]] = []
         for robot in [name for name, turn in self._waiting.items() if turn is not None]:
