@@ -110,7 +110,7 @@ class Vision:
         self.status_slot = self.link.latest(STATUS)
         self._frames = self.link.latest(FRAME)
         self._running = True
-        self._thread = threading.Thread(target=self._run)
+        self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _run(self):

@@ -47,6 +47,11 @@ def only(containers, *names):
         pytest.skip(f"is for {', '.join(names)}")
 
 
+def test_every_image_is_made(images):
+    for image in IMAGES:
+        assert ask("docker", "image", "inspect", image).returncode == 0
+
+
 def test_every_robot_follows_its_ball(running):
     profile = running.profile
     assert all(running.drives(robot) for robot in profile.robots), running.compose("logs", "--tail", "5")

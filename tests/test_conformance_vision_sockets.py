@@ -47,7 +47,7 @@ def our_vision(endpoint):
     """The service as the command runs it, in a thread."""
     ending = threading.Event()
     with folder_of(TOKEN) as folder, open_link("r1", connect=[endpoint], role="vision", secure=folder) as link:
-        running = threading.Thread(target=serve, args=(VisionConfig(), link, ending, lambda line: None))
+        running = threading.Thread(target=serve, args=(VisionConfig(), link, ending, lambda line: None), daemon=True)
         running.start()
         yield
         ending.set()

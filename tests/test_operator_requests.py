@@ -125,8 +125,8 @@ def test_replies_to_others_are_not_taken():
             replies[at] = operator.ask(verb)
 
         threads = [
-            threading.Thread(target=ask, args=(0, robot.operator, Verb.DISARM)),
-            threading.Thread(target=ask, args=(1, other, Verb.RESET)),
+            threading.Thread(target=ask, args=(0, robot.operator, Verb.DISARM), daemon=True),
+            threading.Thread(target=ask, args=(1, other, Verb.RESET), daemon=True),
         ]
         for thread in threads:
             thread.start()

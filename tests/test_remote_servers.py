@@ -140,7 +140,7 @@ def _bomb():
     import grpc
 
     def infer(request, context):
-        return grpc_answer(COLUMNS) + bytes(64 << 20)
+        return grpc_answer(COLUMNS) + bytes(16 << 20)
 
     infer.compression = grpc.Compression.Gzip
     return infer

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import Counter
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import pytest
@@ -57,6 +57,19 @@ class Robot:
         self.link.publish(DETECTIONS, encode(header), encode(said), source)
 
 
+@contextmanager
+def _served(service):
+    """Its thread, ended whatever happens: one that is left would keep the whole test run from its end."""
+    over = threading.Event()
+    thread = threading.Thread(target=service.serve, args=(over,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(5)
+
+
 class Bench:
     """A detector service that is the router, and robots that connect to it."""
 
@@ -64,11 +77,7 @@ class Bench:
         self.endpoint, self.words = free_endpoint(), []
         site = ending.enter_context(open_site("*", listen=[self.endpoint], role=ROLE, about=self._about))
         self.service = DetectorService(site, detector, Serving("hsv", **serving), self.words.append)
-        self._over = threading.Event()
-        thread = threading.Thread(target=self.service.serve, args=(self._over,))
-        thread.start()
-        ending.callback(thread.join, 5)
-        ending.callback(self._over.set)
+        ending.enter_context(_served(self.service))
         self._ending = ending
 
     def _about(self):
@@ -186,13 +195,11 @@ def test_a_service_that_is_gone_is_no_answer_by_the_deadline_and_back_by_itself(
         detector.attach(ending.enter_context(open_zenoh("r1", connect=[endpoint])))
         for _ in range(2):
             assert not _result(robot, detector, seconds=0.05)
-            with open_site("*", connect=[endpoint], role=ROLE) as site:
-                service, over = DetectorService(site, HSV, Serving("hsv"), lambda line: None), threading.Event()
-                thread = threading.Thread(target=service.serve, args=(over,))
-                thread.start()
+            with (
+                open_site("*", connect=[endpoint], role=ROLE) as site,
+                _served(DetectorService(site, HSV, Serving("hsv"), lambda line: None)),
+            ):
                 assert until(lambda: (robot.here(), _result(robot, detector, seconds=DEADLINE_S))[1], 3.0)
-                over.set()
-                thread.join()
         assert "LATE" in detector.refused and any("answers again" in line for line in detector.news())
 
 
@@ -207,6 +214,7 @@ def pair():
     endpoint = free_endpoint()
     with ExitStack() as ending:
         robot = Robot("r1", endpoint, listens=True)
+        robot.link.ignore(DETECTIONS)  # or the service would take the robot for who waits
         service = open_zenoh("r1", connect=[endpoint], role=ROLE)
         link = open_zenoh("r1", connect=[endpoint])
         for one in (robot.link, service, link):

@@ -153,7 +153,7 @@ def test_robots_are_listed_over_a_secured_link(folder, endpoint):
     with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)) as robot:
         found = {}
         deadline_s = time.monotonic() + 5
-        listing = threading.Thread(target=lambda: found.update(list_robots([endpoint], 0.6, str(folder))))
+        listing = threading.Thread(target=lambda: found.update(list_robots([endpoint], 0.6, str(folder))), daemon=True)
         listing.start()
         while listing.is_alive() and time.monotonic() < deadline_s:
             robot.publish(STATUS, b"{}", b"{}")

@@ -272,7 +272,7 @@ def test_over_a_real_link_the_robot_judges_boxes_by_the_frame_they_answer(tmp_pa
     with (RobotProcess(tmp_path) as robot, open_zenoh("r1", connect=[robot.endpoint], role="guest") as far,
           open_zenoh("r1", connect=[robot.endpoint], role="vision") as link):
         statuses, eyes = far.latest(STATUS), Eyes(far)
-        serving = threading.Thread(target=serve, args=(config, link, ending, said.append))
+        serving = threading.Thread(target=serve, args=(config, link, ending, said.append), daemon=True)
         serving.start()
 
         def status() -> Status:

@@ -50,7 +50,7 @@ def fleet():
     config = VisionConfig(robot="r*", listen=(endpoint,), connect=())
     with open_site("r*", listen=[endpoint], role="vision") as site:
         running = Fleet(config, site, said.append)
-        thread = threading.Thread(target=running.serve, args=(ending,))
+        thread = threading.Thread(target=running.serve, args=(ending,), daemon=True)
         thread.start()
         yield running, endpoint, said
         ending.set()

@@ -153,7 +153,7 @@ def test_the_process_ends_within_a_second_of_a_signal(number: signal.Signals) ->
 def test_serve_ends_when_asked(bench: Bench) -> None:
     ending, said = threading.Event(), list[str]()
     link = bench.network.link("r1", role="vision")
-    running = threading.Thread(target=serve, args=(VisionConfig(), link, ending, said.append))
+    running = threading.Thread(target=serve, args=(VisionConfig(), link, ending, said.append), daemon=True)
     running.start()
     ending.set()
     running.join(1.0)

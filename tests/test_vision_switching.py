@@ -68,7 +68,7 @@ def test_a_person_sends_a_robot_somewhere_and_calls_it_off(tmp_path, transport):
                      range_sensor={"kind": f"{__name__}:FarSensor"}) as robot,
         open_link("r1", connect=[of_vision], role="vision", timeout_s=20) as link,
     ):
-        serving = threading.Thread(target=serve, args=(QUIET, link, ending, said.append))
+        serving = threading.Thread(target=serve, args=(QUIET, link, ending, said.append), daemon=True)
         serving.start()
         try:
             _course(robot, ["--connect", of_vision], said)

@@ -171,7 +171,7 @@ class _Publishing:
 
     def __init__(self, links) -> None:
         self._links, self._stop = links, threading.Event()
-        self._thread = threading.Thread(target=self._run)
+        self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
         self._thread.start()
