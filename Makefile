@@ -10,8 +10,13 @@ READY := $(VENV)/.ready
 demo: $(READY)
 	$(BIN)/sightline demo $(ARGS)
 
-test: $(READY)
+test: $(READY)  ## what is quick on all cores; then real processes in real time, one after the other; or just ARGS
+ifdef ARGS
 	$(BIN)/python -m pytest $(ARGS)
+else
+	$(BIN)/python -m pytest -m "not slow and not faults and not kit" --numprocesses auto; quick=$$?; \
+	$(BIN)/python -m pytest -m "slow and not faults and not kit" && exit $$quick
+endif
 
 kit: $(READY)  ## the conformance kit against every broken peer
 	$(BIN)/python -m pytest -m kit $(ARGS)
