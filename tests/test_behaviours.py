@@ -98,7 +98,6 @@ def test_both_laws_reach_a_near_waypoint():
         assert drive.off_m < 0.06 and 0.05 < drive.top_mps <= 0.5 and abs(drive.speeds_mps[-1]) < 0.01
 
 
-@pytest.mark.slow
 def test_the_command_writes_the_page_and_a_picture_of_the_first_start(tmp_path):
     rows, advanced = [Row("legs-slow"), Row("legs-slow", "legs-baseline")], []
 

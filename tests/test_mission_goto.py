@@ -62,12 +62,7 @@ CLOSED = Course(walls=box(1.0, 1.0, 2.0, 2.0))
 SHUT_IN = Course(walls=box(-0.6, -0.5, 0.7, 0.6))
 
 
-def seeds(*these: int) -> list[object]:
-    """The first one quick, the others with the slow tests."""
-    return [one if one == these[0] else pytest.param(one, marks=pytest.mark.slow) for one in these]
-
-
-@pytest.mark.parametrize("seed", seeds(1, 2, 3, 4, 5, 6))
+@pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6])
 def test_the_cylinder_in_the_way_costs_less_than_fifteen_seconds(seed: int) -> None:
     draw = random.Random(seed)
     post = (0.75 + draw.uniform(-0.06, 0.06), 0.75 + draw.uniform(-0.06, 0.06), 0.2)
@@ -78,7 +73,7 @@ def test_the_cylinder_in_the_way_costs_less_than_fifteen_seconds(seed: int) -> N
     assert nearest(run) > CLEAR_M
 
 
-@pytest.mark.parametrize("seed", seeds(1, 2, 3))
+@pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("course", [WIDE_WALL, TRAP, SLALOM, CORNER], ids=["wall", "trap", "slalom", "corner"])
 def test_layouts_are_passed_without_a_touch(course: Course, seed: int) -> None:
     run = drive(course, (1.5, 1.5), start=(0, 0, seed - 2.0), seed=seed)
@@ -86,14 +81,13 @@ def test_layouts_are_passed_without_a_touch(course: Course, seed: int) -> None:
     assert nearest(run) > CLEAR_M
 
 
-@pytest.mark.slow
 def test_a_trap_deeper_than_the_robot_sees_is_left_again() -> None:
     run = drive(DEEP_TRAP, (2.2, 0.0), seed=4, seconds=120)
     assert end_of(run).note == "reached 1 of 1"
     assert nearest(run) > CLEAR_M
 
 
-@pytest.mark.parametrize("seed", seeds(1, 2, 3))
+@pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize(("course", "goal"), [(CLOSED, (1.5, 1.5)), (SHUT_IN, (3.0, 0.4)), (SHUT_IN, (40.0, -30.0))],
                          ids=["goal shut in", "robot shut in", "robot shut in, goal far"])
 def test_a_closed_room_is_said_to_be_closed(course: Course, goal: tuple[float, float], seed: int) -> None:
@@ -120,7 +114,7 @@ def random_course(draw: random.Random) -> Course:
     return Course(sum((one.walls for one in parts), ()), sum((one.posts for one in parts), ()))
 
 
-@pytest.mark.parametrize("seed", seeds(*range(8)))
+@pytest.mark.parametrize("seed", range(8))
 def test_random_layouts(seed: int) -> None:
     draw = random.Random(seed)
     run = drive(random_course(draw), (2.0, 1.0), start=(0, 0, draw.uniform(-3, 3)), seed=seed, seconds=90)

@@ -79,7 +79,7 @@ def errors(run: list[Row], walk: Walk, from_s: float) -> tuple[float, float, flo
 
 
 @pytest.mark.parametrize("speed_mps", [0.2, 0.35, 0.45])
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_person_who_walks_is_followed_at_eight_tenths_of_a_metre(speed_mps: float, seed: int) -> None:
     run = follow(circle(speed_mps), speed_mps, 20, seed)
     bearing_deg, least_m, most_m = errors(run, circle(speed_mps), 4.0)

@@ -167,7 +167,6 @@ def drive(begin_s: float, is_box: bool = False, seed: int = 1, look: str = "plai
                  acceleration=(2.0, 10.0), eye=world.sight).run(45)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("is_box", [False, True], ids=["lamps", "box"])
 @pytest.mark.parametrize("begin_s", [0.0, 2.5, 3.6, 4.0, 7.0, 9.0])
 def test_the_line_is_never_crossed_on_red_and_the_lane_is_driven_to_its_end(begin_s: float, is_box: bool) -> None:
