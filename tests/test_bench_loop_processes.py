@@ -93,7 +93,7 @@ def test_a_short_race_of_the_services_over_each_transport(transport):
     assert race.figures[FLOOR].hot_ms is not None
 
 
-@pytest.mark.slow
+@pytest.mark.kit
 def test_every_peer_answers(tmp_path):
     pytest.importorskip("zmq")
     race = run_race(replace(SMALL, detector_delay_ms=40.0), lambda _: None)

@@ -55,9 +55,14 @@ def test_a_reason_that_was_silent_for_ten_seconds_is_news_again(gap_us, again):
 def test_a_flood_of_refused_commands_is_a_few_lines_in_the_log_and_readable_in_the_status(tmp_path):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint, twist=b"nan|0") as vision:
         assert until(lambda: vision.status().refused.get("NOT_FINITE", 0) > 60, 10)
-        for _ in range(2000):
-            vision.link.publish(TWIST, b"{", b"0.1|0")
-        assert until(lambda: vision.status().refused.get("MALFORMED", 0) > 1000, 10)
+
+        def flooded():
+            """Little by little: what a busy machine cannot send at once is dropped before the robot sees it."""
+            for _ in range(50):
+                vision.link.publish(TWIST, b"{", b"0.1|0")
+            return vision.status().refused.get("MALFORMED", 0) > 1000
+
+        assert until(flooded, 10)
         lines = [line for line in robot.output().splitlines() if "refused" in line]
         assert any("refused NOT_FINITE from vision" in line for line in lines)
         assert any("refused MALFORMED from vision" in line for line in lines)

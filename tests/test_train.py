@@ -139,7 +139,8 @@ class TestGraph:
     """The ONNX file, by weights that mean nothing."""
 
     @pytest.fixture(scope="class")
-    def made(self, tmp_path_factory):
+    @classmethod
+    def made(cls, tmp_path_factory):
         pytest.importorskip("onnx")
         from operator_side.train_export import onnx_bytes
 

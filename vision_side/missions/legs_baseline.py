@@ -85,6 +85,8 @@ class LegsBaseline:
 
 def _seventy(scan: RangeScan) -> list[float]:
     """The 70 rays it looked at, each the scan's nearest by angle; inf beyond an arc's ends."""
+    if not scan.angle_increment_rad:  # one ray only: no arc
+        return [math.inf] * _RAYS
     angles = np.radians(_FIRST_DEG - np.arange(_RAYS))
     turned = np.remainder(angles - scan.angle_min_rad, math.tau)
     index = np.rint(turned / scan.angle_increment_rad).astype(np.int64)
