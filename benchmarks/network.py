@@ -6,7 +6,7 @@ The robot plays recorded pictures through a camera that can change their quality
 import json
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.interrupted import terminated_like_interrupted
 from benchmarks.loop_crew import Crew
-from benchmarks.loop_figures import LoopCheck
+from benchmarks.loop_figures import LoopCheck, at_most
 from benchmarks.loop_pictures import write_pictures
 from benchmarks.network_figures import Stretch, figures_of, judge
 from benchmarks.network_fleet import fleet
@@ -34,6 +34,7 @@ from benchmarks.network_stage import (
 )
 from benchmarks.network_takeover import moved, router, standby
 from benchmarks.network_uplink import uplink
+from benchmarks.network_wheels import on_old_sight, read_told
 from protocol.errors import ConfigError, HardwareError
 from sim.wire import Shapes
 from sim.wire_tun import ADDRESS_A, why_impossible
@@ -116,7 +117,14 @@ def _course(row: Row, stage: Stage) -> NetworkRun:
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
     figures = tuple(figures_of(notes, stretch) for stretch in stretches)
     harmed = LoopCheck("injected", float(injected), "", 1.0, injected >= 1)
-    return NetworkRun(row, stage.seed, injected, figures, (harmed, *judge(row, figures)))
+    return NetworkRun(row, stage.seed, injected, figures, (harmed, *judge(row, figures), *_judge_wheels(stage, notes)))
+
+
+def _judge_wheels(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[LoopCheck]:
+    """From what the wheels were told, whatever the robot says of itself; over Zenoh, where twists can be heard."""
+    if notes["twists"]:
+        lines = on_old_sight(read_told(stage.wheels.read_text("ascii")), notes["twists"])
+        yield at_most("moved on frames over 400 ms", float(lines), "lines", 0)
 
 
 def _start(row: Row, wire: BenchWire, crew: Crew, stage: Stage) -> None:

@@ -87,6 +87,10 @@ ROWS: Final = (
         Phase(both(delay_ms=5, rate_bit_s=1e7), judged=False),
         Phase(both(delay_ms=5, rate_bit_s=1e6), settle_s=STEP_SETTLES_S),
     ), p95_ms=250),
+    Row("rise", "1 Mbit/s, then 10 Mbit/s", (
+        Phase(both(delay_ms=5, rate_bit_s=1e6), judged=False),
+        Phase(both(delay_ms=5, rate_bit_s=1e7), settle_s=STEP_SETTLES_S),
+    ), least_fps=12, p95_ms=160),
     Row("rtt200", "200 ms round trip", _steady(delay_ms=100), least_fps=20, p95_ms=200 + 60),
     Row("cut", "a partition of 5 s", (
         Phase(_NEAR, judged=False), Phase(both(cut=True), CUT_S, judged=False), Phase(_NEAR, settle_s=HEALS_S),

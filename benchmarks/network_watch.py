@@ -3,21 +3,22 @@
     python -m benchmarks.network_watch ENDPOINT FILE [statuses]
 
 It runs beside the robot, on the near side of the wire, so that watching costs the wire nothing, and acknowledges
-nothing. Written at SIGTERM as JSON: frames (seq, t_us, latency_us, bytes), statuses (t_us and what `NOTED` names). With
-`statuses` it takes no frames.
+nothing. Written at SIGTERM as JSON: frames (seq, t_us, latency_us, bytes), statuses (t_us and what `NOTED` names), and
+over Zenoh, where peers hear one another, twists (heard_us, t_us of the frame answered). With `statuses` only those.
 """
 
 import json
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.loop_ours import ROBOT
-from protocol.channels import FRAME, STATUS
+from protocol.channels import FRAME, STATUS, TWIST
 from protocol.codec import decode
-from protocol.messages import FrameHeader, Stamp, Status
+from protocol.messages import AnswerHeader, FrameHeader, Stamp, Status
 from protocol.transports.link import Message
 from protocol.transports.opening import open_link
 
@@ -31,11 +32,16 @@ class Notes:
     def __init__(self) -> None:
         self.frames: list[tuple[bytes, int]] = []
         self.statuses: list[tuple[bytes, bytes]] = []
+        self.twists: list[tuple[int, bytes]] = []
         self.heard = threading.Event()
 
     def frame(self, message: Message) -> None:
         """Its header and size only."""
         self.frames.append((message.header, len(message.payload)))
+
+    def twist(self, message: Message) -> None:
+        """When it came, by the clock of all processes of this machine."""
+        self.twists.append((time.monotonic_ns() // 1000, message.header))
 
     def status(self, message: Message) -> None:
         """Kept undecoded: decoding is for the end."""
@@ -47,12 +53,17 @@ class Notes:
         return {
             "frames": [_frame_row(header, size) for header, size in self.frames],
             "statuses": [_status_row(header, payload) for header, payload in self.statuses],
+            "twists": [(at_us, _answered_us(header)) for at_us, header in self.twists],
         }
 
 
 def _frame_row(header: bytes, size: int) -> tuple[Any, ...]:
     frame = decode(FrameHeader, header)
     return frame.seq, frame.t_us, frame.latency_us, size
+
+
+def _answered_us(header: bytes) -> int:
+    return decode(AnswerHeader, header).echo.t_us
 
 
 def _status_row(header: bytes, payload: bytes) -> tuple[Any, ...]:
@@ -74,6 +85,8 @@ def main(endpoint: str, path: Path, only: str = "") -> None:
         link.subscribe(STATUS, notes.status)
         if only != "statuses":
             link.subscribe(FRAME, notes.frame)
+            if not secure:
+                link.subscribe(TWIST, notes.twist)
         notes.heard.wait()
         print("watching", flush=True)
         while not ending.wait(0.1):

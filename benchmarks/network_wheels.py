@@ -1,7 +1,18 @@
 """What a robot's wheels were told, as its log drive notes it, held against when something was harmed. Pure."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+from robot_side.limits import TICK_US, SafetyConfig, stop_bound
+
+_LATE_US: Final = 2 * TICK_US
+"""A decision holds for a tick; who notes a twist may hear it a little after the robot."""
+_OLD_US: Final = SafetyConfig().zero_speed_age_ms * 1000 + _LATE_US
+_RAMPED_OUT_US: Final = stop_bound(SafetyConfig()).zero_us + _LATE_US
+"""Age of a frame at which even the ramp that it left behind is at its end."""
+_FASTER_RAD_S: Final = 0.15
+"""Less is no gain of speed: turning a twist into wheel speeds rounds."""
 
 
 class Told(NamedTuple):
@@ -21,6 +32,26 @@ def read_told(text: str) -> list[Told]:
     """Whole lines; one that is still being written is left out."""
     parts = [line.split(",") for line in text.split("\n")[:-1]]
     return [Told(int(t), float(left), float(right)) for t, left, right in parts]
+
+
+def on_old_sight(rows: Sequence[Told], answers: Sequence[Sequence[int]]) -> int:
+    """Lines that no young frame allows; `answers` are (heard_us, t_us of the frame answered) of every command sent.
+
+    With the youngest frame that was answered by then older than is driven on, no wheel may turn faster than before;
+    when even the ramp is at its end, none may turn.
+    """
+    ordered, known, youngest_us, lines = sorted(answers, key=lambda one: one[0]), 0, 0, 0
+    for before, row in pairwise(rows):
+        while known < len(ordered) and ordered[known][0] <= row.t_us + _LATE_US:
+            youngest_us = max(youngest_us, ordered[known][1])
+            known += 1
+        age_us = row.t_us - youngest_us
+        lines += (age_us > _OLD_US and _is_faster(before, row)) or (age_us > _RAMPED_OUT_US and row.moves)
+    return lines
+
+
+def _is_faster(before: Told, row: Told) -> bool:
+    return max(abs(row[1]) - abs(before[1]), abs(row[2]) - abs(before[2])) > _FASTER_RAD_S
 
 
 def moves_again_s(rows: Sequence[Told], since_us: int, until_us: int) -> float | None:

@@ -12,7 +12,7 @@ from benchmarks.network_stage import NetworkRun, Stage
 from operator_side.faults.judge import Motors, measure_stop, moved_on_old_sight, wheel_mps
 from operator_side.faults.ledger import TOLD
 from operator_side.faults.rig import ROBOT, Rig, Setup
-from operator_side.network_person import STOPPED
+from operator_side.network_person import RESET, STOPPED
 from protocol.errors import HardwareError, SightlineError
 from sim.wire import Shapes
 
@@ -48,20 +48,21 @@ def _run(row: Row, stage: Stage, rig: Rig) -> NetworkRun:
     rows = rig.motors()
     checks = (
         LoopCheck("injected", float(injected), "", 1.0, injected >= 1),
-        *judge_stops(rows, told_us),
+        *judge_stops(rows, told_us, [one.t_us for one in rig.noted("person", RESET)]),
         judge_said(told_us, [one.frame_us for one in rig.noted("person", STOPPED)]),
         at_most("moved on frames over 400 ms", moved_on_old_sight(rows, rig.sent(), None), "lines", 0),
     )
     return NetworkRun(row, stage.seed, injected, (), checks, {"stops": len(told_us)})
 
 
-def judge_stops(rows: Sequence[Motors], told_us: Sequence[int]) -> tuple[LoopCheck, LoopCheck]:
-    """When each STOP, said at `told_us`, shows in what the motors were told, and when the wheels stood."""
-    ends_us = [*told_us[1:], rows[-1].t_us + 1]
-    windows = [_window(rows, begin_us, end_us) for begin_us, end_us in zip(told_us, ends_us, strict=True)]
-    reached = [reached_ms(window, at_us) for window, at_us in zip(windows, told_us, strict=True)]
-    zero = [measure_stop(rows, at_us, _again_us(window)).zero_ms
-            for window, at_us in zip(windows, told_us, strict=True)]
+def judge_stops(rows: Sequence[Motors], told_us: Sequence[int], reset_us: Sequence[int]) -> Sequence[LoopCheck]:
+    """When each STOP, said at `told_us`, shows in what the motors were told, and when the wheels stood; each holds
+    until the wheels turn after its reset.
+    """
+    ends_us = [_again_us(rows, at_us) for at_us in reset_us]
+    pairs = list(zip(told_us, ends_us, strict=True))
+    reached = [reached_ms(_window(rows, at_us, end_us), at_us) for at_us, end_us in pairs]
+    zero = [measure_stop(rows, at_us, end_us).zero_ms for at_us, end_us in pairs]
     return (
         at_most(f"STOP reaches the wheels, p99 of {len(reached)}", _p99(reached), "ms", REACHES_MS),
         at_most(f"wheels at zero, p99 of {len(zero)}", _p99(zero), "ms", ZERO_MS),
@@ -75,31 +76,26 @@ def judge_said(told_us: Sequence[int], stopped_us: Sequence[int]) -> LoopCheck:
     return at_most(f"robot says STOPPED, p99 of {len(said)}", value, "ms", SAID_MS)
 
 
+def _again_us(rows: Sequence[Motors], reset_us: int) -> int:
+    """Just before the wheels turn after the reset; the end of the log if they do not."""
+    return next((row.t_us - 1 for row in rows if row.t_us > reset_us and wheel_mps(row) > 0), rows[-1].t_us)
+
+
 def _window(rows: Sequence[Motors], begin_us: int, end_us: int) -> list[Motors]:
     """What they were told when it began, and all up to its end."""
     before = [row for row in rows if row.t_us <= begin_us]
-    return [*before[-1:], *(row for row in rows if begin_us < row.t_us < end_us)]
+    return [*before[-1:], *(row for row in rows if begin_us < row.t_us <= end_us)]
 
 
 def reached_ms(window: Sequence[Motors], told_us: int) -> float | None:
-    """From STOP to the first line of the fall that ended at zero; None if the wheels never stood."""
-    zero = next((index for index, row in enumerate(window) if wheel_mps(row) == 0), None)
-    if zero is None:
+    """From STOP to the first line of the fall after which the wheels stayed at zero; None if they turn to the end."""
+    zero = 1 + max((index for index, row in enumerate(window) if wheel_mps(row) > 0), default=-1)
+    if zero == len(window):
         return None
     first = zero
     while first > 1 and wheel_mps(window[first - 2]) > wheel_mps(window[first - 1]):
         first -= 1
     return max(0, window[first].t_us - told_us) / 1000
-
-
-def _again_us(window: Sequence[Motors]) -> int | None:
-    """Just before the wheels turned again after having stood: the reset."""
-    stood = False
-    for row in window:
-        stood = stood or wheel_mps(row) == 0
-        if stood and wheel_mps(row) > 0:
-            return row.t_us - 1
-    return None
 
 
 def _p99(values: Sequence[float | None]) -> float | None:

@@ -13,10 +13,13 @@ from typing import Final
 from operator_side.faults.ledger import TOLD, Ledger
 from operator_side.requests import SOURCE, Operator
 from protocol.messages import Reply, State, Status, Verb
+from protocol.refusals import Refusal
 from protocol.transports.zenoh import open_zenoh
 
 STOPPED: Final = "stopped"
 """Noted with the stamp of the first status that said so."""
+RESET: Final = "reset"
+"""Noted just before it is asked: the wheels stay at zero until then."""
 DRIVES_MPS: Final = 0.2
 _PATIENCE_S: Final = 20.0
 _PAUSE_S: Final = 0.2, 0.8
@@ -39,14 +42,18 @@ def run(endpoint: str, robot: str, ledger: Ledger, seconds: float, seed: int) ->
             assert operator.report is not None
             ledger.note(STOPPED, operator.report.stamp.t_us)
             _until(operator, lambda status: not any(status.applied))
-            _agreed(operator.ask(Verb.RESET))
-            _agreed(operator.arm(_PATIENCE_S))
+            ledger.note(RESET)
+            _agreed(lambda: operator.ask(Verb.RESET))
+            _agreed(lambda: operator.arm(_PATIENCE_S))
     print("person done", flush=True)
 
 
-def _agreed(reply: Reply) -> None:
-    if not reply.ok:
-        raise SystemExit(f"the robot refused: {reply.detail}")
+def _agreed(ask: Callable[[], Reply]) -> None:
+    """As a person does, ask anew when the robot says that what was asked came too late: the medium is full."""
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while not (reply := ask()).ok:
+        if not reply.detail.startswith(Refusal.STALE) or time.monotonic() > deadline_s:
+            raise SystemExit(f"the robot refused: {reply.detail}")
 
 
 def _drives(status: Status) -> bool:

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from benchmarks.network_fleet import ROBOTS, judge_fleet
-from benchmarks.network_wheels import moves_again_s, read_told
+from benchmarks.network_wheels import moves_again_s, on_old_sight, read_told
 from operator_side.faults.judge import Motors
 from operator_side.network_medium import judge_said, judge_stops, reached_ms
 from sim.wire_tun import why_impossible
@@ -42,6 +42,28 @@ def test_wheels_that_stay_still_do_not_move_again():
     assert moves_again_s([], 0, 1) is None
 
 
+ANSWERS = [(at_us, at_us - 50_000) for at_us in range(0, SECOND_US, 50_000)]
+"""Frames 50 ms old when answered, for one second; then none."""
+
+
+def test_wheels_that_ramp_down_after_the_last_young_frame_moved_on_no_old_one():
+    assert on_old_sight(told((3, 1.3), (2, 0.1), (1, 0.1), (0, 2)), ANSWERS) == 0
+    assert on_old_sight(told((0, 0.1), (3, 0.5), (-5, 0.5), (0, 2)), ANSWERS) == 0, "young frames allow all"
+
+
+@pytest.mark.parametrize("speeds", [((3, 1.3), (2, 0.2), (5, 0.02), (0, 2)), ((3, 1.3), (2, 1.7), (0, 0.02)),
+                                    ((3, 1.3), (2, 0.2), (-5, 0.02), (0, 2))])  # fmt: skip
+def test_wheels_that_gain_speed_or_go_on_without_a_young_frame_are_counted(speeds):
+    assert on_old_sight(told(*speeds), ANSWERS) >= 1
+    late = [(at_us, at_us - 900_000) for at_us in range(SECOND_US, 3 * SECOND_US, 50_000)]
+    assert on_old_sight(told(*speeds), ANSWERS + late) >= 1, "answers to old frames allow nothing"
+
+
+def test_without_any_answer_wheels_may_only_stand():
+    assert on_old_sight(told((0, 3)), []) == 0
+    assert on_old_sight(read_told("1000000,0,0\n1020000,3.0,3.0\n"), []) == 1
+
+
 # --- STOP --------------------------------------------------------------------------------------------------------
 
 
@@ -64,10 +86,17 @@ def test_a_stop_reaches_the_wheels_with_the_first_line_of_the_fall_that_ends_at_
 
 def test_one_stop_in_vain_is_no_p99():
     heard = motors(*[15.0] * 10, *FALL, *[0.0] * 20, *[15.0] * 20)
-    reached, zero = judge_stops(heard, [5 * TICK_US])
+    reached, zero = judge_stops(heard, [5 * TICK_US], [35 * TICK_US])
     assert reached.ok and zero.ok and reached.value == pytest.approx(20 * (10 - 5))
-    reached, zero = judge_stops(heard, [5 * TICK_US, 45 * TICK_US])
+    reached, zero = judge_stops(heard, [5 * TICK_US, 45 * TICK_US], [35 * TICK_US, 50 * TICK_US])
     assert not reached.ok and reached.value is None and not zero.ok
+
+
+def test_wheels_that_stood_for_lack_of_young_frames_had_not_heard_the_stop():
+    heard = motors(*[15.0] * 4, *FALL, *[15.0] * 6, *FALL, *[0.0] * 10)
+    reached, zero = judge_stops(heard, [2 * TICK_US], [30 * TICK_US])
+    assert reached.value == pytest.approx(20 * (17 - 2)), "the second fall is the one that lasts"
+    assert zero.value == pytest.approx(20 * (21 - 2), abs=20)
 
 
 def test_a_robot_that_never_says_it_is_stopped_is_not_ok():
@@ -78,7 +107,7 @@ def test_a_robot_that_never_says_it_is_stopped_is_not_ok():
 
 def test_a_late_stop_is_over_its_bound():
     late = motors(*[15.0] * 25, *FALL, *[0.0] * 20)
-    reached, zero = judge_stops(late, [5 * TICK_US])
+    reached, zero = judge_stops(late, [5 * TICK_US], [40 * TICK_US])
     assert not reached.ok and reached.value == pytest.approx(20 * (25 - 5)) and zero.ok
 
 
