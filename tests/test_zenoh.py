@@ -40,7 +40,7 @@ def test_an_endpoint_that_is_none_is_refused_with_the_right_form(endpoint, end):
 def test_well_formed_endpoints_and_their_send_buffer():
     assert check_endpoint("tcp/[::1]:7447") == ("tcp", "::1", 7447)
     assert check_endpoint("tls/robot.local:1#so_sndbuf=1") == ("tls", "robot.local", 1)
-    assert with_send_buffer("tcp/h:1") == "tcp/h:1#so_sndbuf=65536"
+    assert with_send_buffer("tcp/h:1") == "tcp/h:1#so_sndbuf=262144"
     assert with_send_buffer("tcp/h:1#iface=wlan0") == "tcp/h:1#iface=wlan0"
     assert with_send_buffer("udp/h:1") == "udp/h:1"
 
@@ -51,10 +51,14 @@ def test_the_owner_of_a_free_port_is_nobody():
 
 def test_nobody_answering_is_said_in_time():
     endpoint, begin_s = free_endpoint(), time.monotonic()
-    said = f"nobody answers at {endpoint}; is the robot running? tried for 0.4 s"
+    said = f"nobody answers at {endpoint}; is the robot or router running? tried for 0.4 s"
     with pytest.raises(LinkError, match=re.escape(said)):
         open_zenoh("r1", connect=[endpoint], timeout_s=0.4)
     assert 0.3 < time.monotonic() - begin_s < 2
+    with socket.create_server(("127.0.0.1", check_endpoint(endpoint)[2])):
+        more = f"{said}, and what listens there does not speak Zenoh"
+        with pytest.raises(LinkError, match=re.escape(more)):
+            open_zenoh("r1", connect=[endpoint], timeout_s=0.4)
 
 
 def test_an_address_of_another_machine_cannot_be_listened_on():
@@ -68,6 +72,7 @@ def test_an_address_of_another_machine_cannot_be_listened_on():
         ({"robot": "r/1", "listen": ["tcp/127.0.0.1:7447"]}, "robot id 'r/1'"),
         ({"robot": "*", "connect": ["tcp/127.0.0.1:7447"]}, "robot id '\\*'"),
         ({"robot": "r1"}, "no endpoint"),
+        ({"robot": "r1", "listen": ["tcp/127.0.0.1:7447"] * 2}, "7447 is given twice to listen on"),
         ({"robot": "r1", "listen": ["tcp/127.0.0.1:7447"], "max_frame_bytes": 0}, "max_frame_bytes 0"),
     ],
 )
@@ -206,3 +211,25 @@ def test_no_thread_or_descriptor_is_left_behind():
         open_and_close()
     assert until(lambda: _count("fd") <= before[0] + 2, 3)
     assert until(lambda: _count("task") <= before[1] + 2, 3)
+
+
+def test_a_close_while_others_publish_is_silent(monkeypatch):
+    """A publisher in use cannot be undeclared; that is no traceback on somebody's terminal."""
+    raised, over = [], threading.Event()
+    monkeypatch.setattr(threading, "excepthook", lambda args: raised.append(args.exc_value))
+    for _ in range(8):
+        endpoint = free_endpoint()
+        with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint], role="vision") as peer:
+            peer.latest(FRAME)
+            over.clear()
+            for _ in range(2):
+                threading.Thread(target=lambda: _publish_until(robot, over), daemon=True).start()
+            time.sleep(0.1)
+            robot.close()
+            over.set()
+    assert raised == []
+
+
+def _publish_until(link, over):
+    while not over.is_set():
+        link.publish(FRAME, b"{}", bytes(60_000))

@@ -6,8 +6,10 @@ from typing import Final
 
 from protocol.errors import ConfigError
 
-SEND_BUFFER_BYTES: Final = 65_536
-"""A small socket buffer keeps frames young on a slow link: what waits in the socket can no longer be dropped."""
+SEND_BUFFER_BYTES: Final = 262_144
+"""A bounded socket buffer keeps frames young: what waits in the socket can no longer be dropped, and credit bounds it.
+It holds what is under way, 200 ms of the whole stream; with a quarter of it, pictures over such a distance had 16 kB in
+place of 34, and their age a p95 of 351 ms in place of 219 (`bench network --only rtt200`)."""
 
 _ENDPOINT = re.compile(r"(tcp|tls|quic|udp|ws)/(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]]+):([0-9]{1,5})(\?[^#\s]*)?(#\S*)?")
 _BUFFERED = ("tcp", "tls")
@@ -32,8 +34,10 @@ def with_send_buffer(endpoint: str) -> str:
 
 
 def check_endpoints(listen: Sequence[str], connect: Sequence[str]) -> None:
-    """Raise ConfigError unless there is at least one endpoint and every one is well formed."""
+    """Raise ConfigError unless there is at least one endpoint, every one well formed and listened on once."""
     if not listen and not connect:
         raise ConfigError("no endpoint: give one to listen on (--listen) or to connect to (--connect)")
     for endpoint in (*listen, *connect):
         check_endpoint(endpoint)
+        if listen.count(endpoint) > 1:
+            raise ConfigError(f"{endpoint} is given twice to listen on: name it once")

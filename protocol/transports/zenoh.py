@@ -221,7 +221,9 @@ class ZenohLink:
     def _end(self) -> None:
         import zenoh
 
-        with suppress(zenoh.ZError):  # a session that broke is closed
+        # A session that broke is closed. A publisher that somebody puts with now cannot be undeclared ("Already
+        # borrowed", a RuntimeError); the session's close, which runs last in any case, ends it.
+        with suppress(zenoh.ZError, RuntimeError):
             self._ending.close()
 
 
