@@ -7,22 +7,26 @@ from protocol.codec import decode, encode
 from protocol.errors import WireError
 from protocol.messages import AnswerHeader, Echo, FrameHeader
 from protocol.transports.link import Link, Message
+from protocol.transports.secured import SOURCES, certificate_role
 
 
 class Viewer:
-    """One viewer's session; `role` names it on the wire."""
+    """One viewer's session; `role` names it on the wire. Keys in `secure` may be of a role that has nothing to say."""
 
-    def __init__(self, link: Link, role: str) -> None:
+    def __init__(self, link: Link, role: str, secure: str = "") -> None:
         self._link, self._role = link, role
+        self._is_silent = bool(secure) and not SOURCES.get(certificate_role(role))
         self._session = secrets.token_hex(4)
         self._seq = 0
 
     def acknowledge(self, message: Message) -> bool:
-        """Answer one frame; False for what is none."""
+        """Answer one frame, where that is allowed; False for what is none."""
         try:
             frame = decode(FrameHeader, message.header)
         except WireError:
             return False
+        if self._is_silent:
+            return True
         echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
         header = AnswerHeader(source=self._role, session=self._session, seq=self._seq, echo=echo)
         self._seq += 1

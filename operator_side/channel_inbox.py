@@ -14,10 +14,10 @@ MAX_WAITING: Final = 64
 class ChannelInbox:
     """Hears `channel` from its making on."""
 
-    def __init__(self, link: Link, role: str, channel: Channel) -> None:
+    def __init__(self, link: Link, role: str, channel: Channel, secure: str = "") -> None:
         self._words: queue.Queue[Message] = queue.Queue(MAX_WAITING)
         self._picture: LatestSlot[Message] | None = LatestSlot() if channel.encoding == JPEG else None
-        self._viewer = Viewer(link, role) if channel is FRAME else None
+        self._viewer = Viewer(link, role, secure) if channel is FRAME else None
         self.robot, self.channel = link.robot, channel
         self._refused = 0
         link.subscribe(channel, self._put)

@@ -43,7 +43,7 @@ def capture(
     check_target(path, seconds)
     wanted, role = OVERLAY if overlay else FRAME, viewer_role(secure)
     with open_link(robot, connect=connect, role=role, secure=secure) as link:
-        pictures = Pictures(link, role, wanted)
+        pictures = Pictures(link, role, wanted, secure)
         if path.suffix.lower() in PICTURES:
             got = snapshot(pictures, path, wanted)
         else:

@@ -11,6 +11,7 @@ import typer
 from operator_side.around import find_around
 from operator_side.mission_asking import MissionDesk
 from operator_side.mission_text import mission_lines
+from operator_side.pictures import viewer_role
 from operator_side.requests import SOURCE, Operator
 from operator_side.status_text import status_line, status_lines
 from protocol.messages import Reply, Status, Verb
@@ -45,7 +46,7 @@ def register(app: typer.Typer) -> None:
 def robots(
     connect: MaybeConnect = None,
     secure: Secure = "",
-    seconds: Annotated[float, typer.Option(min=0.2, max=60, help="How long to listen.")] = 0.8,
+    seconds: Annotated[float, typer.Option(min=0.2, max=60, help="How long to listen.")] = 0.6,
     as_json: Json = False,
 ) -> int:
     """List who is there: robots and their state, who sees and steers, versions and round-trip times.
@@ -68,7 +69,8 @@ def status(
     as_json: Json = False,
 ) -> None:
     """Say what a robot does and why: state, driver, twist, frame age, latency, every refusal; its vision's mission."""
-    with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
+    role = viewer_role(secure) if secure else SOURCE  # a viewer's keys are enough to look
+    with open_link(robot, connect=connect, role=role, secure=secure) as link:
         desk = MissionDesk(link)
         while True:
             state = desk.operator.wait_report().status

@@ -107,7 +107,7 @@ class _Source:
             return still
         role = viewer_role(self._secure)
         with open_link(self._robot, connect=self._connect, role=role, secure=self._secure) as link:
-            return of_robot(Pictures(link, role, FRAME), frames)
+            return of_robot(Pictures(link, role, FRAME, self._secure), frames)
 
     @contextmanager
     def gallery(self, frames: int) -> "Iterator[Gallery]":
@@ -121,7 +121,7 @@ class _Source:
             return
         role, ending = viewer_role(self._secure), threading.Event()
         with open_link(self._robot, connect=self._connect, role=role, secure=self._secure) as link:
-            pictures, reel = Pictures(link, role, FRAME), Reel(frames)
+            pictures, reel = Pictures(link, role, FRAME, self._secure), Reel(frames)
             filling = threading.Thread(target=fill, args=(reel, pictures, ending), name="pictures", daemon=True)
             filling.start()
             try:

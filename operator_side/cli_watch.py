@@ -66,21 +66,21 @@ def watch(
     with open_link(robot, connect=connect, role=role, secure=secure) as link, suppress(KeyboardInterrupt):
         if channel is not None:
             shown = (lambda message: json.dumps(message_object(message))) if as_json else message_line
-            inbox = ChannelInbox(link, role, CHANNELS[channel])
+            inbox = ChannelInbox(link, role, CHANNELS[channel], secure)
             return _print_channel(inbox, shown, count or sys.maxsize, ends_s)
         if text:
             return _show_text(link, ends_s)
-        with _page(link, role, CHANNELS[show], port) as address:
+        with _page(link, role, CHANNELS[show], port, secure) as address:
             typer.echo(f"watch: {robot} is on {address} for a browser on this machine; Ctrl-C ends it")
             while time.monotonic() < ends_s:
                 time.sleep(min(_WAIT_S, max(0.0, ends_s - time.monotonic())))
     return 0
 
 
-def _page(link: Link, role: str, first: Channel, port: int) -> AbstractContextManager[str]:
+def _page(link: Link, role: str, first: Channel, port: int, secure: str) -> AbstractContextManager[str]:
     from operator_side.watch_page import watch_page
 
-    return watch_page(link, role, first, port)
+    return watch_page(link, role, first, port, secure)
 
 
 def _print_channel(inbox: ChannelInbox, shown: Callable[[Message], str], count: int, ends_s: float) -> int:

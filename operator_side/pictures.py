@@ -50,11 +50,12 @@ def viewer_role(secure: str) -> str:
 class Pictures:
     """The newest picture, taken by one thread at a time. Nothing is subscribed to before the first `take`."""
 
-    def __init__(self, link: Link, role: str, first: Channel = OVERLAY) -> None:
-        """`first` is what is wanted: vision's own pictures, with frames in their absence, or FRAME."""
+    def __init__(self, link: Link, role: str, first: Channel = OVERLAY, secure: str = "") -> None:
+        """`first` is what is wanted: vision's own pictures, with frames in their absence, or FRAME. `role` and the keys
+        in `secure` are those of `link`."""
         self.robot = link.robot
         self._link, self._first = link, first
-        self._viewer = Viewer(link, role)
+        self._viewer = Viewer(link, role, secure)
         self._news = threading.Condition()
         self._newest: Message | None = None
         self._heard: set[str] = set()

@@ -19,9 +19,9 @@ _SHOWN_PICTURES = 2  # the newest, and the one before, which a second page may b
 
 
 @contextmanager
-def watch_page(link: Link, role: str, first: Channel, port: int) -> Iterator[str]:
+def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) -> Iterator[str]:
     """Serve the page while inside; gives its address. Raises LinkError for a port in use."""
-    pictures, desk, ending = Pictures(link, role, first), MissionDesk(link), threading.Event()
+    pictures, desk, ending = Pictures(link, role, first, secure), MissionDesk(link), threading.Event()
     reel = Reel(_SHOWN_PICTURES, pictures.age_us)
 
     def state(_ask: Ask, _body: bytes) -> Answer:

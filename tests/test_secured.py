@@ -2,17 +2,21 @@
 
 import threading
 import time
+from contextlib import closing
 from itertools import product
 
 import pytest
 
 from operator_side import keys
-from protocol.channels import ACK, CHANNELS, FRAME, MISSION, REPORT, REQUEST, STATUS, TWIST, Direction
+from protocol.channels import (
+    ACK, CHANNELS, FRAME, MAX_HEADER_BYTES, MISSION, REPORT, REQUEST, STATUS, TWIST, Direction,
+)
 from protocol.errors import ConfigError, LinkError
-from protocol.transports.secured import ROLES, SOURCES, certificate_role, may_hear, may_publish
+from protocol.transports.secured import ROLES, SOURCES, certificate_role, may_hear, may_publish, secured_for
 from protocol.transports.websocket_keys import read_tokens
 from protocol.transports.zenoh import open_zenoh
 from protocol.transports.zenoh_around import list_robots
+from protocol.transports.zenoh_session import MAX_MESSAGE_BYTES, open_session
 from tests.link_rigs import free_endpoint, until
 
 SAID = (TWIST, ACK, REQUEST, MISSION, REPORT)
@@ -79,6 +83,24 @@ def test_each_role_says_what_it_may_and_nothing_else(folder, endpoint):
             time.sleep(0.1)  # what is denied must have had its chance
             assert said(heard) == allowed
             heard.clear()
+
+
+def test_what_is_over_its_channels_bound_ends_at_who_listens(folder, endpoint):
+    """At a router, so that it crosses no robot's radio; what is just within it passes."""
+    heard = []
+    with (
+        closing(open_session([endpoint], (), 5.0, secured_for(str(folder), "robot"))),
+        open_session((), [endpoint], 5.0, secured_for(str(folder), "robot")) as robot,
+        open_session((), [endpoint], 5.0, secured_for(str(folder), "vision")) as vision,
+    ):
+        robot.declare_subscriber("sightline/r1/twist/*", lambda sample: heard.append(len(sample.payload)))
+        bound = TWIST.max_payload_bytes
+        assert until(lambda: vision.put("sightline/r1/twist/vision", b"0", attachment=b"h") or heard)
+        heard.clear()
+        for size in (bound + 1, MAX_MESSAGE_BYTES // 2, bound):
+            vision.put("sightline/r1/twist/vision", bytes(size), attachment=bytes(MAX_HEADER_BYTES))
+        assert until(lambda: bound in heard)
+        assert set(heard) - {1} == {bound}
 
 
 def says_all(peer):
@@ -149,11 +171,15 @@ def test_a_machine_without_its_keys_is_told_which(broken):
         open_zenoh("r1", connect=["tls/127.0.0.1:7447"], role="vision", secure=str(broken))
 
 
-def test_robots_are_listed_over_a_secured_link(folder, endpoint):
+@pytest.mark.parametrize("role", ["operator", "viewer"])
+def test_robots_are_listed_over_a_secured_link(folder, endpoint, role, tmp_path):
+    for name in ("ca.pem", f"{role}.pem", f"{role}.key"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
     with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)) as robot:
         found = {}
         deadline_s = time.monotonic() + 5
-        listing = threading.Thread(target=lambda: found.update(list_robots([endpoint], 0.6, str(folder))), daemon=True)
+        secure = str(tmp_path)
+        listing = threading.Thread(target=lambda: found.update(list_robots([endpoint], 0.6, secure)), daemon=True)
         listing.start()
         while listing.is_alive() and time.monotonic() < deadline_s:
             robot.publish(STATUS, b"{}", b"{}")

@@ -14,6 +14,7 @@ from protocol.channels import FRAME, TWIST
 from protocol.codec import decode, encode
 from protocol.errors import LinkError
 from protocol.messages import AnswerHeader, Echo, FrameHeader
+from protocol.transports.denied import WHY
 from protocol.transports.zenoh import open_zenoh
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, Vision, driving
@@ -35,21 +36,28 @@ def _sightline(*arguments):
     return subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
 
 
-def test_vision_drives_and_an_operator_stops_it(robot):
+def test_vision_drives_an_operator_stops_it_and_a_viewer_sees_that(robot, tmp_path):
     folder = robot.config["secure"]
     with Vision(robot.endpoint, secure=folder):
         assert driving(robot)
         stopped = _sightline("stop", "r1", "--connect", robot.endpoint, "--secure", folder)
         assert stopped.returncode == 0 and "STOPPED" in stopped.stdout, stopped
         assert until(lambda: robot.speed() == 0.0)
+    (tmp_path / "viewer").mkdir()
+    for name in ("ca.pem", "viewer.pem", "viewer.key"):
+        (tmp_path / "viewer" / name).write_bytes(Path(folder, name).read_bytes())
+    looked = _sightline("status", "r1", "--connect", robot.endpoint, "--secure", str(tmp_path / "viewer"))
+    assert "STOPPED" in looked.stdout, "to look, a viewer's keys are enough"
+    assert "refused a" not in robot.output(), "nobody was turned away"
 
 
 @pytest.mark.parametrize("role", ["viewer", "operator"])
 def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, role):
     """It sees the frames and answers each of them correctly, under a certificate that is not vision's."""
     with open_zenoh("r1", connect=[robot.endpoint], role=role, secure=robot.config["secure"]) as rogue:
-        frames, session, answered = rogue.latest(FRAME), secrets.token_hex(4), 0
-        ends_s = time.monotonic() + 2.0
+        frames, session, answered, told_s = rogue.latest(FRAME), secrets.token_hex(4), 0, None
+        began_s = time.monotonic()
+        ends_s = began_s + 1.5
         while time.monotonic() < ends_s:
             message = frames.take(0.2)
             if message is None:
@@ -59,8 +67,13 @@ def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, ro
             answer = AnswerHeader(source="vision", session=session, seq=answered, echo=echo)
             rogue.publish(TWIST, encode(answer), b"0.4000|0.0000", "vision")
             answered += 1
+            if told_s is None and "refused a message" in robot.output():
+                told_s = time.monotonic() - began_s
         assert answered > 5, "it could have driven, had it been heard"
-        assert robot.speed() == 0.0
+        assert robot.speed() == 0.0 and told_s is not None and told_s < 1.0, robot.output()
+    told = [line for line in robot.output().splitlines() if "refused a message" in line]
+    assert told[0].startswith(f"robot r1: refused a message of {role} from 127.0.0.1 at {robot.endpoint}"), told
+    assert told[0].endswith(WHY) and len(told) <= 3, "a rogue does not fill the log"
 
 
 def test_without_keys_nobody_even_watches(robot):

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from protocol.transports import tcp_table
+from protocol.transports.denied import Certificates
 from protocol.transports.tcp_table import Visitors
 from protocol.transports.tls_refusals import RefusalLines, refusal_cause
 from tests.link_rigs import free_endpoint, until
@@ -92,6 +93,39 @@ def test_ever_new_causes_take_no_memory():
     assert len(lines._told) + len(lines._untold) <= 33
 
 
+# --- what access rules turned away ------------------------------------------------------------------------------------
+
+
+def _accepted(end, role, kind="TLS"):
+    return (_HEAD.format(f"zenoh_link_{kind.lower()}::unicast").replace(" WARN", "DEBUG")
+            + f"Accepted {kind} connection on 127.0.0.1:7447: {end}. Common Name: {role}.\n")
+
+
+def test_who_is_connected_is_named_by_certificate_the_newest_first():
+    known = Certificates()
+    lines = [_accepted("10.0.0.7:1", "vision"), _accepted("[fe80::1]:2", "viewer"), _accepted("10.0.0.9:3", "operator"),
+             _accepted("[::ffff:10.0.0.8]:4", "viewer", "QUIC")]
+    assert all(known.note(line) for line in lines)
+    assert known.connected({"10.0.0.7:1", "fe80::1:2", "1.2.3.4:5"}) == "viewer from fe80::1 or vision from 10.0.0.7"
+    assert known.connected({"10.0.0.8:4"}) == "viewer from 10.0.0.8" and known.connected(set()) == ""
+    assert known.note(_accepted("10.0.0.7:1", "viewer")) and known.connected({"10.0.0.7:1"}) == "viewer from 10.0.0.7"
+
+
+def test_what_is_no_line_of_ours_is_left_to_others():
+    known = Certificates()
+    for line in ("", "robot r1: on tls/0.0.0.0:7447", _line("tls handshake eof"), "Accepted TLS connection on x: y:1."):
+        assert not known.note(line)
+    assert known.note(_HEAD.format("zenoh_link_tls::unicast").replace(" WARN", "DEBUG") + "Closing TLS link")
+
+
+def test_ever_new_connections_take_no_memory_and_a_crowd_is_counted():
+    known = Certificates()
+    for number in range(2_000):
+        known.note(_accepted(f"10.0.{number // 256}.{number % 256}:7", "viewer"))
+    assert len(known._roles) == 256
+    assert known.connected(known._roles).endswith("viewer from 10.0.7.204 or 252 others")
+
+
 # --- the kernel's table ----------------------------------------------------------------------------------------------
 
 _ROWS = "  sl  local_address rem_address   st\n   0: {local} {remote} {state} 0 0 0 0\n"
@@ -106,7 +140,7 @@ def test_a_far_end_is_read_from_the_table(monkeypatch, tmp_path, table, local, r
     (tmp_path / table).write_text(_ROWS.format(local=local, remote=remote, state="06"))
     monkeypatch.setattr(tcp_table, "TABLES", tmp_path)
     visitors = Visitors([0x1D17])
-    assert visitors.who_left(0.0) == host
+    assert visitors.here() == set() and visitors.who_left(0.0) == host
     assert visitors.who_left(0.0) == "", "it left once"
     assert Visitors([0x1D18]).who_left(0.0) == ""
 

@@ -11,7 +11,7 @@ from websockets.sync.client import connect
 
 from protocol.channels import ACK, DETECTIONS, FRAME, REQUEST, STATUS, TWIST
 from protocol.errors import ConfigError, LinkError
-from protocol.transports.websocket import NOT_GRANTED, open_websocket
+from protocol.transports.websocket import open_websocket
 from protocol.transports.websocket_access import (
     NO_TOKEN,
     NOT_LISTED,
@@ -23,6 +23,7 @@ from protocol.transports.websocket_access import (
 from protocol.transports.websocket_doorlog import DoorLog
 from protocol.transports.websocket_endpoints import parse_endpoint, with_allowed
 from protocol.transports.websocket_keys import own_token, read_tokens
+from protocol.transports.websocket_peer import NOT_GRANTED
 from protocol.transports.websocket_seat import SEAT_US, Seat
 from robot_side.config import RobotConfig
 from tests.link_rigs import claim, until
@@ -227,7 +228,7 @@ def test_a_role_may_publish_what_the_table_of_channels_gives_it():
 
 
 @pytest.mark.parametrize("role", TOKENS)
-def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role):
+def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role, capfd):
     endpoint, here = everywhere()
     sources = ("vision", "teleop", "operator", "guest")
     heard, sent = [], [*itertools.product(["twist", "ack", "request", "detections"], sources)]
@@ -242,6 +243,12 @@ def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role):
             assert until(lambda: len(heard) == len(allowed) and robot.refused[NOT_GRANTED] == len(sent) - len(allowed))
             assert heard == allowed
             assert robot.has_listener(STATUS)  # everybody may watch
+            # Told once each, at once, ten a second; an acknowledgement that returns no credit is not worth a word.
+            forbidden = {"/".join(pair) for pair in sent if pair not in grant_of(role) and pair[0] != "ack"}
+            told = [line for line in capfd.readouterr().err.splitlines() if line.startswith("refused ")]
+            named = [line.split()[1] for line in told]
+            assert set(named) <= forbidden and len(set(named)) == len(named) >= min(10, len(forbidden))
+            assert all(" from 127.0.0.1: the role of its token may not say that" in line for line in told)
 
 
 # --- one of many -----------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from protocol.channels import CHANNELS, KEY_PREFIX, REQUEST, Channel, Direction
+from protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REQUEST, Channel, Direction
 from protocol.errors import ConfigError
 from protocol.transports.endpoints import check_endpoint
 
@@ -73,6 +73,15 @@ class Secured:
             "subjects": [{"id": role, "cert_common_names": [role]} for role in ROLES],
             "policies": [{"subjects": [role], "rules": [rule["id"] for rule in rules[role]]} for role in ROLES],
         }
+
+
+def size_section() -> list[dict[str, Any]]:
+    """Zenoh's `low_pass_filter`: what is over its channel's bound ends at whoever listens, and crosses no radio."""
+    return [
+        {"id": f"size of {channel.name}", "flows": ["ingress"], "messages": ["put"], "key_exprs": [_pattern(channel)],
+         "size_limit": MAX_HEADER_BYTES + channel.max_payload_bytes}
+        for channel in CHANNELS.values()
+    ]
 
 
 def secured_for(folder: str, source: str) -> Secured | None:

@@ -40,6 +40,10 @@ class Visitors:
                 return ""
             time.sleep(_LOOK_S)
 
+    def here(self) -> set[str]:
+        """`address:port` of the far ends of connections that last."""
+        return {end for end, leaves in self._ends().items() if not leaves}
+
     def _ends(self) -> dict[str, bool]:
         """`address:port` of the far ends of connections to our ports, and whether they are ending."""
         rows = [row for table in ("tcp", "tcp6") for row in _rows(table)]

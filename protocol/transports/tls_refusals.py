@@ -9,7 +9,7 @@ import re
 from typing import Final
 
 LOG_FILTER: Final = "off,zenoh_link_tls=warn,zenoh_link_quic=warn,zenoh_link_commons::quic=warn"
-"""What is asked of Zenoh's log: nothing of it is written per message."""
+"""What is asked of Zenoh's log about handshakes: nothing of it is written per message."""
 
 _COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
 _LINE: Final = re.compile(r"\S+Z +(?:WARN|ERROR) .*?(?:zenoh_link_tls|zenoh_link_quic|zenoh_link_commons)\S*: (.*)")
@@ -71,9 +71,9 @@ class RefusalLines:
         self._untold: dict[str, int] = {}
         self._told: dict[str, tuple[int, int]] = {}
 
-    def is_due(self, cause: str, now_us: int) -> int:
-        """How often `cause` was given since the last line about it, if one is due; else 0."""
-        self._untold[cause] = self._untold.get(cause, 0) + 1
+    def is_due(self, cause: str, now_us: int, times: int = 1) -> int:
+        """`cause` was given `times` more: how often since the last line about it, if one is due; else 0."""
+        self._untold[cause] = self._untold.get(cause, 0) + times
         told_us, period_us = self._told.get(cause, (now_us - _FIRST_PERIOD_US, 0))
         silent_us = now_us - told_us
         if silent_us < period_us:

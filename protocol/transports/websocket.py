@@ -36,8 +36,6 @@ from protocol.transports.websocket_seat import Seat
 from protocol.transports.websocket_wants import Wants
 from protocol.transports.websocket_wire import Wire
 
-NOT_GRANTED: Final = "NOT_GRANTED"
-"""Counted for a message that the role of the sender's token may not publish."""
 CLOSE_S: Final = 1.5
 """A close that takes longer is left to daemon threads, so that no process hangs on a dead peer."""
 
@@ -280,8 +278,7 @@ class WebSocketLink:
         if parsed is None:
             self._rules.refuse(INEXACT_KEY)
             return
-        if not peer.may_publish(packet.key):
-            self._rules.refuse(NOT_GRANTED)
+        if not peer.admits(packet.key, self._rules.refuse, self._tell):
             return
         if parsed[1] is TWIST and self._peers[0] is not peer:
             self._put_first(peer)

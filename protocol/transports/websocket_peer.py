@@ -8,9 +8,10 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from protocol.channels import Channel
+from protocol.channels import ACK, Channel
 from protocol.errors import WireError
 from protocol.transports.link_rules import OVERSIZE
+from protocol.transports.tls_refusals import RefusalLines
 from protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, V1, Dialect, PeerError
 from protocol.transports.websocket_framing import Packet
 from protocol.transports.websocket_life import Life
@@ -26,6 +27,9 @@ PROTOCOL_OPTIONS: Final[dict[str, Any]] = {"extensions": None, "logger": logging
 """No compression: pictures do not shrink, and trying costs three times the CPU."""
 SILENT: Final = "SILENT"
 """Counted for a peer that left a ping unanswered, or took nothing for long."""
+
+NOT_GRANTED: Final = "NOT_GRANTED"
+"""Counted for a message that the role of the sender's token may not publish."""
 
 logging.getLogger("sightline.websocket").addHandler(logging.NullHandler())  # else Python prints to the terminal
 
@@ -43,15 +47,26 @@ class Peer:
         self._wire, self._dialect = wire, dialect
         self._reader = threading.current_thread()
         self._gone = threading.Event()
+        self._forbidden = RefusalLines()
         self._look_us = 0
 
     def hears(self, channel: Channel) -> bool:
         """Whether the peer wants `channel`."""
         return self._dialect.hears(channel)
 
-    def may_publish(self, key: str) -> bool:
-        """Whether what it showed when it came in lets it publish on `key`."""
-        return self._wire.granted is None or tuple(key.split("/")[2:]) in self._wire.granted
+    def admits(self, key: str, refuse: Callable[[str], None], tell: Callable[[str], None]) -> bool:
+        """Whether its token lets it publish on `key`; if not, that is counted and, ever more seldom, told."""
+        said = tuple(key.split("/")[2:])
+        if self._wire.granted is None or said in self._wire.granted:
+            return True
+        refuse(NOT_GRANTED)
+        what = "/".join(said)
+        times = 0 if said[0] == ACK.name else self._forbidden.is_due(what, _now_us())  # a viewer that acknowledges
+        if times:
+            often = f" ({times} times)" if times > 1 else ""
+            who = self._wire.address[0] or "a client"
+            tell(f"refused {what} from {who}{often}: the role of its token may not say that (docs/security.md)")
+        return False
 
     def offer(self, post: Post) -> None:
         """Send it if the peer wants it, now or when there is room and nothing newer; never blocks."""

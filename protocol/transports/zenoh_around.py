@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from protocol.channels import KEY_PREFIX, STATUS, parse_key
@@ -13,7 +14,7 @@ from protocol.transports.endpoints import check_endpoints
 from protocol.transports.link import Message
 from protocol.transports.link_rules import LinkRules
 from protocol.transports.presence import ASKS, MAX_PEERS, Peer, quickest
-from protocol.transports.secured import secured_for
+from protocol.transports.secured import Secured, secured_for
 from protocol.transports.zenoh_presence import ANSWER_S, ask
 from protocol.transports.zenoh_session import open_session
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     import zenoh
 
 ROLE: Final = "operator"
+VIEWER: Final = "viewer"
 _BETWEEN_ASKS_S: Final = 0.05
 
 
@@ -36,7 +38,7 @@ def look_around(connect: Sequence[str], seconds: float, secure: str = "") -> Aro
     """Everybody heard at `connect` within `seconds`. Raises as `open_zenoh` does."""
     check_endpoints((), connect)
     with ExitStack() as ending:
-        session = open_session((), connect, seconds, secured_for(secure, ROLE))
+        session = open_session((), connect, seconds, _own_keys(secure))
         ending.callback(session.close)
         return Around(_statuses(session, ending), _listen(session, seconds))
 
@@ -50,9 +52,19 @@ def peers_at(connect: Sequence[str], seconds: float, secure: str = "") -> list[P
     """Everybody who answers at `connect`, with the quickest of a few round trips. Raises as `open_zenoh` does."""
     check_endpoints((), connect)
     with ExitStack() as ending:
-        session = open_session((), connect, seconds, secured_for(secure, ROLE))
+        session = open_session((), connect, seconds, _own_keys(secure))
         ending.callback(session.close)
         return _asked(session, time.monotonic() + seconds)
+
+
+def _own_keys(folder: str) -> Secured | None:
+    """An operator's, or a viewer's where there are only those: to look takes no more."""
+    only_viewer = folder and not _has(folder, ROLE) and _has(folder, VIEWER)
+    return secured_for(folder, VIEWER if only_viewer else ROLE)
+
+
+def _has(folder: str, role: str) -> bool:
+    return (Path(folder).expanduser() / f"{role}.key").is_file()
 
 
 def _listen(session: zenoh.Session, seconds: float) -> list[Peer]:

@@ -10,13 +10,14 @@ from __future__ import annotations
 import json
 import logging
 import re
+import socket
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from protocol.errors import ConfigError, LinkError, SightlineError
 from protocol.transports.endpoints import check_endpoint, with_send_buffer
 from protocol.transports.port_owner import port_owner
-from protocol.transports.secured import Secured
+from protocol.transports.secured import Secured, size_section
 from protocol.transports.tls_trouble import tls_trouble
 from protocol.transports.zenoh_discovery import NO_MULTICAST, multicast_section
 
@@ -31,6 +32,8 @@ MAX_MESSAGE_BYTES: Final = 1_048_576
 HANDSHAKE_MS: Final = 3000
 MAX_SESSIONS: Final = 64
 """At one who listens: a fleet of twenty robots, its visions, and the people who watch."""
+_OVER_UDP: Final = ("udp", "quic")
+_KNOCK_S: Final = 0.3
 RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
 
@@ -79,6 +82,7 @@ def session_config(
         config["transport"]["link"]["tls"] = secured.tls_section()
         if listen:  # a client has one peer, whoever listens, and that one judges
             config["access_control"] = secured.access_section()
+            config["low_pass_filter"] = size_section()
     return config
 
 
@@ -124,13 +128,24 @@ def _explain(
         trouble = next((found for endpoint in connect if (found := tls_trouble(endpoint, secured))), "")
         if trouble:
             return LinkError(f"refused at {where}: {trouble}")
-        refused = "" if "quic/" not in where else ", or one end refuses the other's keys: the robot's log says which"
-        return LinkError(f"nobody answers at {where}; is the robot running? tried for {timeout_s:g} s{refused}")
+        more = "" if "quic/" not in where else ", or one end refuses the other's keys: the robot's log says which"
+        more += ", and what listens there does not speak Zenoh" if any(map(_is_open, connect)) else ""
+        return LinkError(f"nobody answers at {where}; is the robot or router running? tried for {timeout_s:g} s{more}")
     where = next((endpoint for endpoint in listen if endpoint.partition("#")[0] in text), " or ".join(listen))
     if "in use" in text:
         return _port_in_use(where)
     cause = re.split(r" at /|\(os error", text.rpartition("[")[2])[0].rpartition(": ")[2].strip(" .]")
     return LinkError(f"cannot listen on {where}: {cause}; use an address of this machine, e.g. tcp/127.0.0.1:7447")
+
+
+def _is_open(endpoint: str) -> bool:
+    transport, host, port = check_endpoint(endpoint)
+    try:
+        if transport not in _OVER_UDP:
+            socket.create_connection((host, port), _KNOCK_S).close()
+    except OSError:
+        return False
+    return transport not in _OVER_UDP
 
 
 def _port_in_use(endpoint: str) -> LinkError:
