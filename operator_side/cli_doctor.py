@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from operator_side.doctor.finding import Finding, as_object
+from protocol.transports.opening import check_endpoint
 
 
 def register(app: typer.Typer) -> None:
@@ -30,6 +31,8 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> int:
     """Look for what commonly goes wrong, and say the exact line that mends it. Exit code 5 if something is wrong."""
+    if peer is not None:
+        check_endpoint(peer)
     found: list[Finding] = []
     for finding in _findings(robot, peer, camera, camera_sets or [], secure):
         found.append(finding)

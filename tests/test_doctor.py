@@ -1,6 +1,7 @@
 """`sightline doctor`: what it says of this machine, of a real robot, and of a way that leads nowhere."""
 
 import json
+import os
 import re
 import socket
 
@@ -37,6 +38,7 @@ def test_what_is_only_said_is_no_failure():
 def test_what_has_a_unit_is_a_number_for_scripts():
     check = Finding("round trip", True, "12.5", "", "ms", "60").check
     assert (check["value"], check["bound"]) == (12.5, 60.0)
+    assert Finding("a", True, "x", "do").check["fix"] == "" and Finding("a", False, "x", "do").check["fix"] == "do"
     assert Finding("port 1", None, "12").check["value"] == "12"
     assert Finding("odd", None, "n/a", "", "ms").check == {
         "name": "odd", "ok": None, "value": "n/a", "fix": "", "unit": "ms", "bound": None,
@@ -58,6 +60,19 @@ def test_a_processor_that_is_held_back_is_told(monkeypatch, tmp_path, stat, cpu,
     found = {one.name: one for one in machine._slowed_down()}
     assert {one.ok for one in found.values()} == {ok} and len(found) == 3
     assert ok or found["throttled by quota"].value == "12 times, 34 ms in all"
+
+
+@pytest.mark.parametrize(("said", "ok"), [("Power save: on", False), ("Power save: off", True), ("", None)])
+def test_a_radio_that_saves_power_is_told_with_the_command_that_stops_it(monkeypatch, tmp_path, said, ok):
+    (tmp_path / "wlan0" / "wireless").mkdir(parents=True)
+    (tmp_path / "eth0").mkdir()
+    (tmp_path / "iw").write_text(f"#!/bin/sh\necho '{said}'\n")
+    (tmp_path / "iw").chmod(0o755)
+    monkeypatch.setattr(machine, "INTERFACES", tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    (found,) = machine._power_save()
+    assert (found.name, found.ok) == ("power save wlan0", ok)
+    assert found.fix == "sudo iw dev wlan0 set power_save off" if said else "apt install iw" in found.value
 
 
 _ARP = "IP address HW type Flags HW address Mask Device\n192.168.1.7 0x1 {} aa:bb:cc:dd:ee:ff * wlan0\n"
@@ -114,7 +129,8 @@ def test_a_busy_port_is_told_with_its_owner(capsys, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as server:
         monkeypatch.setattr(machine, "PORTS", {server.getsockname()[1]: "mine"})
         check = _checks(capsys)[f"port {server.getsockname()[1]}"]
-    assert "in use by" in check["value"] and "(pid " in check["value"] and check["fix"]
+    assert "in use by" in check["value"] and f"(pid {os.getpid()})" in check["value"]
+    assert f"kill {os.getpid()}," in check["fix"]
 
 
 def test_a_package_of_the_same_name_is_told(capsys, monkeypatch):
@@ -141,13 +157,24 @@ def test_nobody_listening_is_told_apart_from_no_such_name(capsys):
 
 def test_somebody_else_on_the_port_is_no_robot(capsys):
     with socket.create_server(("127.0.0.1", 0)) as server:
-        checks = _checks(capsys, "--peer", f"tcp/127.0.0.1:{server.getsockname()[1]}")
+        port = server.getsockname()[1]
+        checks = _checks(capsys, "--peer", f"tcp/127.0.0.1:{port}")
     assert checks["round trip p50"]["ok"] and not checks["link"]["ok"]
+    assert checks["link"]["fix"] == (
+        f"there: sightline robot --listen tcp/0.0.0.0:{port}; what listens on the port now is something else"
+    )
+
+
+def test_what_mends_a_link_stands_apart_from_what_is_wrong():
+    (found,) = between.findings("quic/127.0.0.1:1", "r1", "")
+    assert found.value == "refused at quic/127.0.0.1:1: a quic/ endpoint needs keys"
+    assert found.fix == "give --secure DIR"
 
 
 def test_an_endpoint_that_is_none_is_refused(capsys):
     assert cli.run(["doctor", "--json", "--peer", "foo"]) == 2
-    assert "error: endpoint 'foo' is none" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert "error: endpoint 'foo' is none" in said.err and said.out == "", "before anything is looked at"
 
 
 def test_a_camera_that_is_not_there_says_so(capsys):

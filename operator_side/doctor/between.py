@@ -10,7 +10,8 @@ from pathlib import Path
 from statistics import median, quantiles
 
 from operator_side.acknowledge import Viewer
-from operator_side.doctor.finding import Finding, histogram
+from operator_side.doctor.finding import Finding, histogram, trouble
+from operator_side.pictures import viewer_role
 from operator_side.requests import Operator
 from operator_side.status_text import encoding_text, stream_is_whole
 from protocol.channels import FRAME
@@ -45,21 +46,35 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
     """Everything about the way to `endpoint` and, if it is a robot's, its stream."""
     transport, host, port = _address(endpoint)
     if transport not in _OVER_UDP:
-        knocks_ms, trouble = _knock(host, port)
-        if trouble:
-            yield Finding("reach", False, f"{host}:{port} does not answer", trouble + neighbour(host))
+        knocks_ms, why = _knock(host, port)
+        if why:
+            yield Finding("reach", False, f"{host}:{port} does not answer", why + neighbour(host))
             return
         yield from _round_trip(knocks_ms, "handshakes")
     if not host.startswith(LOOPBACK):
         yield _found_by_multicast(host)
     try:
-        with open_link(robot, connect=[endpoint], role=ROLE, secure=secure) as link:
+        role = viewer_role(secure) if secure else ROLE  # an operator's keys may acknowledge frames
+        with open_link(robot, connect=[endpoint], role=role, secure=secure) as link:
             if transport in _OVER_UDP:
                 yield from _round_trip(_asked_ms(link), "questions")
             yield from _peers(link, robot)
-            yield from _robot(link, robot)
+            yield from _robot(link, robot, Viewer(link, role, secure))
     except SightlineError as error:
-        yield Finding("link", False, str(error))
+        yield _no_link(error, endpoint)
+
+
+def _no_link(error: SightlineError, endpoint: str) -> Finding:
+    """Nobody there at all, which a handshake would have shown, or somebody who does not speak as the endpoint says."""
+    found = trouble("link", error)
+    if "nobody answers" not in found.value:
+        return found
+    transport, _, port = _address(endpoint)
+    form = f"ws://0.0.0.0:{port}" if transport == "ws" else f"{transport}/0.0.0.0:{port}"
+    fix = f"there: sightline robot --listen {form}"
+    if transport not in _OVER_UDP:
+        fix += "; what listens on the port now is something else"
+    return Finding("link", False, found.value, fix)
 
 
 def _found_by_multicast(host: str) -> Finding:
@@ -155,14 +170,14 @@ def _round_trip(knocks_ms: list[float], what: str) -> Iterator[Finding]:
     yield Finding("jitter", None, f"{max(knocks_ms) - min(knocks_ms):.2f} ms over {len(knocks_ms)} {what}{lines}")
 
 
-def _robot(link: Link, robot: str) -> Iterator[Finding]:
+def _robot(link: Link, robot: str, viewer: Viewer) -> Iterator[Finding]:
     status = Operator(link).wait_report().status
     yield Finding("robot", None, f"{robot} is {status.state}: {status.reason}")
     yield from _refusals(status)
-    fps, kilobytes = _watch(link)
+    fps, kilobytes = _watch(link, viewer)
     asked = status.stream.fps
     enough = fps >= 0.8 * asked if asked else fps > 0
-    fix = "smaller pictures or a lower rate: camera.options.width_px, stream.max_fps in the robot's configuration"
+    fix = "smaller pictures or fewer, on the robot: --set camera.options.width_px=320 --set stream.max_fps=15"
     rate = f"{fps:.1f} per second, {kilobytes:.0f} kB each, {fps * kilobytes / 125:.2f} Mbit/s"
     yield Finding("frames", enough, rate, fix)
     whole = stream_is_whole(status.stream)
@@ -175,9 +190,9 @@ def _refusals(status: Status) -> Iterator[Finding]:
         yield Finding(f"refused {reason}", None, f"{count} times since its start")
 
 
-def _watch(link: Link) -> tuple[float, float]:
+def _watch(link: Link, viewer: Viewer) -> tuple[float, float]:
     """Frames per second and kB a frame over a few seconds; each is acknowledged, as any viewer does."""
-    slot, viewer, begun_s = link.latest(FRAME), Viewer(link, ROLE), time.monotonic()
+    slot, begun_s = link.latest(FRAME), time.monotonic()
     sizes: list[int] = []
     while time.monotonic() - begun_s < _LOOK_S:
         message = slot.take(0.2)

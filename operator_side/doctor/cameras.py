@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from operator_side.doctor.finding import Finding
+from operator_side.doctor.finding import Finding, trouble
 from protocol.errors import SightlineError
 
 DEVICES: Final = Path("/dev")
@@ -88,7 +88,7 @@ def delivered(kind: str, sets: list[str]) -> Finding:
                 picture = opened.read(0.5)
                 stamps_us += [picture.t_us] if picture else []
     except SightlineError as error:
-        return Finding(f"camera {kind}", False, str(error))
+        return trouble(f"camera {kind}", error)
     if len(stamps_us) < 2:
         return Finding(f"camera {kind}", False, "no pictures", "plug it in anew; another program may have it")
     fps = (len(stamps_us) - 1) / (stamps_us[-1] - stamps_us[0]) * 1e6

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from protocol.errors import SightlineError
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -25,11 +27,17 @@ class Finding:
         unit = f" {self.unit}" if self.unit else ""
         return f"{sign} {self.name:<19} {self.value}{unit}{fix}"
 
-
     @property
     def check(self) -> dict[str, Any]:
-        """For scripts: what has a unit is a number."""
-        return {**asdict(self), **{name: _number(getattr(self, name)) for name in ("value", "bound") if self.unit}}
+        """For scripts: what has a unit is a number; what is well needs no mending."""
+        numbers = {name: _number(getattr(self, name)) for name in ("value", "bound") if self.unit}
+        return {**asdict(self), **numbers, "fix": "" if self.ok is True else self.fix}
+
+
+def trouble(name: str, error: SightlineError) -> Finding:
+    """What an error says; by our own habit the fix stands behind its last semicolon."""
+    what, _, fix = str(error).rpartition("; ")
+    return Finding(name, False, what or fix, fix if what else "")
 
 
 def _number(text: str) -> float | str | None:

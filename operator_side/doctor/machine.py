@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
-from operator_side.doctor.finding import Finding
+from operator_side.doctor.finding import Finding, trouble
 from protocol import VERSION
 from protocol.errors import SightlineError
 from protocol.transports.port_owner import port_owner
@@ -25,6 +25,7 @@ _STOLEN_PERCENT = 2.0
 CPUS = Path("/sys/devices/system/cpu")
 CGROUP = Path("/sys/fs/cgroup")
 PROC_STAT = Path("/proc/stat")
+INTERFACES = Path("/sys/class/net")
 _EXPIRES_SOON = datetime.timedelta(days=30)
 _OURS = ("protocol", "robot_side", "vision_side", "sim", "operator_side", "benchmarks")
 _EXTRAS = {"zenoh": "eclipse-zenoh", "websocket": "websockets", "vision": "opencv-python-headless", "sim": "pybullet"}
@@ -73,7 +74,8 @@ def _port(port: int, what: str) -> Finding:
     owner = port_owner(port)
     if not owner:
         return Finding(f"port {port}", None, f"{what}: free")
-    fix = "if that is not Sightline: end it, or choose another port with --listen"
+    number = owner.rpartition("(pid ")[2].rstrip(")")
+    fix = f"if that is not Sightline: kill {number}, or choose another port with --listen"
     return Finding(f"port {port}", None, f"{what}: in use by {owner}", fix)
 
 
@@ -135,7 +137,7 @@ def _slowed_down() -> Iterator[Finding]:
 
 
 def _power_save() -> Iterator[Finding]:
-    for device in sorted(Path("/sys/class/net").glob("*/wireless")):
+    for device in sorted(INTERFACES.glob("*/wireless")):
         name = device.parent.name
         said = _asked("iw", "dev", name, "get", "power_save")
         fix = f"sudo iw dev {name} set power_save off"
@@ -172,7 +174,7 @@ def _certificates(folder: str) -> Iterator[Finding]:
     try:
         certificates = keys.look(Path(folder))
     except SightlineError as error:
-        yield Finding("certificates", False, str(error))
+        yield trouble("certificates", error)
         return
     now = datetime.datetime.now(datetime.UTC)
     for one in certificates:
