@@ -45,6 +45,7 @@ def test_a_robot_is_measured_and_its_end_is_seen(tmp_path):
             assert exporter.stdout.readline() == f"metrics of r1: http://127.0.0.1:{port}/metrics\n"
             assert driving(robot)
             assert until(lambda: _health(port) == 200)
+            assert until(lambda: 0 < _samples(port).get(("sightline_frame_age_seconds", "r1"), 0) < 0.15)
             vision.twist = b"nan|0"
             assert until(lambda: _samples(port).get(("sightline_commands_refused_total", "NOT_FINITE", "r1"), 0) > 3)
             samples = _samples(port)

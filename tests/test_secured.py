@@ -9,7 +9,16 @@ import pytest
 
 from operator_side import keys
 from protocol.channels import (
-    ACK, CHANNELS, FRAME, MAX_HEADER_BYTES, MISSION, REPORT, REQUEST, STATUS, TWIST, Direction,
+    ACK,
+    CHANNELS,
+    FRAME,
+    MAX_HEADER_BYTES,
+    MISSION,
+    REPORT,
+    REQUEST,
+    STATUS,
+    TWIST,
+    Direction,
 )
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.secured import ROLES, SOURCES, certificate_role, may_hear, may_publish, secured_for
