@@ -21,6 +21,13 @@ class Section:
 _SEEDS: Final = "201,202,203,204,205,206"
 _BALLS: Final = "behind,circle,eight,pushed,static,walls"
 """All others are on docs/behaviours.md."""
+
+
+def _rows(*names: str, extra: tuple[str, ...] = ()) -> tuple[str, ...]:
+    only = [part for name in names for part in ("--only", name)]
+    return ("bench", "network", *only, *extra, "--seconds", "60")
+
+
 SECTIONS: Final = (
     Section(
         "following",
@@ -103,13 +110,25 @@ SECTIONS: Final = (
     ),
     Section(
         "network",
-        "Slow, lossy, far and broken networks",
+        "Slow and lossy networks",
         "Robot and vision, as two machines would have them, in two network namespaces; every packet goes over a wire "
-        "that delays, loses and slows it. Ages are from capture to the accepted command. Where packets are lost, five "
-        "seeds, each demand as the worst of them fared. A robot stands and turns again in `standby`, `router` and "
-        "`moved`, judged from what its wheels were told. In `fleet` one process plays the twenty robots, with sessions,"
-        " headers and credit of their own: forty robot processes on two cores would measure themselves.",
-        ("bench", "network", "--seeds", "1,2,3,4,5", "--seconds", "60"),
+        "that loses and slows it. Ages are from capture to the accepted command. Where packets are lost, five seeds, "
+        "each demand as the worst of them fared.",
+        _rows("radio", "bursts", "thin", "through", "step", "rise", extra=("--seeds", "1,2,3,4,5")),
+    ),
+    Section(
+        "network-far",
+        "Far and broken networks",
+        "The same wire with nothing lost: a round trip of 2, 40 and 200 ms, five seconds without a wire, and one.",
+        _rows("near", "rtt40", "rtt200", "cut", "nothing"),
+    ),
+    Section(
+        "network-sites",
+        "Several machines",
+        "The same wire. A robot stands and turns again in `standby`, `router` and `moved`, judged from what its wheels "
+        "were told. In `fleet` one process plays the twenty robots, with sessions, headers and credit of their own: "
+        "forty robot processes on two cores would measure themselves.",
+        _rows("uplink", "standby", "router", "moved", "fleet"),
     ),
     Section(
         "network-stop",
