@@ -20,7 +20,8 @@ from vision_side.missions.port import Plan, RangeScan, View
 _STEP_US = 100_000  # it ran at 10 Hz
 _REACH_M = 0.2
 _RAY_RAD = 0.25  # 13 rays over 3 rad
-_FIRST_RAD = {"front": -1.5, "left": 0.0708, "right": -3.0708}
+_SENSORS = {"front": (0.077, 0.0, -1.5), "left": (0.065, 0.053, 0.0708), "right": (0.065, -0.053, -3.0708)}
+"""Of its robot: how far each stands ahead and to the left of the axle's midpoint, and where its rays begin."""
 _SAME_RAY_RAD = 0.2
 
 
@@ -152,14 +153,21 @@ class GotoBaseline:
 
 
 def _three_sensors(scan: RangeScan) -> dict[str, list[float]]:
-    """Its three sensors of 13 rays, from whatever rays there are; no ray so near to the angle: nothing seen."""
+    """What each sensor sees itself: the scan has its echoes from the axle's midpoint, the law goes by each sensor's."""
     angles = scan.angle_min_rad + np.arange(len(scan.ranges_m)) * scan.angle_increment_rad
-    return {name: [_range_at(scan, angles, first + _RAY_RAD * index) for index in range(13)]
-            for name, first in _FIRST_RAD.items()}
+    seen = np.isfinite(scan.ranges_m) & (scan.ranges_m <= scan.range_max_m)
+    x_m, y_m = scan.ranges_m[seen] * np.cos(angles[seen]), scan.ranges_m[seen] * np.sin(angles[seen])
+    return {name: _rays(x_m - ahead_m, y_m - left_m, first_rad)
+            for name, (ahead_m, left_m, first_rad) in _SENSORS.items()}
 
 
-def _range_at(scan: RangeScan, angles: NDArray[Any], angle_rad: float) -> float:
-    off = np.abs(np.remainder(angles - angle_rad + math.pi, math.tau) - math.pi)
-    near = np.flatnonzero(off <= _SAME_RAY_RAD)
-    seen = [float(scan.ranges_m[one]) for one in near[np.argsort(off[near])] if math.isfinite(scan.ranges_m[one])]
-    return seen[0] if seen and seen[0] <= scan.range_max_m else math.inf
+def _rays(x_m: NDArray[Any], y_m: NDArray[Any], first_rad: float) -> list[float]:
+    """Its 13 rays, each the echo nearest to its direction; none near or within reach: nothing seen."""
+    away_m, angles = np.hypot(x_m, y_m), np.arctan2(y_m, x_m)
+    rays = [math.inf] * 13
+    for index in range(13):
+        off = np.abs(np.remainder(angles - first_rad - _RAY_RAD * index + math.pi, math.tau) - math.pi)
+        off[away_m > _REACH_M] = math.inf
+        if len(off) and off.min() <= _SAME_RAY_RAD:
+            rays[index] = float(away_m[off.argmin()])
+    return rays
