@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from protocol.codec import encode
+from protocol.jpeg import JpegSize
 from protocol.messages import CameraModel, DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader
 from sim.label_bus import KEPT
 from vision_side.config import BoxesConfig
@@ -16,13 +17,13 @@ SOURCE = "guest"
 
 
 def boxes_message(
-    header: FrameHeader, labels: Iterable[dict[str, Any]], camera: CameraModel, session: str, seq: int
+    header: FrameHeader, labels: Iterable[dict[str, Any]], size: CameraModel | JpegSize, session: str, seq: int
 ) -> tuple[bytes, bytes]:
-    """Header and payload for the channel `detections`: the labels of the frame of `header`."""
+    """Header and payload for the channel `detections`: the labels of the frame of `header`, in pixels of its `size`."""
     echo = Echo(channel="frame", session=header.session, seq=header.seq, t_us=header.t_us)
     boxes = tuple(DetectedBox.model_validate(one) for one in labels)
     stamp = DetectionsHeader(source=SOURCE, session=session, seq=seq, echo=echo)
-    return encode(stamp), encode(Detections(width_px=camera.width_px, height_px=camera.height_px, boxes=boxes))
+    return encode(stamp), encode(Detections(width_px=size.width_px, height_px=size.height_px, boxes=boxes))
 
 
 class Labels:

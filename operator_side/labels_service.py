@@ -7,10 +7,11 @@ import secrets
 from collections.abc import Callable
 
 from operator_side.labels import SOURCE, boxes_message
-from protocol.channels import CAMERA, DETECTIONS, FRAME
+from protocol.channels import DETECTIONS, FRAME
 from protocol.codec import decode
 from protocol.errors import WireError
-from protocol.messages import CameraModel, FrameHeader
+from protocol.jpeg import read_jpeg_size
+from protocol.messages import FrameHeader
 from protocol.transports.link import LatestSlot, Link, Message
 from protocol.transports.opening import open_link
 from sim.label_bus import LabelReader
@@ -40,8 +41,6 @@ class LabelPublisher:
     def __init__(self, link: Link, labels: LabelReader) -> None:
         self._link, self._labels = link, labels
         self._frames: LatestSlot[Message] = link.latest(FRAME)
-        self._cameras: LatestSlot[Message] = link.latest(CAMERA)
-        self._camera: CameraModel | None = None
         self._session = secrets.token_hex(4)
         self._seq = 0
 
@@ -49,26 +48,17 @@ class LabelPublisher:
         """The next frame's boxes, if one comes soon."""
         frame = self._frames.take(_WAIT_S)
         self._labels.drain()
-        camera = self._cameras.take()
-        if camera is not None:
-            self._camera = self._decoded_camera(camera) or self._camera
-        if frame is not None and self._camera is not None:
-            self._publish(frame, self._camera)
+        if frame is not None:
+            self._publish(frame)
 
-    def _publish(self, frame: Message, camera: CameraModel) -> None:
+    def _publish(self, frame: Message) -> None:
+        """By the picture's own size: on a slow link the robot sends smaller ones."""
         try:
-            header = decode(FrameHeader, frame.header)
+            header, size = decode(FrameHeader, frame.header), read_jpeg_size(frame.payload)
         except WireError:
             return
-        boxes = self._labels.of(header.t_us)
+        boxes = self._labels.of(header.t_us, size.width_px)
         if boxes is not None:
-            stamp, payload = boxes_message(header, boxes, camera, self._session, self._seq)
+            stamp, payload = boxes_message(header, boxes, size, self._session, self._seq)
             self._link.publish(DETECTIONS, stamp, payload)
             self._seq += 1
-
-    @staticmethod
-    def _decoded_camera(message: Message) -> CameraModel | None:
-        try:
-            return decode(CameraModel, message.payload, CAMERA.max_payload_bytes)
-        except WireError:
-            return None

@@ -17,7 +17,7 @@ LABELLED_US = "labelled_us"
 
 
 class Label(NamedTuple):
-    """One box, in pixels of the encoded picture."""
+    """One box, in pixels of the camera's whole picture; it may be encoded smaller."""
 
     label: str
     score: float
@@ -27,9 +27,9 @@ class Label(NamedTuple):
     y2_px: float
 
 
-def to_json(labels: Iterable[Label], t_us: int) -> bytes:
-    """The labels of the picture captured at `t_us`, as they go over the bus."""
-    return json.dumps({LABELLED_US: t_us, "boxes": [one._asdict() for one in labels]}).encode()
+def to_json(labels: Iterable[Label], t_us: int, width_px: int) -> bytes:
+    """The labels of the picture captured at `t_us`, `width_px` wide, as they go over the bus."""
+    return json.dumps({LABELLED_US: t_us, "width_px": width_px, "boxes": [one._asdict() for one in labels]}).encode()
 
 
 class LabelReader:
@@ -38,12 +38,16 @@ class LabelReader:
     def __init__(self, socket_dir: str) -> None:
         self._connection = Connection(socket_dir, TRUTH)
         self._connection.hello()
-        self._kept: OrderedDict[int, list[dict[str, Any]]] = OrderedDict()
+        self._kept: OrderedDict[int, dict[str, Any]] = OrderedDict()
 
-    def of(self, t_us: int) -> list[dict[str, Any]] | None:
-        """The boxes of the picture captured at `t_us`; None if they were lost. They come before their picture."""
+    def of(self, t_us: int, width_px: int) -> list[dict[str, Any]] | None:
+        """The boxes of the picture captured at `t_us`, in pixels of one `width_px` wide; None if they were lost.
+
+        They come before their picture.
+        """
         self.drain()
-        return self._kept.get(t_us)
+        table = self._kept.get(t_us)
+        return None if table is None else [_scaled(box, width_px / table["width_px"]) for box in table["boxes"]]
 
     def drain(self) -> None:
         """Take in what waits; often, for a socket holds ten messages. Raises HardwareError without a simulation."""
@@ -54,10 +58,14 @@ class LabelReader:
         if f'"{LABELLED_US}"'.encode() not in message:
             return
         table = json.loads(message)
-        self._kept[table[LABELLED_US]] = table["boxes"]
+        self._kept[table[LABELLED_US]] = table
         if len(self._kept) > KEPT:
             self._kept.popitem(last=False)
 
     def close(self) -> None:
         """Idempotent."""
         self._connection.close()
+
+
+def _scaled(box: dict[str, Any], factor: float) -> dict[str, Any]:
+    return {name: value * factor if name.endswith("_px") else value for name, value in box.items()}

@@ -111,7 +111,7 @@ class Simulation:
         """A picture for each way in which one is wanted: one, unless cameras differ in what they ask."""
         asked = self._clients.wanted_pictures()
         if asked and self._world.scenario.labels and self._clients.has(TRUTH):
-            self._clients.send(TRUTH, to_json(self._world.labels(), t_us))
+            self._clients.send(TRUTH, to_json(self._world.labels(), t_us, self._world.camera_model.width_px))
         for wanted in asked:
             self._clients.send_picture(wanted, PICTURE_HEAD.pack(t_us, wanted[1]) + self._world.render(*wanted))
 

@@ -11,8 +11,11 @@ import numpy as np
 import simplejpeg
 
 from operator_side.labels import Labels, boxes_message
-from protocol.codec import decode
+from operator_side.labels_service import LabelPublisher
+from protocol.channels import DETECTIONS, FRAME
+from protocol.codec import decode, encode
 from protocol.messages import Detections, DetectionsHeader, FrameHeader
+from protocol.transports.memory import MemoryNetwork
 from sim.bus import SimCamera, TruthReader
 from sim.label_bus import Label, LabelReader, to_json
 from sim.scenario import Wall, load_scenario
@@ -81,9 +84,27 @@ def test_labels_become_the_boxes_of_the_frame_they_are_of():
 
 
 def test_labels_are_no_truth_to_a_reader_of_truth():
-    message = to_json([Label("legs", 1.0, 1.0, 2.0, 3.0, 4.0)], 17)
+    message = to_json([Label("legs", 1.0, 1.0, 2.0, 3.0, 4.0)], 17, 320)
     assert b'"t_us"' not in message, "that is what tells truth from the rest"
     assert json.loads(message)["labelled_us"] == 17
+
+
+def assert_boxes_of_a_smaller_picture(labels, camera) -> None:
+    """What is published for a frame of half the size is in that frame's pixels."""
+    network, heard = MemoryNetwork(), []
+    robot, person = network.link("r1"), network.link("r1", role="guest")
+    robot.subscribe(DETECTIONS, heard.append)
+    publisher = LabelPublisher(person, labels)
+    while (picture := camera.read(1.0)) is None or picture.scale_percent != 50:
+        pass
+    robot.publish(FRAME, encode(FrameHeader(session="00000001", seq=1, t_us=picture.t_us)), picture.jpeg)
+    network.advance(1)
+    publisher.step()
+    network.advance(2)
+    found = decode(Detections, heard[0].payload, 65_536)
+    assert (found.width_px, found.height_px) == (160, 120)
+    whole = labels.of(picture.t_us, 320)
+    assert [box.x1_px for box in found.boxes] == [pytest.approx(box["x1_px"] / 2) for box in whole]
 
 
 @pytest.mark.slow
@@ -98,12 +119,14 @@ def test_a_running_simulation_labels_the_picture_that_it_sends(tmp_path):
         def labelled() -> bool:
             labels.drain()
             picture = camera.read(1.0)
-            boxes = labels.of(picture.t_us) if picture else None
+            boxes = labels.of(picture.t_us, 320) if picture else None
             seen.append(boxes)
             return boxes is not None and truth.read(1.0) is not None
 
         eventually(labelled)
-        assert labels.of(1) is None
+        assert labels.of(1, 320) is None
+        assert camera.adjust(80, 50)
+        assert_boxes_of_a_smaller_picture(labels, camera)
     finally:
         simulator.process.kill()
         simulator.process.wait(10)
