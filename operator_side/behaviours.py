@@ -54,8 +54,9 @@ def _run(case: Case, picture: Path | None) -> Score:
         from operator_side.plot import plot_run
     scenario, run = run_of(case)
     if picture is not None:
+        whose = f" on {case.robot}" if case.robot else ""
         law = case.mission or scenario.mission
-        plot_run(picture, run.samples, scenario, f"{scenario.name}, {law}, seed {case.seed}")
+        plot_run(picture, run.samples, scenario, f"{scenario.name}{whose}, {law}, seed {case.seed}")
     return score(run.samples, scenario.stand_off_m, figures_of(scenario, run.samples, run.said))
 
 

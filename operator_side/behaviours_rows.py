@@ -66,15 +66,18 @@ ROWS: Final = (
 )  # fmt: skip
 
 CHARACTER: Final = {
-    "band": "Its forward band is 60 % of the picture wide, so it hardly ever turns before the ball leaves the picture; "
-    "then it stands.",
-    "pixel-pi": "A speed of 200 / area and a sum of all corrections, per frame, without clamps: pixels are no metres, "
-    "and the sum has no end.",
-    "pixel-p": "It decides five times a second, in pixels, with a speed for near the middle and one for elsewhere: it "
-    "knows no distance and overshoots.",
-    "legs-baseline": "A sum of errors without time and clamp, and a field that is not the same to the left and to the "
-    "right.",
-    "goto-baseline": "Two laws that never act together and a machine of three states without a memory: it turns by the "
-    "clock, and cannot say that there is no way.",
+    "band": "Straight on at 0.1 m/s, and no turn before the ball is 30 % of the picture's width off the middle. The "
+    "ball is quicker: soon it looks too small for the band, so the robot stands, and the ball leaves the picture.",
+    "pixel-pi": "It does not turn within 20 pixels of the middle, so the target hangs some degrees to one side and "
+    "swings there, ever more as the sum of all corrections grows. And 200 / area is a speed for one distance: the one "
+    "at which it happens to be the target's.",
+    "pixel-p": "It decides five times a second, by pixels: forward until the ball's radius is 50 of them, then not at "
+    "all. So it keeps another distance than it should, by runs and stops; to a ball that rolls straight ahead it "
+    "points well.",
+    "legs-baseline": "Sums of errors without time and clamp, and a field that is not the same to the left and to the "
+    "right: the person swings from edge to edge of the picture, and out of it.",
+    "goto-baseline": "Its sensors reach 0.2 m, it comes at up to 0.5 m/s and turns by the clock. With this delay it is "
+    "so near when it turns that the range guard lets no corner come nearer; it never backs away, and cannot say that "
+    "there is no way. With none it goes round the cylinder.",
 }
 """What an older law is like, and why it fails where it does."""

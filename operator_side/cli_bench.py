@@ -105,7 +105,9 @@ def demo(
     *,
     scenario: Annotated[str, typer.Option(help="`all`, or names separated by commas.")] = "all",
     seeds: Annotated[str, typer.Option(help="Separated by commas.")] = "201,202,203",
-    seconds: Annotated[float, typer.Option(min=5, max=3600, help="Of each demo.")] = 20.0,
+    seconds: Annotated[
+        float | None, typer.Option(min=5, max=3600, help="Of each demo [default: 20, or what the course takes].")
+    ] = None,
     as_json: Json = False,
 ) -> int:
     """Many demos in real time; the median over seeds is judged."""

@@ -36,6 +36,7 @@ def plot_run(path: Path, samples: Sequence[Truth], scenario: Scenario, title: st
         _plot_bearing(upper, times_s, samples)
         _plot_distance(lower, times_s, samples, scenario.stand_off_m)
     figure.suptitle(title)
+    canvas.draw()  # type: ignore[no-untyped-call]  # equal scales change the numbers; what room those take shows now
     canvas.print_png(path)  # type: ignore[no-untyped-call]
 
 
@@ -54,7 +55,8 @@ def _plot_ways(axes: "Axes", samples: Sequence[Truth], scenario: Scenario) -> No
     for wall in scenario.walls:
         axes.fill(*zip(*wall_corners(wall), strict=True), color=WALL_COLOUR)
     _plot_things(axes, scenario)
-    axes.plot([t.target_x_m for t in samples], [t.target_y_m for t in samples], color=TARGET_COLOUR, label="target")
+    if scenario.target.shape != "place":
+        axes.plot([t.target_x_m for t in samples], [t.target_y_m for t in samples], color=TARGET_COLOUR, label="target")
     axes.plot([t.x_m for t in samples], [t.y_m for t in samples], color=ROBOT_COLOUR, label="robot")
     start, end = samples[0], samples[-1]
     axes.plot(start.x_m, start.y_m, "o", color=ROBOT_COLOUR)
@@ -74,8 +76,8 @@ def _plot_things(axes: "Axes", scenario: Scenario) -> None:
     for thing in scenario.things:
         if isinstance(thing, Static):
             axes.add_patch(_circle(thing.at_m, thing.reach_m, WALL_COLOUR))
-    for x_m, y_m in scenario.goals_m:
-        axes.plot(x_m, y_m, "x", color=TARGET_COLOUR, markersize=12)
+    if scenario.goals_m:
+        axes.plot(*zip(*scenario.goals_m, strict=True), "x", color=TARGET_COLOUR, markersize=12, label="waypoint")
     if scenario.light:
         axes.add_patch(_circle(scenario.light.at_m, LIGHT_DRAWN_M, "black"))
         line_x_m, line_y_m = scenario.light.ahead(scenario.light.line_m)

@@ -4,7 +4,7 @@ Frames that were answered go in again in the order they were answered, one pipel
 scan and the mission that its answer cites.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -72,12 +72,13 @@ class _Answers:
     """What somebody else found in each frame, for a vision without eyes of its own."""
 
 
-def replay(path: Path) -> Replayed:
-    """Replay the recording at `path`. Raises ConfigError if it is none."""
+def replay(path: Path, on_step: Callable[[Step], None] = lambda _step: None) -> Replayed:
+    """Replay the recording at `path`; `on_step` is told each answered frame. Raises ConfigError if it is none."""
     answers = _answers(path)
     missing = _gather_cited(path, answers)
     result = Replayed(gaps=answers.gaps + missing)
     for step in _steps(path, answers):
+        on_step(step)
         result.total += 1
         result.equal += step.sent == step.now
         if step.sent != step.now and not result.first_difference:

@@ -1,0 +1,75 @@
+"""How a demo, and many of them, are judged: by what the mission said too, and each figure by its own kind of bound."""
+
+from dataclasses import replace
+
+import pytest
+
+from benchmarks.real_time import _figures
+from operator_side import demo_report
+from operator_side.demo import RECORDING, DemoOptions, DemoRun
+from operator_side.lockstep import Conditions, Lockstep
+from operator_side.recording import Recorder
+from operator_side.replay import VISION_CONFIG
+from operator_side.scenario_settings import robot_config, robot_of, vision_config
+from protocol.channels import CAMERA
+from protocol.codec import encode
+from protocol.messages import Stamp
+from sim.scenario import load_scenario
+from sim.world import World
+
+
+@pytest.fixture(scope="module")
+def lights(tmp_path_factory) -> DemoRun:
+    """Two seconds at a traffic light, as a demo leaves them but for the wire: the real line in virtual time."""
+    folder = tmp_path_factory.mktemp("lights")
+    scenario = load_scenario("traffic-light")
+    model = robot_of(scenario)
+    config = vision_config(scenario, model, 3)
+    with World(scenario, model, 3) as world:
+        lockstep = Lockstep(world, robot_config(model, auto_arm=True), config, Conditions(), 3)
+        with Recorder(lockstep.network.link("r1"), folder / RECORDING, {VISION_CONFIG: config.model_dump_json()}):
+            stamp = Stamp(session="00000001", seq=0, t_us=0)
+            lockstep.network.link("r1").publish(CAMERA, encode(stamp), encode(world.camera_model))
+            while world.now_us < 2_000_000:
+                lockstep.step()
+    (folder / "vision.log").touch()
+    return DemoRun(DemoOptions("traffic-light"), scenario, folder, lockstep.run.samples)
+
+
+def misread(run: DemoRun):
+    """(share of the frames that were read wrong, whether that is accepted)."""
+    judged = demo_report.report(run)
+    return next((check.value, check.ok) for check in judged.checks if check.name == "wrong_states_percent")
+
+
+def test_whether_the_light_is_read_right_is_judged_from_the_recording(lights, monkeypatch):
+    monkeypatch.setattr(demo_report, "_draw", lambda *_given: None)
+    assert misread(lights) == (0.0, True)
+    assert misread(replace(lights, samples=[replace(one, light="off") for one in lights.samples])) == (100.0, False)
+    first, late = lights.samples[0], lights.samples[len(lights.samples) // 2 :]
+    assert misread(replace(lights, samples=[replace(first, light="off"), *late])) == (0.0, True), "nobody saw it change"
+
+
+# --- many demos ------------------------------------------------------------------------------------------------------
+
+
+def figure(name: str, bound: float, *values: float | None):
+    """What is made of one figure with these values."""
+    results = [{"checks": [{"name": name, "value": value, "unit": "", "bound": bound}],
+                "replayed": {"total": 9, "equal": 9}} for value in values]
+    return _figures("ball", results)[0]
+
+
+@pytest.mark.parametrize(("name", "bound", "values", "middle", "worst", "ok"), [
+    ("bearing_rms_deg", 1.5, (0.2, 9.0, 0.4), 0.4, 9.0, True),
+    ("bearing_rms_deg", 1.5, (0.2, 1.6, 9.0), 1.6, 9.0, False),
+    ("least_distance_m", 0.7, (0.8, 0.1, 0.9), 0.8, 0.1, True),
+    ("least_distance_m", 0.7, (0.8, 0.6, 0.5), 0.6, 0.5, False),
+    ("lost_percent", 0.0, (0.0, 0.0, 0.1), 0.0, 0.1, False), ("lost_percent", 0.0, (0.0, 0.0, 0.0), 0.0, 0.0, True),
+    ("wall_contact_s", 0.1, (0.0, 0.0, 0.2), 0.0, 0.2, False), ("wall_contact_s", 0.1, (0.0, 0.0, 0.1), 0.0, 0.1, True),
+    ("least_crossings", 1.0, (1, 2, 0), 1, 0, False), ("least_crossings", 1.0, (1, 2, 1), 1, 1, True),
+    ("reached_s", 22.5, (12.0, None, 13.0), None, None, False),
+])  # fmt: skip
+def test_the_median_is_judged_and_where_no_room_is_left_every_run(name, bound, values, middle, worst, ok):
+    judged = figure(name, bound, *values)
+    assert (judged.median, judged.worst, judged.ok) == (middle, worst, ok)

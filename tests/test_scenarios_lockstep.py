@@ -1,0 +1,82 @@
+"""Every scenario by name, and every older law, over the real line in virtual time; bounds are in test_lockstep.py."""
+
+import math
+from statistics import fmean
+
+import pytest
+
+from operator_side.lockstep import Conditions, Run, run_lockstep
+from operator_side.scenario_settings import robot_of
+from operator_side.score_course import STEP_S
+from protocol.messages import State
+from sim.scenario import load_scenario, scenario_names
+from sim.truth import Truth
+
+BASICS = {"static", "circle", "eight", "pushed", "behind", "walls"}
+"""Those that test_lockstep.py holds against all their bounds."""
+
+
+def drive(name: str, seed: int, seconds: float, mission: str | None = None) -> Run:
+    scenario = load_scenario(name)
+    conditions = Conditions(latency_ms=50, loss=0.1)
+    return run_lockstep(scenario, robot_of(scenario), seed, conditions, seconds, mission=mission)
+
+
+def last(run: Run, seconds: float) -> list[Truth]:
+    return [truth for truth in run.samples if truth.t_us > run.samples[-1].t_us - seconds * 1e6]
+
+
+@pytest.mark.parametrize("name", sorted(set(scenario_names()) - BASICS))
+def test_every_scenario_runs_and_its_robot_is_let_drive(name):
+    run = drive(name, 801, 1.2)
+    assert State.ACTIVE in run.states and len(run.twists) > 15
+    assert run.samples[-1].contacts == 0
+    assert all(phase not in ("failed", "cannot reach") for _, phase, _ in run.said)
+    if load_scenario(name).target.shape != "place":
+        assert run.samples[-1].visible and abs(math.degrees(run.samples[-1].bearing_rad)) < 5
+
+
+def test_a_target_behind_a_wall_is_not_driven_at_through_it():
+    """Without the range guard this start touches the wall for 0.24 s."""
+    run = drive("occluder", 804, 8.4)
+    assert sum(not truth.visible for truth in run.samples) > 100
+    assert run.samples[-1].wall_contacts * STEP_S < 0.1
+
+
+# --- the older laws, which must fail as they did -----------------------------------------------------------------
+
+
+def test_band_steering_hardly_turns_and_then_stands():
+    """A tenth of a metre a second, straight on: the ball is soon too small for its band, and then out of sight."""
+    run = drive("blue-sphere", 811, 14.6, "band")
+    assert all(abs(truth.linear_mps) < 0.01 and not truth.visible for truth in last(run, 0.5))
+    phases = [phase for _, phase, _ in run.said]
+    assert "too far" in phases and phases[-1] == "no target"
+
+
+def test_pixels_are_no_metres_for_the_integral_law():
+    """200 / area is a speed for one distance, whichever that is; and the target hangs at the edge of the dead band."""
+    run = drive("ball", 811, 9.0, "pixel-pi")
+    truths = last(run, 4.0)
+    assert all(truth.visible for truth in truths)
+    assert fmean(truth.distance_m for truth in truths) > 0.9
+    assert fmean(abs(math.degrees(truth.bearing_rad)) for truth in truths) > 3
+
+
+def test_two_speeds_by_the_pixel_never_settle():
+    run = drive("chaser", 811, 9.0, "pixel-p")
+    distances = [truth.distance_m for truth in last(run, 6.0)]
+    assert max(distances) < 1.1 and max(distances) - min(distances) > 0.05
+    assert {phase for t_us, phase, _ in run.said if t_us > 3e6} == {"near", "straight"}
+
+
+def test_the_older_legs_law_swings_from_edge_to_edge():
+    run = drive("legs", 811, 8.0, "legs-baseline")
+    assert max(abs(math.degrees(truth.bearing_rad)) for truth in last(run, 4.0)) > 30
+
+
+def test_the_older_waypoint_law_stands_before_the_cylinder_and_never_says_so():
+    """Its sensors reach 0.2 m and it comes at 0.5 m/s: once so near, the guard lets no corner turn nearer."""
+    run = drive("thymio", 811, 8.0, "goto-baseline")
+    assert len({(round(truth.x_m, 2), round(truth.y_m, 2)) for truth in last(run, 2.0)}) == 1
+    assert run.samples[-1].contacts == 0 and run.said[-1][1] in ("left contour", "right contour")
