@@ -30,7 +30,8 @@ def install(
 
     Without --yes it only shows what it would do.
     """
-    program, file = Path(sys.executable).with_name("sightline"), config or Path(f"/etc/sightline/{service}.toml")
+    program = Path(sys.executable).with_name("sightline")
+    file = (config or Path(f"/etc/sightline/{service}.toml")).expanduser().absolute()  # systemd begins elsewhere
     planned = units.plan(service, program, file, user or getpass.getuser(), units.UNIT_DIR)
     if not yes:
         _show(planned, _beside(service, program, file) if file.exists() else None)

@@ -9,6 +9,7 @@ import pytest
 import typer
 
 from operator_side import cli
+from operator_side.service_settings import load_service
 from operator_side.teleop_text import KEYS
 from robot_side.hardware.gpio_drive import GpioDriveConfig
 
@@ -56,6 +57,15 @@ def test_every_option_that_it_names_exists_and_none_is_left_out():
     named = set(re.findall(r"`([a-z_]+)`", " ".join(row.split("|")[1] for row in table.splitlines() if row)))
     own = {name for name in GpioDriveConfig.model_fields if not name.endswith("ward_pin")} - {"wheel_radius_m"}
     assert named - {"left_forward_pin", "right_backward_pin"} == own
+
+
+def test_vision_is_told_the_cars_own_limits():
+    """What it asks for beyond them the gate cuts, but it steers better if it knows."""
+    car, eyes = (load_service(service, file=str(ROOT / "examples" / name), environ={}).config for service, name in (
+        ("robot", "raspberry-car.toml"), ("vision", "raspberry-car-vision.toml")))
+    assert eyes.steer.max_linear_mps == car.safety.max_linear_mps
+    assert eyes.steer.max_angular_rad_s == car.safety.max_angular_rad_s >= eyes.search.rate_rad_s
+    assert eyes.latency.linear_acceleration_mps2 == car.safety.max_acceleration_mps2
 
 
 def test_the_files_that_they_name_exist():

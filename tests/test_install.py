@@ -64,6 +64,14 @@ def test_it_shows_first_and_writes_nothing(capsys, monkeypatch, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_file_that_is_named_from_here_is_found_from_anywhere(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    Path("car.toml").write_text(CAR)
+    assert cli.run(["install", "robot", "--config", "car.toml", "--user", "pi"]) == 0
+    said = capsys.readouterr().out
+    assert said.count(f"robot --config {tmp_path / 'car.toml'}") == 3 and "--config car.toml" not in said
+
+
 def test_a_service_that_could_not_begin_is_not_installed(capsys, tmp_path):
     broken = tmp_path / "vision.toml"
     broken.write_text("nonsense = 1")
