@@ -69,13 +69,24 @@ def list_detectors(as_json: Json = False) -> int:
     with needs("vision"):
         from vision_side.detect.choice import FAMILY
     rows = [(name, _problem(lambda name=name: FAMILY.load(name))) for name in FAMILY.names()]  # type: ignore[misc]
+    model = _shipped_model()
     if as_json:
-        typer.echo(json.dumps({"detectors": [{"name": name, "usable": not why, "why": why} for name, why in rows]}))
+        listed = [{"name": name, "usable": not why, "why": why} for name, why in rows]
+        typer.echo(json.dumps({"detectors": listed, "model_hash": model}))
     else:
+        comes = f", comes with model {model}" if model else "; comes without a model: onnx:PATH"
         for name, why in rows:
-            typer.echo(f"{name:<12} {why or 'ok'}")
+            typer.echo(f"{name:<12} {why or 'ok'}{comes if name == 'onnx' and not why else ''}")
         typer.echo("or package.module:Name; boxes: what somebody else publishes, see docs/detectors.md")
     return 0
+
+
+def _shipped_model() -> str:
+    try:
+        from vision_side.detect.onnx_detector import shipped_digest
+    except ImportError:  # the list says itself what is missing
+        return ""
+    return shipped_digest()
 
 
 def _problem(load: Callable[[], Any]) -> str:
@@ -103,20 +114,40 @@ def check(
     options: dict[str, Any] = {"detector.device": device}
     given: Any = load_service("vision", file=config, sets=(), options=options, environ=os.environ).config
     with needs("vision"):
+        from vision_side.detect.around import news_of
         from vision_side.detect.choice import check_device, choose_detector
         from vision_side.detect.contract import check_detector, time_detector
     settings = given.model_copy(update={"detector": given.detector.model_copy(update={"kind": name})})
     check_device(settings)
-    own = options_of(sets or ())
+    own, made = _nested(options_of(sets or ())), list["Detector"]()
 
     def make() -> "Detector":
-        return choose_detector(name, own, settings)
+        made.append(choose_detector(name, own, settings))
+        return made[-1]
 
     verdicts = check_detector(make, seed)
     ok = not any(one.wrong for one in verdicts)
     times = time_detector(make, seed=seed) if ok else []
-    typer.echo(json.dumps(_as_json(name, ok, verdicts, times)) if as_json else _as_text(name, verdicts, times))
+    said = list(dict.fromkeys(line for one in made for line in news_of(one)))
+    report = _as_json(name, ok, verdicts, times) | {"said": said}
+    typer.echo(json.dumps(report) if as_json else _as_text(name, verdicts, times, said))
     return 0 if ok else CHECK_FAILED
+
+
+def _nested(options: dict[str, Any]) -> dict[str, Any]:
+    """`hsv.shape=any` is the option `shape` of the section `hsv`. Raises ConfigError for one that is both."""
+    tables: dict[str, Any] = {}
+    for name, value in options.items():
+        *sections, last = name.split(".")
+        table = tables
+        for section in sections:
+            table = table.setdefault(section, {})
+            if not isinstance(table, dict):
+                raise ConfigError(f"--set {name}: {section!r} has a value already, and so no options")
+        if isinstance(table.get(last), dict):
+            raise ConfigError(f"--set {name}: options of {last!r} are given besides; give one or the other")
+        table[last] = value
+    return tables
 
 
 def promote(
@@ -156,10 +187,11 @@ def _or_none(value: float) -> float | None:
     return None if math.isnan(value) else round(value, 3)
 
 
-def _as_text(name: str, verdicts: Sequence["Verdict"], times: Sequence["Times"]) -> str:
+def _as_text(name: str, verdicts: Sequence["Verdict"], times: Sequence["Times"], said: Sequence[str]) -> str:
     lines = [f"{name}:"]
     for one in verdicts:
         lines.append(f"  {'FAIL' if one.wrong else 'ok':<5} {one.promise}" + (f": {one.wrong}" if one.wrong else ""))
     for took in times:
         lines.append(f"  {took.width_px}x{took.height_px}: {took.p50_ms:.2f} ms p50, {took.p95_ms:.2f} ms p95")
+    lines += [f"  it says: {line}" for line in said]
     return "\n".join(lines)

@@ -20,7 +20,7 @@ from operator_side.processes import Processes
 from operator_side.recording import Recorder
 from operator_side.replay import VISION_CONFIG
 from operator_side.requests import SOURCE, Operator
-from operator_side.scenario_settings import robot_of, robot_table, vision_table
+from operator_side.scenario_settings import robot_of, robot_table, vision_config, vision_table
 from operator_side.service_settings import load_service
 from operator_side.shaped_vision import Shape
 from operator_side.toml_text import toml_text
@@ -30,12 +30,15 @@ from sim.bus import TruthReader
 from sim.scenario import Scenario, load_scenario
 from sim.toml_file import laid_over
 from sim.truth import Truth
+from vision_side.detect.choice import BOXES, check_choice
 
 ROBOT: Final = "r1"
 READY_S: Final = 30.0
 """For one process to say that it is ready; a first start reads hundreds of megabytes from disk."""
 ARM_S: Final = 15.0
 _DYING_S: Final = 1.0
+_SILENT_S: Final = 2.0
+"""Without a word from the simulation: longer than a busy machine keeps it from its turn."""
 RECORDING: Final = "run.mcap"
 MOTOR_LOG: Final = "motors.csv"
 TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{}", "legacy": "ws-legacy://127.0.0.1:{}"}
@@ -83,6 +86,7 @@ class DemoRun:
 def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
     """Run it. Raises ConfigError, LinkError or the failure of a process; nothing is left running in any case."""
     scenario = load_scenario(options.scenario)
+    _check_eyes(options, scenario)
     run = DemoRun(options, scenario, _run_folder(options, scenario))
     with ExitStack() as ending:
         ending.enter_context(terminated_like_interrupted())
@@ -97,6 +101,17 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
             raise
         run.killed = processes.end()
     return run
+
+
+def _check_eyes(options: DemoOptions, scenario: Scenario) -> None:
+    """Raise ConfigError for a detector that vision would refuse, before anything is started."""
+    kind = options.detector
+    if kind is None or (kind == BOXES and scenario.labels):
+        return
+    if kind == BOXES:
+        raise ConfigError(f"--detector {BOXES}: nobody finds boxes in {scenario.name}; take one that looks itself, "
+                          "e.g. hsv")
+    check_choice(kind, {}, vision_config(scenario, robot_of(scenario), options.seed, options.mission))
 
 
 def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str], None]) -> None:
@@ -147,7 +162,7 @@ def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthR
     end_s = started_s + run.options.seconds if run.options.seconds else float("inf")
     while time.monotonic() < end_s:
         processes.check()
-        sample = truth.read(timeout_s=0.5)
+        sample = truth.read(timeout_s=_SILENT_S)
         if sample is None:
             raise HardwareError("the simulation says nothing any more; see sim.log in the run folder")
         run.samples.append(sample)

@@ -25,7 +25,6 @@ class Card:
     parameters: int
     size_bytes: int
     sha256: str
-    seconds: float
     validated: int
     report: Report
 
@@ -66,7 +65,6 @@ def _made(card: Card) -> list[str]:
         f"- Steps: {training.steps} of {training.batch} cut-outs (the last {100 * (1 - training.whole_from):.0f} % "
         f"half as many whole pictures), AdamW, learning rate {training.rate:g}, weights averaged.",
         f"- Thresholds: {thresholds}, chosen on {card.validated} scenes a column of the seeds from {VALIDATED_FROM}.",
-        f"- It took {card.seconds / 60:.0f} minutes, on a machine that did other things besides.",
     ]
 
 

@@ -1,7 +1,6 @@
 """`sightline train`: scenes, training, thresholds, ONNX file, judgement, model card. Shell (files)."""
 
 import hashlib
-import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -58,7 +57,6 @@ class TrainOptions:
 
 def run_training(options: TrainOptions, say: Callable[[str], None], progress: Progress) -> Path:
     """Everything, in order; the model's path. What a run that was cut left in the folder is gone on with."""
-    began_s = time.monotonic()
     with progress(options.scenes, "scenes") as advance:
         scenes = drawn_scenes(options.out, options.scenes, options.jobs, advance)
     weights = train(scenes, options.training, options.device, options.out, say)
@@ -70,9 +68,8 @@ def run_training(options: TrainOptions, say: Callable[[str], None], progress: Pr
     report = judged(model, options.judged)
     digest = hashlib.sha256(model.read_bytes()).hexdigest()
     parameters = sum(int(one.size) for one in weights.values())
-    trained_s = time.monotonic() - began_s
     card = Card(options.training, options.scenes, options.device, thresholds, parameters, model.stat().st_size, digest,
-                trained_s, options.validated, report)
+                options.validated, report)
     (options.out / CARD).write_text(card_text(card), "utf-8")
     return model
 

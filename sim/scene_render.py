@@ -1,6 +1,7 @@
 """Draws labelled scenes: bodies by TinyRenderer, boxes from its segmentation mask. Shell (PyBullet)."""
 
 import math
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -13,7 +14,19 @@ from sim.engine import pybullet
 from sim.light import LIT, Light, Part, State, colour_of
 from sim.scene_backdrop import backdrop
 from sim.scene_plan import plan_scene, without_what_hides
-from sim.scenes import HEIGHT_PX, MOST_HIDDEN, WIDTH_PX, Box, Column, Lens, Scene, ScenePlan, Solid, Truth
+from sim.scenes import (
+    HEIGHT_PX,
+    MOST_HIDDEN,
+    VALIDATED_FROM,
+    WIDTH_PX,
+    Box,
+    Column,
+    Lens,
+    Scene,
+    ScenePlan,
+    Solid,
+    Truth,
+)
 from sim.thing_bodies import ball_visual
 from sim.things import Colour, Legs
 
@@ -40,10 +53,13 @@ class SceneRenderer:
         pybullet.disconnect(physicsClientId=self._client)
 
     def scene(self, seed: int, column: Column) -> Scene:
-        """The scene of that seed; a ball in it shows at least what `MOST_HIDDEN` leaves."""
+        """The scene of that seed. Where it is to judge or to choose, a ball shows at least what `MOST_HIDDEN` leaves.
+
+        In training one that shows less is unclear, and nothing is learned there.
+        """
         plan = plan_scene(seed, column)
         drawn = self._drawn(plan)
-        if any(one.label == "ball" and one.seen < 1 - MOST_HIDDEN for one in drawn.truths):
+        if seed >= VALIDATED_FROM and _has_ball(plan.solids) and not _has_ball(drawn.truths):
             drawn = self._drawn(without_what_hides(plan))
         return drawn
 
@@ -121,6 +137,10 @@ class SceneRenderer:
     def _body(self, visual: int, at: tuple[float, float, float],
               turn: tuple[float, float, float, float] = _NO_TURN) -> int:
         return int(pybullet.createMultiBody(0, -1, visual, at, turn, physicsClientId=self._client))
+
+
+def _has_ball(ones: Sequence[Solid] | Sequence[Truth]) -> bool:
+    return any(one.label == "ball" for one in ones)
 
 
 def _projection(lens: Lens) -> list[float]:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from operator_side import cli
+from operator_side import cli, cli_detector
 from tests.onnx_rig import brightness_model
+from vision_side.detect import onnx_detector
 
 BROKEN = '''
 from vision_side.detect.local import Hsv
@@ -69,12 +70,38 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("vision", "--detector", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
         (("vision", "--shadow", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
         (("vision", "--dry-run", "--detector", "boxes"), 2, "own eyes"),
+        (("detector", "check", "boxes"), 2, "that looks itself"),
+        (("detector", "check", "hsv", "--set", "hsv.min_radius_px=900"), 2, "'hsv.min_radius_px'"),
+        (("detector", "check", "hsv", "--set", "label=a", "--set", "label.b=1"), 2, "'label' has a value"),
+        (("demo", "--detector", "hsw", "--out", "/nowhere/made"), 2, "did you mean 'hsv'"),
+        (("demo", "--detector", "onnx:/nowhere.onnx", "--out", "/nowhere/made"), 2, "/nowhere.onnx: No such file"),
+        (("demo", "--detector", "boxes", "--out", "/nowhere/made"), 2, "nobody finds boxes in circle"),
     ],
 )
 def test_every_mistake_is_one_line(capsys, arguments: tuple[str, ...], code: int, words: str) -> None:
     found, out, err = run(capsys, *arguments)
     assert (found, out) == (code, "")
     assert words in err and err.count("\n") == 1
+
+
+def test_what_a_detector_says_while_it_is_checked_is_shown(capsys) -> None:
+    code, out, _ = run(capsys, "detector", "check", "http+jpeg://127.0.0.1:1/eyes")
+    assert code == 5 and "FAIL  Every picture" in out and "it says: " in out and "UNREACHABLE" in out
+
+
+def test_an_option_of_a_section_is_set_by_a_dot() -> None:
+    given = {"hsv.shape": "any", "hsv.max_contours": 3, "label": "cup"}
+    assert cli_detector._nested(given) == {"hsv": {"shape": "any", "max_contours": 3}, "label": "cup"}
+
+
+def test_a_copy_without_a_model_says_so(capsys, monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(onnx_detector, "SHIPPED", tmp_path / "sightline.onnx")
+    code, _, err = run(capsys, "detector", "check", "onnx")
+    assert code == 2 and "without a model of its own" in err and err.count("\n") == 1
+    assert "onnx         ok; comes without a model" in run(capsys, "detector", "list")[1]
+    brightness_model(tmp_path / "sightline.onnx", [[1, 1, 9, 9]], [0])
+    assert f"onnx         ok, comes with model {onnx_detector.shipped_digest()}" in run(capsys, "detector", "list")[1]
+    assert json.loads(run(capsys, "detector", "list", "--json")[1])["model_hash"] == onnx_detector.shipped_digest()
 
 
 def test_a_device_that_is_not_there_ends_vision_with_3(capsys, tmp_path: Path) -> None:

@@ -114,6 +114,25 @@ def choose_detector(kind: str, options: Mapping[str, Any], config: VisionConfig)
     Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option, and
     HardwareError for a device that is not there.
     """
+    plugin, settings = _checked(kind, options, config)
+    detector: Detector = plugin(settings)
+    return detector
+
+
+def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) -> None:
+    """Raise ConfigError for what can be known to be wrong before the detector is built: its name, options, model."""
+    _, settings = _checked(kind, options, config)
+    if split(kind)[0] == "onnx":
+        from vision_side.detect.onnx_detector import read_model
+
+        read_model(settings)
+
+
+def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tuple[Any, Any]:
+    """The plug-in and its `Config`."""
+    if kind == BOXES:
+        raise ConfigError(f"{BOXES!r} are what somebody else finds; here a detector is needed that looks itself, "
+                          "e.g. hsv")
     name, address = split(kind)
     plugin = FAMILY.load(name)
     settings = settings_model(plugin)
@@ -123,5 +142,4 @@ def choose_detector(kind: str, options: Mapping[str, Any], config: VisionConfig)
     given: dict[str, Any] = {one: getattr(config, one) for one in _FILLED if one in fields}
     given |= {one: getattr(config.detector, one) for one in _OF_DETECTOR if one in fields}
     given |= {"address": address} if address else {}
-    detector: Detector = plugin(FAMILY.settings(name, plugin, given | dict(options), config))
-    return detector
+    return plugin, FAMILY.settings(name, plugin, given | dict(options), config)

@@ -7,6 +7,7 @@ picture that it gives here what it should.
 import hashlib
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -20,7 +21,7 @@ from vision_side.detect.golden import KEY, difference, golden_picture, read_gold
 from vision_side.detect.local import timed
 from vision_side.detect.onnx_engine import Engine, open_engine
 from vision_side.detect.onnx_header import OnnxHeader, read_onnx_header
-from vision_side.detect.onnx_reading import fit_picture, form_of, read_outputs
+from vision_side.detect.onnx_reading import Form, fit_picture, form_of, read_outputs
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
 from vision_side.detect.refine import refined
 
@@ -55,22 +56,14 @@ class OnnxDetector:
 
     def __init__(self, config: Config) -> None:
         """Raises ConfigError for a file that is no such model, HardwareError for a device that is not there."""
-        path = Path(config.address).expanduser() if config.address else SHIPPED
-        data = _bytes_of(path)
-        try:
-            header = read_onnx_header(data)
-            self._form = form_of(header, config.names, config.colour)
-            self._min_score = _least(config.min_score, header)
-            expected = read_golden(header.metadata[KEY]) if KEY in header.metadata else None
-        except ValueError as error:
-            raise ConfigError(f"model {path}: {error}; see docs/detectors.md") from None
+        model = read_model(config)
+        path, self._form, self._min_score = model.path, model.form, model.min_score
         self._refine = frozenset(config.refine)
-        self._engine = open_engine(path, header, config.device, config.threads)
+        self._engine = open_engine(path, model.header, config.device, config.threads)
         self._news = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
-        digest = hashlib.sha256(data).hexdigest()[:HASH_DIGITS]
-        self.maker = Maker(f"onnx:{path.name}"[:_NAME_LENGTH], digest, self._engine.device)
+        self.maker = Maker(f"onnx:{path.name}"[:_NAME_LENGTH], model.digest, self._engine.device)
         self._failed = False
-        self._warm_up(path, header, config, expected)
+        self._warm_up(path, model.header, config, model.expected)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """A result for each frame for which there is still time."""
@@ -115,6 +108,38 @@ class OnnxDetector:
                                 f"{wrong}; try --device cpu, or fetch the file again")
 
 
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A model's file and what it says of itself."""
+
+    path: Path
+    header: OnnxHeader
+    form: Form
+    min_score: float
+    expected: list[Detection] | None
+    """What it should find in the known picture, if it says."""
+    digest: str
+
+
+def read_model(config: OnnxDetector.Config) -> Model:
+    """The model, without running it. Raises ConfigError for a file that is none, or none of a form known here."""
+    path = Path(config.address).expanduser() if config.address else SHIPPED
+    data = _bytes_of(path)
+    digest = hashlib.sha256(data).hexdigest()[:HASH_DIGITS]
+    try:
+        header = read_onnx_header(data)
+        form = form_of(header, config.names, config.colour)
+        expected = read_golden(header.metadata[KEY]) if KEY in header.metadata else None
+        return Model(path, header, form, _least(config.min_score, header), expected, digest)
+    except ValueError as error:
+        raise ConfigError(f"model {path}: {error}; see docs/detectors.md") from None
+
+
+def shipped_digest() -> str:
+    """Of the model that comes with Sightline, as results carry it; empty where none does."""
+    return hashlib.sha256(SHIPPED.read_bytes()).hexdigest()[:HASH_DIGITS] if SHIPPED.is_file() else ""
+
+
 def _bytes_of(path: Path) -> bytes:
     try:
         size = path.stat().st_size
@@ -122,6 +147,9 @@ def _bytes_of(path: Path) -> bytes:
             raise ConfigError(f"model {path} has {size} bytes; an ONNX file has between 1 and {MAX_BYTES}")
         return path.read_bytes()
     except OSError as error:
+        if path == SHIPPED:
+            raise ConfigError("this copy of Sightline comes without a model of its own: name one, e.g. --detector "
+                              "onnx:ball.onnx, or make it: docs/learned-detector.md") from None
         why = error.strerror or "it cannot be read"
         raise ConfigError(f"model {path}: {why}; name an ONNX file, e.g. --detector onnx:ball.onnx") from None
 

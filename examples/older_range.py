@@ -1,0 +1,19 @@
+"""The colour detector with the older write-up's range for "yellow": from orange to pure green, and any beige. Shell.
+
+    sightline score detectors hsv examples.older_range:OlderRange
+
+It is (20, 25, 25) to (64, 255, 255) in OpenCV's units: half degrees, and 25 of 255. All else is `hsv` as it is, its
+test for round things too, which the write-up did not have.
+"""
+
+from vision_side.config import HsvRange
+from vision_side.detect.local import Hsv
+
+RANGE = HsvRange(hue_low_deg=40, hue_high_deg=128, saturation_low=0.098, value_low=0.098)
+
+
+class OlderRange(Hsv):
+    """`hsv`, but for the range: whatever the configuration says of that, it is this one."""
+
+    def __init__(self, config: Hsv.Config) -> None:
+        super().__init__(config.model_copy(update={"hsv": config.hsv.model_copy(update={"ranges": (RANGE,)})}))
