@@ -1,0 +1,56 @@
+"""The model that ships: its card is true of it, and it finds what it says on scenes that nothing was trained on."""
+
+import hashlib
+
+import cv2
+import pytest
+
+pytest.importorskip("pybullet")
+
+from operator_side import cli_train
+from operator_side.score_scenes import score_scenes, subjects
+from sim.scenes import COLUMNS, JUDGED_FROM, LABELS, WIDTH_PX
+from vision_side.detect.onnx_detector import SHIPPED
+from vision_side.detect.onnx_header import read_onnx_header
+
+CARD = SHIPPED.with_suffix(".md").read_text("utf-8")
+UNSAFE_PERCENT = 5.0
+"""Of wrong objects and of false alarms, in every column: what is asked of a detector that may drive."""
+SEED = JUDGED_FROM + 40_000  # other scenes than those of the card
+
+
+def columns_of_the_card():
+    """Each column's cells: hits, missed, wrong object, false alarms, in percent."""
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in CARD.splitlines() if line.startswith("|")]
+    return {row[0]: [float(cell.removesuffix(" %")) for cell in row[2:6]] for row in rows if row[0] in COLUMNS}
+
+
+def test_the_card_is_of_this_file():
+    data = SHIPPED.read_bytes()
+    assert len(data) < 1_000_000 and hashlib.sha256(data).hexdigest() in CARD
+    header = read_onnx_header(data)
+    assert header.inputs[0].shape == (1, 240, WIDTH_PX, 3) and header.metadata["min_score"] == "0.5"
+    assert all(f"`{label}`" in CARD for label in LABELS)
+
+
+def test_it_is_safe_in_every_column_of_its_card():
+    columns = columns_of_the_card()
+    assert set(columns) == set(COLUMNS)
+    assert all(max(wrong, alarms) <= UNSAFE_PERCENT for _, _, wrong, alarms in columns.values())
+
+
+def test_the_same_command_is_the_default():
+    assert f"`sightline train --scenes {cli_train.SCENES} --steps {cli_train.STEPS} " in CARD
+    assert f"chosen on {cli_train.VALIDATED} scenes a column" in CARD
+
+
+def test_opencv_runs_it():
+    cv2.dnn.readNetFromONNX(str(SHIPPED))
+
+
+def test_it_finds_balls_here_as_often_as_its_card_says():
+    """Few scenes, so four standard deviations of room."""
+    promised = columns_of_the_card()["nominal"][0] / 100
+    one = score_scenes(subjects(["onnx"]), 15, SEED, columns=["nominal"]).columns["nominal"]["onnx"]
+    assert one.hits >= promised - 4 * (promised * (1 - promised) / one.balls) ** 0.5
+    assert one.wrong_object <= 0.12
