@@ -4,22 +4,27 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Any, Final
-
-from operator_side.score import AT_LEAST
-from operator_side.score_bounds import EXACT
 
 _JUDGED: Final = (0, 5)
 
 
 @dataclass(frozen=True, slots=True)
+class Kinds:
+    """Which figures are judged otherwise than by a median that must not exceed its bound."""
+
+    at_least: str
+    """How the names of those begin that must not fall below it."""
+    exact: Collection[str]
+    """Those that leave no room: every run is judged."""
+
+
+@dataclass(frozen=True, slots=True)
 class DemoFigure:
-    """One figure over the seeds of a scenario; `ok` holds the median against the bound (where it leaves no room: every
-    run).
-    """
+    """One figure over the seeds of a scenario, held against its bound."""
 
     name: str
     median: float | None
@@ -30,7 +35,7 @@ class DemoFigure:
 
 
 def measure_demos(
-    scenarios: Sequence[str], seeds: Sequence[int], seconds: float | None, say: Callable[[str], None]
+    scenarios: Sequence[str], seeds: Sequence[int], seconds: float | None, kinds: Kinds, say: Callable[[str], None]
 ) -> list[DemoFigure]:
     """Run every scenario with every seed, for as long as a demo takes if `seconds` is None.
 
@@ -42,7 +47,7 @@ def measure_demos(
         for seed in seeds:
             say(f"{scenario}, seed {seed}")
             results.append(_demo(scenario, seed, seconds))
-        figures += _figures(scenario, results)
+        figures += _figures(scenario, results, kinds)
     return figures
 
 
@@ -57,9 +62,9 @@ def _demo(scenario: str, seed: int, seconds: float | None) -> dict[str, Any]:
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
-def _figures(scenario: str, results: Sequence[dict[str, Any]]) -> list[DemoFigure]:
+def _figures(scenario: str, results: Sequence[dict[str, Any]], kinds: Kinds) -> list[DemoFigure]:
     names = [check["name"] for check in results[0]["checks"]]
-    figures = [_figure(scenario, [_named(result, name) for result in results]) for name in names]
+    figures = [_figure(scenario, [_named(result, name) for result in results], kinds) for name in names]
     differing = [result["replayed"]["total"] - result["replayed"]["equal"] for result in results]
     none = all(result["replayed"]["total"] > 0 for result in results) and not any(differing)
     name = f"{scenario}: twists that replay otherwise"
@@ -70,14 +75,14 @@ def _named(result: dict[str, Any], name: str) -> dict[str, Any]:
     return next(dict(check) for check in result["checks"] if check["name"] == name)
 
 
-def _figure(scenario: str, checks: Sequence[dict[str, Any]]) -> DemoFigure:
+def _figure(scenario: str, checks: Sequence[dict[str, Any]], kinds: Kinds) -> DemoFigure:
     name, bound = checks[0]["name"], float(checks[0]["bound"])
     values = [check["value"] for check in checks]
     numbers = [value for value in values if value is not None]
     if len(numbers) < len(values):
         return DemoFigure(f"{scenario}: {name}", None, None, checks[0]["unit"], bound, False)
-    at_least = name.startswith(AT_LEAST)
+    at_least = name.startswith(kinds.at_least)
     middle, worst = median(numbers), min(numbers) if at_least else max(numbers)
-    held = worst if name in EXACT else middle
+    held = worst if name in kinds.exact else middle
     ok = held >= bound if at_least else held <= bound
     return DemoFigure(f"{scenario}: {name}", middle, worst, checks[0]["unit"], bound, ok)

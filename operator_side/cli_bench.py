@@ -112,13 +112,16 @@ def demo(
 ) -> int:
     """Many demos in real time; the median over seeds is judged."""
     with needs("all"):
-        from benchmarks.real_time import measure_demos
+        from benchmarks.real_time import Kinds, measure_demos
         from operator_side.check_text import number
+        from operator_side.score import AT_LEAST
+        from operator_side.score_bounds import EXACT
         from sim.scenario import load_scenario, scenario_names
     names = scenario_names() if scenario == "all" else scenario.split(",")
     for name in names:
         load_scenario(name)
-    figures = measure_demos(names, numbers("--seeds", seeds, int), seconds, lambda line: typer.echo(line, err=True))
+    wanted, kinds = numbers("--seeds", seeds, int), Kinds(AT_LEAST, EXACT)
+    figures = measure_demos(names, wanted, seconds, kinds, lambda line: typer.echo(line, err=True))
     ok = all(figure.ok for figure in figures)
     if as_json:
         checks = [{**asdict(figure), "value": figure.worst} for figure in figures]

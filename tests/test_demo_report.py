@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import pytest
 
-from benchmarks.real_time import _figures
+from benchmarks.real_time import Kinds, _figures
 from operator_side import demo_report
 from operator_side.demo import RECORDING, DemoOptions, DemoRun
 from operator_side.lockstep import Conditions, Lockstep
 from operator_side.recording import Recorder
 from operator_side.replay import VISION_CONFIG
 from operator_side.scenario_settings import robot_config, robot_of, vision_config
+from operator_side.score import AT_LEAST
+from operator_side.score_bounds import EXACT
 from protocol.channels import CAMERA
 from protocol.codec import encode
 from protocol.messages import Stamp
@@ -57,7 +59,7 @@ def figure(name: str, bound: float, *values: float | None):
     """What is made of one figure with these values."""
     results = [{"checks": [{"name": name, "value": value, "unit": "", "bound": bound}],
                 "replayed": {"total": 9, "equal": 9}} for value in values]
-    return _figures("ball", results)[0]
+    return _figures("ball", results, Kinds(AT_LEAST, EXACT))[0]
 
 
 @pytest.mark.parametrize(("name", "bound", "values", "middle", "worst", "ok"), [
