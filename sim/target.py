@@ -39,7 +39,7 @@ class PathMover:
 
     def way_m(self, now_us: int) -> float:
         """How far along its path it is at `now_us`."""
-        return self._begin_m + self._thing.speed_mps * now_us / 1e6
+        return self._begin_m + self._thing.speed_mps * max(0.0, now_us / 1e6 - self._thing.waits_s)
 
     def place(self, now_us: int) -> Place:
         """Where it is at `now_us`."""

@@ -95,6 +95,8 @@ class OnPath(Thing):
     speed_mps: Annotated[float, Field(ge=0, le=5)]
     phase: Amounts = (0.0, 1.0)
     """Where on the path it begins, as a fraction of a lap."""
+    waits_s: Annotated[float, Field(ge=0, le=600)] = 0.0
+    """How long it stands there first."""
 
     @model_validator(mode="after")
     def _closes(self) -> Self:

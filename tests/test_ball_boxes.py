@@ -18,7 +18,9 @@ from sim.scenario import load_scenario
 from vision_side.config import DetectorConfig, HsvConfig
 from vision_side.detect.onnx_detector import SHIPPED
 
-SCENARIO = load_scenario(str(Path(__file__).parent.parent / "examples" / "ball-boxes.toml"))
+WAITING = load_scenario(str(Path(__file__).parent.parent / "examples" / "ball-boxes.toml"))
+SCENARIO = WAITING.model_copy(update={"target": WAITING.target.model_copy(update={"waits_s": 0.0})})
+"""In virtual time the ball need not wait for processes."""
 ROBOT = robot_of(SCENARIO)
 WRITE_UP = (20, 25, 25, 64, 255, 255)
 """Lowest and highest in OpenCV's units: half degrees, and parts of 255."""

@@ -17,6 +17,7 @@ from sim.light import LIT, Light, Phase, colour_of
 from sim.robot_model import load_robot
 from sim.scenario import load_scenario
 from sim.start import goals_seen
+from sim.target import PathMover
 from sim.things import Legs
 from sim.toml_file import laid_over
 from sim.world import World
@@ -175,3 +176,10 @@ def test_a_desaturated_picture_is_paler(look, least, most):
         rgb = simplejpeg.decode_jpeg(world.render(), "RGB").astype(float)
     vivid = np.quantile((rgb.max(axis=-1) - rgb.min(axis=-1)) / np.maximum(rgb.max(axis=-1), 40), 0.995)
     assert least < vivid < most
+
+
+def test_a_target_that_waits_stands_and_then_moves_as_without():
+    here, waiting = load_scenario("circle").target, load_scenario("circle").target.model_copy(update={"waits_s": 6.0})
+    at_once, later = PathMover(here, 0.25), PathMover(waiting, 0.25)
+    assert later.place(0) == later.place(6_000_000) == at_once.place(0)
+    assert later.place(9_000_000) == at_once.place(3_000_000)
