@@ -152,6 +152,7 @@ def _replay_line(replayed: Replayed) -> str:
 def _next_thing(run: DemoRun) -> str:
     options = run.options
     if not options.latency_ms and not options.loss:
-        return f"next: sightline demo --scenario {run.scenario.name} --latency-ms 100 --loss 0.1"
+        eyes = f" --detector {options.detector}" if options.detector else ""
+        return f"next: sightline demo --scenario {options.scenario}{eyes} --latency-ms 100 --loss 0.1"
     other = "pushed" if run.scenario.name == "eight" else "eight"
     return f"next: sightline demo --scenario {other} --latency-ms {options.latency_ms:g} --loss {options.loss:g}"
