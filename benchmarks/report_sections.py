@@ -23,9 +23,9 @@ _BALLS: Final = "behind,circle,eight,pushed,static,walls"
 """All others are on docs/behaviours.md."""
 
 
-def _rows(*names: str, extra: tuple[str, ...] = ()) -> tuple[str, ...]:
+def _rows(*names: str, extra: tuple[str, ...] = (), seconds: int = 60) -> tuple[str, ...]:
     only = [part for name in names for part in ("--only", name)]
-    return ("bench", "network", *only, *extra, "--seconds", "60")
+    return ("bench", "network", *only, *extra, "--seconds", f"{seconds}")
 
 
 SECTIONS: Final = (
@@ -120,7 +120,7 @@ SECTIONS: Final = (
         "network-far",
         "Far and broken networks",
         "The same wire with nothing lost: a round trip of 2, 40 and 200 ms, five seconds without a wire, and one.",
-        _rows("near", "rtt40", "rtt200", "cut", "nothing"),
+        _rows("near", "rtt40", "rtt200", "cut", "nothing", seconds=30),
     ),
     Section(
         "network-sites",
