@@ -109,8 +109,11 @@ def _wrong_percent(samples: Sequence[Truth], said: Said) -> float | None:
     changes = [now.t_us for before, now in pairwise(samples) if before.light != now.light]
     looked = right = 0
     for t_us, _, note in said:
-        truth = samples[max(0, bisect_right(times_us, t_us) - 1)]
+        after = bisect_right(times_us, t_us)
+        truth, then = samples[max(0, after - 1)], samples[min(after, len(samples) - 1)]
         if not -READ_WITHIN_M < (truth.past_line_m or 0.0) < 0 or _is_new(t_us, changes):
+            continue
+        if truth.light != then.light and t_us > truth.t_us:  # it changed between two samples: before the frame or after
             continue
         looked += 1
         right += note.startswith(f"light {truth.light}")

@@ -73,6 +73,15 @@ def test_a_colour_that_is_told_late_is_wrong(shift_s, wrong):
     assert percent == pytest.approx(wrong, abs=0.01) if wrong is not None else percent > 4
 
 
+@pytest.mark.parametrize("told", ["red", "green"])
+def test_a_frame_between_two_samples_of_different_light_is_of_neither(told):
+    run = drive(lambda at_s: "red" if at_s < 5 else "green", lambda _s: -1.0)
+    said = [(2_000_000, "", "light red"), (4_990_000, "", f"light {told}"), (7_000_000, "", "light green")]
+    assert light_figures(run, said)["wrong_states_percent"] == 0
+    wrong = [(2_000_000, "", "light red"), (4_970_000, "", "light green"), (7_000_000, "", "light green")]
+    assert light_figures(run, wrong)["wrong_states_percent"] > 0
+
+
 def test_unknown_is_not_right_and_far_away_is_not_asked():
     near, far = drive(lambda _s: "red", lambda _s: -1.0), drive(lambda _s: "red", lambda _s: -3.0)
     said = [(round(at * 2e4), "driving", "light unknown") for at in range(600)]
