@@ -135,7 +135,7 @@ SECTIONS: Final = (
         "STOP through a full medium",
         "One medium of 1 Mbit/s that both directions share, packet after packet, video offered at 4 Mbit/s, and a "
         "person beyond it who says STOP, resets and says it again. From the word to the simulated motors' own log.",
-        ("bench", "network", "--only", "medium", "--seconds", "300"),
+        ("bench", "network", "--only", "medium", "--seconds", "120"),
     ),
     Section(
         "network-websocket",
