@@ -18,7 +18,7 @@ else
 	$(BIN)/python -m pytest -m "slow and not faults and not kit" && exit $$quick
 endif
 
-kit: $(READY)  ## the conformance kit against every broken peer
+kit: $(READY)  ## what is long: the conformance kit against every broken peer, every scenario in real time
 	$(BIN)/python -m pytest -m kit $(ARGS)
 
 lint: $(READY)

@@ -2,8 +2,6 @@
 
 import json
 import math
-from bisect import bisect_right
-from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -15,10 +13,9 @@ from operator_side.processes import last_line
 from operator_side.replay import Replayed, Step, replay
 from operator_side.score import Check, Score, score
 from operator_side.score_bounds import judge
-from operator_side.score_course import Said, figures_of
+from operator_side.score_course import figures_of
 from operator_side.shaped_vision import INJECTED
 from protocol.errors import SightlineError
-from sim.truth import Truth
 
 REAL_TIME_FACTOR: Final = 1.5
 """The bounds are those of lockstep; a real machine is granted this much more."""
@@ -60,8 +57,8 @@ def report(run: DemoRun) -> DemoReport:
     recording = run.folder / RECORDING
     said: list[tuple[int, str, str]] = []
     replayed = replay(recording, lambda step: said.append(_said(step)))
-    figures = figures_of(run.scenario, run.samples, list(_told_when_known(said, run.samples)))
-    result = score(run.samples, run.scenario.stand_off_m, figures)
+    during = [one for one in said if run.samples[0].t_us <= one[0] <= run.samples[-1].t_us]
+    result = score(run.samples, run.scenario.stand_off_m, figures_of(run.scenario, run.samples, during))
     injected = _injected(run)
     checks = _checks(run, result) + _injection_checks(run, injected)
     judged = DemoReport(run, result, checks, replayed, injected)
@@ -73,15 +70,6 @@ def report(run: DemoRun) -> DemoReport:
 def _said(step: Step) -> tuple[int, str, str]:
     """What the mission said of a frame: the same pipeline says the same of the same frames."""
     return step.frame.header.t_us, step.answer.seen.phase, step.answer.seen.note
-
-
-def _told_when_known(said: Said, samples: Sequence[Truth]) -> Iterator[tuple[int, str, str]]:
-    """What was said while the light is known: on a busy machine truth has gaps, and in one of them it may change."""
-    times_us = [truth.t_us for truth in samples]
-    for one in said:
-        at = bisect_right(times_us, one[0])
-        if 0 < at < len(samples) and samples[at - 1].light == samples[at].light:
-            yield one
 
 
 def _draw(run: DemoRun, recording: Path) -> None:

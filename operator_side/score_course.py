@@ -110,10 +110,12 @@ def _wrong_percent(samples: Sequence[Truth], said: Said) -> float | None:
     looked = right = 0
     for t_us, _, note in said:
         after = bisect_right(times_us, t_us)
-        truth, then = samples[max(0, after - 1)], samples[min(after, len(samples) - 1)]
-        if not -READ_WITHIN_M < (truth.past_line_m or 0.0) < 0 or _is_new(t_us, changes):
+        if not 0 < after < len(samples):
             continue
-        if truth.light != then.light and t_us > truth.t_us:  # it changed between two samples: before the frame or after
+        truth = samples[after - 1]
+        if truth.light != samples[after].light:  # it changed between two samples: before the frame or after it
+            continue
+        if not -READ_WITHIN_M < (truth.past_line_m or 0.0) < 0 or _is_new(t_us, changes):
             continue
         looked += 1
         right += note.startswith(f"light {truth.light}")

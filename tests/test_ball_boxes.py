@@ -16,7 +16,6 @@ from operator_side.scenario_settings import robot_of, vision_config
 from operator_side.score import ACQUIRED_WITHIN_DEG, score
 from sim.scenario import load_scenario
 from vision_side.config import DetectorConfig, HsvConfig
-from vision_side.detect.onnx_detector import SHIPPED
 
 WAITING = load_scenario(str(Path(__file__).parent.parent / "examples" / "ball-boxes.toml"))
 SCENARIO = WAITING.model_copy(update={"target": WAITING.target.model_copy(update={"waits_s": 0.0})})
@@ -75,8 +74,6 @@ def test_it_is_the_boxes_that_lead_it_astray():
     assert samples[-1].distance_m == pytest.approx(SCENARIO.stand_off_m, abs=0.05)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not SHIPPED.exists(), reason="no model is shipped yet: `sightline train` makes one")
 def test_the_learned_detector_follows_the_ball_past_them():
     samples, result = driven("onnx", 313, PAST_TWO_S)
     assert not any(map(faces_a_box, samples))

@@ -61,8 +61,7 @@ def test_every_robot_follows_its_ball(running):
         worlds = list(together.map(running.truth, sims))
     for rows in worlds:
         assert len(rows) == 250
-        off_rad = sorted(abs(bearing_rad) for bearing_rad, _, _ in rows)
-        assert off_rad[int(0.95 * len(rows))] < profile.max_bearing_rad and off_rad[-1] < 0.4, off_rad[-13:]
+        assert max(abs(bearing_rad) for bearing_rad, _, _ in rows) < profile.max_bearing_rad
         assert all(0.6 < distance_m < 1.0 for _, distance_m, _ in rows)
         assert sum(linear_mps > 0.05 for _, _, linear_mps in rows) > 200
 
