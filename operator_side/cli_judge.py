@@ -101,6 +101,7 @@ def score(
     mission: Annotated[str | None, typer.Option(help="In place of the scenario's own, e.g. a baseline law.")] = None,
     robot_model: Annotated[str | None, typer.Option(help="In place of the scenario's own robot.")] = None,
     look: Annotated[str | None, typer.Option(help="In place of the scenario's own light, e.g. dim.")] = None,
+    detector: Annotated[str | None, typer.Option(help="In place of the scenario's own, e.g. onnx.")] = None,
     page: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Run every behaviour and its baseline, and write this page.")
     ] = None,
@@ -119,7 +120,7 @@ def score(
     wanted = cases(
         scenario_names() if scenario == "all" else scenario.split(","),
         numbers("--seeds", seeds, int), numbers("--latency-ms", latency_ms, float), numbers("--loss", loss, float),
-        seconds, mission=mission, robot=robot_model, look=look,
+        seconds, mission=mission, robot=robot_model, look=look, detector=detector,
     )
     with progress(len(wanted)) as advance:
         report = run_cases(wanted, jobs or os.cpu_count() or 1, lambda _case: advance())

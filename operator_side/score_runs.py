@@ -18,6 +18,7 @@ from operator_side.score_course import figures_of
 from protocol.errors import ConfigError
 from sim.look import look_named
 from sim.scenario import Scenario, load_scenario
+from vision_side.detect.choice import check_choice
 from vision_side.missions.choice import configured
 
 
@@ -31,14 +32,15 @@ class Case:
     seed: int
     seconds: float | None
     mission: str | None = None
-    """In place of the scenario's own, as the robot is; and the look."""
+    """In place of the scenario's own, as the robot, the look and the detector are."""
     robot: str | None = None
     look: str | None = None
+    detector: str | None = None
 
     @property
     def group(self) -> str:
         """What it shares with the runs of other seeds."""
-        others = "".join(f" {one}" for one in (self.mission, self.robot, self.look) if one)
+        others = "".join(f" {one}" for one in (self.mission, self.robot, self.look, self.detector) if one)
         return f"{self.scenario}{others} +{self.latency_ms:g} ms {self.loss:.0%} loss"
 
 
@@ -83,11 +85,15 @@ class ScoreReport:
 def cases(
     scenarios: Sequence[str], seeds: Sequence[int], latencies_ms: Sequence[float], losses: Sequence[float],
     seconds: float | None, *, mission: str | None = None, robot: str | None = None, look: str | None = None,
+    detector: str | None = None,
 ) -> list[Case]:
     """Every combination, those of one group together. Raises ConfigError for a name or number that is none."""
     for name in scenarios:
         scenario = load_scenario(name)
-        configured(vision_config(scenario, robot_of(scenario, robot), 0, mission))
+        config = vision_config(scenario, robot_of(scenario, robot), 0, mission)
+        configured(config)
+        if detector is not None:
+            check_choice(detector, {}, config)
     if look is not None:
         look_named(look)
     if not seeds or any(not 0 <= seed < 2**32 for seed in seeds):
@@ -95,7 +101,7 @@ def cases(
     if any(not 0 <= one <= 10_000 for one in latencies_ms) or any(not 0 <= one < 1 for one in losses):
         raise ConfigError("--latency-ms is 0 to 10000 and --loss 0 to below 1, e.g. --latency-ms 0,50 --loss 0.1")
     return [
-        Case(name, latency_ms, loss, seed, seconds, mission, robot, look)
+        Case(name, latency_ms, loss, seed, seconds, mission, robot, look, detector)
         for name, latency_ms, loss, seed in product(scenarios, latencies_ms, losses, seeds)
     ]
 
@@ -112,7 +118,10 @@ def run_of(case: Case) -> tuple[Scenario, Run]:
     if case.look is not None:
         scenario = scenario.model_copy(update={"look": look_named(case.look)})
     model, conditions = robot_of(scenario, case.robot), Conditions(case.latency_ms, case.loss)
-    return scenario, run_lockstep(scenario, model, case.seed, conditions, case.seconds, mission=case.mission)
+    vision = vision_config(scenario, model, case.seed, case.mission)
+    if case.detector is not None:
+        vision = vision.model_copy(update={"detector": vision.detector.model_copy(update={"kind": case.detector})})
+    return scenario, run_lockstep(scenario, model, case.seed, conditions, case.seconds, vision=vision)
 
 
 def run_cases(wanted: Sequence[Case], jobs: int, on_done: Callable[[Case], None]) -> ScoreReport:

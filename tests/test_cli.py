@@ -107,6 +107,7 @@ def test_alone_it_shows_its_help(capsys):
         (["score", "--scenario", "cirle"], 2, "'circle'"),
         (["score", "--seeds", "a,b"], 2, "--seeds 1,2,3"),
         (["score", "--latency-ms", "-5"], 2, "0 to 10000"),
+        (["score", "--detector", "hvs"], 2, "'hsv'"),
         (["status", "--connect", "here"], 2, "tcp/127.0.0.1:7447"),
         (["arm", "a b"], 2, "'a b'"),
         (["robots", "--connect", "tcp/127.0.0.1:1", "--seconds", "0.3"], 4, "nobody answers at tcp/127.0.0.1:1"),

@@ -56,6 +56,15 @@ def test_runs_on_several_processes_are_those_of_one():
     assert report.runs == [(case, run_case(case)) for case in wanted]
 
 
+def test_another_detector_looks_in_place_of_the_scenarios_own():
+    """Eyes that know yellow only never find a blue ball."""
+    yellow = "examples.older_range:OlderRange"
+    asked = [cases(["blue-sphere"], [303], [50], [0.1], 2.0, detector=kind)[0] for kind in (None, yellow)]
+    own, other = map(run_case, asked)
+    assert own.acquired_s is not None and other.acquired_s is None
+    assert yellow in cases(["static"], [1], [0], [0], None, detector=yellow)[0].group
+
+
 def test_the_command_prints_one_object_and_exits_5_when_not_ok(capsys):
     options = ["--scenario", "static", "--seeds", "302", "--json", "--seconds"]
     assert cli.run(["score", *options, "4"]) == 0
