@@ -37,13 +37,13 @@ def detectors(
     """
     with needs("all"):
         from operator_side.score_detectors_text import text
-        from operator_side.score_scenes import score_scenes, subjects
+        from operator_side.score_scenes import LIGHT_SHARE, score_scenes, subjects
         from operator_side.score_sheet import Sheet
         from operator_side.score_table import progress
     columns = _columns(column)
     asked = subjects(names or list(COMPARED))
     drawn = Sheet(asked) if sheet else None
-    with progress((len(columns) + 1) * frames) as advance:
+    with progress(int((len(columns) + LIGHT_SHARE) * frames)) as advance:
         report = score_scenes(asked, frames, seeds, looks=looks, columns=columns, each=_each(advance, drawn))
     typer.echo(json.dumps(report.to_dict()) if as_json else text(report))
     if sheet and drawn:

@@ -19,6 +19,8 @@ from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, Detecti
 
 _FRAME_US: Final = 33_333
 _ROBOT: Final = "judge"
+LIGHT_SHARE: Final = 2.5
+"""As many scenes of lights and legs as of each column's: the three states share them."""
 LABELLED: Final = LABELS[1:]
 """What is judged by average precision; the ball has columns of its own."""
 
@@ -83,7 +85,10 @@ def score_scenes(
     asked: Sequence[Subject], frames: int, first_seed: int = JUDGED_FROM, *, looks: int = 1,
     columns: Sequence[str] = tuple(COLUMNS), each: Callable[[Seen], None] = lambda _seen: None,
 ) -> Report:
-    """All columns, `frames` scenes each, and as many of lights and legs. `each` is told of every scene."""
+    """All columns, `frames` scenes each, and `LIGHT_SHARE` times as many of lights and legs.
+
+    `each` is told of every scene.
+    """
     seeds = range(first_seed, first_seed + frames)
     verdicts: dict[str, dict[str, list[Judged]]] = {name: {one.name: [] for one in asked} for name in columns}
     found = {one.name: {label: Found() for label in LABELLED} for one in asked}
@@ -95,7 +100,7 @@ def score_scenes(
                 verdicts[name][subject.name].append(verdict(result, seen.scene))
                 if result is not None:
                     made_by[subject.name] = {"device": result.device, "model_hash": result.model_hash}
-    for seen in shown(THINGS, seeds, asked, looks):
+    for seen in shown(THINGS, range(first_seed, first_seed + int(LIGHT_SHARE * frames)), asked, looks):
         each(seen)
         for subject, result in zip(asked, seen.answers, strict=True):
             for label, marks in found[subject.name].items():
