@@ -124,6 +124,15 @@ def _bricks(draw: Random) -> Field:
     return _mixed(joint, _rgb(draw), _rgb(draw))
 
 
+def _quilt(draw: Random) -> Field:
+    """Two of the families above, one where the other is not: no two look alike. At times the contrast is low."""
+    one, two = (FAMILIES[_PIECES[int(draw.integers(len(_PIECES)))]](draw) for _ in range(2))
+    share = _soft(draw, draw.uniform(4, 40)) if draw.random() < 0.5 else _checks(draw)[..., 0] / 255
+    sharp = np.asarray(share > draw.uniform(0.3, 0.7), np.float32)
+    tile = one + sharp[..., None] * (two - one)
+    return np.asarray(tile + draw.uniform(0.0, 0.7) * (tile.mean((0, 1)) - tile), np.float32)
+
+
 def _mosaic(draw: Random) -> Field:
     """Judged only: small squares of colours around two, with joints."""
     count = int(draw.integers(4, 14))
@@ -162,9 +171,12 @@ def _marble(draw: Random) -> Field:
     return _mixed(np.asarray(veins ** draw.uniform(0.3, 2.0), np.float32), base, _near(draw, _near(draw, base)))
 
 
-TRAINED: Final = ("plain", "clouds", "boards", "checks", "stripes", "blots", "dots", "bricks")
+_PIECES: Final = ("plain", "clouds", "boards", "checks", "stripes", "blots", "dots", "bricks")
+TRAINED: Final = (*_PIECES, "quilt", "quilt", "quilt")
+"""Thrice the one that is never the same."""
 JUDGED: Final = ("mosaic", "stones", "weave", "marble")
 FAMILIES: Final[dict[str, Callable[[Random], Field]]] = {
     "plain": _plain, "clouds": _clouds, "boards": _boards, "checks": _checks, "stripes": _stripes, "blots": _blots,
-    "dots": _dots, "bricks": _bricks, "mosaic": _mosaic, "stones": _stones, "weave": _weave, "marble": _marble,
+    "dots": _dots, "bricks": _bricks, "quilt": _quilt,
+    "mosaic": _mosaic, "stones": _stones, "weave": _weave, "marble": _marble,
 }

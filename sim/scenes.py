@@ -71,8 +71,8 @@ COLUMNS: Final = {one.name: one for one in (
 THINGS: Final = Column("lights and legs", lights=1.0, legs=1.0)
 """For traffic lights and legs: one of each in every scene, the three states in turn."""
 TRAINED: Final = Column(
-    "trained", same_colour_boxes=0.45, lights=0.35, legs=0.3, any_colour=0.35, gain=(0.2, 1.1), white_balance=0.33,
-    blurred=0.35, blur_px=(3.0, 21.0), noise=(0.0, 6.0), quality=(25, 95),
+    "trained", same_colour_boxes=0.6, lights=0.35, legs=0.4, any_colour=0.2, gain=(0.2, 1.1), white_balance=0.33,
+    blurred=0.45, blur_px=(3.0, 21.0), noise=(0.0, 6.0), quality=(25, 95),
 )
 
 
