@@ -16,6 +16,8 @@ SCENES = 10_000
 VALIDATED = 200
 """These three are those of the model that ships, so that the same command makes it again; a test compares."""
 OUT = Path("runs/train")
+_LEAST_SHARE = 8
+"""Of a batch for each process that trains: the normalisation needs a few pictures."""
 
 
 def register(app: typer.Typer) -> None:
@@ -28,10 +30,10 @@ def train(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Scenes, checkpoint, model and card go here.")] = OUT,
     scenes: Annotated[int, typer.Option(min=8, max=800_000, help="Drawn once, seeds from 0 up.")] = SCENES,
     steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Of the optimiser.")] = STEPS,
-    batch: Annotated[int, typer.Option(min=2, max=1024, help="Cut-outs of scenes in each step.")] = 24,
+    batch: Annotated[int, typer.Option(min=2, max=1024, help="Cut-outs of scenes in each step.")] = 32,
     seed: Annotated[int, typer.Option(min=0, max=2**31, help="Draws weights, cuts and defects.")] = 1,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What trains.")] = "cpu",
-    jobs: Annotated[int | None, typer.Option(min=1, max=256, help="That draw scenes [default: one per core].")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Processes [default: one per core].")] = None,
     validated: Annotated[int, typer.Option(min=5, help="Scenes of each column that choose thresholds.")] = VALIDATED,
     judged: Annotated[int, typer.Option(min=5, help="Scenes of each column for the card's table.")] = 500,
 ) -> None:
@@ -44,7 +46,8 @@ def train(
     if device == "cuda" and not torch.cuda.is_available():
         raise HardwareError("--device cuda: this PyTorch sees no GPU; check `nvidia-smi` and that PyTorch is a CUDA "
                             "build, or take --device cpu")
-    training, processes = Training(steps, batch, seed=seed), jobs or os.cpu_count() or 1
+    processes = jobs or os.cpu_count() or 1
+    training = Training(steps, batch, seed=seed, jobs=min(processes, max(1, batch // _LEAST_SHARE)))
     options = TrainOptions(out, scenes, training, device, processes, validated, judged)
     try:
         out.mkdir(parents=True, exist_ok=True)

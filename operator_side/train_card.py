@@ -56,11 +56,12 @@ def _input() -> list[str]:
 
 def _made(card: Card) -> list[str]:
     training = card.training
+    families = ", ".join(dict.fromkeys(TRAINED))
     thresholds = ", ".join(f"{label} {one:.2f}" for label, one in zip(LABELS, card.thresholds, strict=True))
     return [
         f"`sightline train --scenes {card.scenes} --steps {training.steps} --batch {training.batch} "
-        f"--seed {training.seed} --device {card.device}`", "",
-        f"- Scenes: seeds 0 to {card.scenes - 1}, floors and walls of the families {', '.join(TRAINED)}; defects are "
+        f"--seed {training.seed} --device {card.device} --jobs {training.jobs}`", "",
+        f"- Scenes: seeds 0 to {card.scenes - 1}, floors and walls of the families {families}; defects are "
         "drawn anew each time a scene is shown.",
         f"- Steps: {training.steps} of {training.batch} cut-outs (the last {100 * (1 - training.whole_from):.0f} % "
         f"half as many whole pictures), AdamW, learning rate {training.rate:g}, weights averaged.",

@@ -12,7 +12,18 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from operator_side.train_network import BRIGHTNESS, DARKEST, GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, Layer, network
+from operator_side.train_network import (
+    BRIGHTNESS,
+    COLOURS,
+    DARKEST,
+    GEOMETRY,
+    LOOKED_AT,
+    OUTPUTS,
+    SIZE_PX,
+    STRIDE,
+    Layer,
+    network,
+)
 from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX
 
 OPSET: Final = 17
@@ -22,6 +33,8 @@ MOST_BOXES: Final = 32
 SAME_BOX: Final = 0.5
 """Of two boxes that overlap by more (intersection by union), only the better is kept: the other's score becomes 0."""
 _LARGEST: Final = 3.2  # of a log size: 390 pixels; keeps exp() finite on any picture
+
+_NO_PEAK: Final = -30.0
 
 Weights = dict[str, npt.NDArray[np.float32]]
 
@@ -65,30 +78,45 @@ def onnx_bytes(weights: Weights, properties: dict[str, str]) -> bytes:
 
 
 def _image(graph: Graph) -> str:
-    """uint8 NHWC -> float NCHW, scaled to the same mean brightness."""
-    graph.add("Transpose", ["image"], "image.planes", perm=[0, 3, 1, 2])
-    graph.add("Cast", ["image.planes"], "image.float", to=TensorProto.FLOAT)
-    graph.add("ReduceMean", ["image.float"], "image.mean", axes=[1, 2, 3], keepdims=1)
+    """uint8 NHWC -> float, scaled to the same mean brightness: one plane whose columns are blue, green, red in turn.
+
+    So nothing is moved about: the first convolution steps over three columns for each pixel.
+    """
+    names = [graph.constant(f"seen.{name}", value, np.int64) for name, value in
+             (("first", [0, 0]), ("end", [HEIGHT_PX, WIDTH_PX]), ("axes", [1, 2]), ("step", [LOOKED_AT, LOOKED_AT]))]
+    graph.add("Slice", ["image", *names], "image.few")
+    graph.add("Cast", ["image.few"], "image.few.float", to=TensorProto.FLOAT)
+    graph.add("ReduceMean", ["image.few.float"], "image.mean", keepdims=0)
     graph.add("Max", ["image.mean", graph.constant("darkest", 255 * DARKEST)], "image.level")
     graph.add("Div", [graph.constant("brightness", BRIGHTNESS), "image.level"], "image.gain")
-    return graph.add("Mul", ["image.float", "image.gain"], "picture")
+    plane = graph.constant("plane", [1, 1, HEIGHT_PX, COLOURS * WIDTH_PX], np.int64)
+    graph.add("Reshape", ["image", plane], "image.plane")
+    return graph.add("DequantizeLinear", ["image.plane", "image.gain"], "picture")
 
 
 def _layer(graph: Graph, layer: Layer, weights: Weights) -> str:
-    takes = ["picture" if name == "image" else name for name in layer.takes]
+    takes = list(layer.takes)
     after = f"{layer.name}.sum" if layer.relu and layer.kind != "head" else layer.name
     if layer.kind in ("add", "add-up"):
         if layer.kind == "add-up":
             takes[1] = _doubled(graph, takes[1])
         graph.add("Add", takes, after)
     else:
-        weight = weights[f"{layer.name}.weight"]
-        names = [graph.constant(f"{layer.name}.{part}", weights[f"{layer.name}.{part}"]) for part in ("weight", "bias")]
-        groups = layer.channels if layer.kind == "depthwise" else 1
-        side = weight.shape[2]
-        graph.add("Conv", [*takes, *names], after, kernel_shape=[side, side], strides=[layer.stride] * 2,
-                  pads=[side // 2] * 4, group=groups)
+        _convolution(graph, layer, takes[0], weights, after)
     return graph.add("Relu", [after], layer.name) if after != layer.name else after
+
+
+def _convolution(graph: Graph, layer: Layer, source: str, weights: Weights, name: str) -> None:
+    """The picture's own goes over colours beside each other in place of colours behind each other."""
+    weight, bias = weights[f"{layer.name}.weight"], weights[f"{layer.name}.bias"]
+    side, colours = weight.shape[2], 1
+    if source == "image":
+        source, colours = "picture", COLOURS
+        weight = weight.transpose(0, 2, 3, 1).reshape(layer.channels, 1, side, side * colours)
+    takes = [source, graph.constant(f"{layer.name}.weight", weight), graph.constant(f"{layer.name}.bias", bias)]
+    around, groups = (side - 1) // 2, layer.channels if layer.kind == "depthwise" else 1
+    graph.add("Conv", takes, name, kernel_shape=[side, side * colours], strides=[layer.stride, layer.stride * colours],
+              pads=[around, around * colours] * 2, group=groups)
 
 
 def _doubled(graph: Graph, name: str) -> str:
@@ -100,24 +128,23 @@ def _doubled(graph: Graph, name: str) -> str:
 def _decoded(graph: Graph, head: str) -> tuple[str, str, str]:
     """The best cells: corners (K, 4), scores (K,), labels (K,)."""
     rows, columns = HEIGHT_PX // STRIDE, WIDTH_PX // STRIDE
-    parts = graph.constant("parts", [len(LABELS), GEOMETRY], np.int64)
-    graph.nodes.append(helper.make_node("Split", [head, parts], ["heat", "geometry"], name="split", axis=1))
-    graph.add("Sigmoid", ["heat"], "likely")
-    graph.add("ReduceMax", ["likely"], "best", axes=[1], keepdims=1)
-    graph.add("ArgMax", ["heat"], "which", axis=1, keepdims=1)
+    maps = [f"heat.{label}" for label in LABELS]
+    parts = graph.constant("parts", [*[1] * len(LABELS), GEOMETRY], np.int64)
+    graph.nodes.append(helper.make_node("Split", [head, parts], [*maps, "rest"], name="split", axis=1))
+    graph.add("Max", maps, "best")
     graph.add("MaxPool", ["best"], "around", kernel_shape=[3, 3], pads=[1, 1, 1, 1], strides=[1, 1])
-    # A peak is no smaller than any cell around it: the difference is zero there and below zero elsewhere.
+    # A peak is no smaller than any cell around it; what is none counts as less than any peak.
     graph.add("GreaterOrEqual", ["best", "around"], "is_peak")
-    graph.add("Cast", ["is_peak"], "peak", to=TensorProto.FLOAT)
-    graph.add("Mul", ["best", "peak"], "peaks")
-    flat = graph.constant("flat", [rows * columns], np.int64)
-    graph.add("Reshape", ["peaks", flat], "peaks.flat")
-    graph.add("Reshape", ["which", flat], "which.flat")
+    graph.add("Where", ["is_peak", "best", graph.constant("no_peak", _NO_PEAK)], "peaks")
+    graph.add("Reshape", ["peaks", graph.constant("flat", [rows * columns], np.int64)], "peaks.flat")
     most = graph.constant("most", [MOST_BOXES], np.int64)
-    graph.nodes.append(helper.make_node("TopK", ["peaks.flat", most], ["top.scores", "cells"], name="topk", axis=0))
-    graph.add("Gather", ["which.flat", "cells"], "labels", axis=0)
-    graph.add("Reshape", ["geometry", graph.constant("flat4", [GEOMETRY, rows * columns], np.int64)], "geometry.flat")
-    graph.add("Gather", ["geometry.flat", "cells"], "own", axis=1)
+    graph.nodes.append(helper.make_node("TopK", ["peaks.flat", most], ["marks", "cells"], name="topk", axis=0))
+    graph.add("Sigmoid", ["marks"], "top.scores")
+    graph.add("Reshape", [head, graph.constant("flat9", [OUTPUTS, rows * columns], np.int64)], "flat.all")
+    graph.add("Gather", ["flat.all", "cells"], "own.all", axis=1)
+    halves = graph.constant("halves", [len(LABELS), GEOMETRY], np.int64)
+    graph.nodes.append(helper.make_node("Split", ["own.all", halves], ["own.heat", "own"], name="split.halves", axis=0))
+    graph.add("ArgMax", ["own.heat"], "labels", axis=0, keepdims=0)
     _corners(graph, columns)
     return "corners", "top.scores", "labels"
 

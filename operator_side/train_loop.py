@@ -1,10 +1,14 @@
 """The training itself: batches prepared beside it, checkpoints, an average of the weights. Shell (threads, files)."""
 
 import json
+import os
+import signal
+import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,10 +16,10 @@ import numpy as np
 import torch
 
 from operator_side.train_module import Network, Weights, folded
-from operator_side.train_network import OUTPUTS
+from operator_side.train_network import OUTPUTS, TAUGHT
 from operator_side.train_samples import CUT_PX, WHOLE_PX, Sample, sample
 from operator_side.train_scenes import DrawnScenes
-from protocol.errors import ConfigError
+from protocol.errors import ConfigError, HardwareError
 from sim.scenes import LABELS
 
 _PREPARED: Final = 3  # batches that wait
@@ -23,6 +27,8 @@ _WARM_UP: Final = 100
 _LEAST_RATE: Final = 0.01  # of the learning rate, at the end
 _AVERAGED: Final = 0.998
 _GEOMETRY_WEIGHT: Final = 1.0
+_TAUGHT_WEIGHT: Final = 0.5
+_MEETING: Final = "meeting"
 _CHECKPOINT_EVERY: Final = 100
 _SAY_EVERY: Final = 50
 
@@ -32,10 +38,12 @@ class Training:
     """What decides the outcome, and so stands in the model card."""
 
     steps: int
-    batch: int = 24
+    batch: int = 32
     rate: float = 3e-3
     decay: float = 1e-4
     seed: int = 1
+    jobs: int = 1
+    """Processes that share each batch; a GPU takes it whole."""
     whole_from: float = 0.8
     """From this part of the steps on, whole pictures in place of cut-outs."""
 
@@ -43,15 +51,65 @@ class Training:
 def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
           say: Callable[[str], None]) -> Weights:
     """Train, or go on from the checkpoint in `folder`; the averaged weights, normalisation folded in."""
+    if device != "cpu" or training.jobs == 1:
+        return _trained(scenes, replace(training, jobs=1), device, folder, say)
+    with _helpers(scenes, training, folder):
+        return _trained(scenes, training, device, folder, say)
+
+
+@contextmanager
+def _helpers(scenes: DrawnScenes, training: Training, folder: Path) -> Iterator[None]:
+    """This process and `jobs` - 1 others, each with its share of every batch, for as long as the context lasts."""
+    (folder / _MEETING).unlink(missing_ok=True)
+    made = torch.multiprocessing.get_context("spawn")
+    helpers = [made.Process(target=_help, args=(rank, scenes, training, folder), daemon=True)
+               for rank in range(1, training.jobs)]
+    for one in helpers:
+        one.start()
+    _meet(0, training, folder)
+    try:
+        yield
+    except RuntimeError as error:
+        if all(one.is_alive() for one in helpers):
+            raise
+        raise HardwareError(f"one of the {training.jobs} processes that train has ended ({error}); the same command "
+                            "goes on from the last checkpoint, and --jobs 1 needs less memory") from None
+    finally:
+        torch.distributed.destroy_process_group()
+        for one in helpers:
+            one.terminate()
+            one.join()
+
+
+def _help(rank: int, scenes: DrawnScenes, training: Training, folder: Path) -> None:
+    """All that a helper does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends the others
+    _meet(rank, training, folder)
+    _trained(scenes, training, "cpu", folder, None)
+
+
+def _meet(rank: int, training: Training, folder: Path) -> None:
+    """Over a file, and on this machine only."""
+    if sys.platform == "linux":
+        os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
+    meeting = (folder / _MEETING).resolve().as_uri()
+    torch.distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=training.jobs)
+
+
+def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
+             say: Callable[[str], None] | None) -> Weights:
+    """What each process does; only the one with `say` keeps checkpoints."""
     torch.set_num_threads(1)  # two are slower on shared cores: the layers are small
     torch.manual_seed(training.seed)
     state = _State(training, torch.device(device))
     checkpoint = folder / "checkpoint.pt"
     begin = state.load(checkpoint)
-    if begin:
+    if begin and say is not None:
         say(f"goes on at step {begin} of {training.steps}")
     for step, batch in enumerate(_batches(scenes, training, begin), start=begin):
         loss = state.learn(step, batch)
+        if say is None:
+            continue
         if (step + 1) % _SAY_EVERY == 0:
             say(f"step {step + 1} of {training.steps}: loss {loss:.3f}")
         if (step + 1) % _CHECKPOINT_EVERY == 0 or step + 1 == training.steps:
@@ -74,6 +132,7 @@ class _State:
         loss = _loss(self.network(self._on_device([one.image for one in batch])), batch, self._on_device)
         self._optimiser.zero_grad()
         loss.backward()
+        self._agree()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
         self._optimiser.step()
         self._schedule.step()
@@ -82,6 +141,16 @@ class _State:
             old = self.average[name]
             self.average[name] = old.lerp(value.detach(), 1 - share) if value.is_floating_point() else value.clone()
         return float(loss.detach())
+
+    def _agree(self) -> None:
+        """Gradients become the mean of all processes', so that all networks stay the same."""
+        if not torch.distributed.is_initialized():
+            return
+        gradients = [one.grad for one in self.network.parameters()]
+        together = torch.cat([one.flatten() for one in gradients])
+        torch.distributed.all_reduce(together)
+        for one, mean in zip(gradients, together.split([one.numel() for one in gradients]), strict=True):
+            one.copy_(mean.view_as(one) / torch.distributed.get_world_size())
 
     def _on_device(self, arrays: list[Any]) -> Any:
         return torch.from_numpy(np.stack(arrays)).to(self._device)
@@ -119,29 +188,38 @@ def _rate(step: int, steps: int) -> float:
 
 def _loss(given: Any, batch: list[Sample], on_device: Callable[[list[Any]], Any]) -> Any:
     """Focal loss on the heat maps, distances on the geometry of the middle cells."""
-    heat, geometry = given[:, : len(LABELS)], given[:, len(LABELS) : OUTPUTS]
+    geometry = given[:, len(LABELS) : OUTPUTS]
     wanted, counts = on_device([one.heat for one in batch]), on_device([one.counts for one in batch])[:, None]
+    asked = _focal(given[:, : len(LABELS)], wanted[:, :-TAUGHT], counts)
+    taught = _focal(given[:, OUTPUTS:], wanted[:, -TAUGHT:], counts)
+    sure = on_device([one.sure for one in batch])[:, None]
+    off = (geometry - on_device([one.geometry for one in batch])).abs() * sure
+    return asked + _TAUGHT_WEIGHT * taught + _GEOMETRY_WEIGHT * off.sum() / sure.sum().clamp(min=1.0)
+
+
+def _focal(heat: Any, wanted: Any, counts: Any) -> Any:
+    """For each middle (Zhou et al., Objects as Points, 2019, equation 1)."""
     likely = torch.sigmoid(heat)
     is_middle = (wanted == 1.0).float()
     found = is_middle * (1 - likely) ** 2 * torch.nn.functional.logsigmoid(heat)
     empty = (1 - is_middle) * (1 - wanted) ** 4 * likely**2 * torch.nn.functional.logsigmoid(-heat)
-    middles = is_middle.sum().clamp(min=1.0)
-    sure = on_device([one.sure for one in batch])[:, None]
-    off = (geometry - on_device([one.geometry for one in batch])).abs() * sure
-    return -((found + empty) * counts).sum() / middles + _GEOMETRY_WEIGHT * off.sum() / sure.sum().clamp(min=1.0)
+    return -((found + empty) * counts).sum() / is_middle.sum().clamp(min=1.0)
 
 
 def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[list[Sample]]:
     """Prepared by a second thread, so that two cores have something to do; a few wait, no more."""
+    rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
     with ThreadPoolExecutor(1) as pool:
         waiting: deque[Future[list[Sample]]] = deque()
         for step in range(first, training.steps):
             for coming in range(step + len(waiting), min(step + _PREPARED, training.steps)):
-                waiting.append(pool.submit(_batch, scenes, training, coming))
+                waiting.append(pool.submit(_batch, scenes, training, coming, rank))
             yield waiting.popleft().result()
 
 
-def _batch(scenes: DrawnScenes, training: Training, step: int) -> list[Sample]:
+def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> list[Sample]:
+    """This process's share."""
     whole = step >= training.whole_from * training.steps
-    size_px, count = (WHOLE_PX, max(1, training.batch // 2)) if whole else (CUT_PX, training.batch)
-    return [sample(scenes, training.seed, step, place, size_px) for place in range(count)]
+    size_px, count = (WHOLE_PX, training.batch // 2) if whole else (CUT_PX, training.batch)
+    share = max(1, count // training.jobs)
+    return [sample(scenes, training.seed, step, place, size_px) for place in range(rank * share, (rank + 1) * share)]

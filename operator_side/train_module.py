@@ -8,7 +8,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from operator_side.train_network import BRIGHTNESS, DARKEST, Layer, network
+from operator_side.train_network import BRIGHTNESS, COLOURS, DARKEST, LOOKED_AT, OUTPUTS, TAUGHT, Layer, network
 from sim.scenes import LABELS
 
 Weights = dict[str, npt.NDArray[np.float32]]
@@ -23,7 +23,7 @@ class Network(nn.Module):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__()
         self.layers = network()
-        channels = {"image": 3}
+        channels = {"image": COLOURS}
         for layer in self.layers:
             channels[layer.name] = layer.channels
             made = _module(layer, channels[layer.takes[0]])
@@ -31,9 +31,9 @@ class Network(nn.Module):  # type: ignore[misc]
                 self.add_module(_key(layer), made)
 
     def forward(self, image: Any) -> Any:
-        """Heat maps (before the sigmoid) and geometry, (N, OUTPUTS, H/4, W/4)."""
+        """Heat maps (before the sigmoid), geometry, heat maps of `TAUGHT`: (N, OUTPUTS + TAUGHT, H/4, W/4)."""
         seen = image.float() / 255
-        mean = seen.mean(dim=(1, 2, 3), keepdim=True).clamp(min=DARKEST)
+        mean = seen[:, :, ::LOOKED_AT, ::LOOKED_AT].mean(dim=(1, 2, 3), keepdim=True).clamp(min=DARKEST)
         known = {"image": seen * (BRIGHTNESS / mean)}
         for layer in self.layers:
             known[layer.name] = self._run(layer, [known[name] for name in layer.takes])
@@ -55,13 +55,14 @@ def _module(layer: Layer, channels: int) -> Any:
     if layer.kind in ("add", "add-up"):
         return None
     if layer.kind == "head":
-        head = nn.Conv2d(channels, layer.channels, 1)
+        head = nn.Conv2d(channels, layer.channels + TAUGHT, 1)
         nn.init.normal_(head.weight, std=0.01)
         nn.init.zeros_(head.bias)
         nn.init.constant_(head.bias[: len(LABELS)], _RARE)
+        nn.init.constant_(head.bias[OUTPUTS:], _RARE)
         return head
     groups = channels if layer.kind == "depthwise" else 1
-    steps = [nn.Conv2d(channels, layer.channels, layer.kernel, layer.stride, layer.kernel // 2, groups=groups,
+    steps = [nn.Conv2d(channels, layer.channels, layer.kernel, layer.stride, (layer.kernel - 1) // 2, groups=groups,
                        bias=False), nn.BatchNorm2d(layer.channels)]
     return nn.Sequential(*steps, nn.ReLU()) if layer.relu else nn.Sequential(*steps)
 
@@ -73,8 +74,8 @@ def folded(state: dict[str, Any]) -> Weights:
     for layer in network():
         key = _key(layer)
         if layer.kind == "head":
-            weights[f"{layer.name}.weight"] = values[f"{key}.weight"].astype(np.float32)
-            weights[f"{layer.name}.bias"] = values[f"{key}.bias"].astype(np.float32)
+            weights[f"{layer.name}.weight"] = values[f"{key}.weight"][:OUTPUTS].astype(np.float32)
+            weights[f"{layer.name}.bias"] = values[f"{key}.bias"][:OUTPUTS].astype(np.float32)
         elif f"{key}.0.weight" in values:
             gain = values[f"{key}.1.weight"] / np.sqrt(values[f"{key}.1.running_var"] + 1e-5)
             bias = values[f"{key}.1.bias"] - gain * values[f"{key}.1.running_mean"]

@@ -16,10 +16,16 @@ SIZE_PX: Final = 16.0
 GEOMETRY: Final = 4
 """Middle off the cell's by x, by y, in cells; log width, log height."""
 OUTPUTS: Final = len(LABELS) + GEOMETRY
+TAUGHT: Final = 1
+"""Heat maps of things that nobody asks for: to tell those from the others is learned the better for naming them. Left
+out of the ONNX file."""
 BRIGHTNESS: Final = 0.5
 """Each picture is scaled to this mean before all else, so that dim and bright look alike ..."""
 DARKEST: Final = 0.03
 """... unless it is darker than this, which would scale up mere noise."""
+LOOKED_AT: Final = 4
+"""Each fourth pixel of each fourth row is enough to know how bright a picture is."""
+COLOURS: Final = 3
 
 Kind = Literal["conv", "depthwise", "add", "add-up", "head"]
 
@@ -40,29 +46,30 @@ class Layer:
 def network() -> tuple[Layer, ...]:
     """All layers, in order; the last is the output."""
     layers = [
-        Layer("half", "conv", ("image",), 16, 3, 2),
+        Layer("half", "conv", ("image",), 16, 2, 2),
         *_down("quarter", "half", 32, 5),
-        *_block("fine", "quarter", 32, 3),
-        *_down("eighth", "fine", 64, 5),
+        *_block("fine1", "quarter", 32, 3),
+        *_block("fine2", "fine1", 32, 3),
+        *_down("eighth", "fine2", 64, 5),
         *_block("middle1", "eighth", 64, 5),
         *_block("middle2", "middle1", 64, 5),
         *_down("sixteenth", "middle2", 128, 5),
     ]
     last = "sixteenth"
-    for number in range(1, 6):
+    for number in range(1, 5):
         layers += _block(f"coarse{number}", last, 128, 5)
         last = f"coarse{number}"
     return (
         *layers,
         *_up("middle", last, "middle2", 64, 5),
-        *_up("top", "middle", "fine", 32, 5),
+        *_up("top", "middle", "fine2", 32, 5),
         Layer("head", "head", ("top",), OUTPUTS),
     )
 
 
 def _down(name: str, source: str, channels: int, kernel: int) -> list[Layer]:
     """Look around in each channel at every second place, mix the channels."""
-    before = {"half": 16, "fine": 32, "middle2": 64}[source]
+    before = {"half": 16, "fine2": 32, "middle2": 64}[source]
     return [
         Layer(f"{name}.around", "depthwise", (source,), before, kernel, 2, relu=False),
         Layer(name, "conv", (f"{name}.around",), channels),

@@ -1,5 +1,6 @@
 """Scenes into what the network learns from: a spoiled cut-out, and the heat maps that it should give. Pure."""
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -7,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import simplejpeg
 
-from operator_side.train_network import GEOMETRY, SIZE_PX, STRIDE
+from operator_side.train_network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
 from operator_side.train_scenes import DrawnScenes
 from sim.scene_defects import spoiled
 from sim.scenes import HEIGHT_PX, LABELS, TRAINED, WIDTH_PX, Box, Random, Truth
@@ -29,7 +30,7 @@ class Sample:
 
     image: npt.NDArray[np.uint8]
     heat: Array
-    """(labels, H/4, W/4), 1 in the middle cell of each object."""
+    """(labels and `TAUGHT`, H/4, W/4), 1 in the middle cell of each object."""
     geometry: Array
     """(4, H/4, W/4)"""
     sure: Array
@@ -48,8 +49,9 @@ def sample(scenes: DrawnScenes, seed: int, step: int, place: int, size_px: tuple
     picture = np.ascontiguousarray(rgb[:, ::-1] if mirrored else rgb)
     bgr = simplejpeg.decode_jpeg(spoiled(picture, TRAINED, draw), "BGR")
     moved = [(one, _moved(one.box, left, top, size_px, mirrored)) for one in scenes.truths[number]]
-    unclear = [_moved(one, left, top, size_px, mirrored) for one in scenes.unclear[number]]
-    return _wanted(np.ascontiguousarray(bgr.transpose(2, 0, 1)), moved, unclear)
+    unclear, others = ([_moved(one, left, top, size_px, mirrored) for one in boxes]
+                       for boxes in (scenes.unclear[number], scenes.others[number]))
+    return _wanted(np.ascontiguousarray(bgr.transpose(2, 0, 1)), moved, unclear, others)
 
 
 def _cut(draw: Random, truths: tuple[Truth, ...], size_px: tuple[int, int]) -> tuple[int, int]:
@@ -69,15 +71,18 @@ def _moved(box: Box, left: int, top: int, size_px: tuple[int, int], mirrored: bo
     return (size_px[0] - x2, y1, size_px[0] - x1, y2) if mirrored else (x1, y1, x2, y2)
 
 
-def _wanted(image: npt.NDArray[np.uint8], objects: list[tuple[Truth, Box]], unclear: list[Box]) -> Sample:
+def _wanted(image: npt.NDArray[np.uint8], objects: list[tuple[Truth, Box]], unclear: list[Box],
+            others: list[Box]) -> Sample:
     rows, columns = image.shape[1] // STRIDE, image.shape[2] // STRIDE
-    one = Sample(image, np.zeros((len(LABELS), rows, columns), np.float32),
+    one = Sample(image, np.zeros((len(LABELS) + TAUGHT, rows, columns), np.float32),
                  np.zeros((GEOMETRY, rows, columns), np.float32), np.zeros((rows, columns), np.float32),
                  np.ones((rows, columns), np.float32))
     for box in unclear:
         _blank(one, box)
     for truth, box in sorted(objects, key=lambda pair: -_area(pair[1])):
         _mark(one, truth, box)
+    for box in others:
+        _mark_other(one, box)
     return one
 
 
@@ -103,21 +108,36 @@ def _mark(one: Sample, truth: Truth, whole: Box) -> None:
     if _area(box) * truth.seen < _LEAST_LEFT * _area(whole):
         _blank(one, box)
         return
-    rows, columns = one.sure.shape
-    x, y = (box[0] + box[2]) / 2 / STRIDE, (box[1] + box[3]) / 2 / STRIDE
-    wide, high = (box[2] - box[0]) / STRIDE, (box[3] - box[1]) / STRIDE
-    off_x, off_y = x - (np.arange(columns) + 0.5), y - (np.arange(rows) + 0.5)
-    bump = (np.exp(-0.5 * (off_y / max(_SPREAD * high, _LEAST_SPREAD)) ** 2)[:, None]
-            * np.exp(-0.5 * (off_x / max(_SPREAD * wide, _LEAST_SPREAD)) ** 2)).astype(np.float32)
-    heat = one.heat[LABELS.index(truth.label)]
-    np.maximum(heat, bump, out=heat)
-    middle = min(rows - 1, int(y)), min(columns - 1, int(x))
-    heat[middle] = 1.0
+    bump, middle = _bumped(one.heat[LABELS.index(truth.label)], box)
     one.counts[middle] = 1.0
     sure = bump >= _SURE
     sure[middle] = True
     one.sure[sure] = np.maximum(bump[sure], _SURE)
-    one.geometry[0][sure] = np.broadcast_to(off_x, bump.shape)[sure]
-    one.geometry[1][sure] = np.broadcast_to(off_y[:, None], bump.shape)[sure]
-    one.geometry[2][sure] = np.log(wide * STRIDE / SIZE_PX)
-    one.geometry[3][sure] = np.log(high * STRIDE / SIZE_PX)
+    for part, values in zip(one.geometry, _edges(box, bump.shape), strict=True):
+        part[sure] = np.broadcast_to(np.asarray(values), bump.shape)[sure]
+
+
+def _mark_other(one: Sample, whole: Box) -> None:
+    """A bump on the last heat map, where enough is left of it."""
+    box = _within(whole, one)
+    if _area(box) > 0 and _area(box) >= _LEAST_LEFT * _area(whole):
+        _bumped(one.heat[-1], box)
+
+
+def _bumped(heat: Array, box: Box) -> tuple[Array, tuple[int, int]]:
+    """Raise the map about the box's middle; the bump, and the middle cell, which is 1."""
+    off_x, off_y, log_wide, log_high = _edges(box, heat.shape)
+    wide, high = (math.exp(one) * SIZE_PX / STRIDE for one in (log_wide, log_high))
+    bump = np.asarray(np.exp(-0.5 * (off_y / max(_SPREAD * high, _LEAST_SPREAD)) ** 2)
+                      * np.exp(-0.5 * (off_x / max(_SPREAD * wide, _LEAST_SPREAD)) ** 2), np.float32)
+    np.maximum(heat, bump, out=heat)
+    middle = int(np.abs(off_y).argmin()), int(np.abs(off_x).argmin())
+    heat[middle] = 1.0
+    return bump, middle
+
+
+def _edges(box: Box, shape: tuple[int, ...]) -> tuple[Array, Array, float, float]:
+    """What cells learn of a box: its middle off theirs by x (a row) and y (a column), log width, log height."""
+    x, y = (box[0] + box[2]) / 2 / STRIDE, (box[1] + box[3]) / 2 / STRIDE
+    off_x, off_y = x - (np.arange(shape[1]) + 0.5), y - (np.arange(shape[0])[:, None] + 0.5)
+    return off_x, off_y, math.log((box[2] - box[0]) / SIZE_PX), math.log((box[3] - box[1]) / SIZE_PX)

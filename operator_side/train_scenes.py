@@ -26,6 +26,17 @@ class DrawnScenes:
     pictures: npt.NDArray[np.uint8]
     truths: tuple[tuple[Truth, ...], ...]
     unclear: tuple[tuple[Box, ...], ...]
+    others: tuple[tuple[Box, ...], ...]
+    """What stands about and is not asked for."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pictures on disk are opened again by who gets them, not copied."""
+        pictures = self.pictures.filename if isinstance(self.pictures, np.memmap) else self.pictures
+        return _reopened, (pictures, self.truths, self.unclear, self.others)
+
+
+def _reopened(pictures: Any, *rest: Any) -> DrawnScenes:
+    return DrawnScenes(pictures if isinstance(pictures, np.ndarray) else np.load(pictures, mmap_mode="r"), *rest)
 
 
 def drawn_scenes(folder: Path, count: int, jobs: int, advance: Callable[[int], None]) -> DrawnScenes:
@@ -40,8 +51,8 @@ def drawn_scenes(folder: Path, count: int, jobs: int, advance: Callable[[int], N
         advance(count)
     rows = json.loads(notes.read_text("utf-8"))
     truths = tuple(tuple(_truth(one) for one in row["truths"]) for row in rows)
-    unclear = tuple(tuple((*one,) for one in row["unclear"]) for row in rows)
-    return DrawnScenes(np.load(pictures, mmap_mode="r"), truths, unclear)
+    unclear, others = (tuple(tuple((*one,) for one in row[kind]) for row in rows) for kind in ("unclear", "others"))
+    return DrawnScenes(np.load(pictures, mmap_mode="r"), truths, unclear, others)
 
 
 def _truth(one: list[Any]) -> Truth:
@@ -72,6 +83,7 @@ def _draw(pictures: Path, seeds: Sequence[int]) -> tuple[int, list[dict[str, Any
         for seed in seeds:
             scene = renderer.scene(seed, TRAINED)
             store[seed] = scene.rgb
-            rows.append({"truths": [[one.label, one.box, one.seen] for one in scene.truths], "unclear": scene.unclear})
+            truths = [[one.label, one.box, one.seen] for one in scene.truths]
+            rows.append({"truths": truths, "unclear": scene.unclear, "others": scene.others})
     store.flush()
     return seeds[0], rows

@@ -1,5 +1,7 @@
 """Training itself, where PyTorch is: it learns, goes on after a cut, and its weights mean the same in ONNX."""
 
+import multiprocessing
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from operator_side.train_loop import Training, train
 from operator_side.train_module import Network, folded
 from operator_side.train_samples import CUT_PX
 from operator_side.train_scenes import DrawnScenes
-from protocol.errors import ConfigError
+from protocol.errors import ConfigError, HardwareError
 from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX, Truth
 
 
@@ -26,7 +28,7 @@ def scenes(count=4):
         x, y = int(draw.integers(60, 260)), int(draw.integers(60, 180))
         cv2.circle(picture, (x, y), 20, (240, 200, 20), -1)
         truths.append((Truth("ball", (x - 20.0, y - 20.0, x + 21.0, y + 21.0), 1.0),))
-    return DrawnScenes(pictures, tuple(truths), ((),) * count)
+    return DrawnScenes(pictures, tuple(truths), ((),) * count, ((),) * count)
 
 
 def test_the_loss_falls(tmp_path):
@@ -57,6 +59,30 @@ def test_a_training_that_was_cut_ends_as_if_it_had_not_been(tmp_path, monkeypatc
     assert all(np.array_equal(whole[name], resumed[name]) for name in whole)
     with pytest.raises(ConfigError, match="other settings"):
         train(scenes(), Training(steps=5, batch=2, seed=4), "cpu", cut, said.append)
+
+
+def test_two_processes_train_one_network(tmp_path):
+    """The second's share counts: the same first half alone ends elsewhere; and a cut is gone on from."""
+    made = []
+    for jobs, batch, steps in ((2, 4, 2), (2, 4, 2), (1, 2, 2)):
+        folder = tmp_path / str(len(made))
+        folder.mkdir()
+        made.append(train(scenes(), Training(steps, batch, seed=4, jobs=jobs), "cpu", folder, lambda _: None))
+    first, again, half = made
+    assert all(np.array_equal(first[name], again[name]) for name in first)
+    assert any(not np.allclose(first[name], half[name], atol=1e-4) for name in first)
+    assert not multiprocessing.active_children()
+
+
+def test_a_process_that_dies_is_one_line(tmp_path):
+    def kill(line):
+        for one in multiprocessing.active_children():
+            one.kill()
+
+    with pytest.raises(HardwareError, match="one of the 2 processes that train has ended") as told:
+        train(scenes(), Training(200, 4, seed=4, jobs=2), "cpu", tmp_path, kill)
+    assert "\n" not in str(told.value) and "--jobs 1" in str(told.value)
+    assert not multiprocessing.active_children()
 
 
 def test_the_graph_gives_what_the_module_gives(tmp_path):
