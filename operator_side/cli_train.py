@@ -13,8 +13,9 @@ from protocol.errors import ConfigError, HardwareError
 
 STEPS = 6000
 SCENES = 10_000
+BATCH = 32
 VALIDATED = 200
-"""These three are those of the model that ships, so that the same command makes it again; a test compares."""
+"""These are those of the model that ships, so that the same command makes it again; a test compares."""
 OUT = Path("runs/train")
 _LEAST_SHARE = 8
 """Of a batch for each process that trains: the normalisation needs a few pictures."""
@@ -30,7 +31,7 @@ def train(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Scenes, checkpoint, model and card go here.")] = OUT,
     scenes: Annotated[int, typer.Option(min=8, max=800_000, help="Drawn once, seeds from 0 up.")] = SCENES,
     steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Of the optimiser.")] = STEPS,
-    batch: Annotated[int, typer.Option(min=2, max=1024, help="Cut-outs of scenes in each step.")] = 32,
+    batch: Annotated[int, typer.Option(min=2, max=1024, help="Cut-outs of scenes in each step.")] = BATCH,
     seed: Annotated[int, typer.Option(min=0, max=2**31, help="Draws weights, cuts and defects.")] = 1,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What trains.")] = "cpu",
     jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Processes [default: one per core].")] = None,
@@ -47,7 +48,7 @@ def train(
         raise HardwareError("--device cuda: this PyTorch sees no GPU; check `nvidia-smi` and that PyTorch is a CUDA "
                             "build, or take --device cpu")
     processes = jobs or os.cpu_count() or 1
-    training = Training(steps, batch, seed=seed, jobs=min(processes, max(1, batch // _LEAST_SHARE)))
+    training = Training(steps, batch, seed=seed, jobs=_sharing(batch, processes))
     options = TrainOptions(out, scenes, training, device, processes, validated, judged)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -55,6 +56,11 @@ def train(
     except OSError as error:
         raise ConfigError(f"--out {out}: {error.strerror or error}") from None
     _say(f"{model}, {model.with_suffix('.md').name}: try it with `sightline score detectors onnx:{model}`")
+
+
+def _sharing(batch: int, processes: int) -> int:
+    """How many processes share a batch evenly."""
+    return max(n for n in range(1, processes + 1) if n == 1 or (batch % n == 0 and batch // n >= _LEAST_SHARE))
 
 
 def _say(line: str) -> None:

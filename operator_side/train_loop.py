@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +30,9 @@ _AVERAGED: Final = 0.998
 _GEOMETRY_WEIGHT: Final = 1.0
 _TAUGHT_WEIGHT: Final = 0.5
 _MEETING: Final = "meeting"
+_MET_WITHIN: Final = timedelta(minutes=3)
+"""All processes there, and each step's gradients: a machine that swaps needs a while."""
+CHECKPOINT: Final = "checkpoint.pt"
 _CHECKPOINT_EVERY: Final = 100
 _SAY_EVERY: Final = 50
 
@@ -53,6 +57,7 @@ def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
     """Train, or go on from the checkpoint in `folder`; the averaged weights, normalisation folded in."""
     if device != "cpu" or training.jobs == 1:
         return _trained(scenes, replace(training, jobs=1), device, folder, say)
+    _State(scenes, training, torch.device(device)).load(folder / CHECKPOINT)  # what it cannot go on from is said once
     with _helpers(scenes, training, folder):
         return _trained(scenes, training, device, folder, say)
 
@@ -66,16 +71,19 @@ def _helpers(scenes: DrawnScenes, training: Training, folder: Path) -> Iterator[
                for rank in range(1, training.jobs)]
     for one in helpers:
         one.start()
-    _meet(0, training, folder)
     try:
+        _meet(0, training, folder)
         yield
     except RuntimeError as error:
+        for one in helpers:
+            one.join(1.0)  # one that has ended is not yet known to have
         if all(one.is_alive() for one in helpers):
             raise
         raise HardwareError(f"one of the {training.jobs} processes that train has ended ({error}); the same command "
                             "goes on from the last checkpoint, and --jobs 1 needs less memory") from None
     finally:
-        torch.distributed.destroy_process_group()
+        if torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
         for one in helpers:
             one.terminate()
             one.join()
@@ -93,7 +101,8 @@ def _meet(rank: int, training: Training, folder: Path) -> None:
     if sys.platform == "linux":
         os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
     meeting = (folder / _MEETING).resolve().as_uri()
-    torch.distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=training.jobs)
+    torch.distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=training.jobs,
+                                         timeout=_MET_WITHIN)
 
 
 def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
@@ -101,8 +110,8 @@ def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
     """What each process does; only the one with `say` keeps checkpoints."""
     torch.set_num_threads(1)  # two are slower on shared cores: the layers are small
     torch.manual_seed(training.seed)
-    state = _State(training, torch.device(device))
-    checkpoint = folder / "checkpoint.pt"
+    state = _State(scenes, training, torch.device(device))
+    checkpoint = folder / CHECKPOINT
     begin = state.load(checkpoint)
     if begin and say is not None:
         say(f"goes on at step {begin} of {training.steps}")
@@ -120,8 +129,9 @@ def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
 class _State:
     """Network, optimiser and average."""
 
-    def __init__(self, training: Training, device: Any) -> None:
-        self._training, self._device = training, device
+    def __init__(self, scenes: DrawnScenes, training: Training, device: Any) -> None:
+        self._made_by = json.dumps({**asdict(training), "scenes": scenes.digest()})
+        self._device = device
         self.network = Network().to(device=device, memory_format=torch.channels_last).train()
         self._optimiser = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay)
         self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimiser, lambda step: _rate(step, training.steps))
@@ -158,7 +168,7 @@ class _State:
     def save(self, path: Path, step: int) -> None:
         """Written beside and moved, so that a cut leaves the one before."""
         torch.save({
-            "training": json.dumps(asdict(self._training)), "step": step, "network": self.network.state_dict(),
+            "training": self._made_by, "step": step, "network": self.network.state_dict(),
             "average": self.average, "optimiser": self._optimiser.state_dict(), "schedule": self._schedule.state_dict(),
         }, path.with_suffix(".part"))
         path.with_suffix(".part").replace(path)
@@ -168,9 +178,9 @@ class _State:
         if not path.exists():
             return 0
         kept = torch.load(path, map_location=self._device, weights_only=True)
-        if json.loads(kept["training"]) != asdict(self._training):
-            raise ConfigError(f"{path} is of a training with other settings: {kept['training']}; remove it, or name "
-                              "another --out")
+        if kept["training"] != self._made_by:
+            raise ConfigError(f"{path} is of a training with other settings or scenes: {kept['training']}; remove it, "
+                              "or name another --out")
         self.network.load_state_dict(kept["network"])
         self.average = kept["average"]
         self._optimiser.load_state_dict(kept["optimiser"])

@@ -1,5 +1,6 @@
 """The scenes that a training run learns from, drawn once into a folder by as many processes as asked. Shell (files)."""
 
+import hashlib
 import json
 import multiprocessing
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from sim.scenes import HEIGHT_PX, TRAINED, VALIDATED_FROM, WIDTH_PX, Box, Truth
 
 _SLICE: Final = 100
 """Scenes that one process draws before it says so."""
+_TRIED: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +30,11 @@ class DrawnScenes:
     unclear: tuple[tuple[Box, ...], ...]
     others: tuple[tuple[Box, ...], ...]
     """What stands about and is not asked for."""
+
+    def digest(self) -> str:
+        """Other scenes have another: how many, what is in them, the first picture."""
+        told = json.dumps([len(self.truths), [[one.label, one.box] for row in self.truths for one in row]])
+        return hashlib.sha256(told.encode() + self.pictures[0].tobytes()).hexdigest()[:16]
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pictures on disk are opened again by who gets them, not copied."""
@@ -44,15 +51,25 @@ def drawn_scenes(folder: Path, count: int, jobs: int, advance: Callable[[int], N
     if not 0 < count <= VALIDATED_FROM:
         raise ConfigError(f"--scenes {count}: 1 to {VALIDATED_FROM}; seeds from there on validate and judge")
     pictures, notes = folder / "scenes.npy", folder / "scenes.json"
-    if not notes.exists() or len(json.loads(notes.read_text("utf-8"))) != count:
-        folder.mkdir(parents=True, exist_ok=True)
-        _draw_all(pictures, notes, count, jobs, advance)
-    else:
+    if _would_be_the_same(pictures, notes, count):
         advance(count)
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
+        notes.unlink(missing_ok=True)  # what is drawn is no longer what it says
+        _draw_all(pictures, notes, count, jobs, advance)
     rows = json.loads(notes.read_text("utf-8"))
     truths = tuple(tuple(_truth(one) for one in row["truths"]) for row in rows)
     unclear, others = (tuple(tuple((*one,) for one in row[kind]) for row in rows) for kind in ("unclear", "others"))
     return DrawnScenes(np.load(pictures, mmap_mode="r"), truths, unclear, others)
+
+
+def _would_be_the_same(pictures: Path, notes: Path, count: int) -> bool:
+    """Whether they were drawn whole, as many, and as they would be drawn now: the first ones are, and compared."""
+    if not notes.exists() or not pictures.exists() or len(json.loads(notes.read_text("utf-8"))) != count:
+        return False
+    drawn = np.load(pictures, mmap_mode="r")
+    with SceneRenderer() as renderer:
+        return all(np.array_equal(drawn[seed], renderer.scene(seed, TRAINED).rgb) for seed in range(min(count, _TRIED)))
 
 
 def _truth(one: list[Any]) -> Truth:
@@ -72,7 +89,8 @@ def _draw_all(pictures: Path, notes: Path, count: int, jobs: int, advance: Calla
             first, drawn = done.result()
             rows[first : first + len(drawn)] = drawn
             advance(len(drawn))
-    notes.write_text(json.dumps(rows), "utf-8")
+    notes.with_suffix(".part").write_text(json.dumps(rows), "utf-8")
+    notes.with_suffix(".part").replace(notes)
 
 
 def _draw(pictures: Path, seeds: Sequence[int]) -> tuple[int, list[dict[str, Any]]]:

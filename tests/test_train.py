@@ -16,31 +16,14 @@ from operator_side.train_samples import CUT_PX, WHOLE_PX, sample
 from operator_side.train_scenes import DrawnScenes, drawn_scenes
 from protocol.errors import ConfigError
 from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX, Truth
+from tests.train_rig import weights
 
 BALL = Truth("ball", (100.0, 60.0, 141.0, 99.0), 1.0)
-
-
-HEAD = 0.02
 
 
 def one_scene(truths=(BALL,), unclear=(), others=()):
     picture = np.full((1, HEIGHT_PX, WIDTH_PX, 3), 120, np.uint8)
     return DrawnScenes(picture, (tuple(truths),), (tuple(unclear),), (tuple(others),))
-
-
-def weights(seed=1):
-    """Random ones of the right shapes, which keep the signal about as large as it is."""
-    draw, channels, made = np.random.default_rng(seed), {"image": 3}, {}
-    for layer in network():
-        channels[layer.name] = layer.channels
-        if layer.kind in ("conv", "depthwise", "head"):
-            each = 1 if layer.kind == "depthwise" else channels[layer.takes[0]]
-            shape = (layer.channels, each, layer.kernel, layer.kernel)
-            made[f"{layer.name}.weight"] = draw.normal(0, (2 / np.prod(shape[1:])) ** 0.5, shape).astype(np.float32)
-            if layer.kind == "head":  # what is added up on the way is large, and scores near 1 are all alike
-                made[f"{layer.name}.weight"] *= np.float32(HEAD)
-            made[f"{layer.name}.bias"] = draw.normal(0, 0.1, layer.channels).astype(np.float32)
-    return made
 
 
 def test_the_table_is_a_network_of_the_agreed_size():
@@ -128,6 +111,20 @@ def test_scenes_are_drawn_once(tmp_path):
     assert first.truths == again.truths == sent.truths and first.others == sent.others and any(first.others)
     assert first.pictures.shape == (8, HEIGHT_PX, WIDTH_PX, 3)
     assert all(picture.std() > 1 for picture in first.pictures) and any(first.truths)
+
+
+def test_scenes_are_drawn_again_when_they_would_be_others_now_or_were_cut(tmp_path, monkeypatch):
+    first = drawn_scenes(tmp_path, 3, 1, lambda _: None)
+    (tmp_path / "scenes.json").unlink()  # as a run leaves it that is cut while it draws
+    again = drawn_scenes(tmp_path, 3, 1, lambda _: None)
+    assert np.array_equal(first.pictures, again.pictures) and first.digest() == again.digest()
+    notes = tmp_path / "scenes.json"
+    stamp = notes.stat().st_mtime_ns
+    pictures = np.lib.format.open_memmap(tmp_path / "scenes.npy", "r+")
+    pictures[1] += 1  # as if they were drawn by an older program
+    pictures.flush()
+    assert drawn_scenes(tmp_path, 3, 1, lambda _: None).truths == first.truths and notes.stat().st_mtime_ns > stamp
+    assert drawn_scenes(tmp_path, 2, 1, lambda _: None).digest() != first.digest()
 
 
 def test_no_scene_of_another_purpose_is_trained_on(tmp_path):

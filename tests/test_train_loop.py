@@ -1,5 +1,6 @@
 """Training itself, where PyTorch is: it learns, goes on after a cut, and its weights mean the same in ONNX."""
 
+import hashlib
 import multiprocessing
 
 import numpy as np
@@ -11,6 +12,7 @@ pytest.importorskip("onnx")
 import cv2
 import torch
 
+from operator_side import cli
 from operator_side.train_export import onnx_bytes
 from operator_side.train_loop import Training, train
 from operator_side.train_module import Network, folded
@@ -57,11 +59,12 @@ def test_a_training_that_was_cut_ends_as_if_it_had_not_been(tmp_path, monkeypatc
     resumed = train(scenes(), training, "cpu", cut, said.append)
     assert said == ["goes on at step 2 of 4"]
     assert all(np.array_equal(whole[name], resumed[name]) for name in whole)
-    with pytest.raises(ConfigError, match="other settings"):
-        train(scenes(), Training(steps=5, batch=2, seed=4), "cpu", cut, said.append)
+    for others, again in ((scenes(), Training(steps=5, batch=2, seed=4)), (scenes(3), training)):
+        with pytest.raises(ConfigError, match="other settings or scenes"):
+            train(others, again, "cpu", cut, said.append)
 
 
-def test_two_processes_train_one_network(tmp_path):
+def test_two_processes_train_one_network(tmp_path, capfd):
     """The second's share counts: the same first half alone ends elsewhere; and a cut is gone on from."""
     made = []
     for jobs, batch, steps in ((2, 4, 2), (2, 4, 2), (1, 2, 2)):
@@ -71,6 +74,9 @@ def test_two_processes_train_one_network(tmp_path):
     first, again, half = made
     assert all(np.array_equal(first[name], again[name]) for name in first)
     assert any(not np.allclose(first[name], half[name], atol=1e-4) for name in first)
+    with pytest.raises(ConfigError, match="other settings"):
+        train(scenes(), Training(3, 4, seed=4, jobs=2), "cpu", tmp_path / "0", lambda _: None)
+    assert "Traceback" not in capfd.readouterr().err
     assert not multiprocessing.active_children()
 
 
@@ -107,3 +113,14 @@ def test_the_graph_gives_what_the_module_gives(tmp_path):
 
 def test_cut_outs_halve_as_evenly_as_pictures():
     assert all(side % 16 == 0 for side in CUT_PX)
+
+
+def test_the_whole_command_ends_with_a_model_and_its_card(tmp_path, capsys):
+    sizes = {"scenes": 8, "steps": 2, "batch": 4, "jobs": 1, "validated": 5, "judged": 5}
+    arguments = [part for name, value in sizes.items() for part in (f"--{name}", str(value))]
+    assert cli.run(["train", "--out", str(tmp_path), *arguments]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert str(tmp_path / "sightline.onnx") in told[-1] and len(told) <= 4
+    card = (tmp_path / "sightline.md").read_text("utf-8")
+    assert "--scenes 8 --steps 2 --batch 4 --seed 1 --device cpu --jobs 1" in card
+    assert hashlib.sha256((tmp_path / "sightline.onnx").read_bytes()).hexdigest() in card

@@ -1,0 +1,35 @@
+"""From trained weights to the file and its card, by weights that mean nothing."""
+
+import hashlib
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("pybullet")
+pytest.importorskip("onnx")
+
+from operator_side.train_card import Card, card_text
+from operator_side.train_export import shifted
+from operator_side.train_shipping import chosen, judged, written
+from sim.scenes import COLUMNS, LABELS
+from tests.train_rig import weights
+from vision_side.config import VisionConfig
+from vision_side.detect.choice import choose_detector
+from vision_side.detect.onnx_header import read_onnx_header
+
+
+def test_weights_become_a_file_with_thresholds_and_a_card_that_is_true_of_it(tmp_path):
+    thresholds = chosen(tmp_path / "unchosen.onnx", weights(), 5, 2)
+    assert len(thresholds) == len(LABELS) and all(0.05 < one < 0.96 for one in thresholds)
+    model = tmp_path / "model.onnx"
+    written(model, shifted(weights(), thresholds))
+    header = read_onnx_header(model.read_bytes())
+    assert header.metadata["min_score"] == "0.5" and "golden" in header.metadata
+    choose_detector(f"onnx:{model}", {}, VisionConfig())  # its own answer to the known picture is checked on the way
+    report = judged(model, 5)
+    assert set(report.columns) == set(COLUMNS) and report.columns["blur"]["onnx"].frames == 5
+    digest = hashlib.sha256(model.read_bytes()).hexdigest()
+    training = SimpleNamespace(steps=7, batch=6, seed=5, jobs=2, rate=0.003, whole_from=0.8)
+    card = card_text(Card(training, 9, "cpu", thresholds, 12345, model.stat().st_size, digest, 5, report))
+    assert "sightline train --scenes 9 --steps 7 --batch 6 --seed 5 --device cpu --jobs 2" in card
+    assert digest in card and all(f"| {name} |" in card for name in COLUMNS) and "12345" in card
