@@ -35,7 +35,7 @@ def detector(
     as_json: Json = False,
 ) -> int:
     """What a detector elsewhere adds to the time of the same frames here (hsv), 320x240."""
-    from operator_side.cli_mission import options_of
+    from operator_side.cli_detector import own_options
 
     with needs("vision"):
         from benchmarks.detector_remote import HOT_S, PACED_S, measure_cost
@@ -45,7 +45,7 @@ def detector(
         from vision_side.detect.choice import choose_detector
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder, _service(name, Path(folder)) as robot:
         here = choose_detector("hsv", {}, VisionConfig())
-        there = choose_detector(name, options_of(sets or ()), VisionConfig())
+        there = choose_detector(name, own_options(sets or ()), VisionConfig())
         if robot is not None:
             attach_detector(there, robot)
         try:

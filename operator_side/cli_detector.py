@@ -109,8 +109,6 @@ def check(
     as_json: Json = False,
 ) -> int:
     """Hold a detector to what the port promises, with drawn pictures, and time it. Exit code 5 if it breaks it."""
-    from operator_side.cli_mission import options_of
-
     options: dict[str, Any] = {"detector.device": device}
     given: Any = load_service("vision", file=config, sets=(), options=options, environ=os.environ).config
     with needs("vision"):
@@ -119,7 +117,7 @@ def check(
         from vision_side.detect.contract import check_detector, time_detector
     settings = given.model_copy(update={"detector": given.detector.model_copy(update={"kind": name})})
     check_device(settings)
-    own, made = _nested(options_of(sets or ())), list["Detector"]()
+    own, made = own_options(sets or ()), list["Detector"]()
 
     def make() -> "Detector":
         made.append(choose_detector(name, own, settings))
@@ -132,6 +130,13 @@ def check(
     report = _as_json(name, ok, verdicts, times) | {"said": said}
     typer.echo(json.dumps(report) if as_json else _as_text(name, verdicts, times, said))
     return 0 if ok else CHECK_FAILED
+
+
+def own_options(texts: Sequence[str]) -> dict[str, Any]:
+    """What `--set KEY=VALUE` gives a detector's own `Config`; a dot is for a section. Raises ConfigError."""
+    from operator_side.cli_mission import options_of
+
+    return _nested(options_of(texts))
 
 
 def _nested(options: dict[str, Any]) -> dict[str, Any]:

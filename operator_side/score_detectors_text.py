@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from operator_side.score import Check
 from operator_side.score_detectors import Figures
 from operator_side.score_scenes import Report
 
@@ -42,6 +43,23 @@ def markdown(report: Report) -> str:
     """For a page."""
     lines = [_line(_HEAD), _line(["---"] * len(_HEAD)), *(_line(row) for row in rows(report))]
     return "\n".join([*lines, "", *(f"- {line}" for line in precision_lines(report))])
+
+
+def check_lines(checks: Sequence[Check]) -> list[str]:
+    """One a line: what, its value, the bound, the verdict."""
+    width = max((len(check.name) for check in checks), default=0)
+    return [f"{check.name.ljust(width)}  {_value(check):>9}  bound {check.bound:g} {check.unit}".rstrip()
+            + ("  ok" if check.ok else "  FAIL") for check in checks]
+
+
+def _value(check: Check) -> str:
+    return "never" if check.value is None else f"{round(check.value, 2):g} {check.unit}".rstrip()
+
+
+def silence_lines(report: Report) -> list[str]:
+    """One for each detector that did not always answer."""
+    return [" ".join(f"{name}: no answer to {one.scenes} of {one.of} scenes, which count as missed: {one.why}".split())
+            for name, one in report.silent.items()]
 
 
 def _line(cells: Sequence[str]) -> str:

@@ -1,9 +1,11 @@
 """Shows labelled scenes to detectors and counts what they answer. Shell (draws scenes, runs detectors).
 
-Every detector gets the same JPEGs through the port that vision uses; each scene is a session of its own.
+Every detector gets the same JPEGs through the port that vision uses; each scene is a session of its own. What it says
+is checked as vision checks it: whatever a plug-in does, it is an answer that a robot could get, or none.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -14,6 +16,8 @@ from sim.scene_render import SceneRenderer
 from sim.scenes import COLUMNS, HEIGHT_PX, JUDGED_FROM, LABELS, THINGS, WIDTH_PX, Column, Scene
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
+from vision_side.detect.around import close_detector, news_of
+from vision_side.detect.checking import asked as checked_answers
 from vision_side.detect.choice import choose_detector
 from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Detector
 
@@ -21,6 +25,7 @@ _FRAME_US: Final = 33_333
 _ROBOT: Final = "judge"
 LIGHT_SHARE: Final = 2.5
 """As many scenes of lights and legs as of each column's: the three states share them."""
+_MOST_SAID: Final = 2  # lines of a detector's own beside why it gave no answer: the first say what is wrong
 LABELLED: Final = LABELS[1:]
 """What is judged by average precision; the ball has columns of its own."""
 
@@ -40,6 +45,17 @@ class Seen:
     scene: Scene
     jpeg: bytes
     answers: tuple[DetectionResult | None, ...]
+    whys: tuple[str, ...]
+    """Why there is no answer; empty where there is one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """How many of how many scenes a subject gave no answer to, and why."""
+
+    scenes: int
+    of: int
+    why: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +68,34 @@ class Report:
     precision: dict[str, dict[str, tuple[int, float | None]]]
     """Objects, AP50."""
     made_by: dict[str, dict[str, str]]
+    silent: dict[str, Silence]
+    """Who did not always answer. No answer counts as missed, which the figures do not tell from having seen nothing."""
 
     def to_dict(self) -> dict[str, Any]:
         """For --json."""
         return asdict(self)
 
 
-def subjects(names: Sequence[str]) -> list[Subject]:
-    """Raises ConfigError for a name that is none, or what it needs is missing."""
-    return [Subject(name, choose_detector(name, {}, VisionConfig())) for name in names]
+def subjects(
+    names: Sequence[str], config: VisionConfig | None = None, options: Mapping[str, Mapping[str, Any]] | None = None
+) -> list[Subject]:
+    """Each once, with its own of the `options`; to be closed. Raises ConfigError for a name that is none, or what it
+    needs is missing, and HardwareError for a device that is not there.
+    """
+    settings, given, asked = config or VisionConfig(), options or {}, list[Subject]()
+    with ExitStack() as ending:
+        ending.callback(close_subjects, asked)
+        for name in dict.fromkeys(names):
+            asked.append(Subject(name, choose_detector(name, given.get(name, {}), settings)))
+        ending.pop_all()
+    return asked
+
+
+def close_subjects(asked: Sequence[Subject]) -> None:
+    """All of them."""
+    with ExitStack() as ending:
+        for one in asked:
+            ending.callback(close_detector, one.detector)
 
 
 def shown(column: Column, seeds: Iterable[int], asked: Sequence[Subject], looks: int) -> Iterable[Seen]:
@@ -70,14 +105,17 @@ def shown(column: Column, seeds: Iterable[int], asked: Sequence[Subject], looks:
         for seed in seeds:
             scene = renderer.scene(seed, column)
             jpeg = as_seen(scene)
-            yield Seen(scene, jpeg, tuple(_answer(one.detector, seed, jpeg, decoder, looks) for one in asked))
+            said = [_answer(one.detector, seed, jpeg, decoder, looks) for one in asked]
+            yield Seen(scene, jpeg, tuple(one if isinstance(one, DetectionResult) else None for one in said),
+                       tuple(one if isinstance(one, str) else "" for one in said))
 
 
-def _answer(detector: Detector, seed: int, jpeg: bytes, decoder: Decoder, looks: int) -> DetectionResult | None:
-    result = None
+def _answer(detector: Detector, seed: int, jpeg: bytes, decoder: Decoder, looks: int) -> DetectionResult | str:
+    """The last look's answer, or why there is none."""
+    result: DetectionResult | str = ""
     for look in range(looks):
         header = FrameHeader(session=f"{seed:08x}", seq=look, t_us=(1 + look) * _FRAME_US)
-        result = detector.detect([DetectFrame(_ROBOT, header, jpeg, decoder)], NO_DEADLINE)[0]
+        (result,) = checked_answers(detector, [DetectFrame(_ROBOT, header, jpeg, decoder)], NO_DEADLINE)
     return result
 
 
@@ -90,24 +128,51 @@ def score_scenes(
     `each` is told of every scene.
     """
     seeds = range(first_seed, first_seed + frames)
-    verdicts: dict[str, dict[str, list[Judged]]] = {name: {one.name: [] for one in asked} for name in columns}
-    found = {one.name: {label: Found() for label in LABELLED} for one in asked}
-    made_by: dict[str, dict[str, str]] = {}
+    counts = [_Count(one, columns) for one in asked]
     for name in columns:
         for seen in shown(COLUMNS[name], seeds, asked, looks):
             each(seen)
-            for subject, result in zip(asked, seen.answers, strict=True):
-                verdicts[name][subject.name].append(verdict(result, seen.scene))
-                if result is not None:
-                    made_by[subject.name] = {"device": result.device, "model_hash": result.model_hash}
+            for count, result, why in zip(counts, seen.answers, seen.whys, strict=True):
+                count.verdicts[name].append(verdict(result, seen.scene))
+                count.note(result, why)
     for seen in shown(THINGS, range(first_seed, first_seed + int(LIGHT_SHARE * frames)), asked, looks):
         each(seen)
-        for subject, result in zip(asked, seen.answers, strict=True):
-            for label, marks in found[subject.name].items():
+        for count, result, why in zip(counts, seen.answers, seen.whys, strict=True):
+            for label, marks in count.found.items():
                 marks.add(label, detections(result), seen.scene)
-    counted = {name: {who: figures(all_of) for who, all_of in own.items()} for name, own in verdicts.items()}
-    precision = {who: precisions(own) for who, own in found.items()}
-    return Report(first_seed, frames, counted, precision, made_by)
+            count.note(result, why)
+    return Report(
+        first_seed, frames,
+        {name: {one.name: figures(one.verdicts[name]) for one in counts} for name in columns},
+        {one.name: precisions(one.found) for one in counts},
+        {one.name: one.made_by for one in counts if one.made_by},
+        {one.name: one.silence() for one in counts if one.unanswered},
+    )
+
+
+class _Count:
+    """All that one subject answered."""
+
+    def __init__(self, subject: Subject, columns: Sequence[str]) -> None:
+        self.name = subject.name
+        self.verdicts: dict[str, list[Judged]] = {name: [] for name in columns}
+        self.found = {label: Found() for label in LABELLED}
+        self.made_by: dict[str, str] = {}
+        self.scenes = self.unanswered = 0
+        self._detector, self._why = subject.detector, ""
+
+    def note(self, result: DetectionResult | None, why: str) -> None:
+        self.scenes += 1
+        if result is not None:
+            self.made_by = {"device": result.device, "model_hash": result.model_hash}
+        else:
+            self.unanswered += 1
+            self._why = self._why or why
+
+    def silence(self) -> Silence:
+        """With what the detector itself says, if it says anything."""
+        said = news_of(self._detector)[:_MOST_SAID]
+        return Silence(self.unanswered, self.scenes, "; ".join(dict.fromkeys([self._why, *said])))
 
 
 def detections(result: DetectionResult | None) -> tuple[Detection, ...]:

@@ -3,18 +3,19 @@
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
 
-from tests import triton_server
+from tests import demanded, triton_server
 from tests.link_rigs import free_endpoint, until
 from tests.remote_rig import BALL_JPEG, COLUMNS, GREY_JPEG, JPEG_INPUT, OUTPUTS, frame, grpc_answer, within
 from vision_side.config import DetectorConfig, HsvConfig, VisionConfig
 from vision_side.detect.choice import choose_detector
 from vision_side.detect.contract import check_detector
 from vision_side.detect.local import Hsv
+from vision_side.detect.remote.fallback import Fallback
 
 ROOT = Path(__file__).parent.parent
 HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
@@ -100,9 +101,9 @@ def _listens(port):
 # --- gRPC ------------------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def _grpc_server(infer, metadata=None):
-    """A server of the Open Inference Protocol that answers with these bytes; `infer(request)` may also raise."""
+def _grpc_started(infer, port=0, metadata=None):
+    """A server of the Open Inference Protocol that answers with these bytes, and its port; `infer(request)` may also
+    raise."""
     grpc = pytest.importorskip("grpc")
     from concurrent.futures import ThreadPoolExecutor
 
@@ -115,8 +116,14 @@ def _grpc_server(infer, metadata=None):
     server = grpc.server(ThreadPoolExecutor(2), compression=getattr(infer, "compression", None),
                          options=[("grpc.max_send_message_length", -1)])
     server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("inference.GRPCInferenceService", handlers)])
-    port = server.add_insecure_port("127.0.0.1:0")
+    port = server.add_insecure_port(f"127.0.0.1:{port}")
     server.start()
+    return server, port
+
+
+@contextmanager
+def _grpc_server(infer, metadata=None):
+    server, port = _grpc_started(infer, metadata=metadata)
     try:
         with _closing(_detector(f"oip+grpc://127.0.0.1:{port}/ball", labels=("box", "ball"))) as detector:
             yield detector
@@ -166,6 +173,20 @@ def test_a_hostile_grpc_answer_is_refused_and_counted(infer, reason):
         assert until(lambda: dict(detector.refused) == {reason: 1}), detector.refused
 
 
+def test_own_eyes_drive_on_while_a_grpc_server_is_gone_and_it_drives_again_within_three_seconds_of_its_return():
+    server, port = _grpc_started(lambda request, context: grpc_answer(COLUMNS))
+    with _closing(Fallback(_detector(f"oip+grpc://127.0.0.1:{port}/ball", labels=("box", "ball")), HSV)) as both:
+        assert until(lambda: both.detect([frame()], within(1.0))[0].detector == "oip+grpc:ball")
+        server.stop(0).wait()
+        for _ in range(20):
+            began_s = time.monotonic()
+            (result,) = both.detect([frame()], within(0.1))
+            assert result.detector == "hsv" and time.monotonic() - began_s < 0.2
+        server, _ = _grpc_started(lambda request, context: grpc_answer(COLUMNS), port)
+        assert until(lambda: both.detect([frame()], within(0.1))[0].detector == "oip+grpc:ball", 3.0), both.news()
+    server.stop(0)
+
+
 def test_grpc_without_its_package_is_said_with_the_command(monkeypatch):
     from protocol.errors import ConfigError
 
@@ -181,9 +202,20 @@ def test_grpc_without_its_package_is_said_with_the_command(monkeypatch):
 def triton(tmp_path_factory):
     why = triton_server.why_impossible()
     if why:
-        pytest.skip(why)
+        demanded.do_without("triton", why)
     with triton_server.TritonServer(tmp_path_factory.mktemp("triton")) as server:
         yield server
+
+
+def test_triton_may_be_missing_but_not_where_it_is_demanded(monkeypatch):
+    monkeypatch.delenv(demanded.NAME, raising=False)
+    with pytest.raises(pytest.skip.Exception, match="no wheel"):
+        demanded.do_without("triton", "no wheel")
+    monkeypatch.setenv(demanded.NAME, "cuda,triton")
+    with pytest.raises(pytest.fail.Exception, match="'triton', and it cannot be had: no wheel") as failed:
+        demanded.do_without("triton", "no wheel")
+    assert "\n" not in str(failed.value)
+    assert f"export {demanded.NAME}=triton " in (ROOT / ".ci" / "run").read_text()
 
 
 KINDS = ("oip+http", "oip+grpc")
@@ -224,14 +256,20 @@ def test_a_detector_over_triton_keeps_the_contract(triton, scheme):
 
 @pytest.mark.slow
 def test_a_killed_triton_is_no_answer_by_the_deadline_and_back_within_three_seconds_of_its_return(triton):
-    with _closing(_triton_detector(triton, "oip+http", "ball_jpeg")) as detector:
-        assert until(lambda: detector.detect([frame()], within(1.0))[0], 10)
+    """Both protocols at one server: it is killed once for both."""
+    with ExitStack() as ending:
+        detectors = [ending.enter_context(_closing(_triton_detector(triton, one, "ball_jpeg"))) for one in KINDS]
+        assert all(until(lambda one=one: one.detect([frame()], within(1.0))[0], 10) for one in detectors)
         triton.kill()
-        for seq in range(10):
+        for seq in range(20):
             began_s = time.monotonic()
-            assert detector.detect([frame(seq)], within(0.1)) == [None] and time.monotonic() - began_s < 0.25
+            assert detectors[seq % 2].detect([frame(seq)], within(0.1)) == [None]
+            assert time.monotonic() - began_s < 0.25
         triton.start()
-        assert until(lambda: detector.detect([frame()], within(0.1))[0], 3.0)
+        back_s = time.monotonic()
+        for one in detectors:
+            left_s = 3.0 - (time.monotonic() - back_s)
+            assert until(lambda one=one: one.detect([frame()], within(0.1))[0], left_s), one.news()
 
 
 def test_the_page_shows_the_configuration_that_was_run():

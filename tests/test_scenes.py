@@ -10,6 +10,7 @@ pytest.importorskip("pybullet")
 
 import simplejpeg
 
+from sim import scene_backdrop
 from sim.scene_defects import as_seen, spoiled, streak
 from sim.scene_plan import plan_scene
 from sim.scene_render import SceneRenderer
@@ -29,6 +30,7 @@ from sim.scenes import (
     Lens,
 )
 from sim.scenes import TRAINED as TRAINED_COLUMN
+from tests import judged_scenes
 
 ALL = [*COLUMNS.values(), THINGS, TRAINED_COLUMN]
 
@@ -51,6 +53,15 @@ def test_a_seed_is_a_scene_in_any_order(renderer):
     assert np.array_equal(first.rgb, again.rgb) and first.truths == again.truths
     assert as_seen(first) == as_seen(again)
     assert not np.array_equal(first.rgb, renderer.scene(JUDGED_FROM + 4, COLUMNS["all at once"]).rgb)
+
+
+def test_the_judged_scenes_are_those_that_figures_were_published_of(monkeypatch):
+    then = judged_scenes.kept()
+    for now, before in zip(judged_scenes.drawn(), then, strict=True):
+        assert (now["column"], now["seed"]) == (before["column"], before["seed"])
+        assert not judged_scenes.differences(now, before), f"{judged_scenes.__doc__}\n{now['column']} {now['seed']}"
+    monkeypatch.setattr(scene_backdrop, "texture", lambda family, seed: texture(family, seed + 1))
+    assert all(map(judged_scenes.differences, judged_scenes.drawn(), then)), "another texture is noticed"
 
 
 def test_a_ball_is_as_large_as_agreed_and_stands_in_view():
