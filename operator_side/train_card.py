@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from operator_side.score_detectors_text import markdown
+from operator_side.score_detectors_bounds import judge
+from operator_side.score_detectors_text import check_lines, markdown
 from operator_side.score_scenes import Report
 from operator_side.train_export import MOST_BOXES, OPSET
 from sim.scene_textures import JUDGED, TRAINED
@@ -75,6 +76,13 @@ def _judged(card: Card) -> list[str]:
     return [
         f"{report.frames} scenes a column, seeds {report.first_seed} to {last}: floors and walls of the families "
         f"{', '.join(JUDGED)}, and light from heights that training never saw. `sightline score detectors onnx "
-        f"--frames {report.frames}` shows it again. What the columns and figures mean: docs/learned-detector.md.", "",
-        markdown(report),
+        f"--frames {report.frames} --demand` shows it again. What the columns and figures mean: "
+        "docs/learned-detector.md.", "", markdown(report), "", *_demanded(report),
     ]
+
+
+def _demanded(report: Report) -> list[str]:
+    checks = judge(report, "onnx")
+    broken = [one for one in checks if not one.ok]
+    kept = f"{len(checks) - len(broken)} of {len(checks)} demands are kept"
+    return [f"{kept}; these are not:", "", "```", *check_lines(broken), "```"] if broken else [f"{kept}."]

@@ -32,4 +32,5 @@ def test_weights_become_a_file_with_thresholds_and_a_card_that_is_true_of_it(tmp
     training = SimpleNamespace(steps=7, batch=6, seed=5, jobs=2, rate=0.003, whole_from=0.8)
     card = card_text(Card(training, 9, "cpu", thresholds, 12345, model.stat().st_size, digest, 5, report))
     assert "sightline train --scenes 9 --steps 7 --batch 6 --seed 5 --device cpu --jobs 2" in card
+    assert "demands are kept; these are not:" in card and "least hits, nominal" in card
     assert digest in card and all(f"| {name} |" in card for name in COLUMNS) and "12345" in card
