@@ -8,8 +8,9 @@ import pytest
 from protocol.config import Config as Settings
 from protocol.errors import ConfigError, HardwareError
 from tests.onnx_rig import brightness_model
+from vision_side import plugin_choice
 from vision_side.config import DetectorConfig, VisionConfig
-from vision_side.detect.choice import FAMILY, choose_detector, configured_detector, is_plain, split
+from vision_side.detect.choice import FAMILY, GROUP, choose_detector, configured_detector, is_plain, split
 from vision_side.detect.colour_filter import ColourFilter
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.local import Adaptive, Hsv
@@ -106,6 +107,9 @@ def test_what_is_around_it_is_built_from_the_inside_out() -> None:
         ({"kind": "adaptive", "options": {"confirm": 0}}, "option 'confirm'"),
         ({"kind": "hsv", "device": "cuda"}, "no device to choose"),
         ({"kind": "boxes", "shadow": "hsv"}, "detector.shadow goes with a detector that runs here"),
+        ({"kind": "boxes", "device": "cuda"}, "detector.device goes with a detector that runs here"),
+        ({"kind": "boxes", "options": {"min_score": 0.5}}, "detector.options goes with a detector that runs here"),
+        ({"kind": "boxes", "shadow_options": {"a": 1}}, "detector.shadow_options goes with"),
         ({"kind": "hsv", "shadow": "hsw"}, "did you mean 'hsv'"),
     ],
 )
@@ -113,6 +117,31 @@ def test_every_mistake_is_one_line(detector: dict, words: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(words)) as refused:
         configured_detector(config(**detector))
     assert "\n" not in str(refused.value) and len(str(refused.value)) < 300
+
+
+class Entry:
+    """An entry point as an installed package has it."""
+
+    def __init__(self, name: str, loaded: object) -> None:
+        self.name, self.loaded = name, loaded
+
+    def load(self) -> object:
+        if isinstance(self.loaded, Exception):
+            raise self.loaded
+        return self.loaded
+
+
+def test_an_installed_package_brings_its_detectors_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    installed = [Entry("lens", Mine), Entry("broken", ImportError("no module named lens"))]
+    monkeypatch.setattr(plugin_choice, "entry_points", lambda group: installed if group == GROUP else [])
+    made = choose_detector("lens:/dev/lens0", {"sure": True}, config())
+    assert isinstance(made, Mine) and made.config == Mine.Config(address="/dev/lens0", robot="r7", deadline_s=0.1,
+                                                                 sure=True)
+    assert isinstance(configured_detector(config(kind="lens", tracked=True)).inner, Mine)
+    with pytest.raises(ConfigError, match="'broken' cannot be loaded: no module named lens"):
+        choose_detector("broken", {}, config())
+    with pytest.raises(ConfigError, match="did you mean 'lens'"):
+        choose_detector("lense", {}, config())
 
 
 def test_a_device_is_handed_to_who_can_have_one(tmp_path: Path) -> None:

@@ -70,6 +70,7 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("vision", "--detector", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
         (("vision", "--shadow", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
         (("vision", "--dry-run", "--detector", "boxes"), 2, "own eyes"),
+        (("vision", "--detector", "boxes", "--device", "cuda", "--connect", "tcp/127.0.0.1:1"), 2, "somebody else's"),
         (("detector", "check", "boxes"), 2, "that looks itself"),
         (("detector", "check", "hsv", "--set", "hsv.min_radius_px=900"), 2, "'hsv.min_radius_px'"),
         (("detector", "check", "hsv", "--set", "label=a", "--set", "label.b=1"), 2, "'label' has a value"),
@@ -107,6 +108,13 @@ def test_a_copy_without_a_model_says_so(capsys, monkeypatch, tmp_path: Path) -> 
 def test_a_device_that_is_not_there_ends_vision_with_3(capsys, tmp_path: Path) -> None:
     path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0])
     code, out, err = run(capsys, "vision", "--detector", f"onnx:{path}", "--device", "cuda",
+                         "--connect", "tcp/127.0.0.1:1")
+    assert (code, out) == (3, "") and "--device auto" in err and err.count("\n") == 1
+
+
+def test_a_device_that_is_not_there_ends_the_service_with_3(capsys, tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0])
+    code, out, err = run(capsys, "detector", "--serve", f"onnx:{path}", "--device", "cuda",
                          "--connect", "tcp/127.0.0.1:1")
     assert (code, out) == (3, "") and "--device auto" in err and err.count("\n") == 1
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from protocol.messages import MAX_DETECTED_BOXES
 from tests.detector_contract import assert_kept
 from vision_side.config import VisionConfig
 from vision_side.detect.choice import choose_detector
@@ -12,7 +13,8 @@ from vision_side.detect.colour_filter import ColourFilter
 from vision_side.detect.contract import check_detector
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.local import Hsv
-from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult
+from vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Detection, DetectionResult
+from vision_side.detect.remote.fallback import Fallback
 from vision_side.detect.shadow import Shadowed
 from vision_side.detect.tracked import Tracked
 
@@ -31,8 +33,8 @@ def test_our_own_keep_every_promise(name: str) -> None:
 @pytest.mark.parametrize(
     "around",
     [Tracked, lambda one: ColourFilter(one, CONFIG.hsv.ranges), lambda one: LabelFilter(one, ("target",)),
-     lambda one: Shadowed(one, hsv(), "hsv", 10**7)],
-    ids=["tracked", "colour", "label", "shadow"],
+     lambda one: Shadowed(one, hsv(), "hsv", 10**7), lambda one: Fallback(one, hsv())],
+    ids=["tracked", "colour", "label", "shadow", "fallback"],
 )
 def test_what_is_around_a_detector_keeps_them_too(around) -> None:
     assert_kept(lambda: around(hsv()), seed=11)
@@ -76,6 +78,24 @@ class Sure(Broken):
     def detect(self, frames, deadline_us):
         wild = Detection(1.0, 1.0, 9.0, 10.0, 1.5, "target")
         return [one and replace(one, detections=(wild,)) for one in super().detect(frames, deadline_us)]
+
+
+class Flat(Broken):
+    def detect(self, frames, deadline_us):
+        flat = Detection(1.0, 1.0, 9.0, 10.0, 0.5, "target", Circle(5.0, 5.0, 0.0))
+        return [one and replace(one, detections=(flat,)) for one in super().detect(frames, deadline_us)]
+
+
+class Numbered(Broken):
+    def detect(self, frames, deadline_us):
+        odd = Detection(1.0, 1.0, 9.0, 10.0, 0.5, "target", track_id=-1)
+        return [one and replace(one, detections=(odd,)) for one in super().detect(frames, deadline_us)]
+
+
+class Crowded(Broken):
+    def detect(self, frames, deadline_us):
+        many = (Detection(1.0, 1.0, 9.0, 10.0, 0.5, "target"),) * (MAX_DETECTED_BOXES + 1)
+        return [one and replace(one, detections=many) for one in super().detect(frames, deadline_us)]
 
 
 class Raising(Broken):
@@ -139,6 +159,7 @@ class Nameless(Broken):
 @pytest.mark.parametrize(
     ("broken", "promise"),
     [(Backwards, "order"), (Short, "order"), (Tired, "answering"), (Beyond, "bounds"), (Sure, "bounds"),
+     (Flat, "bounds"), (Numbered, "bounds"), (Crowded, "bounds"),
      (Raising, "silence"), (Inventing, "silence"), (Slow, "deadline"), (Moody, "the_same"), (Mixing, "robots_apart"),
      (Nameless, "its_name")],
 )

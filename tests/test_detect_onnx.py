@@ -159,6 +159,9 @@ class _FakeRuntime:
         def __init__(self, path: str, options: object, providers: list[str]) -> None:
             self.asked = providers
 
+        def disable_fallback(self) -> None:
+            pass
+
         def get_providers(self) -> list[str]:
             return ["CPUExecutionProvider"]
 

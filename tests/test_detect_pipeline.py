@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from protocol.messages import FrameHeader
+from protocol.messages import MAX_DETECTED_BOXES, FrameHeader
 from tests.detector_rig import Bench, Told, box
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.config import DetectorConfig, TargetConfig, VisionConfig
 from vision_side.decode import Decoder
-from vision_side.detect.checking import MAX_DETECTIONS, checked
+from vision_side.detect.checking import checked
 from vision_side.detect.local import Hsv
-from vision_side.detect.port import DetectFrame, Maker, result_of
+from vision_side.detect.port import Circle, DetectFrame, Maker, result_of
 from vision_side.pipeline import NO_ANSWER, Frame, Pipeline
 
 MODEL = camera()
@@ -74,7 +74,12 @@ class Strange:
         lambda one: [replace(one, detections=(replace(box(1), score=math.inf),))],
         lambda one: [replace(one, detections=(replace(box(1), score=1.2),))],
         lambda one: [replace(one, detections=(replace(box(1), label="x" * 65),))],
-        lambda one: [replace(one, detections=(box(1),) * (MAX_DETECTIONS + 1))],
+        lambda one: [replace(one, detections=(replace(box(1), label=""),))],
+        lambda one: [replace(one, detections=(replace(box(1), label="a\x1b[2J"),))],
+        lambda one: [replace(one, detections=(replace(box(1), circle=Circle(9.0, 9.0, 0.0)),))],
+        lambda one: [replace(one, detections=(replace(box(1), circle=Circle(math.nan, 9.0, 1.0)),))],
+        lambda one: [replace(one, detections=(replace(box(1), track_id=-1),))],
+        lambda one: [replace(one, detections=(box(1),) * (MAX_DETECTED_BOXES + 1))],
         lambda one: [], lambda one: [one, one], lambda one: None, lambda one: ["boxes"], lambda one: 1 / 0,
     ],
 )  # fmt: skip

@@ -9,6 +9,7 @@ from tests.link_rigs import until
 from tests.remote_rig import GREY_JPEG, frame, now_us, within
 from vision_side.config import HsvConfig
 from vision_side.detect.local import Hsv
+from vision_side.detect.own_decoders import MAX_DECODERS, OwnDecoders
 from vision_side.detect.port import Detection, Maker, result_of
 from vision_side.detect.remote.by_deadline import RAISED, ByDeadline
 from vision_side.detect.remote.fallback import GOOD_ANSWERS, RESERVE_US, Fallback
@@ -115,6 +116,13 @@ def test_pixels_of_a_frame_nobody_waits_for_any_more_do_not_get_into_the_next():
     assert seen == [True]
 
 
+def test_ever_new_robots_leave_no_more_decoders_than_there_may_be():
+    decoders = OwnDecoders(10**7)
+    for number in range(2 * MAX_DECODERS):
+        assert decoders.again(frame(1, robot=f"r{number}")).picture().bgr.shape == (240, 320, 3)
+    assert len(decoders._decoders) == MAX_DECODERS
+
+
 def test_close_ends_the_thread_and_what_is_inside(held):
     one = ByDeadline(held)
     one.detect([frame(1)], within(2))
@@ -128,8 +136,8 @@ def test_close_ends_the_thread_and_what_is_inside(held):
 class Asked:
     """What `FakeRemote` was asked."""
 
-    def __init__(self, results, over):
-        self._results, self.over = results, over
+    def __init__(self, results, over, begun=True):
+        self._results, self.over, self.begun = results, over, begun
 
     def take(self, wait):
         results, self._results = self._results, None
@@ -137,7 +145,7 @@ class Asked:
 
 
 class FakeRemote(Held):
-    """Asked without waiting; `state` says how: good, none (no answer that counts), late, or under way."""
+    """Asked without waiting; `state` says how: good, none (no answer that counts), late, overtaken, or under way."""
 
     state = "good"
 
@@ -147,11 +155,11 @@ class FakeRemote(Held):
 
     def ask(self, frames, deadline_us):
         results = self.detect(frames, deadline_us) if self.state in ("good", "none") else None
-        return Asked(results, self.state == "late")
+        return Asked(results, self.state in ("late", "overtaken"), self.state != "overtaken")
 
 
-def _who(fallback, seq, count=1):
-    results = fallback.detect([frame(seq + one) for one in range(count)], within(2))
+def _who(fallback, seq, count=1, robot="r1"):
+    results = fallback.detect([frame(seq + one, robot=robot) for one in range(count)], within(2))
     return [one and one.detector for one in results]
 
 

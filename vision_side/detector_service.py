@@ -21,7 +21,6 @@ from protocol.codec import decode, encode
 from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
 from protocol.messages import (
-    MAX_DETECTED_BOXES,
     DetectedBox,
     DetectedCircle,
     Detections,
@@ -32,6 +31,7 @@ from protocol.messages import (
 from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.clock import now_us
 from vision_side.config import VisionConfig
+from vision_side.detect.around import maker_of, news_of
 from vision_side.detect.checking import asked
 from vision_side.detect.own_decoders import OwnDecoders
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
@@ -110,7 +110,8 @@ class DetectorService:
         self._said = 0
         self._each_us = 0.0
         self._ages_us: deque[int] = deque(maxlen=_AGES)
-        self._maker = ("", "")
+        maker = maker_of(detector)
+        self._maker = (maker.model_hash[:8], maker.device) if maker else ("", "")
         self._looked_at_load_s = time.monotonic()
         self._load_before = (0, 0)
         self._overloaded = self._failed = False
@@ -125,7 +126,9 @@ class DetectorService:
         self._say(f"detector: ended; {self.about()}")
 
     def turn(self) -> bool:
-        """Welcome who is new, then look at one batch; False if nothing waited."""
+        """Tell the detector's news, welcome who is new, then look at one batch; False if nothing waited."""
+        for line in news_of(self._detector):
+            self._say(f"detector: {line}")
         for robot in self._site.robots():
             if robot not in self._links:
                 self._welcome(robot)
@@ -177,7 +180,7 @@ class DetectorService:
         self._each_us += (each_us - self._each_us) * (_SMOOTHING if self._each_us else 1.0)
         for (turn, frame), result in zip(frames, results, strict=True):
             if isinstance(result, str):
-                self._refuse(turn, result)
+                self._refuse(turn, result, late=ended_us > deadline_us)
             else:
                 self._answer(turn, frame, result, ended_us - began_us)
 
@@ -192,21 +195,23 @@ class DetectorService:
             return None
         return self._decoders.frame(turn.robot, header, jpeg, (size.width_px, size.height_px))
 
-    def _refuse(self, turn: Turn[Message], why: str) -> None:
+    def _refuse(self, turn: Turn[Message], why: str, late: bool = False) -> None:
         """Count it; the first is told: the others are in the tallies."""
-        self._tally(turn).refused += 1
+        tally = self._tally(turn)
+        tally.late, tally.refused = tally.late + late, tally.refused + (not late)
         if not self._failed:
             self._failed = True
             self._say(f"detector: {why}")
 
     def _answer(self, turn: Turn[Message], frame: DetectFrame, result: DetectionResult, took_us: int) -> None:
         tally, age_us = self._tally(turn), now_us() - turn.arrived_us
-        payload = _payload(result)
-        if payload is None:
-            tally.refused += 1
-            return
         if age_us > self._serving.deadline_us:
             tally.late += 1
+            return
+        try:
+            payload = _payload(result)
+        except ValueError as error:
+            self._refuse(turn, f"what the detector says cannot be sent: {_first_line(error)}")
             return
         self._said += 1
         stamp = _stamp(frame.header, self._session, self._said, took_us)
@@ -232,15 +237,25 @@ class DetectorService:
                       f"answered, {dropped} dropped in {_LOOK_AT_LOAD_S:.0f} s")
 
 
-def _payload(result: DetectionResult) -> bytes | None:
-    """The boxes as the wire has them; None for a plug-in's that cannot be said."""
-    try:
-        boxes = tuple(_box(one) for one in result.detections[:MAX_DETECTED_BOXES])
-        said = Detections(width_px=result.width_px, height_px=result.height_px, boxes=boxes, detector=result.detector,
-                          device=result.device, model=result.model_hash)
-    except ValidationError:
-        return None
-    return encode(said)
+def _payload(result: DetectionResult) -> bytes:
+    """The boxes as the wire has them, the best first; the last are left out where all are too long for it.
+
+    Raises ValueError for a plug-in's that cannot be said.
+    """
+    boxes = tuple(_box(one) for one in result.detections)
+    said = Detections(width_px=result.width_px, height_px=result.height_px, boxes=boxes, detector=result.detector,
+                      device=result.device, model=result.model_hash)
+    while len(payload := encode(said)) > DETECTIONS.max_payload_bytes:
+        said = said.model_copy(update={"boxes": said.boxes[:-1]})
+    return payload
+
+
+def _first_line(error: ValueError) -> str:
+    """What is wrong with which field."""
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+    return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
 
 
 def _box(one: Detection) -> DetectedBox:

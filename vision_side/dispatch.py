@@ -58,8 +58,7 @@ class Dispatch:
         if pipeline is not None and asked is not None and asked not in (pipeline.asked, self._swapped):
             refused = refused or _ENDED
         eyes, looked = (pipeline.eyes, pipeline.looked) if pipeline else (None, None)
-        for line in news_of(eyes):
-            self._tell("detector", line)
+        self.tell_news(eyes)
         beside = eyes.shadow_text(self._link.robot) if isinstance(eyes, Shadowed) else ""
         report = self._reporter.due(now_s, self._mission, seen, asked, refused, looked=looked, beside=beside)
         if report is None:
@@ -70,6 +69,11 @@ class Dispatch:
             echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
         header = DetectionsHeader(source=SOURCE, session=self._session, seq=self._reports, echo=echo)
         self._link.publish(REPORT, encode(header), encode(report), SOURCE)
+
+    def tell_news(self, eyes: Detector | None) -> None:
+        """What the detector has to say."""
+        for line in news_of(eyes):
+            self._tell("detector", line)
 
     def _choose(self, message: Message, pipeline: Pipeline, frame: FrameHeader) -> None:
         try:

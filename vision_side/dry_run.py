@@ -12,6 +12,7 @@ from protocol.errors import HardwareError
 from protocol.messages import CameraModel, FrameHeader
 from protocol.transports.link import Link
 from vision_side.config import VisionConfig
+from vision_side.detect.around import news_of
 from vision_side.detect.choice import configured_detector
 from vision_side.dispatch import Dispatch
 from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, Seen
@@ -83,6 +84,7 @@ class AckingService(Service):
     def __init__(self, config: VisionConfig, link: Link, say: Say) -> None:
         super().__init__(config, link, say)
         self._dispatch = OnlyScans(config, link, self._tell, self._refuse)
+        self._dispatch.tell_news(self._eyes)
         self._telling = Telling(say)
 
     def _publish(self, header: FrameHeader, answer: Answer, compute_us: int) -> None:
@@ -98,8 +100,12 @@ class OnlyScans(Dispatch):
         if pipeline.mission.wants_scan:
             self._look(pipeline)
 
-    def after(self, now_s: float, pipeline: Pipeline | None, frame: FrameHeader | None, seen: Seen) -> None:
-        """Say nothing."""
+    def after(
+        self, now_s: float, pipeline: Pipeline | None, frame: FrameHeader | None, seen: Seen  # noqa: ARG002
+    ) -> None:
+        """Say only what the detector has to say."""
+        if pipeline is not None:
+            self.tell_news(pipeline.eyes)
 
 
 class Watching:
@@ -109,6 +115,7 @@ class Watching:
         self._camera, self._say = camera, say
         self._pipeline = Pipeline(config, camera.model, eyes=configured_detector(config))
         self._telling = Telling(say)
+        self._tell_news()
         self._session = secrets.token_hex(4)
         self._seq = 0
         self._fault = ""
@@ -126,6 +133,11 @@ class Watching:
             self._seq += 1
             header = FrameHeader(session=self._session, seq=self._seq, t_us=picture.t_us)
             self._telling.step(self._pipeline.step(Frame(header, picture.jpeg)), time.monotonic())
+            self._tell_news()
+
+    def _tell_news(self) -> None:
+        for line in news_of(self._pipeline.eyes):
+            self._say(f"vision: {line}")
 
     def _complain(self, fault: str) -> None:
         if fault != self._fault:

@@ -18,6 +18,7 @@ from vision_side.decode import Picture
 from vision_side.detect.chroma import Chroma
 from vision_side.detect.colour import Region
 from vision_side.detect.hsv import HsvDetector
+from vision_side.detect.labels import Label
 from vision_side.detect.pixel_track import PixelTrack
 from vision_side.detect.port import Circle, Detection
 
@@ -30,7 +31,7 @@ class AdaptiveConfig(Settings):
     """The ranges to begin with, and how much it goes along with."""
 
     hsv: HsvConfig = HsvConfig()
-    label: str = "target"
+    label: Label = "target"
     confirm: Annotated[int, Field(ge=1, le=30)] = 3
     """Pictures in a row with the thing at one place before it is believed."""
     lost_after_s: Annotated[float, Field(gt=0, le=5)] = 0.5

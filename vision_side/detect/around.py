@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from protocol.transports.link import Link
-from vision_side.detect.port import Detector
+from vision_side.detect.port import Detector, Maker
 
 
 class Around:
@@ -20,6 +20,11 @@ class Around:
     def news(self) -> list[str]:
         """What the one inside has to say."""
         return news_of(self.inner)
+
+    @property
+    def maker(self) -> Maker | None:
+        """Who the one inside is, if it says."""
+        return maker_of(self.inner)
 
     def close(self) -> None:
         """Close the one inside."""
@@ -37,6 +42,12 @@ def news_of(detector: Any) -> list[str]:
     """Lines for a person since the last time; none from a detector that has no `news`."""
     news: Callable[[], list[str]] | None = getattr(detector, "news", None)
     return [" ".join(str(line).split()) for line in news()] if news is not None else []
+
+
+def maker_of(detector: Any) -> Maker | None:
+    """Who makes its results, where that is known before the first of them."""
+    maker: Maker | None = getattr(detector, "maker", None)
+    return maker
 
 
 def close_detector(detector: Any) -> None:

@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector, clipped
+from protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER
+from vision_side.detect.labels import LONGEST_LABEL, is_label
+from vision_side.detect.port import Circle, DetectFrame, Detection, DetectionResult, Detector, clipped
 
-MAX_DETECTIONS: Final = 256
-"""Security limit: as many as the channel `detections` takes; more is no answer."""
-_LONGEST_LABEL: Final = 64
 _LONGEST_WHY: Final = 160
+_FURTHEST_PX: Final = 1e6
+"""As for any number on the wire."""
 
 
 def asked(detector: Detector, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | str]:
@@ -49,21 +50,36 @@ def checked(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
     if (result.width_px, result.height_px) != (frame.width_px, frame.height_px):
         raise ValueError(f"it is about a {result.width_px}x{result.height_px} picture")
     found = result.detections
-    if len(found) > MAX_DETECTIONS:
-        raise ValueError(f"{len(found)} boxes; {MAX_DETECTIONS} is the most")
+    if len(found) > MAX_DETECTED_BOXES:  # the wire's own bound: which of more are the best is for the detector to say
+        raise ValueError(f"{len(found)} boxes; {MAX_DETECTED_BOXES} is the most")
     inside = tuple(part for one in found if (part := _checked(one, frame.width_px, frame.height_px)))
     unchanged = len(found) == len(inside) and all(one is part for one, part in zip(found, inside, strict=True))
     return result if unchanged else replace(result, detections=inside)
 
 
 def _checked(one: Detection, width_px: int, height_px: int) -> Detection | None:
-    numbers = [one.x1_px, one.y1_px, one.x2_px, one.y2_px, one.score]
-    if one.circle is not None:
-        numbers += [one.circle.cx_px, one.circle.cy_px, one.circle.radius_px]
-    if not all(math.isfinite(number) for number in numbers):
+    if not all(map(math.isfinite, (one.x1_px, one.y1_px, one.x2_px, one.y2_px, one.score))):
         raise ValueError("a box with a number that is none")
     if not 0 <= one.score <= 1:
         raise ValueError(f"a score of {one.score:g}; it is between 0 and 1")
-    if len(one.label) > _LONGEST_LABEL:
-        raise ValueError(f"a label of {len(one.label)} characters; {_LONGEST_LABEL} is the most")
+    wrong = beside_the_box(one)
+    if wrong:
+        raise ValueError(wrong)
     return clipped(one, width_px, height_px)
+
+
+def beside_the_box(one: Detection) -> str:
+    """What is wrong with its label, circle or track, which nobody could be told of; empty if nothing is."""
+    if not is_label(one.label):
+        return f"a label {one.label[:20]!r} of {len(one.label)} characters; it is 1 to {LONGEST_LABEL} printable ones"
+    if one.circle is not None and not _is_circle(one.circle):
+        return f"a circle at ({one.circle.cx_px:g}, {one.circle.cy_px:g}) with a radius of {one.circle.radius_px:g}"
+    if one.track_id is not None and not 0 <= one.track_id <= MAX_INTEGER:
+        return f"a track number {one.track_id}"[:_LONGEST_WHY]
+    return ""
+
+
+def _is_circle(circle: Circle) -> bool:
+    """Whether the wire can say it."""
+    return (abs(circle.cx_px) <= _FURTHEST_PX and abs(circle.cy_px) <= _FURTHEST_PX
+            and 0 < circle.radius_px <= _FURTHEST_PX)

@@ -70,7 +70,9 @@ def configured_detector(config: VisionConfig) -> Detector | None:
 def _check_no_eyes(config: VisionConfig) -> None:
     """Raise ConfigError for what only a detector of one's own can have."""
     one = config.detector
-    given = [name for name in ("fallback", "shadow", "labels", "only_colour", "tracked") if getattr(one, name)]
+    given = ["device"] if one.device != "auto" else []
+    given += [name for name in ("options", "fallback", "shadow", "shadow_options", "labels", "only_colour", "tracked")
+              if getattr(one, name)]
     if given:
         raise ConfigError(f"detector.{given[0]} goes with a detector that runs here; {BOXES!r} are somebody else's")
 

@@ -15,10 +15,10 @@ from typing import Final
 import cv2
 import numpy as np
 
-from protocol.messages import FrameHeader
+from protocol.messages import MAX_DETECTED_BOXES, FrameHeader
 from vision_side.decode import Decoder
 from vision_side.detect.around import close_detector
-from vision_side.detect.checking import MAX_DETECTIONS
+from vision_side.detect.checking import beside_the_box
 from vision_side.detect.golden import difference
 from vision_side.detect.port import NO_DEADLINE, DetectFrame, DetectionResult, Detector
 
@@ -201,15 +201,15 @@ def _unlike(frame: DetectFrame, one: DetectionResult) -> str:
 
 
 def _out_of_bounds(result: DetectionResult) -> str:
-    if len(result.detections) > MAX_DETECTIONS:
-        return f"{len(result.detections)} boxes; {MAX_DETECTIONS} is the most"
+    if len(result.detections) > MAX_DETECTED_BOXES:
+        return f"{len(result.detections)} boxes; {MAX_DETECTED_BOXES} is the most"
     for one in result.detections:
         if not (0 <= one.x1_px < one.x2_px <= result.width_px and 0 <= one.y1_px < one.y2_px <= result.height_px):
             return f"a box {one.x1_px:g}, {one.y1_px:g}, {one.x2_px:g}, {one.y2_px:g}"
         if not 0 <= one.score <= 1:
             return f"a score of {one.score:g}"
-        if not 0 < len(one.label) <= 64 or not one.label.isprintable():
-            return f"a label {one.label[:80]!r}"
+        if wrong := beside_the_box(one):
+            return wrong
     return ""
 
 

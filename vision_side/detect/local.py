@@ -6,11 +6,13 @@ from typing import Final
 
 from protocol.config import Config as Settings
 from protocol.errors import WireError
+from protocol.messages import MAX_DETECTED_BOXES
 from vision_side.config import HsvConfig
 from vision_side.decode import Picture
 from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveEye
 from vision_side.detect.by_session import BySession
 from vision_side.detect.hsv import HsvDetector
+from vision_side.detect.labels import Label
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
 
 _CPU: Final = "cpu"
@@ -23,20 +25,26 @@ class Hsv:
         """The section `hsv` of vision's configuration, and what its detections are called."""
 
         hsv: HsvConfig = HsvConfig()
-        label: str = "target"
+        label: Label = "target"
+
+    maker = Maker("hsv", device=_CPU)
 
     def __init__(self, config: Config) -> None:
         self._eye = HsvDetector(config.hsv, config.label)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
         """A result for each; it takes well under a millisecond, whatever the deadline."""
-        return [timed(frame, Maker("hsv", device=_CPU), self._eye.detect) for frame in frames]
+        return [timed(frame, self.maker, self._largest) for frame in frames]
+
+    def _largest(self, picture: Picture) -> tuple[Detection, ...]:
+        return self._eye.detect(picture)[:MAX_DETECTED_BOXES]
 
 
 class Adaptive:
     """The colour detector that learns the target's colour as it goes, one memory for each robot."""
 
     Config = AdaptiveConfig
+    maker = Maker("adaptive", device=_CPU)
 
     def __init__(self, config: AdaptiveConfig) -> None:
         self._eyes = BySession(lambda: AdaptiveEye(config))
@@ -47,7 +55,7 @@ class Adaptive:
 
     def _look(self, frame: DetectFrame) -> DetectionResult | None:
         eye, t_us = self._eyes.of(frame.robot, frame.header.session), frame.header.t_us
-        return timed(frame, Maker("adaptive", device=_CPU), lambda picture: eye.detect(picture, t_us))
+        return timed(frame, self.maker, lambda picture: eye.detect(picture, t_us))
 
 
 def timed(

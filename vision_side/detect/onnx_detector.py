@@ -7,7 +7,7 @@ picture that it gives here what it should.
 import hashlib
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -21,7 +21,7 @@ from vision_side.detect.golden import KEY, difference, golden_picture, read_gold
 from vision_side.detect.local import timed
 from vision_side.detect.onnx_engine import Engine, open_engine
 from vision_side.detect.onnx_header import OnnxHeader, read_onnx_header
-from vision_side.detect.onnx_reading import Form, fit_picture, form_of, read_outputs
+from vision_side.detect.onnx_reading import Form, fit_picture, form_of, own_labels, read_outputs
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
 from vision_side.detect.refine import refined
 
@@ -63,7 +63,7 @@ class OnnxDetector:
         self._news = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
         self.maker = Maker(f"onnx:{path.name}"[:_NAME_LENGTH], model.digest, self._engine.device)
         self._failed = False
-        self._warm_up(path, model.header, config, model.expected)
+        self._warm_up(model, config)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """A result for each frame for which there is still time."""
@@ -88,20 +88,20 @@ class OnnxDetector:
         return tuple(refined(picture, one) if one.label in self._refine else one for one in found)
 
     def _run(self, engine: Engine, picture: Picture) -> tuple[Detection, ...]:
-        pixels, fitting = fit_picture(picture, self._form)
-        return read_outputs(engine.run(pixels), self._form, fitting, picture, self._min_score)
+        return _found(engine, picture, self._form, self._min_score)
 
-    def _warm_up(self, path: Path, header: OnnxHeader, config: Config, expected: list[Detection] | None) -> None:
+    def _warm_up(self, model: "Model", config: Config) -> None:
         """Run warm, on the known picture, and compare: with what the model brought, or with itself on the CPU."""
-        picture = Picture(golden_picture(), 1)
+        picture, path, expected = Picture(golden_picture(), 1), model.path, model.expected
+        form, least = model.own_form, max(self._min_score, model.own_min_score)
         try:
             for _ in range(_WARM_UP):
-                found = self._run(self._engine, picture)
+                found = _found(self._engine, picture, form, least)
             if expected is None and self._engine.device != "cpu":
-                expected = list(self._run(open_engine(path, header, "cpu", config.threads), picture))
+                expected = list(_found(open_engine(path, model.header, "cpu", config.threads), picture, form, least))
         except Exception as error:  # whatever an engine raises
             raise ConfigError(f"model {path} does not run: {' '.join(str(error).split())}"[:200]) from None
-        wrong = difference(expected, found, self._min_score) if expected is not None else ""
+        wrong = difference(expected, found, least) if expected is not None else ""
         if wrong:
             where = f"{self._engine.device} ({self._engine.name})"
             raise HardwareError(f"model {path.name} on {where} does not give what it should for its test picture: "
@@ -117,7 +117,9 @@ class Model:
     form: Form
     min_score: float
     expected: list[Detection] | None
-    """What it should find in the known picture, if it says."""
+    """What it should find in the known picture, if it says: by its own labels, from its own least score on."""
+    own_form: Form
+    own_min_score: float
     digest: str
 
 
@@ -128,11 +130,18 @@ def read_model(config: OnnxDetector.Config) -> Model:
     digest = hashlib.sha256(data).hexdigest()[:HASH_DIGITS]
     try:
         header = read_onnx_header(data)
-        form = form_of(header, config.names, config.colour)
-        expected = read_golden(header.metadata[KEY]) if KEY in header.metadata else None
-        return Model(path, header, form, _least(config.min_score, header), expected, digest)
+        form, least = form_of(header, config.names, config.colour), _least(config.min_score, header)
+        if KEY not in header.metadata:
+            return Model(path, header, form, least, None, form, least, digest)
+        own = replace(form, labels=own_labels(header.metadata))
+        return Model(path, header, form, least, read_golden(header.metadata[KEY]), own, _least(None, header), digest)
     except ValueError as error:
         raise ConfigError(f"model {path}: {error}; see docs/detectors.md") from None
+
+
+def _found(engine: Engine, picture: Picture, form: Form, min_score: float) -> tuple[Detection, ...]:
+    pixels, fitting = fit_picture(picture, form)
+    return read_outputs(engine.run(pixels), form, fitting, picture, min_score)
 
 
 def shipped_digest() -> str:

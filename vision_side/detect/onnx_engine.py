@@ -73,6 +73,7 @@ class _Runtime:
         options.log_severity_level = _ERRORS_ONLY
         providers = [PROVIDERS[one] for one in _BEHIND[wanted] if PROVIDERS[one] in available]
         self._session = runtime.InferenceSession(str(path), options, providers=providers)
+        self._session.disable_fallback()  # or a GPU that is lost later becomes the CPU without a word
         got = self._session.get_providers()[0]
         self.device = _DEVICES.get(got, got)
         self.note = "" if device != "auto" or self.device != "cpu" else _why_cpu(wanted)

@@ -15,20 +15,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.messages import MAX_DETECTED_BOXES
 from vision_side.decode import Picture
+from vision_side.detect.labels import clean_label
 from vision_side.detect.onnx_header import OnnxHeader, Tensor
 from vision_side.detect.port import Detection, clipped
 
 Arrays = Mapping[str, NDArray[Any]]
-MAX_BOXES: Final = 64
-"""The surest so many count."""
 _MAX_ROWS: Final = 100_000
 _MAX_OVERLAP: Final = 0.5
 _GREY: Final = 114  # beside a picture that is narrower or lower than the input; what YOLO was trained with
 _STEP_PX: Final = 32  # an input of any size is rounded up to this
 _TRIPLE: Final = {"boxes", "scores", "labels"}
 _MAX_LABELS: Final = 1000
-_LONGEST_LABEL: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +65,7 @@ def form_of(header: OnnxHeader, names: Sequence[str], colour: str) -> Form:
                          "(1, 3, H, W)")
     rows, columns = one.shape[1:3] if rows_first and not floats else one.shape[2:4]
     size = (rows, columns) if rows and columns else None
-    labels = tuple(names) or _labels(header.metadata)
+    labels = tuple(map(clean_label, names)) or own_labels(header.metadata)
     return Form(floats, floats if colour == "auto" else colour == "rgb", size, _kind(header.outputs, labels), labels,
                 one.type)
 
@@ -88,8 +87,8 @@ def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> str:
     raise ValueError(f"it gives {given}; it should be boxes, scores and labels, or one (N, 6), or one (4 + classes, N)")
 
 
-def _labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
-    """`labels` is a JSON list; `names`, as others write it, a Python dictionary of numbers."""
+def own_labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
+    """What the model says: `labels` is a JSON list; `names`, as others write it, a Python dictionary of numbers."""
     try:
         if "labels" in metadata:
             found = json.loads(metadata["labels"])
@@ -100,7 +99,7 @@ def _labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
         raise ValueError("its metadata names no labels: `labels` is a JSON list of words") from None
     if not isinstance(found, list) or len(found) > _MAX_LABELS:
         raise ValueError(f"its metadata names no labels: `labels` is a JSON list of at most {_MAX_LABELS} words")
-    return tuple(str(one)[:_LONGEST_LABEL] for one in found)
+    return tuple(clean_label(str(one)) for one in found)
 
 
 def fit_picture(picture: Picture, form: Form) -> tuple[NDArray[Any], Fitting]:
@@ -139,8 +138,8 @@ def read_outputs(
     boxes, scores, labels = boxes[good], scores[good], labels[good]
     first = np.argsort(-scores, kind="stable")
     if form.kind == "yolo":
-        first = first[_apart(boxes[first], scores[first])]
-    first = first[:MAX_BOXES]
+        first = first[_apart(boxes[first], scores[first], labels[first])]
+    first = first[:MAX_DETECTED_BOXES]  # the surest so many count
     placed = (boxes[first] - [fitting.left, fitting.top] * 2) / fitting.scale * picture.scale
     height, width = (one * picture.scale for one in picture.bgr.shape[:2])
     found = (Detection(x1, y1, x2, y2, score, _word(form.labels, label)) for (x1, y1, x2, y2), score, label in
@@ -150,7 +149,7 @@ def read_outputs(
 
 def _word(labels: Sequence[str], label: float) -> str:
     index = int(label)
-    return labels[index] if 0 <= index < len(labels) else str(index)[:_LONGEST_LABEL]
+    return labels[index] if 0 <= index < len(labels) else clean_label(str(index))
 
 
 def _triple(outputs: Arrays) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
@@ -187,9 +186,12 @@ def _bounded(rows: NDArray[Any]) -> NDArray[Any]:
 _READERS: Final = {"triple": _triple, "rows": _rows, "yolo": _yolo}
 
 
-def _apart(boxes: NDArray[Any], scores: NDArray[Any]) -> NDArray[np.intp]:
-    """Indices of the boxes that no surer one overlaps."""
-    if not len(boxes):
-        return np.zeros(0, np.intp)
+def _apart(boxes: NDArray[Any], scores: NDArray[Any], labels: NDArray[Any]) -> NDArray[np.intp]:
+    """Indices of the boxes that no surer one of the same class overlaps: a cup may stand on a plate."""
     corners = np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]])
-    return np.array(cv2.dnn.NMSBoxes(corners.tolist(), scores.tolist(), 0.0, _MAX_OVERLAP), np.intp).reshape(-1)
+    kept = np.zeros(len(boxes), bool)
+    for label in np.unique(labels):
+        own = np.flatnonzero(labels == label)
+        best = cv2.dnn.NMSBoxes(corners[own].tolist(), scores[own].tolist(), 0.0, _MAX_OVERLAP)
+        kept[own[np.array(best, np.intp).reshape(-1)]] = True
+    return np.flatnonzero(kept)

@@ -7,8 +7,11 @@ from protocol.messages import FrameHeader
 from vision_side.decode import Decoder
 from vision_side.detect.port import DetectFrame
 
-MAX_DECODERS: Final = 256
-"""Security limit: of decoders kept, one for each robot and place in a batch; the longest unused goes first."""
+MAX_DECODERS: Final = 64
+"""Security limit: of decoders kept, one for each robot and place in a batch; the longest unused goes first.
+
+Pictures of 1920x1080, decoded at half scale, are 1.6 MB each: 100 MB at most. A robot whose decoder went gets another.
+"""
 
 
 class OwnDecoders:

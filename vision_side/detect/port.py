@@ -106,8 +106,9 @@ class Detector(Protocol):
     """Finds objects in frames, of one robot or of several.
 
     A class of this kind has a pydantic `Config` and is built as `Plugin(config)`. It may have `news()`, which returns
-    lines for a person that were not returned before, few and short; `attach(link)`, called with each robot's link
-    before its first frame, for who hears something else of it; and `close()`, called once, when nobody will ask again.
+    lines for a person that were not returned before, few and short; `maker`, who its results will name; `attach(link)`,
+    called with each robot's link before its first frame, for who hears something else of it; and `close()`, called
+    once, when nobody will ask again.
     """
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:

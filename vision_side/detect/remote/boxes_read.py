@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.messages import MAX_DETECTED_BOXES, DetectedBox
+from vision_side.detect.labels import clean_label
 from vision_side.detect.port import Circle, Detection, clipped
 from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
 MAX_ROWS: Final = 1024
 """Security limit: a model with a fixed number of rows fills up with scores of 0; more than this is no detector's."""
-MAX_LABEL: Final = 64
 MIN_SCORE: Final = 0.25
 """As for boxes on the wire: less sure than this is no box, unless configured otherwise."""
 _HASH: Final = re.compile("[0-9a-fA-F]{8,64}")
@@ -57,11 +57,6 @@ def _detection(
         raise NoAnswerError(Reason.MALFORMED, f"a box inside out or a score over 1: {corners}, {score:g}")
     one = Detection(x1 * across, y1 * down, x2 * across, y2 * down, score, clean_label(label))
     return clipped(one, *size_px)
-
-
-def clean_label(label: str) -> str:
-    """`label` as the wire allows it: one printable line, bounded; never empty."""
-    return "".join(letter for letter in label if letter.isprintable())[:MAX_LABEL] or "thing"
 
 
 def read_boxes(boxes: Sequence[DetectedBox], size_px: tuple[int, int], min_score: float) -> tuple[Detection, ...]:

@@ -31,6 +31,8 @@ class Pending:
 
     def __init__(self, frames: Sequence[DetectFrame], deadline_us: int) -> None:
         self.frames, self.deadline_us = frames, deadline_us
+        self.begun = False
+        """Whether somebody began to look at them; newer ones may have taken their place before."""
         self._place: LatestSlot[Results] = LatestSlot()
 
     def answer(self, results: Results) -> None:
@@ -99,6 +101,7 @@ class ByDeadline:
         while not self._ending.is_set():
             pending = self._asked.take(LONGEST_WAIT_S)
             if pending is not None and not pending.over:
+                pending.begun = True
                 self._answer(pending)
         close_detector(self._inner)
 

@@ -1,15 +1,17 @@
 """Remote eyes while they answer, own ones while they do not: late or silent once, and the own ones drive. Shell.
 
-While they drive, the remote is asked beside them, and drives again after ten good answers in a row.
+While they drive, the remote is asked beside them, and drives again after ten good answers in a row. Each robot for
+itself: one whose frames are not answered changes nothing for the others.
 """
 
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Sequence
 from typing import Final, Protocol, runtime_checkable
 
 from protocol.transports.link import Link
 from vision_side.clock import now_us
 from vision_side.detect.around import attach_detector, close_detector, news_of
+from vision_side.detect.by_session import MAX_ROBOTS
 from vision_side.detect.news import News
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
 from vision_side.detect.remote.by_deadline import ByDeadline
@@ -23,6 +25,9 @@ Results = list[DetectionResult | None]
 
 class Asked(Protocol):
     """What was asked and may be answered."""
+
+    begun: bool
+    """Whether somebody began to look; newer frames may have taken its place before."""
 
     def take(self, wait: bool) -> Results | None:
         """The results, once; with `wait` by the deadline."""
@@ -52,15 +57,11 @@ class Fallback:
         self._second = second
         self._news = News()
         self._good_answers = good_answers
-        self._good = good_answers
-        """Good answers of the first in a row; it drives while these are enough."""
-        self._beside: Asked | None = None
+        self._good: OrderedDict[str, int] = OrderedDict()
+        """For each robot that the second drives: good answers of the first in a row."""
+        self._beside: list[tuple[list[str], Asked]] = []
+        """Whose frames the first was asked about beside; each robot is in one at most."""
         self.switched = 0
-
-    @property
-    def on_first(self) -> bool:
-        """Whether the first one drives."""
-        return self._good >= self._good_answers
 
     @property
     def refused(self) -> Counter[str]:
@@ -70,15 +71,14 @@ class Fallback:
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
         """As the port says."""
         self._judge()
-        if not self.on_first:
-            return self._by_second(frames, deadline_us)
-        reserve_us = min(RESERVE_US, max(0, deadline_us - now_us()) // 2)
-        results = self._first.detect(frames, deadline_us - reserve_us)
-        if all(results):
-            return results
-        self._good = 0
-        self.switched += 1
-        self._news.add("the remote detector is late or silent: own eyes drive on")
+        firsts = [one for one in frames if one.robot not in self._good]
+        others = [one for one in frames if one.robot in self._good]
+        answers = iter(self._by_first(firsts, deadline_us))
+        results = [next(answers, None) if one.robot not in self._good else None for one in frames]
+        for frame, result in zip(frames, results, strict=True):
+            if result is None and frame.robot not in self._good:
+                self._switch(frame.robot)
+        self._ask_beside(others, deadline_us)
         return self._filled(results, frames, deadline_us)
 
     def attach(self, link: Link) -> None:
@@ -95,25 +95,49 @@ class Fallback:
         """What both have to say, and which of them drives."""
         return [*news_of(self._first), *self._news.take(), *news_of(self._second)]
 
+    def _by_first(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
+        reserve_us = min(RESERVE_US, max(0, deadline_us - now_us()) // 2)
+        return self._first.detect(frames, deadline_us - reserve_us) if frames else []
+
+    def _switch(self, robot: str) -> None:
+        """From now on the second drives."""
+        self._good[robot] = 0
+        if len(self._good) > MAX_ROBOTS:  # who was switched first begins anew with the first one
+            self._good.popitem(last=False)
+        self.switched += 1
+        self._news.add(f"the remote detector is late or silent for {robot}: own eyes drive on")
+
     def _filled(self, results: Results, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
         """The second one's results where the first had none."""
         missing = [frame for frame, result in zip(frames, results, strict=True) if result is None]
-        more = iter(self._second.detect(missing, deadline_us))
+        more = iter(self._second.detect(missing, deadline_us) if missing else [])
         return [next(more) if result is None else result for result in results]
 
-    def _by_second(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
-        if self._beside is None:
-            self._beside = self._first.ask(frames, deadline_us)
-        return self._second.detect(frames, deadline_us)
+    def _ask_beside(self, frames: Sequence[DetectFrame], deadline_us: int) -> None:
+        """Ask the first about frames that the second answers, of robots of which nothing is under way."""
+        under_way = {robot for robots, _ in self._beside for robot in robots}
+        new = [one for one in frames if one.robot not in under_way]
+        if new:
+            self._beside.append(([one.robot for one in new], self._first.ask(new, deadline_us)))
 
     def _judge(self) -> None:
-        """Count the answer that was asked for beside, if it came, or that it did not."""
-        if self._beside is None:
-            return
-        results = self._beside.take(wait=False)
-        if results is None and not self._beside.over:
-            return
-        self._beside = None
-        self._good = self._good + 1 if results and all(results) else 0
-        if self.on_first:
-            self._news.add(f"the remote detector gave {self._good_answers} good answers: it drives again")
+        """Count the answers that were asked for beside, where they came, or that they did not."""
+        waiting = []
+        for robots, asked in self._beside:
+            results = asked.take(wait=False)
+            if results is None and not asked.over:
+                waiting.append((robots, asked))
+            elif results is not None or asked.begun:  # what nobody looked at says nothing of the first
+                self._count(robots, results or [])
+        self._beside = waiting
+
+    def _count(self, robots: Sequence[str], results: Results) -> None:
+        good = dict.fromkeys(robots, len(results) == len(robots))
+        for robot, result in zip(robots, results, strict=False):
+            good[robot] = good[robot] and result is not None
+        for robot in good.keys() & self._good.keys():
+            self._good[robot] = self._good[robot] + 1 if good[robot] else 0
+            if self._good[robot] >= self._good_answers:
+                del self._good[robot]
+                self._news.add(f"the remote detector gave {self._good_answers} good answers for {robot}: it drives "
+                               "again")

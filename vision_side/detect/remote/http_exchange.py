@@ -37,8 +37,8 @@ class HttpExchange:
         self._host, self._port = host, port
         self._socket: socket.socket | None = None
         self._not_before_us = 0
-        self.connections = 0
-        """How often a connection was made: who counts them knows when the server may have become another."""
+        self.lost = 0
+        """How often a kept connection turned out to be over: the server behind the next may be another."""
 
     def get(self, path: str, until_us: int) -> Reply:
         """Raises NoAnswerError as `post` does."""
@@ -70,6 +70,7 @@ class HttpExchange:
             self.close()
             if not kept or error.reason is not Reason.UNREACHABLE:
                 raise
+        self.lost += 1
         try:
             return self._once(method, head, body, until_us)
         except NoAnswerError:
@@ -97,7 +98,6 @@ class HttpExchange:
         connection = socket.create_connection((self._host, self._port), _left_s(until_us))
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket = connection
-        self.connections += 1
         return connection
 
     def _unreachable(self, error: OSError) -> NoAnswerError:

@@ -15,10 +15,11 @@ from protocol.errors import WireError
 from protocol.messages import Counter, Detections, SessionId
 from protocol.refusals import Refusal
 from vision_side.config import Fraction
+from vision_side.detect.labels import clean_label
 from vision_side.detect.port import DetectFrame, Maker
 from vision_side.detect.remote.address import Address, parse_address
 from vision_side.detect.remote.asking import REMOTE, Answer, Asking
-from vision_side.detect.remote.boxes_read import MIN_SCORE, clean_label, hash_of, read_boxes
+from vision_side.detect.remote.boxes_read import MIN_SCORE, hash_of, read_boxes
 from vision_side.detect.remote.by_deadline import MAX_PIXELS, ByDeadline, PixelBound
 from vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES, HttpExchange
 from vision_side.detect.remote.refusing import NoAnswerError, Reason

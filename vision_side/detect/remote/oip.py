@@ -27,6 +27,7 @@ MAX_TENSORS: Final = 16
 BOXES, SCORES, LABELS = "boxes", "scores", "labels"
 _CHANNELS: Final = 3
 _MAX_SIDE: Final = 8192
+_MAX_LABEL_NUMBER: Final = 1 << 31  # of labels written as floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,6 +206,10 @@ def _labels(found: NDArray[Any] | list[str] | None, rows: int, names: tuple[str,
     if isinstance(found, list):
         return found
     numbers = _flat(found)
+    if np.issubdtype(numbers.dtype, np.floating) and (np.abs(numbers.astype(np.float64)) < _MAX_LABEL_NUMBER).all():
+        whole = numbers.astype(np.int64)  # many exported models give their classes as floats
+        numbers = whole if np.array_equal(whole, numbers) else numbers
     if numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer):
-        raise NoAnswerError(Reason.MALFORMED, f"labels of shape {numbers.shape} and type {numbers.dtype}")
+        raise NoAnswerError(Reason.MALFORMED, f"labels of shape {numbers.shape} and type {numbers.dtype}; they are "
+                                              "text or whole numbers")
     return [names[number] if 0 <= number < len(names) else str(number) for number in numbers.tolist()]

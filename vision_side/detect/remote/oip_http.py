@@ -8,10 +8,11 @@ from vision_side.detect.remote.http_exchange import HttpExchange
 from vision_side.detect.remote.oip import Looking, Model, detections_of, tensor_of
 from vision_side.detect.remote.oip_json import HEADER_LENGTH, infer_body, read_infer, read_metadata
 from vision_side.detect.remote.oip_settings import OipSettings
+from vision_side.detect.remote.refusing import NoAnswerError
 
 
 class HttpServer:
-    """A `Server`. What the model is like is asked again over each new connection: it may have become another."""
+    """A `Server`. What the model is like is asked once, and again after every error and every lost connection."""
 
     def __init__(self, address: Address, looking: Looking) -> None:
         self._http = HttpExchange(address.host, address.port)
@@ -21,10 +22,17 @@ class HttpServer:
         self._scheme = address.scheme
         self._model: Model | None = None
         self._asked_at = 0
-        """The connection over which the model was asked for."""
+        """Connections that were lost when the model was asked for."""
 
     def ask(self, frame: DetectFrame, until_us: int) -> Answer:
         """As `Server` says."""
+        try:
+            return self._answer(frame, until_us)
+        except NoAnswerError:
+            self._model = None
+            raise
+
+    def _answer(self, frame: DetectFrame, until_us: int) -> Answer:
         model = self._known_model(until_us)
         tensor, stretch = tensor_of(model, frame, self._looking.rgb)
         number = f"{frame.header.session}-{frame.header.seq}"
@@ -39,10 +47,9 @@ class HttpServer:
         self._http.close()
 
     def _known_model(self, until_us: int) -> Model:
-        if self._model is None or self._asked_at != self._http.connections:
-            self._model = None
+        if self._model is None or self._asked_at != self._http.lost:
             self._model = read_metadata(self._http.get(self._path, until_us).body)
-            self._asked_at = self._http.connections
+            self._asked_at = self._http.lost
         return self._model
 
 

@@ -6,11 +6,10 @@ from pydantic import Field
 
 from protocol.config import Config as Settings
 from vision_side.config import Fraction
-from vision_side.detect.remote.boxes_read import MAX_LABEL, MIN_SCORE
+from vision_side.detect.labels import Label
+from vision_side.detect.remote.boxes_read import MIN_SCORE
 from vision_side.detect.remote.by_deadline import MAX_PIXELS, PixelBound
 from vision_side.detect.remote.oip import Looking
-
-Label = Annotated[str, Field(min_length=1, max_length=MAX_LABEL)]
 
 
 class OipSettings(Settings):

@@ -8,7 +8,11 @@ from vision_side.detect.news import News
 
 _LONGEST: Final = 160
 _TOLD_AT: Final = frozenset(10**power for power in range(10))
-"""A server gone bad is told at the 1st, 10th, 100th ... refusal of a kind, and when it is good again."""
+"""A server gone bad is told at the 1st, 10th, 100th ... refusal of a kind, when it is good again, and when it is bad
+again."""
+_IN_A_ROW: Final = 10
+"""Of answers that were good before, or of refusals: from so many on it is bad again. Fewer come and go, as where one
+robot of several is not answered; a line for each of them would be one for each frame."""
 
 
 class Reason(StrEnum):
@@ -45,17 +49,22 @@ class Tally:
         self.news = News()
         self._name = name
         self._said = ""
+        self._good = self._bad = 0
+        """In a row."""
 
     def refuse(self, error: NoAnswerError) -> None:
         """Count it."""
         self.refused[error.reason] += 1
-        count = self.refused[error.reason]
-        if self._said != error.reason and (self._said in ("", "good") or count in _TOLD_AT):
+        count, good_before = self.refused[error.reason], self._good
+        self._good, self._bad = 0, self._bad + 1
+        again = self._said == "good" and (good_before >= _IN_A_ROW or self._bad == _IN_A_ROW)
+        if again or count in _TOLD_AT:
             self._said = error.reason
             self.news.add(f"detector {self._name}: no answer: {error.reason}: {error.detail} ({count} so far)")
 
     def good(self) -> None:
         """An answer that counts."""
+        self._good, self._bad = self._good + 1, 0
         if self._said != "good":
             before, self._said = self._said, "good"
             self.news.add(f"detector {self._name} answers" + (" again" if before else ""))

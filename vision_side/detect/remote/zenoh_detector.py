@@ -6,6 +6,7 @@
 Nothing is sent: robot and service meet by themselves. Here it is waited, by the deadline, for what cites the frame.
 """
 
+from collections.abc import Sequence
 from typing import Final
 
 from protocol.channels import DETECTIONS, FRAME
@@ -15,9 +16,11 @@ from protocol.errors import WireError
 from protocol.messages import Detections, DetectionsHeader, Source
 from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.config import Fraction
+from vision_side.detect.labels import clean_label
 from vision_side.detect.port import DetectFrame, DetectionResult, Maker, result_of
 from vision_side.detect.remote.asking import REMOTE, FrameByFrame, left_s
-from vision_side.detect.remote.boxes_read import MIN_SCORE, clean_label, hash_of, read_boxes
+from vision_side.detect.remote.boxes_read import MIN_SCORE, hash_of, read_boxes
+from vision_side.detect.remote.by_robot import ByRobot, Expected
 from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
 ROLE: Final = "detector"
@@ -65,10 +68,19 @@ class ZenohDetector(FrameByFrame):
         super().__init__(f"zenoh ({config.source})")
         self._config = config
         self._heard: dict[str, _Heard] = {}
+        self._beside = ByRobot(self.detect)
 
     def attach(self, link: Link) -> None:
         """Hear what is said of its robot."""
         self._heard[link.robot] = _Heard(link, self._config.source)
+
+    def ask(self, frames: Sequence[DetectFrame], deadline_us: int) -> Expected:
+        """Begin to wait for boxes of `frames`, beside who asks."""
+        return self._beside.ask(frames, deadline_us)
+
+    def close(self) -> None:
+        """Wait no longer beside anybody."""
+        self._beside.close()
 
     def _ask(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
         return self._wait(self._of(frame.robot), frame, deadline_us)
