@@ -1,12 +1,22 @@
 """Small ONNX models, written byte by byte: the tests need no package that makes them."""
 
+import contextlib
 import json
 import struct
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 TYPES = {"float32": 1, "uint8": 2, "int64": 7}
+
+
+def without_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where ONNX Runtime knows of no GPU, whatever there is."""
+    with contextlib.suppress(ImportError):
+        import onnxruntime
+
+        monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
 
 
 def _varint(value: int) -> bytes:

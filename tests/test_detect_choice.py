@@ -7,7 +7,7 @@ import pytest
 
 from protocol.config import Config as Settings
 from protocol.errors import ConfigError, HardwareError
-from tests.onnx_rig import brightness_model
+from tests.onnx_rig import brightness_model, without_gpu
 from vision_side import plugin_choice
 from vision_side.config import DetectorConfig, VisionConfig
 from vision_side.detect.choice import FAMILY, GROUP, choose_detector, configured_detector, is_plain, split
@@ -18,6 +18,12 @@ from vision_side.detect.onnx_detector import OnnxDetector
 from vision_side.detect.port import result_of
 from vision_side.detect.shadow import Shadowed
 from vision_side.detect.tracked import Tracked
+
+
+@pytest.fixture(autouse=True)
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is said of a missing device is the same on a machine that has one."""
+    without_gpu(monkeypatch)
 
 
 class Mine:

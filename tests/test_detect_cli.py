@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from operator_side import cli, cli_detector
-from tests.onnx_rig import brightness_model
+from tests.onnx_rig import brightness_model, without_gpu
 from vision_side.detect import onnx_detector
 
 BROKEN = '''
@@ -19,6 +19,12 @@ class Late(Hsv):
     def detect(self, frames, deadline_us):
         return super().detect(frames, deadline_us)[:-1]
 '''
+
+
+@pytest.fixture(autouse=True)
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is said of a missing device is the same on a machine that has one."""
+    without_gpu(monkeypatch)
 
 
 def run(capsys, *arguments: str) -> tuple[int, str, str]:

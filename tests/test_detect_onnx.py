@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from protocol.errors import ConfigError, HardwareError
 from protocol.messages import FrameHeader
 from tests.detector_contract import assert_kept
-from tests.onnx_rig import brightness_model, model, node, part, tensor, value, yolo_model
+from tests.onnx_rig import brightness_model, model, node, part, tensor, value, without_gpu, yolo_model
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.decode import Decoder, Picture
 from vision_side.detect.golden import difference, golden_picture, golden_text, read_golden
@@ -26,6 +26,12 @@ BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 400.0, 300.0]]
 NEEDS_RUNTIME = pytest.mark.skipif(importlib.util.find_spec("onnxruntime") is None,
                                    reason="onnxruntime is not installed: pip install 'sightline[onnx]'")
 PICTURE = Picture(np.full((240, 320, 3), 128, np.uint8), 1)
+
+
+@pytest.fixture(autouse=True)
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is said of a missing device is the same on a machine that has one."""
+    without_gpu(monkeypatch)
 
 
 def frame(bgr: np.ndarray, seq: int = 1) -> DetectFrame:
