@@ -97,6 +97,27 @@ def brightness_model(path: Path, boxes: list[list[float]], labels: list[int], *,
     )
 
 
+def several_model(path: Path, boxes: list[list[float]], size: tuple[int, int] = (240, 320)) -> Path:
+    """The same as `brightness_model`, for any number of pictures at once; all are of label 0."""
+    count = len(boxes)
+    return model(
+        path,
+        [node("Cast", ["image"], ["floats"], to=1),
+         node("ReduceMean", ["floats"], ["mean"], axes=[1, 2, 3], keepdims=0),
+         node("Reshape", ["mean", "column"], ["means"]), node("Mul", ["means", "ones"], ["scores"]),
+         node("Reshape", ["mean", "place"], ["places"]), node("Mul", ["places", "zero"], ["nothing"]),
+         node("Add", ["boxes_in", "nothing"], ["boxes"]),
+         node("Mul", ["scores", "zero"], ["zeros"]), node("Cast", ["zeros"], ["labels"], to=7)],
+        [tensor("column", np.array([-1, 1], np.int64)), tensor("place", np.array([-1, 1, 1], np.int64)),
+         tensor("ones", np.full((1, count), 1 / 255, np.float32)), tensor("zero", np.zeros(1, np.float32)),
+         tensor("boxes_in", np.array(boxes, np.float32).reshape(1, -1, 4))],
+        [value("image", "uint8", (None, *size, 3))],
+        [value("boxes", "float32", (None, count, 4)), value("scores", "float32", (None, count)),
+         value("labels", "int64", (None, count))],
+        {"labels": json.dumps(["ball"])},
+    )
+
+
 def yolo_model(path: Path, columns: np.ndarray, size: tuple[int, int] = (64, 64), names: str = "{0: 'cup'}") -> Path:
     """Always these (4 + classes, N) numbers, as YOLO gives them, whatever the picture."""
     return model(

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
+import numpy as np
 from pydantic import Field
 
 from protocol.config import Config as Settings
@@ -18,10 +19,10 @@ from protocol.errors import ConfigError, HardwareError
 from vision_side.config import Device
 from vision_side.decode import Picture
 from vision_side.detect.golden import KEY, difference, golden_picture, read_golden
-from vision_side.detect.local import timed
+from vision_side.detect.local import timed_together
 from vision_side.detect.onnx_engine import Engine, open_engine
 from vision_side.detect.onnx_header import OnnxHeader, read_onnx_header
-from vision_side.detect.onnx_reading import Form, fit_picture, form_of, own_labels, read_outputs
+from vision_side.detect.onnx_reading import Form, apart, fit_picture, form_of, own_labels, read_outputs
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
 from vision_side.detect.refine import refined
 
@@ -32,6 +33,8 @@ MAX_BYTES: Final = 2**31
 _WARM_UP: Final = 3
 _OTHERWISE: Final = 0.25  # the least score that counts, for a model that does not say
 _NAME_LENGTH: Final = 48
+_MOST_AT_ONCE: Final = 32
+"""Pictures in one run: bounds a GPU's memory."""
 
 
 class OnnxDetector:
@@ -63,32 +66,36 @@ class OnnxDetector:
         self._news = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
         self.maker = Maker(f"onnx:{path.name}"[:_NAME_LENGTH], model.digest, self._engine.device)
         self._failed = False
+        self._at_once = _MOST_AT_ONCE if self._form.batched and self._engine.batches else 1
         self._warm_up(model, config)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
-        """A result for each frame for which there is still time."""
-        return [None if time.monotonic_ns() // 1000 > deadline_us else self._look(one) for one in frames]
+        """A result for each frame for which there is still time; all at once where the model takes that."""
+        results: list[DetectionResult | None] = []
+        while len(results) < len(frames):
+            some = frames[len(results) : len(results) + self._at_once]
+            is_late = time.monotonic_ns() // 1000 > deadline_us
+            results += [None] * len(some) if is_late else self._looked(some)
+        return results
 
     def news(self) -> list[str]:
         """What it runs on, where that is not what one may think; the first failure."""
         news, self._news = self._news, []
         return news
 
-    def _look(self, frame: DetectFrame) -> DetectionResult | None:
+    def _looked(self, frames: Sequence[DetectFrame]) -> list[DetectionResult | None]:
         try:
-            return timed(frame, self.maker, self._seen)
+            return timed_together(frames, self.maker, self._seen)
         except Exception as error:  # an engine that fails on a picture gives no answer, and says so once
             if not self._failed:
                 self._news.append(f"{self.maker.detector} gives no answer: {str(error)[:160]}")
             self._failed = True
-            return None
+            return [None] * len(frames)
 
-    def _seen(self, picture: Picture) -> tuple[Detection, ...]:
-        found = self._run(self._engine, picture)
-        return tuple(refined(picture, one) if one.label in self._refine else one for one in found)
-
-    def _run(self, engine: Engine, picture: Picture) -> tuple[Detection, ...]:
-        return _found(engine, picture, self._form, self._min_score)
+    def _seen(self, pictures: Sequence[Picture]) -> list[Sequence[Detection]]:
+        together = _found(self._engine, pictures, self._form, self._min_score)
+        return [tuple(refined(picture, one) if one.label in self._refine else one for one in found)
+                for picture, found in zip(pictures, together, strict=True)]
 
     def _warm_up(self, model: "Model", config: Config) -> None:
         """Run warm, on the known picture, and compare: with what the model brought, or with itself on the CPU."""
@@ -96,9 +103,10 @@ class OnnxDetector:
         form, least = model.own_form, max(self._min_score, model.own_min_score)
         try:
             for _ in range(_WARM_UP):
-                found = _found(self._engine, picture, form, least)
+                (found,) = _found(self._engine, [picture], form, least)
             if expected is None and self._engine.device != "cpu":
-                expected = list(_found(open_engine(path, model.header, "cpu", config.threads), picture, form, least))
+                on_cpu = open_engine(path, model.header, "cpu", config.threads)
+                expected = list(_found(on_cpu, [picture], form, least)[0])
         except Exception as error:  # whatever an engine raises
             raise ConfigError(f"model {path} does not run: {' '.join(str(error).split())}"[:200]) from None
         wrong = difference(expected, found, least) if expected is not None else ""
@@ -139,9 +147,15 @@ def read_model(config: OnnxDetector.Config) -> Model:
         raise ConfigError(f"model {path}: {error}; see docs/detectors.md") from None
 
 
-def _found(engine: Engine, picture: Picture, form: Form, min_score: float) -> tuple[Detection, ...]:
-    pixels, fitting = fit_picture(picture, form)
-    return read_outputs(engine.run(pixels), form, fitting, picture, min_score)
+def _found(engine: Engine, pictures: Sequence[Picture], form: Form, min_score: float) -> list[tuple[Detection, ...]]:
+    """In each picture; more than one only where form and engine take them."""
+    fitted = [fit_picture(picture, form) for picture in pictures]
+    if len(fitted) == 1:
+        each = [engine.run(fitted[0][0])]
+    else:
+        each = apart(engine.run(np.concatenate([pixels for pixels, _ in fitted])), len(pictures))
+    return [read_outputs(outputs, form, fitting, picture, min_score)
+            for outputs, (_, fitting), picture in zip(each, fitted, pictures, strict=True)]
 
 
 def shipped_digest() -> str:

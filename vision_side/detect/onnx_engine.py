@@ -33,6 +33,8 @@ class Engine(Protocol):
     name: str
     device: str
     note: str
+    batches: bool
+    """Whether it runs several pictures at once, where the model does."""
 
     def run(self, pixels: NDArray[Any]) -> Arrays:
         """The outputs, by name, for one input. Raises whatever the engine raises."""
@@ -58,6 +60,8 @@ def open_engine(path: Path, header: OnnxHeader, device: Device, threads: int) ->
 
 class _Runtime:
     """A session of ONNX Runtime."""
+
+    batches = True
 
     def __init__(self, runtime: Any, path: Path, header: OnnxHeader, device: Device, threads: int) -> None:
         self.name = f"onnxruntime {runtime.__version__}"
@@ -93,6 +97,7 @@ class _OpenCv:
     """OpenCV's own engine, which is there anyway; CPU only."""
 
     device = "cpu"
+    batches = False
     note = "onnxruntime is not installed, so OpenCV runs the model; pip install 'sightline[onnx]' is faster"
 
     def __init__(self, path: Path, header: OnnxHeader) -> None:

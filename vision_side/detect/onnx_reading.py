@@ -51,6 +51,8 @@ class Form:
     """triple, rows or yolo."""
     labels: tuple[str, ...]
     dtype: str = "uint8"
+    batched: bool = False
+    """Whether it takes several pictures at once: how many is left open, in what it takes and gives."""
 
 
 def form_of(header: OnnxHeader, names: Sequence[str], colour: str) -> Form:
@@ -66,8 +68,15 @@ def form_of(header: OnnxHeader, names: Sequence[str], colour: str) -> Form:
     rows, columns = one.shape[1:3] if rows_first and not floats else one.shape[2:4]
     size = (rows, columns) if rows and columns else None
     labels = tuple(map(clean_label, names)) or own_labels(header.metadata)
-    return Form(floats, floats if colour == "auto" else colour == "rgb", size, _kind(header.outputs, labels), labels,
-                one.type)
+    kind = _kind(header.outputs, labels)
+    batched = size is not None and one.shape[0] is None and all(_is_for_several(one, kind) for one in header.outputs)
+    return Form(floats, floats if colour == "auto" else colour == "rgb", size, kind, labels, one.type, batched)
+
+
+def _is_for_several(output: Tensor, kind: str) -> bool:
+    """Whether its first dimension is open and counts pictures."""
+    sides = 2 if kind == "triple" and output.name != "boxes" else 3
+    return len(output.shape) == sides and output.shape[0] is None
 
 
 def _shape_text(one: Tensor) -> str:
@@ -138,13 +147,20 @@ def read_outputs(
     boxes, scores, labels = boxes[good], scores[good], labels[good]
     first = np.argsort(-scores, kind="stable")
     if form.kind == "yolo":
-        first = first[_apart(boxes[first], scores[first], labels[first])]
+        first = first[_uncovered(boxes[first], scores[first], labels[first])]
     first = first[:MAX_DETECTED_BOXES]  # the surest so many count
     placed = (boxes[first] - [fitting.left, fitting.top] * 2) / fitting.scale * picture.scale
     height, width = (one * picture.scale for one in picture.bgr.shape[:2])
     found = (Detection(x1, y1, x2, y2, score, _word(form.labels, label)) for (x1, y1, x2, y2), score, label in
              zip(placed.tolist(), scores[first].tolist(), labels[first].tolist(), strict=True))
     return tuple(one for one in (clipped(one, width, height) for one in found) if one is not None)
+
+
+def apart(outputs: Arrays, count: int) -> list[dict[str, NDArray[Any]]]:
+    """The outputs for `count` pictures, for each by itself. Raises ValueError if there are not as many."""
+    if any(one.shape[:1] != (count,) for one in outputs.values()):
+        raise ValueError(f"outputs of {', '.join(str(one.shape) for one in outputs.values())} for {count} pictures")
+    return [{name: one[index : index + 1] for name, one in outputs.items()} for index in range(count)]
 
 
 def _word(labels: Sequence[str], label: float) -> str:
@@ -186,7 +202,7 @@ def _bounded(rows: NDArray[Any]) -> NDArray[Any]:
 _READERS: Final = {"triple": _triple, "rows": _rows, "yolo": _yolo}
 
 
-def _apart(boxes: NDArray[Any], scores: NDArray[Any], labels: NDArray[Any]) -> NDArray[np.intp]:
+def _uncovered(boxes: NDArray[Any], scores: NDArray[Any], labels: NDArray[Any]) -> NDArray[np.intp]:
     """Indices of the boxes that no surer one of the same class overlaps: a cup may stand on a plate."""
     corners = np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]])
     kept = np.zeros(len(boxes), bool)
