@@ -8,7 +8,17 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from operator_side.train_network import BRIGHTNESS, COLOURS, DARKEST, LOOKED_AT, OUTPUTS, TAUGHT, Layer, network
+from operator_side.train_network import (
+    AGAINST,
+    BRIGHTNESS,
+    COLOURS,
+    DARKEST,
+    LOOKED_AT,
+    OUTPUTS,
+    TAUGHT,
+    Layer,
+    network,
+)
 from sim.scenes import LABELS
 
 Weights = dict[str, npt.NDArray[np.float32]]
@@ -68,14 +78,16 @@ def _module(layer: Layer, channels: int) -> Any:
 
 
 def folded(state: dict[str, Any]) -> Weights:
-    """Every convolution's weight and bias, with the batch normalisation after it worked in."""
+    """Every convolution's weight and bias, with the batch normalisation after it worked in, and `AGAINST`."""
     weights: Weights = {}
-    values = {name: value.detach().cpu().double().numpy() for name, value in state.items()}
+    values = {name: value.detach().cpu().double().numpy().copy() for name, value in state.items()}
     for layer in network():
         key = _key(layer)
         if layer.kind == "head":
-            weights[f"{layer.name}.weight"] = values[f"{key}.weight"][:OUTPUTS].astype(np.float32)
-            weights[f"{layer.name}.bias"] = values[f"{key}.bias"][:OUTPUTS].astype(np.float32)
+            for part in ("weight", "bias"):
+                rows = values[f"{key}.{part}"]
+                rows[LABELS.index("ball")] -= AGAINST * rows[OUTPUTS:].sum(axis=0)
+                weights[f"{layer.name}.{part}"] = rows[:OUTPUTS].astype(np.float32)
         elif f"{key}.0.weight" in values:
             gain = values[f"{key}.1.weight"] / np.sqrt(values[f"{key}.1.running_var"] + 1e-5)
             bias = values[f"{key}.1.bias"] - gain * values[f"{key}.1.running_mean"]
