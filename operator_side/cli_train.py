@@ -11,10 +11,10 @@ import typer
 from operator_side.extras import needs
 from protocol.errors import ConfigError, HardwareError
 
-STEPS = 6000
-SCENES = 10_000
+STEPS = 15_000
+SCENES = 20_000
 BATCH = 32
-VALIDATED = 200
+VALIDATED = 1000
 """These are those of the model that ships, so that the same command makes it again; a test compares."""
 OUT = Path("runs/train")
 _LEAST_SHARE = 8
