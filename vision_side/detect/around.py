@@ -1,10 +1,14 @@
 """What a detector may have besides `detect`, asked for through whatever is around it. Pure."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Final
 
+from protocol.errors import ConfigError, SightlineError
 from protocol.transports.link import Link
 from vision_side.detect.port import Detector, Maker
+
+_LONGEST: Final = 160
 
 
 class Around:
@@ -35,13 +39,19 @@ def attach_detector(detector: Any, link: Link) -> None:
     """Give a detector that hears something else of a robot than frames its link, before the first frame."""
     attach: Callable[[Link], None] | None = getattr(detector, "attach", None)
     if attach is not None:
-        attach(link)
+        with plugin_does("the detector's attach()"):
+            attach(link)
 
 
 def news_of(detector: Any) -> list[str]:
-    """Lines for a person since the last time; none from a detector that has no `news`."""
+    """Lines for a person since the last time; none from a detector that has no `news`. One that raises is told of."""
     news: Callable[[], list[str]] | None = getattr(detector, "news", None)
-    return [" ".join(str(line).split()) for line in news()] if news is not None else []
+    if news is None:
+        return []
+    try:
+        return [" ".join(str(line).split()) for line in news()]
+    except Exception as error:  # a plug-in's own; who only talks badly may still see well
+        return [_raises("the detector's news()", error)]
 
 
 def maker_of(detector: Any) -> Maker | None:
@@ -54,4 +64,20 @@ def close_detector(detector: Any) -> None:
     """Let go of what a detector holds; nothing to do for one that has no `close`."""
     close: Callable[[], None] | None = getattr(detector, "close", None)
     if close is not None:
-        close()
+        with plugin_does("the detector's close()"):
+            close()
+
+
+@contextmanager
+def plugin_does(what: str) -> Iterator[None]:
+    """Whatever a plug-in's own code raises becomes a ConfigError that says whose fault it is."""
+    try:
+        yield
+    except SightlineError:
+        raise
+    except Exception as error:
+        raise ConfigError(f"{_raises(what, error)}; it has to be mended") from error
+
+
+def _raises(what: str, error: Exception) -> str:
+    return f"{what} raises {type(error).__name__}: {' '.join(str(error).split())}"[:_LONGEST]

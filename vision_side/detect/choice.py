@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from protocol.errors import ConfigError
 from vision_side.config import VisionConfig
+from vision_side.detect.around import plugin_does
 from vision_side.detect.colour_filter import ColourFilter
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.port import Detector
@@ -117,7 +118,8 @@ def choose_detector(kind: str, options: Mapping[str, Any], config: VisionConfig)
     HardwareError for a device that is not there.
     """
     plugin, settings = _checked(kind, options, config)
-    detector: Detector = plugin(settings)
+    with plugin_does(f"{kind}, when it is made,"):
+        detector: Detector = plugin(settings)
     return detector
 
 

@@ -1,0 +1,47 @@
+"""A plug-in whose code fails beside the looking: one line that says whose fault it is, and what can go on goes on."""
+
+import pytest
+
+from protocol.config import Config as Settings
+from protocol.errors import ConfigError, HardwareError
+from vision_side.config import VisionConfig
+from vision_side.detect import choice
+from vision_side.detect.around import attach_detector, close_detector, news_of
+
+
+class Failing:
+    def __init__(self, error: Exception) -> None:
+        self._error = error
+
+    def _fail(self, *_: object) -> None:
+        raise self._error
+
+    attach = close = news = _fail
+
+
+def test_what_a_plug_in_raises_is_one_line_that_says_where() -> None:
+    bad = Failing(RuntimeError("two\nlines"))
+    for what, ask in (("attach", lambda: attach_detector(bad, None)), ("close", lambda: close_detector(bad))):
+        with pytest.raises(ConfigError, match=rf"{what}\(\) raises RuntimeError: two lines; it has to be mended"):
+            ask()
+    with pytest.raises(HardwareError, match="no camera"):
+        close_detector(Failing(HardwareError("no camera")))
+
+
+def test_who_only_talks_badly_may_go_on_looking() -> None:
+    (line,) = news_of(Failing(KeyError("x" * 500)))
+    assert "news() raises KeyError" in line and len(line) <= 160
+    assert news_of(object()) == []
+
+
+def test_a_plug_in_that_cannot_be_made_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken:
+        class Config(Settings):
+            pass
+
+        def __init__(self, config: Config) -> None:
+            raise RuntimeError("no memory")
+
+    monkeypatch.setattr(choice, "_checked", lambda *_: (Broken, Broken.Config()))
+    with pytest.raises(ConfigError, match="mine:Broken, when it is made, raises RuntimeError: no memory"):
+        choice.choose_detector("mine:Broken", {}, VisionConfig())
