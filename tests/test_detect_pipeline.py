@@ -146,6 +146,15 @@ def test_the_report_says_who_looks_on_what_and_how_fast() -> None:
     assert said == ("onnx:ball.onnx", "ab12", "cuda", 1234)
 
 
+def test_plain_colour_says_how_long_it_looked_too() -> None:
+    bench = Bench(VisionConfig())
+    assert bench.service._eyes is None
+    bench.frame()
+    report = bench.report()
+    assert (report.detector, report.device) == ("hsv", "cpu")
+    assert report.inference_us is not None and 0 < report.inference_us < 1_000_000
+
+
 def test_until_when_a_detector_may_take_is_said() -> None:
     heard: list[int] = []
 

@@ -11,6 +11,7 @@ from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.asking import Desk, Swap
 from vision_side.config import VisionConfig
 from vision_side.detect.around import news_of
+from vision_side.detect.local import Clocked
 from vision_side.detect.port import Detector
 from vision_side.detect.shadow import Shadowed
 from vision_side.missions.choice import configured
@@ -60,7 +61,10 @@ class Dispatch:
         eyes, looked = (pipeline.eyes, pipeline.looked) if pipeline else (None, None)
         self.tell_news(eyes)
         beside = eyes.shadow_text(self._link.robot) if isinstance(eyes, Shadowed) else ""
-        report = self._reporter.due(now_s, self._mission, seen, asked, refused, looked=looked, beside=beside)
+        plain = pipeline.detector if pipeline else None
+        took_us = plain.took_us if isinstance(plain, Clocked) else None
+        report = self._reporter.due(now_s, self._mission, seen, asked, refused, looked=looked, beside=beside,
+                                    took_us=took_us)
         if report is None:
             return
         self._reports += 1

@@ -112,6 +112,11 @@ class Pipeline:
         return self._asked
 
     @property
+    def detector(self) -> PictureDetector:
+        """What looks where there are no `eyes`."""
+        return self._detector
+
+    @property
     def eyes(self) -> Detector | None:
         """What looks in place of the pipeline's own detector."""
         return self._eyes

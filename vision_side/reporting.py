@@ -25,9 +25,12 @@ class Reporter:
 
     def due(
         self, now_s: float, mission: str, seen: Seen, asked: Asked | None, refused: str, *,
-        looked: DetectionResult | None = None, beside: str = "",
+        looked: DetectionResult | None = None, beside: str = "", took_us: int | None = None,
     ) -> MissionReport | None:
-        """The report, if it is time for one. `looked` is the detector's newest result, `beside` who else looks."""
+        """The report, if it is time for one. `looked` is the detector's newest result, `beside` who else looks.
+
+        `took_us` is how long plain colour looked, which gives no result.
+        """
         state = (mission, seen.phase, seen.done, asked, refused)
         gap_s = LEAST_GAP_S if state != self._said else PERIOD_S
         if self._said is not None and now_s - self._said_s < gap_s:
@@ -36,16 +39,16 @@ class Reporter:
         return MissionReport(
             mission=mission[:_NAME_LENGTH], phase=_line(seen.phase, _PHASE_LENGTH),
             note=_line(seen.note, _TEXT_LENGTH), done=seen.done,
-            asked=asked, refused=refused[:_TEXT_LENGTH], **self._eyes(looked, beside),
+            asked=asked, refused=refused[:_TEXT_LENGTH], **self._eyes(looked, beside, took_us),
         )
 
-    def _eyes(self, looked: DetectionResult | None, beside: str) -> dict[str, Any]:
+    def _eyes(self, looked: DetectionResult | None, beside: str, took_us: int | None) -> dict[str, Any]:
         """Who looks, on what, how fast."""
         name = looked.detector if looked else self._detector
         more = f", {beside}" if beside else ""
         said = {"detector": _line(name[: _NAME_LENGTH - len(more)] + more, _NAME_LENGTH)}
         if looked is None:
-            return {**said, "device": self._device}
+            return {**said, "device": self._device, "inference_us": took_us}
         return {**said, "device": _line(looked.device, _DEVICE_LENGTH), "model": _line(looked.model_hash, _NAME_LENGTH),
                 "inference_us": max(0, looked.compute_us)}
 

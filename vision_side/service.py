@@ -24,6 +24,8 @@ from vision_side.config import VisionConfig
 from vision_side.counts import Counts, Observe
 from vision_side.detect.around import attach_detector, close_detector
 from vision_side.detect.choice import configured_detector
+from vision_side.detect.hsv import HsvDetector
+from vision_side.detect.local import Clocked
 from vision_side.detect.port import Detector
 from vision_side.dispatch import NO_FRAMES, Dispatch
 from vision_side.missions.choice import configured
@@ -113,6 +115,7 @@ class Service:
     def __init__(self, config: VisionConfig, link: Link, say: Say, eyes: Detector | None = None) -> None:
         self._config, self._link, self._say = config, link, say
         self._eyes = eyes or configured_detector(config)
+        self._plain = Clocked(HsvDetector(config.hsv))
         attach_detector(self._eyes, link)
         self._cameras: LatestSlot[Message] = link.latest(CAMERA)
         self._frames = self._arrivals(link)
@@ -177,7 +180,8 @@ class Service:
     def _use(self, camera: CameraModel) -> None:
         self._camera = camera
         before = self._pipeline
-        self._pipeline = before.with_camera(camera) if before else Pipeline(self._config, camera, eyes=self._eyes)
+        self._pipeline = (before.with_camera(camera) if before
+                          else Pipeline(self._config, camera, self._plain, eyes=self._eyes))
         self._counted.clear()
         lens = "calibrated" if camera.calibrated else "not calibrated"
         self._tell("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")

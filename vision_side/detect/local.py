@@ -13,7 +13,7 @@ from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveEye
 from vision_side.detect.by_session import BySession
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.labels import Label
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
+from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, PictureDetector, result_of
 
 _CPU: Final = "cpu"
 
@@ -56,6 +56,21 @@ class Adaptive:
     def _look(self, frame: DetectFrame) -> DetectionResult | None:
         eye, t_us = self._eyes.of(frame.robot, frame.header.session), frame.header.t_us
         return timed(frame, self.maker, lambda picture: eye.detect(picture, t_us))
+
+
+class Clocked:
+    """A detector of one picture, and how long it looked the last time; None before the first."""
+
+    def __init__(self, inner: PictureDetector) -> None:
+        self._inner = inner
+        self.took_us: int | None = None
+
+    def detect(self, picture: Picture) -> tuple[Detection, ...]:
+        """What the one inside finds."""
+        started_ns = time.perf_counter_ns()
+        found = self._inner.detect(picture)
+        self.took_us = (time.perf_counter_ns() - started_ns) // 1000
+        return found
 
 
 def timed(
