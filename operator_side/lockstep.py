@@ -28,6 +28,7 @@ from sim.scenario import Scenario
 from sim.truth import Truth
 from sim.world import World
 from vision_side.config import VisionConfig
+from vision_side.detect.around import close_detector, news_of
 from vision_side.detect.choice import configured_detector
 from vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
 from vision_side.scan import read_scan
@@ -57,6 +58,8 @@ class Run:
     states: set[State] = field(default_factory=set)
     said: list[tuple[int, str, str]] = field(default_factory=list)
     """Capture time of each frame that was answered, and the mission's phase and note."""
+    news: list[str] = field(default_factory=list)
+    """What the detector had to tell a person."""
 
 
 class Lockstep:
@@ -103,6 +106,11 @@ class Lockstep:
             self._tick()
         if self._now_us % _SAMPLE_US == 0:
             self.run.samples.append(self.world.truth())
+
+    def close(self) -> None:
+        """Hear what the detector has to say, and let go of it."""
+        self.run.news += news_of(self._pipeline.eyes)
+        close_detector(self._pipeline.eyes)
 
     # --- robot ---------------------------------------------------------------------------------------------------
 
@@ -192,8 +200,11 @@ def run_lockstep(
     with World(scenario, model, seed) as world:
         lockstep = Lockstep(world, robot_config(model, auto_arm=True), vision, conditions, seed)
         end_us = round((seconds or scenario.seconds) * 1e6)
-        while world.now_us < end_us:
-            lockstep.step()
-            if world.now_us % 1_000_000 == 0:
-                on_progress(world.now_us)
+        try:
+            while world.now_us < end_us:
+                lockstep.step()
+                if world.now_us % 1_000_000 == 0:
+                    on_progress(world.now_us)
+        finally:
+            lockstep.close()
         return lockstep.run

@@ -6,9 +6,9 @@ Each run is a process's own, so that they share the machine's cores; a run itsel
 import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import groupby, product
-from typing import Any
+from typing import Any, Final
 
 from operator_side.lockstep import Conditions, Run, run_lockstep
 from operator_side.scenario_settings import robot_of, vision_config
@@ -20,6 +20,9 @@ from sim.look import look_named
 from sim.scenario import Scenario, load_scenario
 from vision_side.detect.choice import check_choice
 from vision_side.missions.choice import configured
+
+_MOST_NEWS: Final = 3
+"""Of each group: later ones repeat the first with higher counts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,8 @@ class ScoreReport:
 
     runs: list[tuple[Case, Score]]
     judged: list[Judged]
+    news: dict[str, list[str]] = field(default_factory=dict)
+    """What the detector had to tell a person, by group: why it gave no answer, for one."""
 
     @property
     def ok(self) -> bool:
@@ -78,6 +83,7 @@ class ScoreReport:
                  "bound": one.bound, "ok": one.ok}
                 for one in self.judged
             ],
+            "news": self.news,
             "runs": [{**asdict(case), "score": asdict(result)} for case, result in self.runs],
         }
 
@@ -106,10 +112,10 @@ def cases(
     ]
 
 
-def run_case(case: Case) -> Score:
-    """One run in lockstep, scored."""
+def run_case(case: Case) -> tuple[Score, list[str]]:
+    """One run in lockstep, scored, and the detector's news."""
     scenario, run = run_of(case)
-    return score(run.samples, scenario.stand_off_m, figures_of(scenario, run.samples, run.said))
+    return score(run.samples, scenario.stand_off_m, figures_of(scenario, run.samples, run.said)), run.news
 
 
 def run_of(case: Case) -> tuple[Scenario, Run]:
@@ -126,7 +132,7 @@ def run_of(case: Case) -> tuple[Scenario, Run]:
 
 def run_cases(wanted: Sequence[Case], jobs: int, on_done: Callable[[Case], None]) -> ScoreReport:
     """Run `wanted` on `jobs` processes, in any order, and judge them. `on_done` is called as each is done."""
-    results: dict[Case, Score] = {}
+    results: dict[Case, tuple[Score, list[str]]] = {}
     with ProcessPoolExecutor(min(jobs, len(wanted)), multiprocessing.get_context("spawn")) as pool:
         futures = {pool.submit(run_case, case): case for case in wanted}
         try:
@@ -136,8 +142,13 @@ def run_cases(wanted: Sequence[Case], jobs: int, on_done: Callable[[Case], None]
         except BaseException:  # Ctrl-C or a failed run: what has not begun is not worth waiting for
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    runs = [(case, results[case]) for case in wanted]
-    return ScoreReport(runs, judge_runs(runs))
+    runs = [(case, results[case][0]) for case in wanted]
+    news: dict[str, list[str]] = {}
+    for case in wanted:
+        for line in results[case][1]:
+            news.setdefault(case.group, []).append(line)
+    told = {group: list(dict.fromkeys(lines))[:_MOST_NEWS] for group, lines in news.items()}
+    return ScoreReport(runs, judge_runs(runs), told)
 
 
 def judge_runs(runs: Sequence[tuple[Case, Score]]) -> list[Judged]:

@@ -21,13 +21,13 @@ def progress(total: int) -> Iterator[Callable[[], None]]:
 
 
 def score_text(report: ScoreReport) -> str:
-    """One line per figure, under the name of its group."""
+    """One line per figure, under the name of its group and what its detector had to say."""
     lines: list[str] = []
     group = ""
     for one in report.judged:
         if one.group != group:
             group = one.group
-            lines.append(group)
+            lines += [group, *(f"  {line}" for line in report.news.get(group, ()))]
         lines.append(_line(one))
     return "\n".join([*lines, f"{len(report.runs)} runs, {'all within bounds' if report.ok else 'NOT within bounds'}"])
 

@@ -53,16 +53,24 @@ def test_runs_on_several_processes_are_those_of_one():
     done = []
     report = run_cases(wanted, 2, done.append)
     assert sorted(done, key=str) == sorted(wanted, key=str)
-    assert report.runs == [(case, run_case(case)) for case in wanted]
+    assert report.runs == [(case, run_case(case)[0]) for case in wanted] and report.news == {}
 
 
 def test_another_detector_looks_in_place_of_the_scenarios_own():
     """Eyes that know yellow only never find a blue ball."""
     yellow = "examples.older_range:OlderRange"
     asked = [cases(["blue-sphere"], [303], [50], [0.1], 2.0, detector=kind)[0] for kind in (None, yellow)]
-    own, other = map(run_case, asked)
+    own, other = (run_case(case)[0] for case in asked)
     assert own.acquired_s is not None and other.acquired_s is None
     assert yellow in cases(["static"], [1], [0], [0], None, detector=yellow)[0].group
+
+
+def test_a_detector_that_nobody_answers_for_is_said_with_its_reason(capsys):
+    options = ["--scenario", "static", "--seeds", "1,2", "--seconds", "1", "--detector", "oip+http://127.0.0.1:9/ball"]
+    assert cli.run(["score", *options]) == 5
+    told = capsys.readouterr().out
+    said = [line for line in told.splitlines() if line.startswith("  detector")]
+    assert 1 <= len(said) <= 3 and "no answer: UNREACHABLE: 127.0.0.1:9: " in said[0]
 
 
 def test_the_command_prints_one_object_and_exits_5_when_not_ok(capsys):
