@@ -4,8 +4,10 @@ import json
 import socket
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import pytest
 
 from protocol.messages import FrameHeader
 from tests.vision_rig import camera, jpeg_of, scene
@@ -61,6 +63,21 @@ def grpc_answer(columns, answer_id=ASKED):
     slots = [put(1, name) + put(2, kinds[name]) + put_integers(3, column.shape) for name, column in columns.items()]
     contents = [put(6, column.tobytes()) for column in columns.values()]
     return b"".join((put(1, "ball"), put(3, answer_id), *(put(5, slot) for slot in slots), *contents))
+
+
+def grpc_started(infer, port=0, metadata=None):
+    """A server of the Open Inference Protocol and its port; `infer(request, context)` gives bytes or raises."""
+    grpc = pytest.importorskip("grpc")
+    slots = [put(1, one.name) + put(2, one.datatype) + put_integers(3, one.shape) for one in (JPEG_INPUT, *OUTPUTS)]
+    usual = put(1, "ball") + put(4, slots[0]) + b"".join(put(5, one) for one in slots[1:])
+    answers = {"ModelMetadata": lambda request, context: usual if metadata is None else metadata, "ModelInfer": infer}
+    handlers = {name: grpc.unary_unary_rpc_method_handler(answer) for name, answer in answers.items()}
+    server = grpc.server(ThreadPoolExecutor(2), compression=getattr(infer, "compression", None),
+                         options=[("grpc.max_send_message_length", -1)])
+    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("inference.GRPCInferenceService", handlers)])
+    port = server.add_insecure_port(f"127.0.0.1:{port}")
+    server.start()
+    return server, port
 
 
 class Server:

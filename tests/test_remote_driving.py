@@ -7,16 +7,18 @@ import sys
 import time
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 
 from operator_side.processes import Processes
 from tests.link_rigs import until
-from tests.remote_rig import Server, box, http_reply, said
+from tests.remote_rig import Server, box, grpc_answer, grpc_started, http_reply, said
 from tests.robot_process import RobotProcess
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.config import HsvConfig
 from vision_side.decode import Decoder
 from vision_side.detect.hsv import HsvDetector
+from vision_side.detect.protobuf import fields
 
 pytestmark = pytest.mark.slow
 FAR_BALL = jpeg_of(scene(camera(), 2.2, 0.0))
@@ -25,10 +27,21 @@ ZERO_US = 700_000
 DEADLINE_US = 100_000
 
 
-def _answer(_request):
+def _corners():
     """What a good detector says of the picture."""
     one = HsvDetector(HsvConfig()).detect(Decoder(320, 240, 320 * 240).decode(FAR_BALL))[0]
-    return http_reply(said(box(one.x1_px, one.y1_px, one.x2_px, one.y2_px)))
+    return one.x1_px, one.y1_px, one.x2_px, one.y2_px
+
+
+def _answer(_request):
+    return http_reply(said(box(*_corners())))
+
+
+def _infer(request, _context):
+    """The same over gRPC, under the id that was asked with."""
+    asked = bytes(dict(fields(request))[3]).decode()
+    columns = {"boxes": np.float32([_corners()]), "scores": np.float32([0.9]), "labels": np.int64([0])}
+    return grpc_answer(columns, asked)
 
 
 @contextmanager
@@ -96,6 +109,22 @@ def test_hostile_answers_do_not_move_the_robot(tmp_path, hostile):
         time.sleep(0.5)
         assert not [row for row in robot.motor_rows() if row[0] > still_us and (row[1] or row[2])]
         assert "no answer" in log.read_text()
+
+
+def test_a_grpc_server_that_is_gone_is_the_same(tmp_path):
+    server, port = grpc_started(_infer)
+    labels = "detector.options.labels=['ball']"
+    try:
+        with _driving(tmp_path, f"oip+grpc://127.0.0.1:{port}/ball", "--set", labels) as (robot, log):
+            gone_us = time.monotonic_ns() // 1000
+            server.stop(0).wait()
+            assert until(lambda: _wheels_us(robot, gone_us), 3)
+            assert _wheels_us(robot, gone_us) - gone_us <= ZERO_US + DEADLINE_US
+            server, _ = grpc_started(_infer, port)
+            assert until(lambda: robot.speed() > 0.5, 3.0), log.read_text()
+            assert "searching" not in log.read_text() and "answers again" in log.read_text()
+    finally:
+        server.stop(0)
 
 
 def test_a_killed_detector_service_is_the_same_over_zenoh(tmp_path):

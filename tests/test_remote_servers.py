@@ -10,7 +10,15 @@ import pytest
 
 from tests import demanded, triton_server
 from tests.link_rigs import free_endpoint, until
-from tests.remote_rig import BALL_JPEG, COLUMNS, GREY_JPEG, JPEG_INPUT, OUTPUTS, frame, grpc_answer, within
+from tests.remote_rig import (
+    BALL_JPEG,
+    COLUMNS,
+    GREY_JPEG,
+    frame,
+    grpc_answer,
+    grpc_started,
+    within,
+)
 from vision_side.config import DetectorConfig, HsvConfig, VisionConfig
 from vision_side.detect.choice import choose_detector
 from vision_side.detect.contract import check_detector
@@ -101,29 +109,9 @@ def _listens(port):
 # --- gRPC ------------------------------------------------------------------------------------------------------------
 
 
-def _grpc_started(infer, port=0, metadata=None):
-    """A server of the Open Inference Protocol that answers with these bytes, and its port; `infer(request)` may also
-    raise."""
-    grpc = pytest.importorskip("grpc")
-    from concurrent.futures import ThreadPoolExecutor
-
-    from vision_side.detect.protobuf import put, put_integers
-
-    slots = [put(1, one.name) + put(2, one.datatype) + put_integers(3, one.shape) for one in (JPEG_INPUT, *OUTPUTS)]
-    usual = put(1, "ball") + put(4, slots[0]) + b"".join(put(5, one) for one in slots[1:])
-    answers = {"ModelMetadata": lambda request, context: usual if metadata is None else metadata, "ModelInfer": infer}
-    handlers = {name: grpc.unary_unary_rpc_method_handler(answer) for name, answer in answers.items()}
-    server = grpc.server(ThreadPoolExecutor(2), compression=getattr(infer, "compression", None),
-                         options=[("grpc.max_send_message_length", -1)])
-    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("inference.GRPCInferenceService", handlers)])
-    port = server.add_insecure_port(f"127.0.0.1:{port}")
-    server.start()
-    return server, port
-
-
 @contextmanager
 def _grpc_server(infer, metadata=None):
-    server, port = _grpc_started(infer, metadata=metadata)
+    server, port = grpc_started(infer, metadata=metadata)
     try:
         with _closing(_detector(f"oip+grpc://127.0.0.1:{port}/ball", labels=("box", "ball"))) as detector:
             yield detector
@@ -174,7 +162,7 @@ def test_a_hostile_grpc_answer_is_refused_and_counted(infer, reason):
 
 
 def test_own_eyes_drive_on_while_a_grpc_server_is_gone_and_it_drives_again_within_three_seconds_of_its_return():
-    server, port = _grpc_started(lambda request, context: grpc_answer(COLUMNS))
+    server, port = grpc_started(lambda request, context: grpc_answer(COLUMNS))
     with _closing(Fallback(_detector(f"oip+grpc://127.0.0.1:{port}/ball", labels=("box", "ball")), HSV)) as both:
         assert until(lambda: both.detect([frame()], within(1.0))[0].detector == "oip+grpc:ball")
         server.stop(0).wait()
@@ -182,7 +170,7 @@ def test_own_eyes_drive_on_while_a_grpc_server_is_gone_and_it_drives_again_withi
             began_s = time.monotonic()
             (result,) = both.detect([frame()], within(0.1))
             assert result.detector == "hsv" and time.monotonic() - began_s < 0.2
-        server, _ = _grpc_started(lambda request, context: grpc_answer(COLUMNS), port)
+        server, _ = grpc_started(lambda request, context: grpc_answer(COLUMNS), port)
         assert until(lambda: both.detect([frame()], within(0.1))[0].detector == "oip+grpc:ball", 3.0), both.news()
     server.stop(0)
 
