@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from sim.scene_textures import SIDE, texture
+from sim.scene_texture_parts import SIDE
+from sim.scene_textures import texture
 from sim.scenes import HEIGHT_PX, WIDTH_PX, Lens, ScenePlan, Surface
 
 Plane = npt.NDArray[np.float32]

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim.scene_textures import JUDGED, TRAINED, any_rgb
+from sim.scene_texture_parts import any_rgb
+from sim.scene_textures import families
 from sim.scenes import (
     BALL_PX,
     HEIGHT_PX,
@@ -54,10 +55,9 @@ def plan_scene(seed: int, column: Column) -> ScenePlan:
         solids.append(_occluder(draw, ball))
     farthest = max([2.0, *(math.dist(one.at_m, (0, 0, 0)) + 0.5 for one in solids)])
     light_from, ambient = _light_from(draw, is_judged(seed))
-    families = JUDGED if is_judged(seed) else TRAINED
     return ScenePlan(
         seed, column, lens, floor_m, farthest * draw.uniform(1.0, 1.8), draw.uniform(-0.5, 0.5),
-        _surface(draw, families), _surface(draw, families), light_from, ambient, tuple(solids), draw.uniform(0.0, 1.0),
+        _surface(draw, seed), _surface(draw, seed), light_from, ambient, tuple(solids), draw.uniform(0.0, 1.0),
     )
 
 
@@ -160,5 +160,6 @@ def _light_from(draw: Random, judged: bool) -> tuple[Point, float]:
     return way, draw.uniform(0.4, 0.8)
 
 
-def _surface(draw: Random, families: tuple[str, ...]) -> Surface:
-    return Surface(families[int(draw.integers(len(families)))], int(draw.integers(1 << 31)), _log(draw, (0.5, 4.0)))
+def _surface(draw: Random, seed: int) -> Surface:
+    known = families(seed)
+    return Surface(known[int(draw.integers(len(known)))], int(draw.integers(1 << 31)), _log(draw, (0.5, 4.0)))

@@ -19,6 +19,8 @@ JUDGED_FROM: Final = 900_000
 VALIDATED_FROM: Final = 800_000
 """Seeds from here up to `JUDGED_FROM` choose thresholds; training draws below."""
 LABELS: Final = ("ball", "light-red", "light-yellow", "light-green", "legs")
+LATER_FROM: Final = 20_000
+"""Seeds of training from here on have more families of textures: the second round's."""
 STATES: Final[tuple[State, ...]] = ("red", "yellow", "green")
 
 WIDTH_PX, HEIGHT_PX = 320, 240

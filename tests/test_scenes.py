@@ -14,13 +14,15 @@ from sim import scene_backdrop
 from sim.scene_defects import as_seen, spoiled, streak
 from sim.scene_plan import plan_scene
 from sim.scene_render import SceneRenderer
-from sim.scene_textures import FAMILIES, JUDGED, SIDE, TRAINED, texture
+from sim.scene_texture_parts import SIDE
+from sim.scene_textures import FAMILIES, JUDGED, TRAINED, TRAINED_LATER, VALIDATED, texture
 from sim.scenes import (
     BALL_PX,
     COLUMNS,
     HEIGHT_PX,
     JUDGED_FROM,
     LABELS,
+    LATER_FROM,
     MOST_DISTRACTORS,
     MOST_HIDDEN,
     STATES,
@@ -76,12 +78,13 @@ def test_a_ball_is_as_large_as_agreed_and_stands_in_view():
 
 
 def test_what_is_judged_was_never_trained_on():
-    assert not set(JUDGED) & set(TRAINED) and {*JUDGED, *TRAINED} == set(FAMILIES)
+    purposes = {0: TRAINED, LATER_FROM: TRAINED_LATER, VALIDATED_FROM: VALIDATED, JUDGED_FROM: JUDGED}
+    assert not set(JUDGED) & {*TRAINED, *TRAINED_LATER, *VALIDATED} and not set(VALIDATED) & {*TRAINED, *TRAINED_LATER}
+    assert {name for names in purposes.values() for name in names} == set(FAMILIES)
     heights_deg = {True: [], False: []}
-    for seed in [*range(300), *range(JUDGED_FROM, JUDGED_FROM + 300)]:
+    for first, seed in [(first, first + number) for first in purposes for number in range(300)]:
         plan = plan_scene(seed, COLUMNS["nominal"])
-        families = JUDGED if seed >= JUDGED_FROM else TRAINED
-        assert plan.floor.family in families and plan.wall.family in families
+        assert plan.floor.family in purposes[first] and plan.wall.family in purposes[first]
         heights_deg[seed >= JUDGED_FROM].append(math.degrees(math.asin(plan.light_from[2])))
     assert all(30 <= one <= 50 for one in heights_deg[True])
     assert not any(30 < one < 50 for one in heights_deg[False])
