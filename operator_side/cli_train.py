@@ -9,14 +9,16 @@ from typing import Annotated, Literal
 import typer
 
 from operator_side.extras import needs
+from operator_side.train_rounds import Training
 from protocol.errors import ConfigError, HardwareError
 
-STEPS = 15_000
-SCENES = 20_000
+STEPS = [15_000, 14_000]
+SCENES = 40_000
 BATCH = 32
-VALIDATED = 1000
+VALIDATED = 2000
 """These are those of the model that ships, so that the same command makes it again; a test compares."""
 OUT = Path("runs/train")
+_STEPS = "Of one round; say it again for one more, which starts the learning rate anew and takes in more scenes."
 _LEAST_SHARE = 8
 """Of a batch for each process that trains: the normalisation needs a few pictures."""
 
@@ -30,7 +32,7 @@ def train(
     *,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Scenes, checkpoint, model and card go here.")] = OUT,
     scenes: Annotated[int, typer.Option(min=8, max=800_000, help="Drawn once, seeds from 0 up.")] = SCENES,
-    steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Of the optimiser.")] = STEPS,
+    steps: Annotated[list[int], typer.Option(min=1, max=10_000_000, metavar="<int range>", help=_STEPS)] = STEPS,
     batch: Annotated[int, typer.Option(min=2, max=1024, help="Cut-outs of scenes in each step.")] = BATCH,
     seed: Annotated[int, typer.Option(min=0, max=2**31, help="Draws weights, cuts and defects.")] = 1,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What trains.")] = "cpu",
@@ -42,13 +44,12 @@ def train(
     with needs("train"):
         import torch
 
-        from operator_side.train_loop import Training
         from operator_side.train_run import TrainOptions, run_training
     if device == "cuda" and not torch.cuda.is_available():
         raise HardwareError("--device cuda: this PyTorch sees no GPU; check `nvidia-smi` and that PyTorch is a CUDA "
                             "build, or take --device cpu")
     processes = jobs or os.cpu_count() or 1
-    training = Training(steps, batch, seed=seed, jobs=_sharing(batch, processes))
+    training = Training(tuple(steps), batch, seed=seed, jobs=_sharing(batch, processes))
     options = TrainOptions(out, scenes, training, device, processes, validated, judged)
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -2,24 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from operator_side.score_detectors_bounds import judge
 from operator_side.score_detectors_text import check_lines, markdown
 from operator_side.score_scenes import Report
 from operator_side.train_export import MOST_BOXES, OPSET
-from sim.scene_textures import JUDGED, TRAINED
-from sim.scenes import HEIGHT_PX, LABELS, VALIDATED_FROM, WIDTH_PX
-
-if TYPE_CHECKING:
-    from operator_side.train_loop import Training
+from operator_side.train_rounds import WHOLE_FROM, Training
+from sim.scene_textures import JUDGED, TRAINED, TRAINED_LATER, VALIDATED
+from sim.scenes import HEIGHT_PX, LABELS, LATER_FROM, VALIDATED_FROM, WIDTH_PX
 
 
 @dataclass(frozen=True, slots=True)
 class Card:
     """All that stands on it."""
 
-    training: "Training"
+    training: Training
     scenes: int
     device: str
     thresholds: Sequence[float]
@@ -57,17 +54,23 @@ def _input() -> list[str]:
 
 def _made(card: Card) -> list[str]:
     training = card.training
-    families = ", ".join(dict.fromkeys(TRAINED))
     thresholds = ", ".join(f"{label} {one:.2f}" for label, one in zip(LABELS, card.thresholds, strict=True))
+    steps = " ".join(f"--steps {one}" for one in training.rounds)
     return [
-        f"`sightline train --scenes {card.scenes} --steps {training.steps} --batch {training.batch} "
+        f"`sightline train --scenes {card.scenes} {steps} --batch {training.batch} "
         f"--seed {training.seed} --device {card.device} --jobs {training.jobs}`", "",
-        f"- Scenes: seeds 0 to {card.scenes - 1}, floors and walls of the families {families}; defects are "
-        "drawn anew each time a scene is shown.",
-        f"- Steps: {training.steps} of {training.batch} cut-outs (the last {100 * (1 - training.whole_from):.0f} % "
-        f"half as many whole pictures), AdamW, learning rate {training.rate:g}, weights averaged.",
-        f"- Thresholds: {thresholds}, chosen on {card.validated} scenes a column of the seeds from {VALIDATED_FROM}.",
+        f"- Scenes: seeds 0 to {card.scenes - 1}, floors and walls of the families {_families(TRAINED)}; from seed "
+        f"{LATER_FROM} up {_families(TRAINED_LATER)}. Defects are drawn anew each time a scene is shown.",
+        f"- Steps: {' and '.join(map(str, training.rounds))} of {training.batch} cut-outs (the last "
+        f"{100 * (1 - WHOLE_FROM):.0f} % of a round half as many whole pictures), AdamW, learning rate "
+        f"{training.rate:g} at first, half of that in each round that follows, weights averaged.",
+        f"- Thresholds: {thresholds}, chosen on {card.validated} scenes a column of the seeds from {VALIDATED_FROM}, "
+        f"with floors and walls of other families: {_families(VALIDATED)}.",
     ]
+
+
+def _families(names: Sequence[str]) -> str:
+    return ", ".join(dict.fromkeys(names))
 
 
 def _judged(card: Card) -> list[str]:
@@ -75,7 +78,7 @@ def _judged(card: Card) -> list[str]:
     last = report.first_seed + report.frames - 1
     return [
         f"{report.frames} scenes a column, seeds {report.first_seed} to {last}: floors and walls of the families "
-        f"{', '.join(JUDGED)}, and light from heights that training never saw. `sightline score detectors onnx "
+        f"{_families(JUDGED)}, and light from heights that training never saw. `sightline score detectors onnx "
         f"--frames {report.frames} --demand` shows it again. What the columns and figures mean: "
         "docs/learned-detector.md.", "", markdown(report), "", *_demanded(report),
     ]

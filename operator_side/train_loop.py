@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, Final
@@ -18,14 +18,13 @@ import torch
 
 from operator_side.train_module import Network, Weights, folded
 from operator_side.train_network import OUTPUTS, TAUGHT
+from operator_side.train_rounds import Training
 from operator_side.train_samples import CUT_PX, WHOLE_PX, Sample, sample
 from operator_side.train_scenes import DrawnScenes
 from protocol.errors import ConfigError, HardwareError
 from sim.scenes import LABELS
 
 _PREPARED: Final = 3  # batches that wait
-_WARM_UP: Final = 100
-_LEAST_RATE: Final = 0.01  # of the learning rate, at the end
 _AVERAGED: Final = 0.998
 _GEOMETRY_WEIGHT: Final = 1.0
 _TAUGHT_WEIGHT: Final = 0.5
@@ -37,27 +36,12 @@ _CHECKPOINT_EVERY: Final = 100
 _SAY_EVERY: Final = 50
 
 
-@dataclass(frozen=True, slots=True)
-class Training:
-    """What decides the outcome, and so stands in the model card."""
-
-    steps: int
-    batch: int = 32
-    rate: float = 3e-3
-    decay: float = 1e-4
-    seed: int = 1
-    jobs: int = 1
-    """Processes that share each batch; a GPU takes it whole."""
-    whole_from: float = 0.8
-    """From this part of the steps on, whole pictures in place of cut-outs."""
-
-
 def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
           say: Callable[[str], None]) -> Weights:
     """Train, or go on from the checkpoint in `folder`; the averaged weights, normalisation folded in."""
     if device != "cpu" or training.jobs == 1:
         return _trained(scenes, replace(training, jobs=1), device, folder, say)
-    _State(scenes, training, torch.device(device)).load(folder / CHECKPOINT)  # what it cannot go on from is said once
+    _checkpoint(folder / CHECKPOINT, _made_by(scenes, training), device)  # what it cannot go on from is said once
     with _helpers(scenes, training, folder):
         return _trained(scenes, training, device, folder, say)
 
@@ -126,15 +110,31 @@ def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
     return folded(state.average)
 
 
+def _made_by(scenes: DrawnScenes, training: Training) -> str:
+    """All that a checkpoint has to be of for a training to go on from it."""
+    return json.dumps({**asdict(training), "scenes": scenes.digest()})
+
+
+def _checkpoint(path: Path, made_by: str, device: Any) -> dict[str, Any] | None:
+    """What is kept there; None if nothing is. Raises ConfigError for a checkpoint of another training."""
+    if not path.exists():
+        return None
+    kept: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+    if kept["training"] != made_by:
+        raise ConfigError(f"{path} is of a training with other settings or scenes: {kept['training']}; remove it, "
+                          "or name another --out")
+    return kept
+
+
 class _State:
     """Network, optimiser and average."""
 
     def __init__(self, scenes: DrawnScenes, training: Training, device: Any) -> None:
-        self._made_by = json.dumps({**asdict(training), "scenes": scenes.digest()})
+        self._made_by = _made_by(scenes, training)
         self._device = device
         self.network = Network().to(device=device, memory_format=torch.channels_last).train()
         self._optimiser = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay)
-        self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimiser, lambda step: _rate(step, training.steps))
+        self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimiser, training.rate_at)
         self.average = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
 
     def learn(self, step: int, batch: list[Sample]) -> float:
@@ -175,25 +175,14 @@ class _State:
 
     def load(self, path: Path) -> int:
         """The step to go on from; 0 without a checkpoint. Raises ConfigError for one of another training."""
-        if not path.exists():
+        kept = _checkpoint(path, self._made_by, self._device)
+        if kept is None:
             return 0
-        kept = torch.load(path, map_location=self._device, weights_only=True)
-        if kept["training"] != self._made_by:
-            raise ConfigError(f"{path} is of a training with other settings or scenes: {kept['training']}; remove it, "
-                              "or name another --out")
         self.network.load_state_dict(kept["network"])
         self.average = kept["average"]
         self._optimiser.load_state_dict(kept["optimiser"])
         self._schedule.load_state_dict(kept["schedule"])
         return int(kept["step"])
-
-
-def _rate(step: int, steps: int) -> float:
-    """Up, then down along a cosine."""
-    if step < _WARM_UP:
-        return (step + 1) / _WARM_UP
-    done = min(1.0, (step - _WARM_UP) / max(1, steps - _WARM_UP))
-    return float(_LEAST_RATE + (1 - _LEAST_RATE) * 0.5 * (1 + np.cos(np.pi * done)))
 
 
 def _loss(given: Any, batch: list[Sample], on_device: Callable[[list[Any]], Any]) -> Any:
@@ -229,7 +218,7 @@ def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[li
 
 def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> list[Sample]:
     """This process's share."""
-    whole = step >= training.whole_from * training.steps
-    size_px, count = (WHOLE_PX, training.batch // 2) if whole else (CUT_PX, training.batch)
-    share = max(1, count // training.jobs)
-    return [sample(scenes, training.seed, step, place, size_px) for place in range(rank * share, (rank + 1) * share)]
+    size_px, count = (WHOLE_PX, training.batch // 2) if training.whole_at(step) else (CUT_PX, training.batch)
+    share, known = max(1, count // training.jobs), training.scenes_at(step, len(scenes.truths))
+    return [sample(scenes, known, (training.seed, step, place), size_px)
+            for place in range(rank * share, (rank + 1) * share)]

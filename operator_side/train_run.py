@@ -8,7 +8,8 @@ from pathlib import Path
 
 from operator_side.train_card import Card, card_text
 from operator_side.train_export import shifted
-from operator_side.train_loop import Training, train
+from operator_side.train_loop import train
+from operator_side.train_rounds import Training
 from operator_side.train_scenes import drawn_scenes
 from operator_side.train_shipping import chosen, judged, written
 

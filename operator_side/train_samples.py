@@ -39,10 +39,10 @@ class Sample:
     """(H/4, W/4): 0 where nobody can say what is right."""
 
 
-def sample(scenes: DrawnScenes, seed: int, step: int, place: int, size_px: tuple[int, int]) -> Sample:
-    """Number `place` of the batch of that step: a scene, a cut, a side, defects; the same for the same numbers."""
-    draw = np.random.default_rng([seed, step, place])
-    number = int(draw.integers(len(scenes.truths)))
+def sample(scenes: DrawnScenes, known: int, numbers: tuple[int, int, int], size_px: tuple[int, int]) -> Sample:
+    """One of the first `known` scenes, a cut, a side, defects; the same for the same seed, step, place in a batch."""
+    draw = np.random.default_rng(numbers)
+    number = int(draw.integers(known))
     left, top = _cut(draw, scenes.truths[number], size_px)
     rgb = scenes.pictures[number][top : top + size_px[1], left : left + size_px[0]]
     mirrored = bool(draw.random() < 0.5)

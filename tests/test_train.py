@@ -26,6 +26,11 @@ def one_scene(truths=(BALL,), unclear=(), others=()):
     return DrawnScenes(picture, (tuple(truths),), (tuple(unclear),), (tuple(others),))
 
 
+def shown(scenes, seed, step, place, size_px):
+    """Any of all scenes."""
+    return sample(scenes, len(scenes.truths), (seed, step, place), size_px)
+
+
 def test_the_table_is_a_network_of_the_agreed_size():
     sizes = {"image": (HEIGHT_PX, WIDTH_PX)}
     for layer in network():
@@ -50,7 +55,7 @@ def decoded(one, row, column):
 def test_the_cells_about_an_objects_middle_learn_its_box():
     ones, mirrored = 0, 0
     for place in range(20):
-        one = sample(one_scene(), 7, 0, place, WHOLE_PX)
+        one = shown(one_scene(), 7, 0, place, WHOLE_PX)
         assert one.image.shape == (3, HEIGHT_PX, WIDTH_PX) and one.image.dtype == np.uint8
         box = BALL.box if one.heat[0, 19, 30] == 1.0 else (WIDTH_PX - 141, 60, WIDTH_PX - 100, 99)
         mirrored += box is not BALL.box
@@ -63,16 +68,24 @@ def test_the_cells_about_an_objects_middle_learn_its_box():
 
 
 def test_the_same_numbers_give_the_same_sample():
-    first, again = (sample(one_scene(), 3, 11, 2, CUT_PX) for _ in range(2))
+    first, again = (shown(one_scene(), 3, 11, 2, CUT_PX) for _ in range(2))
     assert np.array_equal(first.image, again.image) and np.array_equal(first.heat, again.heat)
     assert first.image.shape == (3, CUT_PX[1], CUT_PX[0])
-    assert not np.array_equal(first.image, sample(one_scene(), 3, 12, 2, CUT_PX).image)
+    assert not np.array_equal(first.image, shown(one_scene(), 3, 12, 2, CUT_PX).image)
+
+
+def test_only_the_scenes_that_are_known_by_then_are_shown():
+    pictures = np.full((4, HEIGHT_PX, WIDTH_PX, 3), 120, np.uint8)
+    scenes = DrawnScenes(pictures, tuple((Truth(label, BALL.box, 1.0),) for label in LABELS[:4]), ((),) * 4, ((),) * 4)
+    for known in (1, 3, 4):
+        heats = [sample(scenes, known, (1, 0, place), WHOLE_PX).heat for place in range(60)]
+        assert {int(np.argwhere(heat == 1.0)[0, 0]) for heat in heats} == {*range(known)}
 
 
 def test_what_the_cut_leaves_too_little_of_is_neither_right_nor_wrong():
     blanked = marked = 0
     for place in range(60):
-        one = sample(one_scene(), 5, 0, place, CUT_PX)
+        one = shown(one_scene(), 5, 0, place, CUT_PX)
         has_middle = bool((one.heat == 1.0).any())
         marked += has_middle
         blanked += not has_middle and one.counts.min() == 0
@@ -81,22 +94,22 @@ def test_what_the_cut_leaves_too_little_of_is_neither_right_nor_wrong():
 
 
 def test_what_is_unclear_in_a_scene_is_not_learned():
-    one = sample(one_scene((), [(40.0, 40.0, 80.0, 80.0)]), 5, 0, 1, WHOLE_PX)
+    one = shown(one_scene((), [(40.0, 40.0, 80.0, 80.0)]), 5, 0, 1, WHOLE_PX)
     assert not one.heat.any() and 90 < np.count_nonzero(one.counts == 0) < 150
 
 
 def test_what_nobody_asks_for_is_taught_on_a_map_of_its_own():
     box = (40.0, 60.0, 90.0, 100.0)
-    alone, beside = (sample(one_scene(truths, (), [box]), 5, 0, 1, WHOLE_PX) for truths in ((), (BALL,)))
+    alone, beside = (shown(one_scene(truths, (), [box]), 5, 0, 1, WHOLE_PX) for truths in ((), (BALL,)))
     assert np.unique(np.argwhere(alone.heat > 0)[:, 0]).tolist() == [len(LABELS)] and (alone.heat[-1] == 1).sum() == 1
     assert not alone.sure.any() and not alone.geometry.any(), "where its edges are is not learned"
     assert any(np.allclose(beside.heat[-1], one) for one in (alone.heat[-1], alone.heat[-1][:, ::-1])), "or mirrored"
-    assert np.array_equal(beside.geometry, sample(one_scene(), 5, 0, 1, WHOLE_PX).geometry)
+    assert np.array_equal(beside.geometry, shown(one_scene(), 5, 0, 1, WHOLE_PX).geometry)
 
 
 def test_labels_have_maps_of_their_own():
     for number, label in enumerate(LABELS):
-        one = sample(one_scene((Truth(label, (40.0, 60.0, 90.0, 200.0), 1.0),)), 5, 0, 1, WHOLE_PX)
+        one = shown(one_scene((Truth(label, (40.0, 60.0, 90.0, 200.0), 1.0),)), 5, 0, 1, WHOLE_PX)
         assert np.unique(np.argwhere(one.heat > 0)[:, 0]).tolist() == [number]
 
 

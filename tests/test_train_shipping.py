@@ -1,7 +1,6 @@
 """From trained weights to the file and its card, by weights that mean nothing."""
 
 import hashlib
-from types import SimpleNamespace
 
 import pytest
 
@@ -10,6 +9,7 @@ pytest.importorskip("onnx")
 
 from operator_side.train_card import Card, card_text
 from operator_side.train_export import shifted
+from operator_side.train_rounds import Training
 from operator_side.train_shipping import chosen, judged, written
 from sim.scenes import COLUMNS, LABELS
 from tests.train_rig import weights
@@ -29,8 +29,8 @@ def test_weights_become_a_file_with_thresholds_and_a_card_that_is_true_of_it(tmp
     report = judged(model, 5)
     assert set(report.columns) == set(COLUMNS) and report.columns["blur"]["onnx"].frames == 5
     digest = hashlib.sha256(model.read_bytes()).hexdigest()
-    training = SimpleNamespace(steps=7, batch=6, seed=5, jobs=2, rate=0.003, whole_from=0.8)
+    training = Training((7, 3), batch=6, seed=5, jobs=2)
     card = card_text(Card(training, 9, "cpu", thresholds, 12345, model.stat().st_size, digest, 5, report))
-    assert "sightline train --scenes 9 --steps 7 --batch 6 --seed 5 --device cpu --jobs 2" in card
+    assert "sightline train --scenes 9 --steps 7 --steps 3 --batch 6 --seed 5 --device cpu --jobs 2" in card
     assert "demands are kept; these are not:" in card and "least hits, nominal" in card
     assert digest in card and all(f"| {name} |" in card for name in COLUMNS) and "12345" in card

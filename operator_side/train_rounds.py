@@ -1,0 +1,58 @@
+"""What decides a training's outcome, and what changes as it goes: learning rate, scenes, cut-outs. Pure."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+_WARM_UP: Final = 100
+"""Steps, at the begin of each round."""
+_LEAST_RATE: Final = 0.01
+"""Of a round's highest, at its end."""
+WHOLE_FROM: Final = 0.8
+"""From this part of a round on, whole pictures in place of cut-outs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """What stands in the model card."""
+
+    rounds: tuple[int, ...]
+    """Steps of each. A round has the learning rate up and down again, half as high as the round before, and takes in as
+    many scenes more."""
+    batch: int = 32
+    rate: float = 3e-3
+    decay: float = 1e-4
+    seed: int = 1
+    jobs: int = 1
+    """Processes that share each batch; a GPU takes it whole."""
+
+    @property
+    def steps(self) -> int:
+        """Of all rounds."""
+        return sum(self.rounds)
+
+    def rate_at(self, step: int) -> float:
+        """The learning rate by `rate`: up, then down along a cosine, in each round."""
+        number, within, steps = self._place(step)
+        if within < _WARM_UP:
+            return float(0.5**number * (within + 1) / _WARM_UP)
+        done = min(1.0, (within - _WARM_UP) / max(1, steps - _WARM_UP))
+        return float(0.5**number * (_LEAST_RATE + (1 - _LEAST_RATE) * 0.5 * (1 + math.cos(math.pi * done))))
+
+    def scenes_at(self, step: int, scenes: int) -> int:
+        """How many of the scenes, from the first on, are shown by then."""
+        return max(1, scenes * (self._place(step)[0] + 1) // len(self.rounds))
+
+    def whole_at(self, step: int) -> bool:
+        """Whether whole pictures are shown, half as many."""
+        _, within, steps = self._place(step)
+        return within >= WHOLE_FROM * steps
+
+    def _place(self, step: int) -> tuple[int, int, int]:
+        """The round, the step in it, its steps; after the last step, the end of the last round."""
+        begin = 0
+        for number, steps in enumerate(self.rounds[:-1]):
+            if step < begin + steps:
+                return number, step - begin, steps
+            begin += steps
+        return len(self.rounds) - 1, step - begin, self.rounds[-1]

@@ -1,0 +1,33 @@
+"""What changes as a training goes on."""
+
+import pytest
+
+from operator_side.train_rounds import WHOLE_FROM, Training
+
+
+@pytest.mark.parametrize("rounds", [(1000,), (1000, 600), (300, 1000, 500)])
+def test_each_round_has_the_rate_up_and_down_again_half_as_high(rounds):
+    training, begin = Training(rounds), 0
+    for number, steps in enumerate(rounds):
+        rates = [training.rate_at(step) for step in range(begin, begin + steps)]
+        top = rates.index(max(rates))
+        assert max(rates) == pytest.approx(0.5**number) and 90 <= top <= 101
+        assert rates[: top + 1] == sorted(rates[: top + 1]) and rates[top:] == sorted(rates[top:], reverse=True)
+        assert 0 < rates[0] < 0.02 * 0.5**number and 0 < rates[-1] < 0.02 * 0.5**number
+        begin += steps
+    assert 0 < training.rate_at(training.steps) < 0.02, "the optimiser asks for one more than there are"
+
+
+@pytest.mark.parametrize(("rounds", "known"), [((10,), [40]), ((10, 5), [20, 40]), ((3, 4, 5), [13, 26, 40])])
+def test_each_round_takes_in_more_scenes_and_the_last_all(rounds, known):
+    training, begin = Training(rounds), 0
+    for steps, expected in zip(rounds, known, strict=True):
+        assert {training.scenes_at(step, 40) for step in range(begin, begin + steps)} == {expected}
+        begin += steps
+    assert training.steps == sum(rounds) and training.scenes_at(0, 1) == 1
+
+
+def test_each_round_ends_with_whole_pictures():
+    training = Training((100, 50))
+    whole = [training.whole_at(step) for step in range(150)]
+    assert whole == [number % 100 >= WHOLE_FROM * (100 if number < 100 else 50) for number in range(150)]
