@@ -1,5 +1,6 @@
 """What every `Link` promises, run over every transport. A transport joins by adding a rig to `tests/link_rigs.py`."""
 
+import itertools
 import random
 import time
 from collections.abc import Iterator
@@ -64,9 +65,10 @@ def test_messages_keep_their_order(rig):
     for number in range(300):
         robot.publish(STATUS, b"", b"%d" % number)
         rig.wait(0.0005)
-    assert rig.until(lambda: got and got[-1] == 299)
+    more = itertools.count(300)  # on a busy machine any message may be dropped, the last one too
+    assert rig.until(lambda: robot.publish(STATUS, b"", b"%d" % next(more)) and got and got[-1] >= 300)
     assert got == sorted(set(got))
-    assert len(got) > 200
+    assert sum(number < 300 for number in got) > 200
 
 
 def test_newest_wins_with_a_consumer_of_200_ms(rig):
