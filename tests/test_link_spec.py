@@ -64,11 +64,11 @@ def test_messages_keep_their_order(rig):
     assert rig.until(lambda: robot.has_listener(STATUS))
     for number in range(300):
         robot.publish(STATUS, b"", b"%d" % number)
-        rig.wait(0.0005)
+        rig.wait(0.002)
     more = itertools.count(300)  # on a busy machine any message may be dropped, the last one too
     assert rig.until(lambda: robot.publish(STATUS, b"", b"%d" % next(more)) and got and got[-1] >= 300)
     assert got == sorted(set(got))
-    assert sum(number < 300 for number in got) > 30  # six busy loops beside two cores leave 100 and more
+    assert sum(number < 300 for number in got) > 200
 
 
 def test_newest_wins_with_a_consumer_of_200_ms(rig):

@@ -32,16 +32,10 @@ def test_the_card_is_of_this_file():
     assert all(f"`{label}`" in CARD for label in LABELS)
 
 
-ONE_FRAME = 1.0
-"""Of the hundred without a ball in a column: the hardest has 6 where 5 are wanted (docs/learned-detector.md)."""
-
-
 def test_it_is_safe_in_every_column_of_its_card():
     columns = columns_of_the_card()
     assert set(columns) == set(COLUMNS)
-    assert all(wrong <= 100 * MOST_WRONG for _, _, wrong, _ in columns.values())
-    assert all(alarms <= 100 * MOST_WRONG + (name == "all at once") * ONE_FRAME
-               for name, (_, _, _, alarms) in columns.items())
+    assert all(max(wrong, alarms) <= 100 * MOST_WRONG for _, _, wrong, alarms in columns.values())
 
 
 def test_the_same_command_is_the_default():
