@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from benchmarks.loop_pictures import write_pictures
+from protocol.clock import monotonic_us
 from protocol.errors import HardwareError
 from protocol.messages import Holder
 from robot_side.hardware.v4l2_camera import V4l2Camera
@@ -132,7 +133,7 @@ def _take_one(device: StandIn) -> bool:
 def _send_one(camera: V4l2Camera, sending: Sending) -> bool:
     """As the network process does it; a peer answers after some milliseconds. Whether a frame was made ready."""
     picture = camera.read(1.0)
-    now_us = time.monotonic_ns() // 1000
+    now_us = monotonic_us()
     if picture is None or not sending.may_capture(now_us, listening=True):
         return False
     sent = sending.on_camera(picture, now_us)

@@ -11,6 +11,7 @@ from statistics import median
 from typing import Final
 
 from protocol.channels import FRAME
+from protocol.clock import monotonic_us
 from protocol.codec import encode
 from protocol.messages import FrameHeader
 from protocol.transports.link import Link
@@ -59,9 +60,9 @@ def _timed(detector: Detector, frame: DetectFrame, robot: Link | None) -> tuple[
     began_ns = time.perf_counter_ns()
     if robot is not None:
         robot.publish(FRAME, encode(frame.header), frame.jpeg)
-    result = detector.detect([frame], time.monotonic_ns() // 1000 + _DEADLINE_US)[0]
+    result = detector.detect([frame], monotonic_us() + _DEADLINE_US)[0]
     return (time.perf_counter_ns() - began_ns) / 1000, result is not None
 
 
 def _header(number: int) -> FrameHeader:
-    return FrameHeader(session="0000abcd", seq=number, t_us=time.monotonic_ns() // 1000)
+    return FrameHeader(session="0000abcd", seq=number, t_us=monotonic_us())

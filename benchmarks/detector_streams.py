@@ -15,6 +15,7 @@ from typing import Final
 
 from benchmarks.loop_pictures import write_pictures
 from protocol.channels import DETECTIONS, FRAME, STATUS
+from protocol.clock import monotonic_us
 from protocol.codec import decode, encode
 from protocol.errors import SightlineError, WireError
 from protocol.messages import DetectionsHeader, FrameHeader, Stamp, State, Status
@@ -85,18 +86,18 @@ class _Streams:
                 return
             if echo is not None and self.counting:
                 self.load.answered[robot] += 1
-                self.load.ages_ms.append((_now_us() - echo.t_us) / 1000)
+                self.load.ages_ms.append((monotonic_us() - echo.t_us) / 1000)
 
         return note
 
     def say(self) -> None:
-        stamp = encode(Stamp(session="0000abcd", seq=self._seq, t_us=_now_us()))
+        stamp = encode(Stamp(session="0000abcd", seq=self._seq, t_us=monotonic_us()))
         for link in self._links:
             link.publish(STATUS, stamp, encode(Status(state=State.HOLD, reason="bench")))
 
     def frame(self, index: int) -> None:
         self._seq += 1
-        header = FrameHeader(session="0000abcd", seq=self._seq, t_us=_now_us())
+        header = FrameHeader(session="0000abcd", seq=self._seq, t_us=monotonic_us())
         self._links[index].publish(FRAME, encode(header), self._jpeg)
         self.load.offered += self.counting
 
@@ -155,7 +156,3 @@ def _offer(robots: _Streams, streams: int, seconds: float, pid: int) -> None:
 def _memory_mb(pid: int) -> float:
     text = Path(f"/proc/{pid}/status").read_text()
     return int(text.partition("VmRSS:")[2].split()[0]) / 1024
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000

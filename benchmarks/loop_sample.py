@@ -18,6 +18,7 @@ from benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
 from benchmarks.loop_ours import running_services
 from benchmarks.loop_setting import FLOOR, OUR_EYES, OURS, OWN_EYES, TAKEN_BOUND_PERCENT, LoopSetting
 from benchmarks.loop_sockets import carried_between, carried_bytes
+from protocol.clock import monotonic_us
 
 _SETTLE_S: Final = 1.5
 _DRAIN_S: Final = 0.3
@@ -75,10 +76,10 @@ def _take_one(name: str, setting: LoopSetting, folder: Path, number: int) -> Sam
     with Crew(folder) as crew, _running(name, setting, folder, crew) as contestant:
         time.sleep(_SETTLE_S)
         carried_before = carried_bytes(contestant.ports)
-        before, begin_us = read_machine(contestant.pids), _now_us()
+        before, begin_us = read_machine(contestant.pids), monotonic_us()
         time.sleep(setting.seconds)
         crew.check()
-        after, end_us = read_machine(contestant.pids), _now_us()
+        after, end_us = read_machine(contestant.pids), monotonic_us()
         carried_after = carried_bytes(contestant.ports)
         memory_mb = {process: high_water_mb(pid) for process, pid in contestant.pids.items()}
         time.sleep(_DRAIN_S + (setting.detector_delay_ms + setting.busy_ms) / 1000)
@@ -117,7 +118,3 @@ def _running(name: str, setting: LoopSetting, folder: Path, crew: Crew) -> Itera
 
 def _hot_us(contestant: Contestant) -> float | None:
     return json.loads(contestant.tally.read_text())["hot_us"] if isinstance(contestant, Peer) else None
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000

@@ -4,8 +4,9 @@ Kept in memory, at the cost of an append, and written at the end. All processes 
 """
 
 import json
-import time
 from pathlib import Path
+
+from protocol.clock import monotonic_us
 
 
 class Tally:
@@ -24,7 +25,7 @@ class Tally:
 
     def judge(self, t_us: int) -> None:
         """The answer to the picture of `t_us` is there, parsed and ready for the motors."""
-        self._judged_us.append((t_us, time.monotonic_ns() // 1000))
+        self._judged_us.append((t_us, monotonic_us()))
         if len(self._judged_us) == 1:
             print("first answer", flush=True)
 

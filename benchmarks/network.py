@@ -28,13 +28,13 @@ from benchmarks.network_stage import (
     Scene,
     Stage,
     Wiring,
-    now_us,
     start_robot,
     start_vision,
 )
 from benchmarks.network_takeover import moved, router, standby
 from benchmarks.network_uplink import uplink
 from benchmarks.network_wheels import on_old_sight, read_told
+from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, HardwareError
 from sim.wire import Shapes
 from sim.wire_tun import ADDRESS_A, why_impossible
@@ -107,10 +107,10 @@ def _course(row: Row, stage: Stage) -> NetworkRun:
         stretches = []
         for phase, seconds in zip(row.phases, spans_s(row, stage.setting.seconds), strict=True):
             wire.shape(stage.seeded(phase.shapes))
-            begin_us = now_us()
+            begin_us = monotonic_us()
             settle_s = phase.settle_s or (0.0 if phase.seconds else _SETTLE_S)
             time.sleep(seconds if phase.seconds else seconds + settle_s)
-            stretches.append(Stretch(begin_us, begin_us + round(settle_s * 1e6), now_us()))
+            stretches.append(Stretch(begin_us, begin_us + round(settle_s * 1e6), monotonic_us()))
             crew.check()
         injected = wire.shape(Shapes()) - before
         crew.end()

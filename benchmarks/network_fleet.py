@@ -9,7 +9,8 @@ from benchmarks.loop_figures import LoopCheck, at_most, percentile
 from benchmarks.loop_pictures import write_pictures
 from benchmarks.network_robots import Settings
 from benchmarks.network_rows import Row
-from benchmarks.network_stage import EVERYWHERE, NetworkRun, Stage, now_us
+from benchmarks.network_stage import EVERYWHERE, NetworkRun, Stage
+from protocol.clock import monotonic_us
 from sim.wire import Shapes
 from sim.wire_tun import ADDRESS_B
 
@@ -35,9 +36,9 @@ def fleet(row: Row, stage: Stage) -> NetworkRun:
         crew.start("robots", "benchmarks.network_robots", settings.model_dump_json(), namespace=wire.robot_side)
         crew.wait_line("robots", f"playing {ROBOTS} robots")
         time.sleep(_SETTLE_S)
-        begin_us = now_us()
+        begin_us = monotonic_us()
         time.sleep(stage.setting.seconds)
-        end_us = now_us()
+        end_us = monotonic_us()
         crew.check()
         injected = wire.shape(Shapes()) - before
         crew.end()

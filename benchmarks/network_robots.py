@@ -18,8 +18,8 @@ from pathlib import Path
 from random import Random
 
 from benchmarks.loop_pictures import camera_of
-from benchmarks.network_stage import now_us
 from protocol.channels import ACK, FRAME, STATUS, TWIST
+from protocol.clock import monotonic_us
 from protocol.codec import decode, encode
 from protocol.config import Config
 from protocol.jpeg import read_jpeg_size
@@ -94,7 +94,7 @@ class PlayedRobot:
         self._link.publish(STATUS, encode(stamp), encode(Status(state=State.ACTIVE, reason="played", stream=stream)))
 
     def _on_answer(self, message: Message) -> None:
-        at_us, header = now_us(), decode(AnswerHeader, message.header)
+        at_us, header = monotonic_us(), decode(AnswerHeader, message.header)
         if header.echo.session != self._session:
             return
         who = Holder(source=header.source, session=header.session)
@@ -108,7 +108,7 @@ def main(settings: Settings) -> None:
     ending, chance = threading.Event(), Random(settings.seed)
     signal.signal(signal.SIGTERM, lambda *_: ending.set())
     with ExitStack() as links:
-        begin_us = now_us() + 1_000_000
+        begin_us = monotonic_us() + 1_000_000
         robots = [
             PlayedRobot(name, links.enter_context(
                 open_link(name, connect=[settings.endpoint], role="robot", timeout_s=_CONNECT_S)
@@ -122,8 +122,8 @@ def main(settings: Settings) -> None:
 
 def _play(robots: list[PlayedRobot], ending: threading.Event) -> None:
     while not ending.is_set():
-        due_us = min(robot.play(now_us()) for robot in robots)
-        time.sleep(max(0, due_us - now_us()) / 1e6)
+        due_us = min(robot.play(monotonic_us()) for robot in robots)
+        time.sleep(max(0, due_us - monotonic_us()) / 1e6)
 
 
 if __name__ == "__main__":

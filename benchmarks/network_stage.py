@@ -1,7 +1,6 @@
 """What the rows of `bench network` are run with: a setting, a folder, robots and visions on the wire. Shell (files)."""
 
 import json
-import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -146,8 +145,3 @@ def _camera_toml(stage: Stage, passes_through: bool) -> str:
     kind, path = ("folder", stage.pictures) if passes_through else ("video", stage.film)
     quality = "" if passes_through else f"quality = {QUALITY}, "
     return f'kind = "{kind}"\noptions = {{path = {json.dumps(str(path))}, {quality}hfov_deg = {_HFOV_DEG}}}\n'
-
-
-def now_us() -> int:
-    """The clock of all processes of this machine."""
-    return time.monotonic_ns() // 1000

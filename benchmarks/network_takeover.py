@@ -13,8 +13,9 @@ from typing import Final
 from benchmarks.loop_crew import Crew
 from benchmarks.loop_figures import LoopCheck, at_most
 from benchmarks.network_rows import Row
-from benchmarks.network_stage import EVERYWHERE, BenchWire, NetworkRun, Stage, now_us, start_robot, start_vision
+from benchmarks.network_stage import EVERYWHERE, BenchWire, NetworkRun, Stage, start_robot, start_vision
 from benchmarks.network_wheels import Told, moves_again_s, read_told
+from protocol.clock import monotonic_us
 from protocol.errors import HardwareError
 from sim.wire_tun import ADDRESS_A, ADDRESS_B, move_address
 
@@ -42,7 +43,7 @@ def standby(row: Row, stage: Stage) -> NetworkRun:
         def harm() -> int:
             start()
             time.sleep(_STEADY_S)
-            killed_us = now_us()
+            killed_us = monotonic_us()
             os.kill(visions[-2][1], signal.SIGKILL)
             return killed_us
 
@@ -64,7 +65,7 @@ def router(row: Row, stage: Stage) -> NetworkRun:
             os.kill(crews[-1][1], signal.SIGKILL)
             time.sleep(DOWN_S)
             start()
-            return now_us()
+            return monotonic_us()
 
         start()
         _start_clients(stage, wire, ending)
@@ -78,7 +79,7 @@ def moved(row: Row, stage: Stage) -> NetworkRun:
 
         def harm() -> int:
             time.sleep(_STEADY_S)
-            moved_us = now_us()
+            moved_us = monotonic_us()
             move_address(wire.robot_side, *addresses)
             addresses.reverse()
             return moved_us
@@ -142,7 +143,7 @@ def _wait_again(stage: Stage, harmed_us: int) -> float | None:
     again_s = None
     while time.monotonic() < deadline_s and not again_s:
         time.sleep(0.1)
-        again_s = moves_again_s(_told(stage), harmed_us, now_us())
+        again_s = moves_again_s(_told(stage), harmed_us, monotonic_us())
     return again_s
 
 

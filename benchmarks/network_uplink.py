@@ -14,8 +14,9 @@ from benchmarks.loop_crew import Crew
 from benchmarks.loop_figures import LoopCheck, at_most
 from benchmarks.network_figures import sent_between
 from benchmarks.network_rows import Row
-from benchmarks.network_stage import BenchWire, NetworkRun, Stage, now_us, start_robot, start_vision
+from benchmarks.network_stage import BenchWire, NetworkRun, Stage, start_robot, start_vision
 from benchmarks.network_takeover import start_router
+from protocol.clock import monotonic_us
 from sim.wire import Shapes
 from sim.wire_tun import ADDRESS_B
 
@@ -61,10 +62,10 @@ def _stretch(wire: BenchWire, shapes: Shapes, seconds: float) -> tuple[int, int,
     """(from, until, bytes that came from the robot in between)."""
     time.sleep(_SETTLE_S)
     wire.shape(shapes)
-    begin_us, begin_bytes = now_us(), wire.carried_bytes["ab"]
+    begin_us, begin_bytes = monotonic_us(), wire.carried_bytes["ab"]
     time.sleep(seconds)
     wire.shape(shapes)
-    return begin_us, now_us(), wire.carried_bytes["ab"] - begin_bytes
+    return begin_us, monotonic_us(), wire.carried_bytes["ab"] - begin_bytes
 
 
 def _stream_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: tuple[int, int, int]) -> tuple[float, float]:

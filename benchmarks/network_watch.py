@@ -11,12 +11,12 @@ import json
 import signal
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.loop_ours import ROBOT
 from protocol.channels import FRAME, STATUS, TWIST
+from protocol.clock import monotonic_us
 from protocol.codec import decode
 from protocol.messages import AnswerHeader, FrameHeader, Stamp, Status
 from protocol.transports.link import Message
@@ -41,7 +41,7 @@ class Notes:
 
     def twist(self, message: Message) -> None:
         """When it came, by the clock of all processes of this machine."""
-        self.twists.append((time.monotonic_ns() // 1000, message.header))
+        self.twists.append((monotonic_us(), message.header))
 
     def status(self, message: Message) -> None:
         """Kept undecoded: decoding is for the end."""

@@ -13,6 +13,7 @@ from typing import Final
 from operator_side.acknowledge import Viewer
 from operator_side.requests import SOURCE as OPERATOR
 from protocol.channels import FRAME, OVERLAY, STATUS, Channel
+from protocol.clock import monotonic_us
 from protocol.codec import decode
 from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
@@ -88,7 +89,7 @@ class Pictures:
 
     def age_us(self, shot: Shot) -> int | None:
         """How old the picture is at the least, by the robot's clock."""
-        return self.clock.age_us(shot.session, shot.t_us, time.monotonic_ns() // 1000)
+        return self.clock.age_us(shot.session, shot.t_us, monotonic_us())
 
     @property
     def is_heard(self) -> bool:
@@ -149,4 +150,4 @@ class Pictures:
         except WireError:
             return
         self._status_s = time.monotonic()
-        self.clock.hear(stamp.session, stamp.t_us, time.monotonic_ns() // 1000)
+        self.clock.hear(stamp.session, stamp.t_us, monotonic_us())

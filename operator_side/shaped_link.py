@@ -5,7 +5,6 @@ what is due on a thread of its own. What it did is counted, so that a run in whi
 """
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from protocol.channels import Channel, Direction
+from protocol.clock import monotonic_us
 from protocol.transports.link import LatestSlot, Link, Message
 from protocol.transports.memory import Leg, split_legs
 
@@ -128,7 +128,7 @@ class ShapedLink:
 
     def _put(self, direction: Direction, deliver: Callable[[], Any]) -> None:
         with self._changed:
-            self._lines[direction].put(deliver, _now_us())
+            self._lines[direction].put(deliver, monotonic_us())
             self._changed.notify()
 
     def _release(self) -> None:
@@ -138,12 +138,8 @@ class ShapedLink:
 
     def _wait_due(self) -> list[Callable[[], Any]]:
         with self._changed:
-            due = [deliver for line in self._lines.values() for deliver in line.take_due(_now_us())]
+            due = [deliver for line in self._lines.values() for deliver in line.take_due(monotonic_us())]
             if not due and not self._closed:
                 next_us = min((line.next_us for line in self._lines.values() if line.next_us is not None), default=None)
-                self._changed.wait(None if next_us is None else max(0.0, (next_us - _now_us()) / 1e6))
+                self._changed.wait(None if next_us is None else max(0.0, (next_us - monotonic_us()) / 1e6))
             return due
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000

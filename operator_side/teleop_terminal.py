@@ -21,6 +21,7 @@ from operator_side.teleop_evdev import Gamepad
 from operator_side.teleop_pad import PadKey
 from operator_side.teleop_text import KEYS, live_line
 from protocol.channels import FRAME, REPLY, STATUS, Channel
+from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, HardwareError
 from protocol.transports.link import LatestSlot, Link, Message
 
@@ -88,7 +89,7 @@ class Cockpit:
         if self._gamepad in ready and self._gamepad is not None:
             self._read_gamepad(self._gamepad)
         self._take_messages()
-        self._publish(self._teleop.messages(_now_us()))
+        self._publish(self._teleop.messages(monotonic_us()))
         self._show()
 
     def _read_keys(self) -> None:
@@ -98,7 +99,7 @@ class Cockpit:
             data = b""
         if not data or b"\x04" in data:
             self._ended = True
-        self._teleop.on_keys(data.decode("utf-8", "replace"), _now_us())
+        self._teleop.on_keys(data.decode("utf-8", "replace"), monotonic_us())
 
     def _read_gamepad(self, gamepad: Gamepad) -> None:
         try:
@@ -109,8 +110,8 @@ class Cockpit:
         if PadKey.STOP in pressed:
             self._teleop.stop()
         elif PadKey.HAND_OVER in pressed:
-            self._teleop.hand_over(_now_us())
-        self._teleop.on_stick(gamepad.pad.shares, _now_us())
+            self._teleop.hand_over(monotonic_us())
+        self._teleop.on_stick(gamepad.pad.shares, monotonic_us())
 
     def _take_messages(self) -> None:
         for slot, handle in self._slots:
@@ -123,7 +124,7 @@ class Cockpit:
             self._link.publish(message.channel, message.header, message.payload, message.source)
 
     def _show(self) -> None:
-        now_us = _now_us()
+        now_us = monotonic_us()
         if now_us - self._shown_us >= _SHOW_US:
             self._shown_us = now_us
             width = shutil.get_terminal_size().columns
@@ -173,7 +174,3 @@ def _signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]
     finally:
         for number, earlier in before.items():
             signal.signal(number, earlier)
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000

@@ -8,12 +8,12 @@ import secrets
 import select
 import signal
 import struct
-import time
 from collections import Counter
 from contextlib import ExitStack, suppress
 from types import FrameType
 
 from protocol.channels import REQUEST, TWIST, check_robot_id
+from protocol.clock import monotonic_us
 from protocol.codec import decode
 from protocol.errors import WireError
 from protocol.messages import LastRefusal, State, StreamStatus
@@ -96,16 +96,16 @@ class Driver:
             signal.signal(number, self._on_signal)
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
-        self._ending_since_us = self._ending_since_us or _now_us()
+        self._ending_since_us = self._ending_since_us or monotonic_us()
 
     def loop(self) -> int:
         """Tick at absolute 20 ms deadlines and whenever a command arrives, until the end is asked for and reached."""
         self._greet()
-        deadline_us = _now_us()
+        deadline_us = monotonic_us()
         while not self._ended():
             self._wait(deadline_us)
             arrived = self._drain()
-            now_us = _now_us()
+            now_us = monotonic_us()
             if now_us >= deadline_us:
                 self._driving.tick_late_max_us = max(self._driving.tick_late_max_us, now_us - deadline_us)
                 deadline_us = max(deadline_us + TICK_US, now_us)
@@ -125,14 +125,14 @@ class Driver:
 
     def _ended(self) -> bool:
         if self.child.failed_at_start:
-            self._ending_since_us = self._ending_since_us or _now_us()
+            self._ending_since_us = self._ending_since_us or monotonic_us()
         if self._ending_since_us is None:
             return False
         self._driving.gate.disarm("shutting down")
-        return (self._driving.at_rest and self._obeyed) or _now_us() - self._ending_since_us > _SHUTDOWN_US
+        return (self._driving.at_rest and self._obeyed) or monotonic_us() - self._ending_since_us > _SHUTDOWN_US
 
     def _wait(self, deadline_us: int) -> None:
-        timeout_s = max(0, deadline_us - _now_us()) / 1e6
+        timeout_s = max(0, deadline_us - monotonic_us()) / 1e6
         readable = [self.child.socket] if self.child.socket else []
         select.select(readable, [], [], timeout_s)
 
@@ -171,12 +171,12 @@ class Driver:
         try:
             wheels = self._drive.wheels()
             scan = self._scanned()
-            speeds = self._driving.tick(_now_us(), wheels, scan)
+            speeds = self._driving.tick(monotonic_us(), wheels, scan)
         except DeadZoneError:  # with the first scan, and without one nothing moves
             raise
         except Exception as error:  # a plug-in is foreign code; a reading may be no number
             self._driving.gate.fault(f"{error or type(error).__name__}")
-            speeds = self._driving.tick(_now_us(), None, None)
+            speeds = self._driving.tick(monotonic_us(), None, None)
         try:
             self._drive.set(*speeds)
             self._obeyed = True
@@ -238,20 +238,16 @@ class Driver:
     def _on_raw(self, packet: bytes) -> bool:
         message, refused_before = ipc.unpack_message(packet), self._driving.gate.last_refusal
         if message.channel is TWIST:
-            judged = self._driving.on_twist(message, _now_us())
+            judged = self._driving.on_twist(message, monotonic_us())
             if judged is not None:
                 self._verdicts.append(judged)
         elif message.channel is REQUEST:
-            self._driving.on_request(message, _now_us())
+            self._driving.on_request(message, monotonic_us())
         refusal = self._driving.gate.last_refusal
         if refusal is not None and refusal is not refused_before:
             self._tell(refusal)
         return True
 
     def _tell(self, refusal: LastRefusal, times: int = 1) -> None:
-        if line := self._refusals.line(refusal, _now_us(), times):
+        if line := self._refusals.line(refusal, monotonic_us(), times):
             self.scribe.say(f"robot {self._driving.config.robot}: {line}")
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000

@@ -14,6 +14,7 @@ from collections import Counter
 from contextlib import ExitStack, suppress
 
 from protocol.channels import ACK, FRAME, REQUEST, TWIST
+from protocol.clock import monotonic_us
 from protocol.codec import encode
 from protocol.errors import HardwareError, SightlineError, WireError
 from protocol.log_lines import use_form
@@ -71,8 +72,8 @@ class Network:
         listening = self._link.has_listener(FRAME)
         self._sending.motion = self._driver.motion(self._sending.motion)
         with self._lock:
-            due = self._sending.may_capture(_now_us(), listening)
-            nap_s = self._sending.wait_us(_now_us()) / 1e6
+            due = self._sending.may_capture(monotonic_us(), listening)
+            nap_s = self._sending.wait_us(monotonic_us()) / 1e6
         if not due:
             self._credit.wait(min(nap_s, _LONGEST_NAP_S) if listening and nap_s > 0 else _LONGEST_NAP_S)
             self._credit.clear()
@@ -100,8 +101,8 @@ class Network:
     def _send(self, picture: Picture) -> None:
         self._sending.motion = self._driver.motion(self._sending.motion)
         with self._lock:
-            sent = self._sending.on_camera(picture, _now_us())
-            camera = self._sending.camera_message(self._adjusting.seen(picture), _now_us())
+            sent = self._sending.on_camera(picture, monotonic_us())
+            camera = self._sending.camera_message(self._adjusting.seen(picture), monotonic_us())
         if camera is not None:  # before the first picture that it is the model of
             self._link.publish(camera.channel, camera.header, camera.payload)
         if sent is None:
@@ -122,7 +123,7 @@ class Network:
                 self._driver.retry()
                 with suppress(ValueError):  # a message over its bounds: one lost message
                     self._on_packet(packet)
-                now_us = _now_us()
+                now_us = monotonic_us()
                 if now_us >= status_due_us:
                     status_due_us = now_us + _STREAM_STATUS_US
                     self._report(now_us)
@@ -136,7 +137,7 @@ class Network:
         kind = ipc.kind_of(packet)
         if kind is ipc.Kind.VERDICT:
             with self._lock:
-                self._sending.on_judged(ipc.unpack_judged(packet), _now_us())
+                self._sending.on_judged(ipc.unpack_judged(packet), monotonic_us())
             self._credit.set()
         elif kind is ipc.Kind.PUBLISH:
             message = ipc.unpack_message(packet)
@@ -164,15 +165,11 @@ class Network:
     def _on_ack(self, message: Message) -> None:
         try:
             with self._lock:
-                self._sending.on_ack(message, _now_us())
+                self._sending.on_ack(message, monotonic_us())
         except WireError as error:
             self._refused_acks[error.reason] += 1
             return
         self._credit.set()
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000
 
 
 def _say(robot: str, line: str) -> None:

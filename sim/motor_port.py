@@ -4,9 +4,9 @@ The log is what stopping is judged by, so a line is with the kernel before its c
 """
 
 import math
-import time
 from pathlib import Path
 
+from protocol.clock import monotonic_us
 from protocol.errors import ConfigError
 from sim.bus import MOTION_SET
 
@@ -30,7 +30,7 @@ class MotorPort:
 
     def take(self, data: bytes) -> None:
         """One packet from a drive; what is no pair of finite speeds is counted and changes nothing."""
-        t_us = time.monotonic_ns() // 1000
+        t_us = monotonic_us()
         speeds = MOTION_SET.unpack(data) if len(data) == MOTION_SET.size else (math.nan, math.nan)
         if not all(map(math.isfinite, speeds)):
             self.refused += 1

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
+from protocol.clock import monotonic_us
 from protocol.codec import encode
 from protocol.errors import ConfigError
 from sim.bus import CAMERA, MOTION, MOTION_ANGLES, PICTURE_HEAD, RANGE, RANGE_HEAD, TRUTH, SimSocketConfig, Simulated
@@ -57,7 +58,7 @@ class Simulation:
         self._encoders, self._truth = Cadence(ENCODERS_US), Cadence(TRUTH_US)
         self._frames = Cadence(1e6 / world.robot.camera.fps)
         self._scans = Cadence(1e6 / world.robot.lidar.rate_hz)
-        self._offset_us = _monotonic_us()
+        self._offset_us = monotonic_us()
         self._lag_us = 0
         self._told_lag = False
         self.stopping = False
@@ -71,7 +72,7 @@ class Simulation:
     def run(self) -> None:
         """Step until told to stop or the time is over."""
         end_us = self._config.seconds * 1e6 if self._config.seconds else float("inf")
-        self._offset_us = _monotonic_us()
+        self._offset_us = monotonic_us()
         while not self.stopping and self._world.now_us < end_us:
             self._wait()
             self._world.set_wheels(*self._motors.speeds_rad_s)
@@ -83,7 +84,7 @@ class Simulation:
         """Sleep to the next step's deadline, and mind how late it is."""
         from sim.world import STEP_US
 
-        late_us = _monotonic_us() - (self._offset_us + self._world.now_us + STEP_US)
+        late_us = monotonic_us() - (self._offset_us + self._world.now_us + STEP_US)
         if late_us < 0:
             time.sleep(-late_us / 1e6)
         self._lag_us = max(0, late_us)
@@ -165,7 +166,3 @@ def _world_class() -> type[World]:
     except ImportError as error:
         raise ConfigError(f"the simulation needs {error.name}; install it with: pip install 'sightline[sim]'") from None
     return World
-
-
-def _monotonic_us() -> int:
-    return time.monotonic_ns() // 1000

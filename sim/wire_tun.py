@@ -14,7 +14,6 @@ import select
 import struct
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,6 +21,7 @@ from typing import Final
 
 from pydantic import ValidationError
 
+from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, HardwareError
 from sim.wire import Leg, Shapes, Wire
 
@@ -116,17 +116,17 @@ def _reshape(wire: Wire) -> bool:
 
 def _wait_s(wire: Wire) -> float:
     due_us = min((leg.next_us for leg in (wire.ab, wire.ba) if leg.next_us is not None), default=float("inf"))
-    return max(0.0, min(_LONGEST_WAIT_S, (due_us - _now_us()) / 1e6))
+    return max(0.0, min(_LONGEST_WAIT_S, (due_us - monotonic_us()) / 1e6))
 
 
 def _read(tun: int, leg: Leg) -> None:
     with suppress(BlockingIOError):
         for _ in range(_READS_PER_TURN):
-            leg.put(os.read(tun, 2 * MTU_BYTES), _now_us())
+            leg.put(os.read(tun, 2 * MTU_BYTES), monotonic_us())
 
 
 def _write(leg: Leg, tun: int) -> None:
-    for packet in leg.take_due(_now_us()):
+    for packet in leg.take_due(monotonic_us()):
         with suppress(OSError):  # the far end is going away
             os.write(tun, packet)
 
@@ -136,10 +136,6 @@ def _read_shapes(line: str) -> Shapes:
         return Shapes.model_validate_json(line)
     except ValidationError as error:
         raise ConfigError(f"wire: {line.strip()[:80]!r}: {error.errors(include_url=False)[0]['msg']}") from None
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000
 
 
 if __name__ == "__main__":

@@ -3,12 +3,12 @@
 import json
 import socket
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
+from protocol.clock import monotonic_us
 from protocol.messages import FrameHeader
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.decode import Decoder
@@ -27,13 +27,9 @@ def frame(seq=1, jpeg=BALL_JPEG, robot="r1", session=SESSION, width_px=320, heig
     return DetectFrame(robot, header, jpeg, Decoder(width_px, height_px, 1920 * 1080))
 
 
-def now_us():
-    return time.monotonic_ns() // 1000
-
-
 def within(seconds):
     """A deadline."""
-    return now_us() + round(seconds * 1e6)
+    return monotonic_us() + round(seconds * 1e6)
 
 
 def http_reply(body, status="200 OK", headers=(), length=None):

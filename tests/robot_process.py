@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 from protocol.channels import FRAME, STATUS, TWIST
@@ -153,8 +152,3 @@ def stop_after(rows, since_us: int, wheel_radius_m: float = 0.035):
         if after > since_us and t < zero_us:
             metres += abs(left + right) / 2 * wheel_radius_m * (after - max(t, since_us)) / 1e6
     return (zero_us - since_us) / 1e6, metres
-
-
-def now_us() -> int:
-    """The robot's clock."""
-    return time.monotonic_ns() // 1000

@@ -115,7 +115,7 @@ def test_the_frame_that_a_verdict_permits_carries_the_latency_of_that_verdict(dr
     monkeypatch.setattr(driver.child, "send_aside", lambda packet: told.append(ipc.unpack_motion(packet)))
     monkeypatch.setattr(driver.child, "send", lambda packet: told.append(ipc.unpack_judged(packet)))
     driver._driving.gate.latency_us = None
-    monkeypatch.setattr("robot_side.driver._now_us", lambda: T_US + 4_000)
+    monkeypatch.setattr("robot_side.driver.monotonic_us", lambda: T_US + 4_000)
     _arm(driver)
     parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
     parent.forward(answer(driver._driving.session))

@@ -265,7 +265,7 @@ def test_the_end_is_low_before_the_pins_are_given_back_whoever_gives_them():
 
 def test_the_expected_wheels_turn_as_the_table_says(drive, monkeypatch):
     clock = SimpleNamespace(us=1_000_000)
-    monkeypatch.setattr("robot_side.hardware.gpio_drive._now_us", lambda: clock.us)
+    monkeypatch.setattr("robot_side.hardware.gpio_drive.monotonic_us", lambda: clock.us)
     drive.set(0.0, 0.0)
     start = drive.wheels()
     drive.set(0.05 / 0.0325, -1.0)  # less than the least duty gives: it turns at that

@@ -16,6 +16,7 @@ import pytest
 import websocket
 
 from benchmarks.loop_pictures import camera_of, write_pictures
+from protocol.clock import monotonic_us
 from protocol.twist_text import parse_twist
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, driving, stop_after
@@ -61,10 +62,6 @@ def rows_of(path: Path) -> list[list[str]]:
     return [line.split(",", 2) for line in text[: text.rfind("\n") + 1].splitlines()]
 
 
-def now_us() -> int:
-    return time.monotonic_ns() // 1000
-
-
 # --- the older vision, our robot -------------------------------------------------------------------------------------
 
 
@@ -103,9 +100,9 @@ def best_rate_fps(log: Path, enough_fps: float) -> float:
 
 
 def _rate_fps(log: Path, seconds: float) -> float:
-    begin_us = now_us()
+    begin_us = monotonic_us()
     time.sleep(seconds)
-    end_us = now_us()
+    end_us = monotonic_us()
     return sum(begin_us <= int(t_us) < end_us for t_us, *_ in rows_of(log)) / (end_us - begin_us) * 1e6
 
 
@@ -131,7 +128,7 @@ def test_on_a_quiet_machine_the_older_vision_sees_95_percent_of_the_pictures(tmp
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
 def test_without_its_vision_the_robot_stands_within_700_ms(tmp_path, pictures, number):
     with old_vision_drives(tmp_path, pictures) as (robot, vision, _, _):
-        since_us = now_us()
+        since_us = monotonic_us()
         os.kill(vision.pid, number)
         assert until(lambda: robot.motor_rows()[-1][1:] == (0.0, 0.0), 3)
         seconds, metres = stop_after(robot.motor_rows(), since_us)

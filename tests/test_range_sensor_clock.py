@@ -2,7 +2,7 @@
 
 import pytest
 
-from robot_side.hardware.pace import now_us
+from protocol.clock import monotonic_us
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess, Vision, driving
 from tests.test_vision_switching import FarSensor
@@ -16,6 +16,6 @@ def test_wheels_do_not_falter_with_every_scan(tmp_path):
         assert until(lambda: "robot r1: on" in robot.output(), 10), robot.output()
         with Vision(robot.endpoint):
             assert driving(robot), "0.4 m/s"
-            since_us = now_us()
+            since_us = monotonic_us()
             assert until(lambda: robot.motor_rows()[-1][0] > since_us + 1_000_000, 5), "ten scans"
             assert min(left for t_us, left, _ in robot.motor_rows() if t_us > since_us) > 0.0

@@ -5,8 +5,9 @@ import time
 
 import pytest
 
+from protocol.clock import monotonic_us
 from tests.link_rigs import until
-from tests.remote_rig import GREY_JPEG, frame, now_us, within
+from tests.remote_rig import GREY_JPEG, frame, within
 from vision_side.config import HsvConfig
 from vision_side.detect.local import Hsv
 from vision_side.detect.own_decoders import MAX_DECODERS, OwnDecoders
@@ -176,7 +177,7 @@ def test_late_once_and_own_eyes_drive_on_in_that_very_frame():
 
 def test_of_a_short_deadline_the_remote_has_half():
     remote = FakeRemote()
-    began_us, deadline_us = now_us(), within(0.01)
+    began_us, deadline_us = monotonic_us(), within(0.01)
     Fallback(remote, Held("own")).detect([frame()], deadline_us)
     assert began_us < remote.deadlines[0] <= deadline_us - 4_000
 

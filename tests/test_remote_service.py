@@ -5,10 +5,11 @@ from dataclasses import replace
 import pytest
 
 from protocol.channels import DETECTIONS, FRAME
+from protocol.clock import monotonic_us
 from protocol.codec import decode, encode
 from protocol.messages import Detections, FrameHeader
 from protocol.transports.memory import MemoryNetwork
-from tests.remote_rig import BALL_JPEG, now_us
+from tests.remote_rig import BALL_JPEG
 from vision_side.config import HsvConfig
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.local import Hsv
@@ -119,7 +120,7 @@ class Late:
         self.answers = answers
 
     def detect(self, frames, deadline_us):
-        while now_us() <= deadline_us:
+        while monotonic_us() <= deadline_us:
             pass
         return [result_of(one, (), Maker("late")) if self.answers else None for one in frames]
 

@@ -10,10 +10,11 @@ import time
 
 import pytest
 
+from protocol.clock import monotonic_us
 from protocol.messages import State
 from robot_side.latch import StopLatch
 from tests.link_rigs import until
-from tests.robot_process import RobotProcess, Vision, driving, now_us, stop_after
+from tests.robot_process import RobotProcess, Vision, driving, stop_after
 
 BOUND_S, BOUND_M = 0.7, 0.25
 
@@ -27,7 +28,7 @@ def test_it_drives_on_fresh_answers_and_stops_when_they_end(tmp_path):
             assert status.state is State.ACTIVE and status.holder.session == vision.session
             assert until(lambda: vision.status().stream.fps >= 25)
             frames = vision.headers
-        since = now_us()
+        since = monotonic_us()
         assert until(lambda: robot.speed() == 0.0, 3)
         time.sleep(0.2)
         seconds, metres = stop_after(robot.motor_rows(), since)
@@ -40,7 +41,7 @@ def test_it_drives_on_fresh_answers_and_stops_when_they_end(tmp_path):
 def test_the_wheels_stop_when_the_network_process_dies_or_hangs(tmp_path, number):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
         assert driving(robot)
-        since = now_us()
+        since = monotonic_us()
         robot.kill_network(number)
         time.sleep(1.0)
         seconds, metres = stop_after(robot.motor_rows(), since)

@@ -201,7 +201,7 @@ def test_frames_of_a_session_that_is_over_are_left_out_and_said_once(bench):
 
 def test_of_two_robots_with_one_id_the_second_is_refused_and_that_is_said(bench, monkeypatch):
     """Where they cannot meet, nobody but vision can see that they are two."""
-    monkeypatch.setattr("vision_side.service.time.monotonic_ns", lambda: 1_000 * bench.now_us)
+    monkeypatch.setattr("vision_side.service.monotonic_us", lambda: bench.now_us)
     bench.camera()
     answers = {"0000abcd": 0, "0000beef": 0}
     for seq in range(1, 10):

@@ -17,6 +17,7 @@ from typing import Final, Protocol
 from pydantic import ValidationError
 
 from protocol.channels import DETECTIONS, FRAME
+from protocol.clock import monotonic_us
 from protocol.codec import decode, encode
 from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
@@ -29,7 +30,6 @@ from protocol.messages import (
     FrameHeader,
 )
 from protocol.transports.link import LatestSlot, Link, Message
-from vision_side.clock import now_us
 from vision_side.config import VisionConfig
 from vision_side.detect.around import maker_of, news_of
 from vision_side.detect.checking import asked
@@ -133,7 +133,7 @@ class DetectorService:
             if robot not in self._links:
                 self._welcome(robot)
         with self._guard:
-            batch = self._turns.take(now_us(), int(self._each_us))
+            batch = self._turns.take(monotonic_us(), int(self._each_us))
         if batch:
             self._look(batch)
         return bool(batch)
@@ -162,20 +162,20 @@ class DetectorService:
 
         def heard(message: Message) -> None:
             with self._guard:
-                self._turns.offer(robot, message, now_us())
+                self._turns.offer(robot, message, monotonic_us())
             self._bell.put(True)
 
         link.subscribe(FRAME, heard)
         self._say(f"detector: looks at the pictures of {robot}")
 
     def _look(self, batch: list[Turn[Message]]) -> None:
-        began_us = now_us()
+        began_us = monotonic_us()
         frames = [(turn, frame) for turn in batch if (frame := self._frame(turn)) is not None]
         if not frames:
             return
         deadline_us = min(turn.arrived_us for turn, _ in frames) + self._serving.deadline_us
         results = asked(self._detector, [frame for _, frame in frames], deadline_us)
-        ended_us = now_us()
+        ended_us = monotonic_us()
         each_us = (ended_us - began_us) / len(frames)
         self._each_us += (each_us - self._each_us) * (_SMOOTHING if self._each_us else 1.0)
         for (turn, frame), result in zip(frames, results, strict=True):
@@ -204,7 +204,7 @@ class DetectorService:
             self._say(f"detector: {why}")
 
     def _answer(self, turn: Turn[Message], frame: DetectFrame, result: DetectionResult, took_us: int) -> None:
-        tally, age_us = self._tally(turn), now_us() - turn.arrived_us
+        tally, age_us = self._tally(turn), monotonic_us() - turn.arrived_us
         if age_us > self._serving.deadline_us:
             tally.late += 1
             return

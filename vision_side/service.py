@@ -14,6 +14,7 @@ from types import FrameType
 from typing import TypeVar
 
 from protocol.channels import ACK, CAMERA, FRAME, MAX_HEADER_BYTES, TWIST
+from protocol.clock import monotonic_us
 from protocol.codec import decode
 from protocol.errors import WireError
 from protocol.messages import CameraModel, FrameHeader, Stamp
@@ -190,7 +191,7 @@ class Service:
         header = self._decoded(FrameHeader, message.header, MAX_HEADER_BYTES)
         if header is None:
             return
-        if not self._sessions.admits(header.session, header.t_us, time.monotonic_ns() // 1000):
+        if not self._sessions.admits(header.session, header.t_us, monotonic_us()):
             self.skipped["OTHER_SESSION"] += 1
             self._tell("other", f"frames of session {header.session} are refused: robot {self._config.robot} is "
                                 f"steered in session {self._sessions.current}; two robots with this id? give each its "
@@ -205,7 +206,7 @@ class Service:
             self._publish(header, Answer(None, Seen("no picture", note="no camera model yet")), 0)
             return
         self._dispatch.before(self._pipeline, header)
-        deadline_us = time.monotonic_ns() // 1000 + round(self._config.detector.deadline_s * 1e6)
+        deadline_us = monotonic_us() + round(self._config.detector.deadline_s * 1e6)
         answer = self._pipeline.step(Frame(header, message.payload, deadline_us))
         if answer.twist is None:
             self._count_skipped(self._pipeline.skipped)

@@ -19,6 +19,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from protocol.channels import OVERLAY, PREVIEW, Channel
+from protocol.clock import monotonic_us
 from protocol.codec import encode
 from protocol.messages import CameraModel, DetectionsHeader, Echo, FrameHeader
 from protocol.robot_clock import RobotClock
@@ -78,7 +79,7 @@ class Viewing:
         jpeg: bytes | None = None,
     ) -> None:
         """Show an answered frame to who watches, if it is time; without `jpeg` one that was kept."""
-        now_us = time.monotonic_ns() // 1000
+        now_us = monotonic_us()
         self._clock.hear(header.session, header.t_us, now_us)
         channels = tuple(
             channel for channel, pace in self._paces.items() if self._link.has_listener(channel) and pace.is_due(now_us)

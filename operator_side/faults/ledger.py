@@ -6,11 +6,11 @@
 """
 
 import os
-import time
 from pathlib import Path
 from typing import Final
 
 from operator_side.faults.judge import Sent
+from protocol.clock import monotonic_us
 
 GOOD: Final = "good"
 INJECTED: Final = "injected"
@@ -25,7 +25,7 @@ class Ledger:
 
     def note(self, kind: str, frame_us: int = 0) -> None:
         """Note one event, now."""
-        os.write(self._file, f"{kind},{now_us()},{frame_us}\n".encode())
+        os.write(self._file, f"{kind},{monotonic_us()},{frame_us}\n".encode())
 
 
 def read_ledger(path: Path, kind: str) -> list[Sent]:
@@ -34,8 +34,3 @@ def read_ledger(path: Path, kind: str) -> list[Sent]:
         return []
     rows = [line.split(",") for line in path.read_text("ascii").split("\n")[:-1]]
     return [Sent(int(t), int(frame)) for what, t, frame in rows if what == kind]
-
-
-def now_us() -> int:
-    """The clock of this machine's processes, the simulated robot's among them."""
-    return time.monotonic_ns() // 1000

@@ -16,11 +16,12 @@ from operator_side.faults import camera, judge
 from operator_side.faults.clock import write_wrong_clock
 from operator_side.faults.fleet import COMMAND_LINE, Fleet, raise_priority
 from operator_side.faults.judge import Motors, Sent, wheel_mps
-from operator_side.faults.ledger import GOOD, INJECTED, now_us, read_ledger
+from operator_side.faults.ledger import GOOD, INJECTED, read_ledger
 from operator_side.faults.peer import PeerOptions, Role
 from operator_side.faults.sampler import Hole, read_holes, stalled_us
 from operator_side.faults.wires import BenchWire
 from operator_side.toml_text import toml_text
+from protocol.clock import monotonic_us
 from protocol.errors import SightlineError
 from robot_side.limits import TICK_US
 from sim.bus import SimDrive, SimSocketConfig
@@ -160,20 +161,20 @@ class Rig:
 
     def trigger(self, name: str = "peer") -> int:
         """Let a peer's fault begin; returns when that was."""
-        at_us = now_us()
+        at_us = monotonic_us()
         self.fleet.signal(name, signal.SIGUSR1)
         return at_us
 
     def camera_mode(self, mode: str) -> int:
         """From the next picture on the camera does this; returns when it was told."""
-        at_us, new = now_us(), self.folder / "camera.new"
+        at_us, new = monotonic_us(), self.folder / "camera.new"
         new.write_text(mode, "ascii")
         new.replace(self.folder / camera.MODE)
         return at_us
 
     def signal_network(self, number: signal.Signals) -> int:
         """Send the robot's network process a signal; returns when that was."""
-        at_us = now_us()
+        at_us = monotonic_us()
         os.kill(self.fleet.child("robot"), number)
         return at_us
 
@@ -196,7 +197,7 @@ class Rig:
         self.until(lambda: self._is_steady(mps), seconds, f"{mps} m/s")
 
     def _is_steady(self, mps: float) -> bool:
-        late = [row for row in self._latest_motors() if row.t_us > now_us() - STEADY_US]
+        late = [row for row in self._latest_motors() if row.t_us > monotonic_us() - STEADY_US]
         return len(late) > STEADY_US / 40_000 and all(wheel_mps(row) >= mps for row in late)
 
     def probe_motors(self) -> float:

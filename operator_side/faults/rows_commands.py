@@ -4,10 +4,10 @@ from functools import partial
 from typing import Final
 
 from operator_side.faults.judge import at_least, at_most, most_gain_mps2, wheel_mps
-from operator_side.faults.ledger import now_us
 from operator_side.faults.rig import Rig, Setup
 from operator_side.faults.row import Injected, Row
 from operator_side.faults.rows_processes import SETTLED_S
+from protocol.clock import monotonic_us
 from robot_side.limits import SafetyConfig
 
 ATTACKED_S: Final = 3.0
@@ -56,7 +56,7 @@ def _two_visions(rig: Rig) -> Injected:
     last = [row for row in rig.motors() if row.t_us >= rig.sent("second")[0].t_us]
     backwards = sum(row.left_rad_s + row.right_rad_s < 0 for row in last)
     slowest_mps = min(map(wheel_mps, last))
-    at_us = now_us()
+    at_us = monotonic_us()
     rig.fleet.kill("second")
     rig.fleet.kill("peer")
     rig.watch(SETTLED_S)
@@ -71,9 +71,9 @@ def _take_over(rig: Rig) -> Injected:
     """A person takes over at full speed and drives back, then is lost: a stop that vision does not end."""
     rig.start_peer("person", "driver", source="teleop", linear_mps=-0.4, angular_rad_s=0.0)
     rig.until(lambda: _goes_back(rig), 15.0, "a takeover")
-    took_ms = (now_us() - rig.sent("person")[0].t_us) / 1000
+    took_ms = (monotonic_us() - rig.sent("person")[0].t_us) / 1000
     rig.watch(0.5)
-    at_us = now_us()
+    at_us = monotonic_us()
     rig.fleet.kill("person")
     rig.watch(SETTLED_S + 1.0)
     return Injected(1, at_us, checks=(at_most("person obeyed after", took_ms, "ms", 1000.0),))
@@ -88,7 +88,7 @@ def _holder_dies(rig: Rig) -> Injected:
     """The driver dies while another waits: a stop first, the other only when the lease is over."""
     rig.start_peer("second", "driver", linear_mps=0.3)
     rig.until(lambda: len(rig.sent("second")) > 10, 15.0, "a second driver")
-    at_us = now_us()
+    at_us = monotonic_us()
     rig.fleet.kill("peer")
     rig.watch(ATTACKED_S)
     last_us = rig.sent("peer")[-1].t_us

@@ -7,12 +7,13 @@ from typing import Final
 
 from operator_side.faults.crowd import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
 from operator_side.faults.judge import Motors, at_least, at_most, wheel_mps
-from operator_side.faults.ledger import INJECTED, now_us
+from operator_side.faults.ledger import INJECTED
 from operator_side.faults.rig import READY_S, Rig, Setup
 from operator_side.faults.row import Injected, Row
 from operator_side.faults.rows_processes import AGAIN_S, BUSY, SETTLED_S, busy_processes
 from operator_side.faults.sampler import Hole
 from operator_side.score import Check
+from protocol.clock import monotonic_us
 from protocol.transports.websocket_listen import MAX_CLIENTS
 from robot_side.limits import TICK_US
 
@@ -28,13 +29,13 @@ HONEST_MS: Final = 10.0
 
 def _crowd(rig: Rig, kind: str, at_least_times: int) -> Injected:
     """They come while the robot is driven and stay; then whoever drives dies."""
-    came_us = now_us()
+    came_us = monotonic_us()
     rig.start_crowd(kind)
     rig.fleet.wait_line("crowd", READY, READY_S)
     rig.watch(CROWDED_S)
     slowest_mps = min(wheel_mps(row) for row in rig.motors() if row.t_us > came_us)
     times = len(rig.noted("crowd", INJECTED))
-    at_us = now_us()
+    at_us = monotonic_us()
     rig.fleet.kill("peer")
     rig.watch(SETTLED_S)
     checks = [at_least("came", times, "times", at_least_times), at_least("speed kept", slowest_mps, "m/s", KEPT_MPS)]
@@ -52,12 +53,12 @@ def _keep_time(rig: Rig) -> Injected:
     rig.start_peer("person", "operator", fault="lateness")
     rig.fleet.wait_line("person", "person ready", AGAIN_S)
     with busy_processes():
-        since_us = now_us()
+        since_us = monotonic_us()
         rig.watch(STARVED_S)
         rows = [row for row in rig.motors() if row.t_us > since_us]
         rig.trigger("person")
         rig.fleet.wait_line("person", "late by", AGAIN_S)
-        at_us = now_us()
+        at_us = monotonic_us()
         rig.fleet.kill("peer")
         rig.watch(SETTLED_S)
     said = rig.fleet.log("person").read_text("utf-8").rpartition("late by ")[2]

@@ -3,10 +3,10 @@
 from functools import partial
 from typing import Final
 
-from operator_side.faults.ledger import now_us
 from operator_side.faults.rig import Rig, Setup
 from operator_side.faults.row import Injected, Row
 from operator_side.faults.rows_processes import drives_again
+from protocol.clock import monotonic_us
 from sim.wire import Shape, Shapes
 
 BAD_S: Final = 6.0
@@ -25,23 +25,23 @@ def shape(rig: Rig, shapes: Shapes) -> int:
 def _cut(rig: Rig, shapes: Shapes, seconds: float) -> Injected:
     """Cut for a while: nothing sent after the cut is obeyed until the wire is whole again."""
     before = shape(rig, shapes)
-    at_us = now_us()
+    at_us = monotonic_us()
     rig.watch(seconds)
-    harmed, resumed_us = shape(rig, Shapes()) - before, now_us()
+    harmed, resumed_us = shape(rig, Shapes()) - before, monotonic_us()
     return Injected(harmed, at_us, resumed_us, drives_again(rig))
 
 
 def _worsen(rig: Rig, shapes: Shapes) -> Injected:
     """Bad for a while, but not cut: frames that are still young may be driven on."""
     before = shape(rig, shapes)
-    at_us = now_us()
+    at_us = monotonic_us()
     rig.watch(BAD_S)
     return Injected(shape(rig, Shapes()) - before, at_us, again=drives_again(rig))
 
 
 def _flap(rig: Rig) -> Injected:
     before = shape(rig, Shapes())
-    at_us = now_us()
+    at_us = monotonic_us()
     for _ in range(FLAPS):
         shape(rig, Shapes(ab=CUT, ba=CUT))
         rig.watch(FLAP_S)

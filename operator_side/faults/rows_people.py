@@ -5,11 +5,12 @@ from functools import partial
 from typing import Final
 
 from operator_side.faults.judge import Motors, at_least, at_most, wheel_mps
-from operator_side.faults.ledger import TOLD, now_us
+from operator_side.faults.ledger import TOLD
 from operator_side.faults.rig import Rig, Setup
 from operator_side.faults.row import Injected, Row
 from operator_side.faults.rows_network import LOSSY, shape
 from operator_side.faults.rows_processes import AGAIN_S, SETTLED_S, drives_again
+from protocol.clock import monotonic_us
 from robot_side.kinematics import DiffDriveConfig
 from sim.wire import Shapes
 from vision_side.config import TrackConfig
@@ -91,7 +92,7 @@ def _stop_then_restart(rig: Rig) -> Injected:
     before = rig.fleet.child("robot")
     rig.signal_network(signal.SIGKILL)
     rig.until(lambda: rig.fleet.child("robot") not in (0, before), AGAIN_S, "a new network process")
-    since_us = now_us()
+    since_us = monotonic_us()
     rig.until(lambda: rig.sent("peer")[-1].t_us > since_us, AGAIN_S, "commands after the restart")
     rig.watch(BAD_S)
     return Injected(1, at_us)
@@ -110,8 +111,8 @@ def _reset_moving(rig: Rig) -> Injected:
 def _drive_on(rig: Rig) -> Injected:
     """Drive with the wrong clock for a while, then let vision die."""
     rig.watch(BAD_S)
-    slowest_mps = min((wheel_mps(row) for row in rig.motors() if row.t_us > now_us() - BAD_S * 1e6), default=0.0)
-    at_us = now_us()
+    slowest_mps = min((wheel_mps(row) for row in rig.motors() if row.t_us > monotonic_us() - BAD_S * 1e6), default=0.0)
+    at_us = monotonic_us()
     rig.fleet.kill("peer")
     rig.watch(SETTLED_S)
     checks = (at_least("speed kept", slowest_mps, "m/s", 0.4),)

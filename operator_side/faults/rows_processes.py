@@ -11,9 +11,9 @@ from functools import partial
 from typing import Final
 
 from operator_side.faults.judge import at_most
-from operator_side.faults.ledger import now_us
 from operator_side.faults.rig import Rig, Setup
 from operator_side.faults.row import Injected, Row
+from protocol.clock import monotonic_us
 
 STOPPED_S: Final = 3.0
 SETTLED_S: Final = 1.5
@@ -34,17 +34,17 @@ def drives_again(rig: Rig) -> bool:
 
 
 def _kill_vision(rig: Rig) -> Injected:
-    at_us = now_us()
+    at_us = monotonic_us()
     rig.fleet.kill("peer")
     rig.watch(SETTLED_S)
     return Injected(1, at_us)
 
 
 def _pause_vision(rig: Rig) -> Injected:
-    at_us = now_us()
+    at_us = monotonic_us()
     rig.fleet.signal("peer", signal.SIGSTOP)
     rig.watch(STOPPED_S)
-    resumed_us = now_us()
+    resumed_us = monotonic_us()
     rig.fleet.signal("peer", signal.SIGCONT)
     return Injected(1, at_us, resumed_us, drives_again(rig))
 
@@ -62,10 +62,10 @@ def _slow_detector(rig: Rig) -> Injected:
 
 
 def _restart_vision(rig: Rig) -> Injected:
-    at_us = now_us()
+    at_us = monotonic_us()
     rig.fleet.kill("peer")
     rig.watch(SETTLED_S)
-    resumed_us = now_us()
+    resumed_us = monotonic_us()
     rig.start_peer("second", "vision")
     return Injected(1, at_us, resumed_us, drives_again(rig))
 
@@ -117,7 +117,7 @@ def _starve(rig: Rig) -> Injected:
 
 
 def _end_robot(rig: Rig, number: signal.Signals) -> Injected:
-    started_s, at_us = time.monotonic(), now_us()
+    started_s, at_us = time.monotonic(), monotonic_us()
     rig.fleet.signal("robot", number)
     code = rig.fleet.exit_code("robot", FREE_MS / 1000)
     free_ms = (time.monotonic() - started_s) * 1000 if code is not None and _is_free(rig.endpoint) else None

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from operator_side.faults.ledger import now_us
+from protocol.clock import monotonic_us
 
 PERIOD_S: Final = 0.005
 STALL_US: Final = 20_000
@@ -28,11 +28,11 @@ class Hole(NamedTuple):
 def sample(path: Path) -> None:
     """Wake every 5 ms, for ever, and note every pause over 20 ms."""
     file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-    last_us = now_us()
+    last_us = monotonic_us()
     print("sampling", flush=True)
     while True:
         time.sleep(PERIOD_S)
-        woke_us = now_us()
+        woke_us = monotonic_us()
         if woke_us - last_us > STALL_US:
             os.write(file, f"{last_us},{woke_us}\n".encode())
         last_us = woke_us

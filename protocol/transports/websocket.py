@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from protocol.channels import FRAME, TWIST, Channel, parse_key
+from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.link_rules import INEXACT_KEY, LinkRules
@@ -262,14 +263,14 @@ class WebSocketLink:
         if end.legacy is None:
             return V1(self.robot, self._rules.role)
         if listening:
-            return LegacyToVision(self.robot, end.legacy, _now_us, Client(who, self._seat, self._tell))
+            return LegacyToVision(self.robot, end.legacy, monotonic_us, Client(who, self._seat, self._tell))
         bound = self._rules.payload_bound(FRAME)
-        return LegacyToRobot(self.robot, end.legacy, _now_us, secrets.token_hex(4), bound)
+        return LegacyToRobot(self.robot, end.legacy, monotonic_us, secrets.token_hex(4), bound)
 
     def _tell(self, text: str) -> None:
         """One line to the log, of not too many."""
         with self._joining:
-            line = self._log.line(text, _now_us())
+            line = self._log.line(text, monotonic_us())
         if line:
             print(line, file=sys.stderr, flush=True)
 
@@ -291,7 +292,3 @@ class WebSocketLink:
                 self._rules.deliver(parsed[1], packet.key, packet.header, packet.payload, callback)
         finally:
             self._in_callback.now = False
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from protocol.channels import ACK, Channel
+from protocol.clock import monotonic_us
 from protocol.errors import WireError
 from protocol.transports.link_rules import OVERSIZE
 from protocol.transports.tls_refusals import RefusalLines
@@ -61,7 +62,7 @@ class Peer:
             return True
         refuse(NOT_GRANTED)
         what = "/".join(said)
-        times = 0 if said[0] == ACK.name else self._forbidden.is_due(what, _now_us())  # a viewer that acknowledges
+        times = 0 if said[0] == ACK.name else self._forbidden.is_due(what, monotonic_us())  # a viewer that acknowledges
         if times:
             often = f" ({times} times)" if times > 1 else ""
             who = self._wire.address[0] or "a client"
@@ -90,7 +91,7 @@ class Peer:
         """Read until the connection ends; a peer that breaks the rules is dropped and told why."""
         from websockets.exceptions import ConnectionClosed
 
-        life = Life(_now_us())
+        life = Life(monotonic_us())
         try:
             while self._turn(life, deliver, refuse):
                 self._wire.wait(_TICK_US / 1e6)
@@ -108,7 +109,7 @@ class Peer:
 
     def _turn(self, life: Life, deliver: Callable[[Peer, Packet], None], refuse: Callable[[str], None]) -> bool:
         """Read what there is, and send; False if the other end is to be given up."""
-        now_us = _now_us()  # before reading: however long this end stood still, what came meanwhile counts
+        now_us = monotonic_us()  # before reading: however long this end stood still, what came meanwhile counts
         for message in self._wire.receive():
             self._read(message, deliver, refuse)
         if now_us < self._look_us:  # whoever was given a message waits for this thread to rest
@@ -184,7 +185,3 @@ def count_end(closed: ConnectionClosed, refuse: Callable[[str], None]) -> None:
     counted = _COUNTED_FOR_CODE.get(closed.sent.code) if closed.sent and not closed.rcvd_then_sent else None
     if counted is not None:
         refuse(counted)
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000

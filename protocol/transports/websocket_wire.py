@@ -17,6 +17,7 @@ from contextlib import suppress
 from itertools import takewhile
 from typing import TYPE_CHECKING, Final
 
+from protocol.clock import monotonic_us
 from protocol.transports.websocket_kernel import way_out
 from protocol.transports.websocket_life import WayOut
 from protocol.transports.websocket_messages import Messages, unmasked_head
@@ -48,7 +49,7 @@ class Wire:
         self.lock = threading.Lock()
         self.granted: frozenset[tuple[str, ...]] | None = None
         """(channel, source) of what the other end may publish; None for all. Set by who checked its token."""
-        self.heard_us = _now_us()
+        self.heard_us = monotonic_us()
         """When the other end was last heard."""
         self._unheard_bytes = 0
         self._near = near
@@ -134,7 +135,7 @@ class Wire:
         except OSError:
             return False
         if data:
-            self.heard_us, self._unheard_bytes = _now_us(), 0
+            self.heard_us, self._unheard_bytes = monotonic_us(), 0
             self._messages.feed(data)
         return bool(data)
 
@@ -256,10 +257,6 @@ class Wire:
     def _ring(self) -> None:
         with suppress(OSError):  # closed, or rung often enough
             self._bell.send(b"!", socket.MSG_DONTWAIT)
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000
 
 
 def _joined(writes: Sequence[bytes]) -> list[bytes]:

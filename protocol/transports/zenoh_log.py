@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
+from protocol.clock import monotonic_us
 from protocol.log_lines import JsonLines
 from protocol.transports import denied
 from protocol.transports.endpoints import check_endpoint
@@ -95,7 +96,7 @@ class _Told:
 
     def _often(self, cause: str, times: int) -> str | None:
         """How often since the last line about `cause`, in words; None if no line is due."""
-        told = self._lines.is_due(cause, time.monotonic_ns() // 1000, times) if cause else 0
+        told = self._lines.is_due(cause, monotonic_us(), times) if cause else 0
         return None if not told else f" ({told} times)" if told > 1 else ""
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from pydantic import ValidationError
 
+from protocol.clock import monotonic_us
 from protocol.codec import encode
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.presence import (
@@ -90,7 +91,7 @@ def ask(session: zenoh.Session, timeout_s: float = ANSWER_S) -> list[Peer]:
     import zenoh
 
     answers: list[Peer] = []
-    asked_us = _now_us()
+    asked_us = monotonic_us()
     replies = session.get(
         EVERYBODY, zenoh.handlers.FifoChannel(MAX_PEERS), target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s,
@@ -99,7 +100,7 @@ def ask(session: zenoh.Session, timeout_s: float = ANSWER_S) -> list[Peer]:
         sample = reply.ok
         if sample is None or len(answers) >= MAX_PEERS:
             continue
-        peer = read_answer(str(sample.key_expr), sample.payload.to_bytes(), asked_us, _now_us(),
+        peer = read_answer(str(sample.key_expr), sample.payload.to_bytes(), asked_us, monotonic_us(),
                            time.time_ns() // 1000)
         if peer is not None:
             answers.append(peer)
@@ -120,7 +121,3 @@ def _host() -> str:
 
 def _printed(text: str) -> str:
     return "".join(letter for letter in text if letter.isprintable())
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000

@@ -5,10 +5,11 @@ from typing import Annotated
 
 from pydantic import Field
 
+from protocol.clock import monotonic_us
 from protocol.errors import HardwareError, WireError
 from protocol.jpeg import JpegSize, read_jpeg_size
 from robot_side.hardware.lens import LensConfig, camera_model
-from robot_side.hardware.pace import Pace, now_us
+from robot_side.hardware.pace import Pace
 from robot_side.ports import Picture
 
 
@@ -41,7 +42,7 @@ class FolderCamera:
         if not self._pace.wait(timeout_s):
             return None
         self._count += 1
-        return Picture(self._pictures[(self._count - 1) % len(self._pictures)], now_us())
+        return Picture(self._pictures[(self._count - 1) % len(self._pictures)], monotonic_us())
 
     def close(self) -> None:
         """Nothing to give back."""

@@ -12,6 +12,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, HardwareError
 from robot_side.hardware.gpio_pins import Pins, open_pins
 from robot_side.hardware.gpio_table import DutyTable, TableConfig, table_of
@@ -81,7 +82,7 @@ class GpioDrive:
         self._pause = pause
         self._enabled = self._failed = False
         self._expected_mps = (0.0, 0.0)
-        self._angles = WheelAngles(0.0, 0.0, _now_us())
+        self._angles = WheelAngles(0.0, 0.0, monotonic_us())
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
         """Give wheel speeds; takes two PWM periods where a wheel reverses, else no time."""
@@ -135,7 +136,7 @@ class GpioDrive:
         return self.table.speed(left) / shares[0], self.table.speed(right) / shares[1]
 
     def _expected(self) -> WheelAngles:
-        now_us = _now_us()
+        now_us = monotonic_us()
         seconds, radius_m = (now_us - self._angles.t_us) / 1e6, self._config.wheel_radius_m
         left, right = (speed / radius_m * seconds for speed in self._expected_mps)
         return WheelAngles(self._angles.left_rad + left, self._angles.right_rad + right, now_us)
@@ -204,7 +205,3 @@ def _rows(config: GpioDriveConfig) -> tuple[tuple[float, float], ...]:
     except (OSError, UnicodeDecodeError) as error:
         said = error.strerror if isinstance(error, OSError) else "is no text"
         raise ConfigError(f"{path}: cannot be read: {said}; `sightline calibrate drive` writes one") from None
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000

@@ -1,8 +1,8 @@
 """A drive without motors: writes what it is told to a file, and turns ideal wheels. Shell (a file and a clock)."""
 
-import time
 from pathlib import Path
 
+from protocol.clock import monotonic_us
 from protocol.config import Config
 from protocol.errors import HardwareError
 from robot_side.ports import WheelAngles
@@ -25,7 +25,7 @@ class LogDrive:
         except OSError as error:
             raise HardwareError(f"drive log {config.path}: {error.strerror}; choose a writable file") from None
         self._speeds = (0.0, 0.0)
-        self._angles = WheelAngles(0.0, 0.0, time.monotonic_ns() // 1000)
+        self._angles = WheelAngles(0.0, 0.0, monotonic_us())
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
         """Log the speeds and turn by them from now on."""
@@ -36,7 +36,7 @@ class LogDrive:
 
     def wheels(self) -> WheelAngles:
         """Where ideal wheels would be now."""
-        now_us = time.monotonic_ns() // 1000
+        now_us = monotonic_us()
         seconds = (now_us - self._angles.t_us) / 1e6
         left, right = self._speeds
         return WheelAngles(self._angles.left_rad + left * seconds, self._angles.right_rad + right * seconds, now_us)

@@ -2,6 +2,7 @@
 
 import time
 
+from protocol.clock import monotonic_us
 from robot_side.hardware.buffer_time import Clocks
 
 
@@ -24,12 +25,7 @@ class Pace:
         return True
 
 
-def now_us() -> int:
-    """The robot's monotonic clock, in microseconds."""
-    return time.monotonic_ns() // 1000
-
-
 def read_clocks() -> Clocks:
     """Every clock that a driver may stamp with, now."""
     boot_us = time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000
-    return Clocks(now_us(), boot_us, time.time_ns() // 1000)
+    return Clocks(monotonic_us(), boot_us, time.time_ns() // 1000)

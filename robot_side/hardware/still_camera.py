@@ -5,10 +5,11 @@ from typing import Annotated
 
 from pydantic import Field
 
+from protocol.clock import monotonic_us
 from protocol.errors import HardwareError
 from robot_side.hardware.folder_camera import jpeg_size
 from robot_side.hardware.lens import LensConfig, camera_model
-from robot_side.hardware.pace import Pace, now_us
+from robot_side.hardware.pace import Pace
 from robot_side.ports import Picture
 
 
@@ -37,7 +38,7 @@ class StillCamera:
 
     def read(self, timeout_s: float) -> Picture | None:
         """The picture, at the next tick."""
-        return Picture(self._jpeg, now_us()) if self._pace.wait(timeout_s) else None
+        return Picture(self._jpeg, monotonic_us()) if self._pace.wait(timeout_s) else None
 
     def close(self) -> None:
         """Nothing to give back."""

@@ -10,10 +10,11 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, HardwareError
 from protocol.jpeg import JpegSize
 from robot_side.hardware.lens import LensConfig, camera_model
-from robot_side.hardware.pace import Pace, now_us
+from robot_side.hardware.pace import Pace
 from robot_side.ports import Picture, scaled_size, share_of
 
 _USUAL_FPS = 30.0
@@ -57,7 +58,7 @@ class VideoCamera:
         done, bgr = self._capture.retrieve()
         if not done:
             raise self._broken()
-        t_us = now_us()
+        t_us = monotonic_us()
         scale = self._scale_percent
         if scale != 100:
             size = scaled_size(self.model.width_px, self.model.height_px, scale)

@@ -5,7 +5,6 @@ picture that it gives here what it should.
 """
 
 import hashlib
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field
 
+from protocol.clock import monotonic_us
 from protocol.config import Config as Settings
 from protocol.errors import ConfigError, HardwareError
 from vision_side.config import Device
@@ -74,7 +74,7 @@ class OnnxDetector:
         results: list[DetectionResult | None] = []
         while len(results) < len(frames):
             some = frames[len(results) : len(results) + self._at_once]
-            is_late = time.monotonic_ns() // 1000 > deadline_us
+            is_late = monotonic_us() > deadline_us
             results += [None] * len(some) if is_late else self._looked(some)
         return results
 

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from protocol.clock import monotonic_us
 from protocol.transports.link import Link
-from vision_side.clock import now_us
 from vision_side.detect.agreement import Agreement
 from vision_side.detect.around import attach_detector, close_detector, news_of
 from vision_side.detect.by_session import MAX_ROBOTS
@@ -130,7 +130,7 @@ class Shadowed:
         return pair
 
     def _is_fit(self, pair: _Pair) -> bool:
-        return pair.answered_us is not None and now_us() - pair.answered_us <= _FRESH_US
+        return pair.answered_us is not None and monotonic_us() - pair.answered_us <= _FRESH_US
 
     def _put(self, task: _Task) -> None:
         """The newest frame of each robot waits; an older one that was not looked at yet is left out."""
@@ -154,11 +154,11 @@ class Shadowed:
 
     def _compare(self, task: _Task) -> None:
         frame = self._decoders.again(task.frame)
-        answer = self._ask(not task.promoted, [frame], now_us() + _PATIENCE_US)[0]
+        answer = self._ask(not task.promoted, [frame], monotonic_us() + _PATIENCE_US)[0]
         pair = self._pairs.get(frame.robot)
         if answer is None or pair is None or pair.promoted is not task.promoted:
             return
-        answer, pair.answered_us = checked(frame, answer), now_us()
+        answer, pair.answered_us = checked(frame, answer), monotonic_us()
         line = pair.agreement.add(task.result, answer) if task.result is not None else ""
         if line:
             self._news.add(f"shadow: {line}")

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
+from protocol.clock import monotonic_us
 from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
-from vision_side.clock import now_us
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
 from vision_side.detect.remote.refusing import NoAnswerError, Reason, Tally
 
@@ -83,13 +83,13 @@ class Asking(FrameByFrame):
         self._server.close()
 
     def _ask(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
-        began_us = now_us()
+        began_us = monotonic_us()
         _check_picture(frame)
         try:
             answer = self._server.ask(frame, deadline_us)
         except WireError as error:  # of pixels that were asked for
             raise NoAnswerError(Reason.BAD_PICTURE, error.detail) from None
-        ended_us = now_us()
+        ended_us = monotonic_us()
         if ended_us > deadline_us:
             raise NoAnswerError(Reason.LATE, f"{(ended_us - deadline_us) / 1000:.0f} ms after the deadline")
         return result_of(frame, answer.detections, answer.maker, ended_us - began_us)
@@ -107,4 +107,4 @@ def _check_picture(frame: DetectFrame) -> None:
 
 def left_s(until_us: int) -> float:
     """What is left until then, 0 if nothing is; bounded for who has no deadline."""
-    return min(max(0, until_us - now_us()) / 1e6, LONGEST_WAIT_S)
+    return min(max(0, until_us - monotonic_us()) / 1e6, LONGEST_WAIT_S)

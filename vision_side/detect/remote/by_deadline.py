@@ -11,8 +11,8 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
+from protocol.clock import monotonic_us
 from protocol.transports.link import LatestSlot, Link
-from vision_side.clock import now_us
 from vision_side.detect.around import attach_detector, close_detector, news_of
 from vision_side.detect.own_decoders import OwnDecoders
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
@@ -46,7 +46,7 @@ class Pending:
     @property
     def over(self) -> bool:
         """Whether the deadline has passed."""
-        return now_us() > self.deadline_us
+        return monotonic_us() > self.deadline_us
 
 
 class ByDeadline:

@@ -8,8 +8,8 @@ from collections import Counter, OrderedDict
 from collections.abc import Sequence
 from typing import Final, Protocol, runtime_checkable
 
+from protocol.clock import monotonic_us
 from protocol.transports.link import Link
-from vision_side.clock import now_us
 from vision_side.detect.around import attach_detector, close_detector, news_of
 from vision_side.detect.by_session import MAX_ROBOTS
 from vision_side.detect.news import News
@@ -96,7 +96,7 @@ class Fallback:
         return [*news_of(self._first), *self._news.take(), *news_of(self._second)]
 
     def _by_first(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
-        reserve_us = min(RESERVE_US, max(0, deadline_us - now_us()) // 2)
+        reserve_us = min(RESERVE_US, max(0, deadline_us - monotonic_us()) // 2)
         return self._first.detect(frames, deadline_us - reserve_us) if frames else []
 
     def _switch(self, robot: str) -> None:

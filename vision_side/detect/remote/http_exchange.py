@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
-from vision_side.clock import now_us
+from protocol.clock import monotonic_us
 from vision_side.detect.remote.asking import left_s
 from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
@@ -93,7 +93,7 @@ class HttpExchange:
             raise NoAnswerError(Reason.MALFORMED, f"not HTTP: {type(error).__name__}: {error}") from None
 
     def _connect(self, until_us: int) -> socket.socket:
-        if now_us() < self._not_before_us:
+        if monotonic_us() < self._not_before_us:
             raise NoAnswerError(Reason.UNREACHABLE, f"{self._host}:{self._port} is tried again in a moment")
         connection = socket.create_connection((self._host, self._port), _left_s(until_us))
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -102,7 +102,7 @@ class HttpExchange:
 
     def _unreachable(self, error: OSError) -> NoAnswerError:
         if self._socket is None:
-            self._not_before_us = now_us() + RETRY_US
+            self._not_before_us = monotonic_us() + RETRY_US
         why = error.strerror or str(error) or type(error).__name__
         return NoAnswerError(Reason.UNREACHABLE, f"{self._host}:{self._port}: {why}; does the server run there?")
 
