@@ -126,6 +126,8 @@ def test_thresholds_hold_false_alarms_and_wrong_objects_down():
 def test_a_labels_threshold_balances_what_is_found_and_what_is_right():
     assert label_threshold(Found(2, [(0.9, True), (0.4, True), (0.3, False)])) == pytest.approx(0.4)
     assert label_threshold(Found(2, [(0.9, True), (0.2, False), (0.19, False), (0.1, False)])) == pytest.approx(0.9)
+    overlooked_is_worse = Found(2, [(0.9, True), (0.5, False), (0.4, False), (0.35, False), (0.3, True)])
+    assert label_threshold(overlooked_is_worse) == pytest.approx(0.3)
     assert label_threshold(Found()) == pytest.approx(0.3)
 
 
