@@ -12,8 +12,8 @@ from operator_side.extras import needs
 from operator_side.train_rounds import Training
 from protocol.errors import ConfigError, HardwareError
 
-STEPS = [15_000, 14_000]
-SCENES = 40_000
+STEPS = [15_000, 14_000, 13_000]
+SCENES = 60_000
 BATCH = 32
 VALIDATED = 2000
 """These are those of the model that ships, so that the same command makes it again; a test compares."""

@@ -8,8 +8,8 @@ from operator_side.score_detectors_text import check_lines, markdown
 from operator_side.score_scenes import Report
 from operator_side.train_export import MOST_BOXES, OPSET
 from operator_side.train_rounds import WHOLE_FROM, Training
-from sim.scene_textures import JUDGED, TRAINED, TRAINED_LATER, VALIDATED
-from sim.scenes import HEIGHT_PX, LABELS, LATER_FROM, VALIDATED_FROM, WIDTH_PX
+from sim.scene_textures import JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED
+from sim.scenes import HARDER_FROM, HEIGHT_PX, LABELS, LATER_FROM, VALIDATED_FROM, WIDTH_PX
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,9 @@ def _made(card: Card) -> list[str]:
         f"`sightline train --scenes {card.scenes} {steps} --batch {training.batch} "
         f"--seed {training.seed} --device {card.device} --jobs {training.jobs}`", "",
         f"- Scenes: seeds 0 to {card.scenes - 1}, floors and walls of the families {_families(TRAINED)}; from seed "
-        f"{LATER_FROM} up {_families(TRAINED_LATER)}. Defects are drawn anew each time a scene is shown.",
+        f"{LATER_FROM} up {_families(TRAINED_LATER)}; from {HARDER_FROM} up {_families(TRAINED_HARDER)}, with more "
+        "legs and more boxes of the ball's colour. Defects are drawn anew each time a scene is shown; from the third "
+        "round on a third of the pictures are clear, and a third are dim, blurred and coarse at once.",
         f"- Steps: {' and '.join(map(str, training.rounds))} of {training.batch} cut-outs (the last "
         f"{100 * (1 - WHOLE_FROM):.0f} % of a round half as many whole pictures), AdamW, learning rate "
         f"{training.rate:g} at first, half of that in each round that follows, weights averaged.",

@@ -219,6 +219,6 @@ def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[li
 def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> list[Sample]:
     """This process's share."""
     size_px, count = (WHOLE_PX, training.batch // 2) if training.whole_at(step) else (CUT_PX, training.batch)
-    share, known = max(1, count // training.jobs), training.scenes_at(step, len(scenes.truths))
-    return [sample(scenes, known, (training.seed, step, place), size_px)
+    share, shown = max(1, count // training.jobs), training.shown_at(step, len(scenes.truths))
+    return [sample(scenes, shown, (training.seed, step, place), size_px)
             for place in range(rank * share, (rank + 1) * share)]

@@ -12,6 +12,20 @@ WHOLE_FROM: Final = 0.8
 """From this part of a round on, whole pictures in place of cut-outs."""
 
 
+_HARDER_FROM: Final = 2
+"""This round and those after it, counted from 0, are of harder pictures."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """Which scenes a step draws from: the first `known`, of which those from `newest` on came with its round."""
+
+    newest: int
+    known: int
+    harder: bool = False
+    """Whether newer scenes, other things than asked for, and bad pictures are shown more than by chance."""
+
+
 @dataclass(frozen=True, slots=True)
 class Training:
     """What stands in the model card."""
@@ -39,9 +53,11 @@ class Training:
         done = min(1.0, (within - _WARM_UP) / max(1, steps - _WARM_UP))
         return float(0.5**number * (_LEAST_RATE + (1 - _LEAST_RATE) * 0.5 * (1 + math.cos(math.pi * done))))
 
-    def scenes_at(self, step: int, scenes: int) -> int:
-        """How many of the scenes, from the first on, are shown by then."""
-        return max(1, scenes * (self._place(step)[0] + 1) // len(self.rounds))
+    def shown_at(self, step: int, scenes: int) -> Shown:
+        """Which of so many scenes are shown then."""
+        number = self._place(step)[0]
+        known = max(1, scenes * (number + 1) // len(self.rounds))
+        return Shown(min(known - 1, scenes * number // len(self.rounds)), known, number >= _HARDER_FROM)
 
     def whole_at(self, step: int) -> bool:
         """Whether whole pictures are shown, half as many."""

@@ -9,14 +9,17 @@ import numpy.typing as npt
 import simplejpeg
 
 from operator_side.train_network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
+from operator_side.train_rounds import Shown
 from operator_side.train_scenes import DrawnScenes
 from sim.scene_defects import spoiled
-from sim.scenes import HEIGHT_PX, LABELS, TRAINED, WIDTH_PX, Box, Random, Truth
+from sim.scenes import DEFECTS, HEIGHT_PX, LABELS, TRAINED, WIDTH_PX, Box, Column, Random, Truth
 
 CUT_PX: Final = (192, 160)
 """Width and height of the cut-outs that most of the training sees: less than half the time of a whole picture."""
 WHOLE_PX: Final = (WIDTH_PX, HEIGHT_PX)
 _LEAST_LEFT: Final = 0.4  # of an object's box after the cut; with less left it is neither right nor wrong
+_NEW: Final = 0.5  # from the third round on, of the samples: of the scenes that the round adds, and no others
+_AROUND_OTHERS: Final = 0.3  # and these, by what nobody asks for
 _SPREAD: Final = 0.09  # standard deviation of the bump on the heat map, by the object's side
 _LEAST_SPREAD: Final = 0.6  # cells
 _SURE: Final = 0.4  # of the bump: cells from there up learn where the object's edges are
@@ -39,27 +42,41 @@ class Sample:
     """(H/4, W/4): 0 where nobody can say what is right."""
 
 
-def sample(scenes: DrawnScenes, known: int, numbers: tuple[int, int, int], size_px: tuple[int, int]) -> Sample:
-    """One of the first `known` scenes, a cut, a side, defects; the same for the same seed, step, place in a batch."""
+def sample(scenes: DrawnScenes, shown: Shown, numbers: tuple[int, int, int], size_px: tuple[int, int]) -> Sample:
+    """One of the scenes, a cut, a side, defects; the same for the same seed, step, place in a batch."""
     draw = np.random.default_rng(numbers)
-    number = int(draw.integers(known))
-    left, top = _cut(draw, scenes.truths[number], size_px)
+    number, around, column = (_harder if shown.harder else _plain)(draw, scenes, shown)
+    left, top = _cut(draw, around, size_px)
     rgb = scenes.pictures[number][top : top + size_px[1], left : left + size_px[0]]
     mirrored = bool(draw.random() < 0.5)
     picture = np.ascontiguousarray(rgb[:, ::-1] if mirrored else rgb)
-    bgr = simplejpeg.decode_jpeg(spoiled(picture, TRAINED, draw), "BGR")
+    bgr = simplejpeg.decode_jpeg(spoiled(picture, column, draw), "BGR")
     moved = [(one, _moved(one.box, left, top, size_px, mirrored)) for one in scenes.truths[number]]
     unclear, others = ([_moved(one, left, top, size_px, mirrored) for one in boxes]
                        for boxes in (scenes.unclear[number], scenes.others[number]))
     return _wanted(np.ascontiguousarray(bgr.transpose(2, 0, 1)), moved, unclear, others)
 
 
-def _cut(draw: Random, truths: tuple[Truth, ...], size_px: tuple[int, int]) -> tuple[int, int]:
-    """The cut's corner: three times in four with the middle of one object in it."""
+def _plain(draw: Random, scenes: DrawnScenes, shown: Shown) -> tuple[int, list[Box], Column]:
+    """A scene, what of it a cut is made around, its defects."""
+    number = int(draw.integers(shown.known))
+    return number, [one.box for one in scenes.truths[number]], TRAINED
+
+
+def _harder(draw: Random, scenes: DrawnScenes, shown: Shown) -> tuple[int, list[Box], Column]:
+    """The same, with more of the newest scenes, of what nobody asks for, of bad pictures."""
+    number = int(draw.integers(shown.newest if draw.random() < _NEW else 0, shown.known))
+    asked = [one.box for one in scenes.truths[number]]
+    around = list(scenes.others[number]) if draw.random() < _AROUND_OTHERS else asked
+    return number, around, DEFECTS[int(draw.integers(len(DEFECTS)))]
+
+
+def _cut(draw: Random, boxes: list[Box], size_px: tuple[int, int]) -> tuple[int, int]:
+    """The cut's corner: three times in four with the middle of one box in it."""
     most = (WIDTH_PX - size_px[0], HEIGHT_PX - size_px[1])
     corner = [int(draw.integers(0, one + 1)) for one in most]
-    if truths and draw.random() < 0.75:
-        box = truths[int(draw.integers(len(truths)))].box
+    if boxes and draw.random() < 0.75:
+        box = boxes[int(draw.integers(len(boxes)))]
         for axis in (0, 1):
             middle = (box[axis] + box[axis + 2]) / 2
             corner[axis] = int(np.clip(middle - draw.uniform(0.05, 0.95) * size_px[axis], 0, most[axis]))

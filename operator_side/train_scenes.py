@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from protocol.errors import ConfigError
 from sim.scene_render import SceneRenderer
-from sim.scenes import HEIGHT_PX, TRAINED, VALIDATED_FROM, WIDTH_PX, Box, Truth
+from sim.scenes import HEIGHT_PX, VALIDATED_FROM, WIDTH_PX, Box, Truth, trained_column
 
 _SLICE: Final = 100
 """Scenes that one process draws before it says so."""
@@ -69,7 +69,8 @@ def _would_be_the_same(pictures: Path, notes: Path, count: int) -> bool:
         return False
     drawn = np.load(pictures, mmap_mode="r")
     with SceneRenderer() as renderer:
-        return all(np.array_equal(drawn[seed], renderer.scene(seed, TRAINED).rgb) for seed in range(min(count, _TRIED)))
+        return all(np.array_equal(drawn[seed], renderer.scene(seed, trained_column(seed)).rgb)
+                   for seed in range(min(count, _TRIED)))
 
 
 def _truth(one: list[Any]) -> Truth:
@@ -99,7 +100,7 @@ def _draw(pictures: Path, seeds: Sequence[int]) -> tuple[int, list[dict[str, Any
     rows = []
     with SceneRenderer() as renderer:
         for seed in seeds:
-            scene = renderer.scene(seed, TRAINED)
+            scene = renderer.scene(seed, trained_column(seed))
             store[seed] = scene.rgb
             truths = [[one.label, one.box, one.seen] for one in scene.truths]
             rows.append({"truths": truths, "unclear": scene.unclear, "others": scene.others})

@@ -13,7 +13,7 @@ import numpy as np
 from sim import scene_patterns
 from sim.camera import floor_tile
 from sim.scene_texture_parts import SIDE, Field, Random, Texture, grid, mixed, near, rgb, soft
-from sim.scenes import JUDGED_FROM, LATER_FROM, VALIDATED_FROM
+from sim.scenes import HARDER_FROM, JUDGED_FROM, LATER_FROM, VALIDATED_FROM
 
 _FLOORS = 16  # of the simulated room's own; each takes as long to make as a scene
 
@@ -150,6 +150,11 @@ _MORE: Final = ("leaves", "spectrum", "scribbles", "speckle")
 _PATCHES: Final = (*_PIECES, *_MORE)
 TRAINED_LATER: Final = (*_MORE, "leaves", "quilt", "patchwork", "patchwork", "patchwork")
 """Of the scenes that the second round of training adds."""
+TRAINED_HARDER: Final = (
+    "plain", "clouds", "boards", "checks", "stripes", "blots", "bricks", "spectrum", "scribbles", "speckle", "quilt",
+    "quilt", "patchwork", "patchwork",
+)
+"""Of the third round's. None is of discs alone: with so many flat ones about, balls look less sure than they are."""
 VALIDATED: Final = ("plaid", "scales", "script", "ridges")
 """A threshold that was chosen on textures that training knows is too low for others."""
 JUDGED: Final = ("mosaic", "stones", "weave", "marble")
@@ -170,4 +175,6 @@ def families(seed: int) -> tuple[str, ...]:
         return JUDGED
     if seed >= VALIDATED_FROM:
         return VALIDATED
+    if seed >= HARDER_FROM:
+        return TRAINED_HARDER
     return TRAINED_LATER if seed >= LATER_FROM else TRAINED

@@ -5,7 +5,7 @@ textures, light from heights in between.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -21,6 +21,8 @@ VALIDATED_FROM: Final = 800_000
 LABELS: Final = ("ball", "light-red", "light-yellow", "light-green", "legs")
 LATER_FROM: Final = 20_000
 """Seeds of training from here on have more families of textures: the second round's."""
+HARDER_FROM: Final = 40_000
+"""Seeds of training from here on have more legs, and more boxes of the ball's colour: the third round's."""
 STATES: Final[tuple[State, ...]] = ("red", "yellow", "green")
 
 WIDTH_PX, HEIGHT_PX = 320, 240
@@ -76,6 +78,15 @@ TRAINED: Final = Column(
     "trained", same_colour_boxes=0.6, lights=0.35, legs=0.4, any_colour=0.2, gain=(0.2, 1.1), white_balance=0.33,
     blurred=0.45, blur_px=(3.0, 21.0), noise=(0.0, 6.0), quality=(25, 95),
 )
+HARDER: Final = replace(TRAINED, name="trained harder", same_colour_boxes=0.85, legs=0.75, any_colour=0.1)
+DEFECTS: Final = (
+    TRAINED,
+    Column("little at once", gain=(0.85, 1.05), white_balance=0.06, noise=(0.5, 3.5), quality=(25, 95)),
+    Column("much at once", gain=(0.22, 1.05), white_balance=0.32, blurred=1.0, blur_px=(7.0, 21.0), noise=(0.5, 4.0),
+           quality=(25, 45)),
+)
+"""From the third round on each is as likely, so that scores mean the same in clear pictures and in bad ones: bad ones
+need the higher threshold otherwise, and there is one for all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +195,11 @@ class Scene:
     others: tuple[Box, ...]
     unclear: tuple[Box, ...]
     """Things that are asked for, but hardly in view: neither right nor wrong."""
+
+
+def trained_column(seed: int) -> Column:
+    """What is hard about the scene of that seed when it is trained on."""
+    return HARDER if seed >= HARDER_FROM else TRAINED
 
 
 def is_judged(seed: int) -> bool:

@@ -15,10 +15,11 @@ from sim.scene_defects import as_seen, spoiled, streak
 from sim.scene_plan import plan_scene
 from sim.scene_render import SceneRenderer
 from sim.scene_texture_parts import SIDE
-from sim.scene_textures import FAMILIES, JUDGED, TRAINED, TRAINED_LATER, VALIDATED, texture
+from sim.scene_textures import FAMILIES, JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED, texture
 from sim.scenes import (
     BALL_PX,
     COLUMNS,
+    HARDER_FROM,
     HEIGHT_PX,
     JUDGED_FROM,
     LABELS,
@@ -30,6 +31,7 @@ from sim.scenes import (
     VALIDATED_FROM,
     WIDTH_PX,
     Lens,
+    trained_column,
 )
 from sim.scenes import TRAINED as TRAINED_COLUMN
 from tests import judged_scenes
@@ -78,8 +80,10 @@ def test_a_ball_is_as_large_as_agreed_and_stands_in_view():
 
 
 def test_what_is_judged_was_never_trained_on():
-    purposes = {0: TRAINED, LATER_FROM: TRAINED_LATER, VALIDATED_FROM: VALIDATED, JUDGED_FROM: JUDGED}
-    assert not set(JUDGED) & {*TRAINED, *TRAINED_LATER, *VALIDATED} and not set(VALIDATED) & {*TRAINED, *TRAINED_LATER}
+    purposes = {0: TRAINED, LATER_FROM: TRAINED_LATER, HARDER_FROM: TRAINED_HARDER, VALIDATED_FROM: VALIDATED,
+                JUDGED_FROM: JUDGED}
+    trained = {*TRAINED, *TRAINED_LATER, *TRAINED_HARDER}
+    assert not set(JUDGED) & {*trained, *VALIDATED} and not set(VALIDATED) & trained
     assert {name for names in purposes.values() for name in names} == set(FAMILIES)
     heights_deg = {True: [], False: []}
     for first, seed in [(first, first + number) for first in purposes for number in range(300)]:
@@ -88,6 +92,15 @@ def test_what_is_judged_was_never_trained_on():
         heights_deg[seed >= JUDGED_FROM].append(math.degrees(math.asin(plan.light_from[2])))
     assert all(30 <= one <= 50 for one in heights_deg[True])
     assert not any(30 < one < 50 for one in heights_deg[False])
+
+
+def test_what_is_trained_last_has_more_boxes_of_the_balls_colour_and_more_legs():
+    def share(first, shape):
+        plans = [plan_scene(seed, trained_column(seed)) for seed in range(first, first + 200)]
+        return sum(any(one.shape == shape for one in plan.solids) for plan in plans) / 200
+
+    assert trained_column(HARDER_FROM - 1) == TRAINED_COLUMN
+    assert share(HARDER_FROM, "legs") > share(0, "legs") + 0.2 and share(HARDER_FROM, "box") > share(0, "box")
 
 
 def test_columns_have_what_their_names_say():

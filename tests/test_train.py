@@ -12,6 +12,7 @@ import cv2
 
 from operator_side import cli
 from operator_side.train_network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
+from operator_side.train_rounds import Shown
 from operator_side.train_samples import CUT_PX, WHOLE_PX, sample
 from operator_side.train_scenes import DrawnScenes, drawn_scenes
 from protocol.errors import ConfigError
@@ -28,7 +29,7 @@ def one_scene(truths=(BALL,), unclear=(), others=()):
 
 def shown(scenes, seed, step, place, size_px):
     """Any of all scenes."""
-    return sample(scenes, len(scenes.truths), (seed, step, place), size_px)
+    return sample(scenes, Shown(0, len(scenes.truths)), (seed, step, place), size_px)
 
 
 def test_the_table_is_a_network_of_the_agreed_size():
@@ -74,12 +75,53 @@ def test_the_same_numbers_give_the_same_sample():
     assert not np.array_equal(first.image, shown(one_scene(), 3, 12, 2, CUT_PX).image)
 
 
-def test_only_the_scenes_that_are_known_by_then_are_shown():
+def four_scenes():
+    """Each of another label, which says which one was shown."""
     pictures = np.full((4, HEIGHT_PX, WIDTH_PX, 3), 120, np.uint8)
-    scenes = DrawnScenes(pictures, tuple((Truth(label, BALL.box, 1.0),) for label in LABELS[:4]), ((),) * 4, ((),) * 4)
+    return DrawnScenes(pictures, tuple((Truth(label, BALL.box, 1.0),) for label in LABELS[:4]), ((),) * 4,
+                       (((4.0, 180.0, 44.0, 220.0),),) * 4)
+
+
+def times_shown(which, count):
+    """How many times each of the four was."""
+    heats = [sample(four_scenes(), which, (1, 0, place), WHOLE_PX).heat for place in range(count)]
+    return np.bincount([int(np.argwhere(heat[: len(LABELS)] == 1.0)[0, 0]) for heat in heats], minlength=4).tolist()
+
+
+def test_only_the_scenes_that_are_known_by_then_are_shown():
     for known in (1, 3, 4):
-        heats = [sample(scenes, known, (1, 0, place), WHOLE_PX).heat for place in range(60)]
-        assert {int(np.argwhere(heat == 1.0)[0, 0]) for heat in heats} == {*range(known)}
+        assert {place for place, times in enumerate(times_shown(Shown(0, known), 60)) if times} == {*range(known)}
+
+
+def test_a_round_of_harder_pictures_shows_its_own_scenes_more_often():
+    assert min(times_shown(Shown(3, 4), 200)) > 30
+    times = times_shown(Shown(3, 4, harder=True), 200)
+    assert min(times) > 10 and 95 < times[3] < 155
+
+
+def test_a_round_of_harder_pictures_is_cut_around_other_things_too():
+    def middle_in_view(which):
+        seen = [sample(four_scenes(), which, (1, 0, place), CUT_PX).heat[-1].max() == 1.0 for place in range(200)]
+        return sum(seen)
+
+    assert middle_in_view(Shown(0, 4, harder=True)) > middle_in_view(Shown(0, 4)) + 20
+
+
+def test_a_round_of_harder_pictures_has_more_clear_ones_and_more_bad_ones():
+    """Of black and white squares: clear ones are bright with sharp edges, bad ones neither."""
+    squares = (np.indices((HEIGHT_PX, WIDTH_PX)) // 40).sum(0) % 2 * 255
+    scenes = DrawnScenes(np.repeat(squares[None, ..., None], 3, 3).astype(np.uint8), ((),), ((),), ((),))
+
+    def kinds(which):
+        pictures = [sample(scenes, which, (1, 0, place), WHOLE_PX).image.astype(int) for place in range(150)]
+        sharp = [np.abs(np.diff(one.mean(0))).max() > 60 for one in pictures]
+        bright = [one.mean() > 100 for one in pictures]
+        both = list(zip(sharp, bright, strict=True))
+        return both.count((True, True)), both.count((False, False))
+
+    clear, bad = kinds(Shown(0, 1, harder=True))
+    clear_before, bad_before = kinds(Shown(0, 1))
+    assert clear > clear_before + 10 and bad > bad_before + 10
 
 
 def test_what_the_cut_leaves_too_little_of_is_neither_right_nor_wrong():

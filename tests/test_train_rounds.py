@@ -2,7 +2,7 @@
 
 import pytest
 
-from operator_side.train_rounds import WHOLE_FROM, Training
+from operator_side.train_rounds import WHOLE_FROM, Shown, Training
 
 
 @pytest.mark.parametrize("rounds", [(1000,), (1000, 600), (300, 1000, 500)])
@@ -20,11 +20,15 @@ def test_each_round_has_the_rate_up_and_down_again_half_as_high(rounds):
 
 @pytest.mark.parametrize(("rounds", "known"), [((10,), [40]), ((10, 5), [20, 40]), ((3, 4, 5), [13, 26, 40])])
 def test_each_round_takes_in_more_scenes_and_the_last_all(rounds, known):
-    training, begin = Training(rounds), 0
-    for steps, expected in zip(rounds, known, strict=True):
-        assert {training.scenes_at(step, 40) for step in range(begin, begin + steps)} == {expected}
-        begin += steps
-    assert training.steps == sum(rounds) and training.scenes_at(0, 1) == 1
+    training, begin, before = Training(rounds), 0, 0
+    for number, (steps, expected) in enumerate(zip(rounds, known, strict=True)):
+        shown = Shown(before, expected, harder=number >= 2)
+        assert {training.shown_at(step, 40) for step in range(begin, begin + steps)} == {shown}
+        begin, before = begin + steps, expected
+    assert training.steps == sum(rounds) and training.shown_at(0, 1) == Shown(0, 1)
+    for step in range(training.steps):
+        few = training.shown_at(step, 1)
+        assert 0 <= few.newest < few.known == 1, "a single scene is shown in every round"
 
 
 def test_each_round_ends_with_whole_pictures():
