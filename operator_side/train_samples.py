@@ -18,8 +18,8 @@ CUT_PX: Final = (192, 160)
 """Width and height of the cut-outs that most of the training sees: less than half the time of a whole picture."""
 WHOLE_PX: Final = (WIDTH_PX, HEIGHT_PX)
 _LEAST_LEFT: Final = 0.4  # of an object's box after the cut; with less left it is neither right nor wrong
-_NEW: Final = 0.5  # from the third round on, of the samples: of the scenes that the round adds, and no others
-_AROUND_OTHERS: Final = 0.3  # and these, by what nobody asks for
+_NEW: Final = 0.5  # of the samples of a harder round: drawn from the scenes that it adds alone
+_AROUND_OTHERS: Final = 0.3  # of those samples: cut around what nobody asks for, where others are around objects
 _SPREAD: Final = 0.09  # standard deviation of the bump on the heat map, by the object's side
 _LEAST_SPREAD: Final = 0.6  # cells
 _SURE: Final = 0.4  # of the bump: cells from there up learn where the object's edges are

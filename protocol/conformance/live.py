@@ -1,13 +1,13 @@
 """A bench in real time: the peer is somebody at an endpoint. Shell (a lock, a clock, a link's threads)."""
 
 import threading
-import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Final, Self
 
 from protocol.channels import Channel
+from protocol.clock import monotonic_us
 from protocol.conformance.bench import Access, Bench
 from protocol.conformance.case import NotApplicableError
 from protocol.transports.link import Link, Message
@@ -47,7 +47,7 @@ class LiveBench(Bench):
 
     @property
     def now_us(self) -> int:
-        return time.monotonic_ns() // 1000
+        return monotonic_us()
 
     @property
     def dropped_here(self) -> Counter[str]:
