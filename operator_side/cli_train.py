@@ -1,16 +1,20 @@
 """Command `train`: make the learned detector again, or one's own. Shell."""
 
+import hashlib
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from operator_side.extras import needs
 from operator_side.train_rounds import Training
 from protocol.errors import ConfigError, HardwareError
+
+if TYPE_CHECKING:  # it needs the extra
+    from operator_side.train_export import Weights
 
 STEPS = [15_000, 14_000, 13_000]
 SCENES = 60_000
@@ -19,6 +23,7 @@ VALIDATED = 2000
 """These are those of the model that ships, so that the same command makes it again; a test compares."""
 OUT = Path("runs/train")
 _STEPS = "Of one round; say it again for one more, which starts the learning rate anew and takes in more scenes."
+_START = "A model that this command made: train the last round alone, from there on."
 _LEAST_SHARE = 8
 """Of a batch for each process that trains: the normalisation needs a few pictures."""
 
@@ -37,6 +42,7 @@ def train(
     seed: Annotated[int, typer.Option(min=0, max=2**31, help="Draws weights, cuts and defects.")] = 1,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What trains.")] = "cpu",
     jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Processes [default: one per core].")] = None,
+    start: Annotated[Path | None, typer.Option(metavar="MODEL", help=_START)] = None,
     validated: Annotated[int, typer.Option(min=5, help="Scenes of each column that choose thresholds.")] = VALIDATED,
     judged: Annotated[int, typer.Option(min=5, help="Scenes of each column for the card's table.")] = 500,
 ) -> None:
@@ -49,14 +55,28 @@ def train(
         raise HardwareError("--device cuda: this PyTorch sees no GPU; check `nvidia-smi` and that PyTorch is a CUDA "
                             "build, or take --device cpu")
     processes = jobs or os.cpu_count() or 1
-    training = Training(tuple(steps), batch, seed=seed, jobs=_sharing(batch, processes))
-    options = TrainOptions(out, scenes, training, device, processes, validated, judged)
+    weights, digest = _begun(start) if start else (None, "")
+    training = Training(tuple(steps), batch, seed=seed, jobs=_sharing(batch, processes), start=digest)
+    options = TrainOptions(out, scenes, training, device, processes, validated, judged, weights)
     try:
         out.mkdir(parents=True, exist_ok=True)
         model = run_training(options, _say, _progress)
     except OSError as error:
         raise ConfigError(f"--out {out}: {error.strerror or error}") from None
     _say(f"{model}, {model.with_suffix('.md').name}: try it with `sightline score detectors onnx:{model}`")
+
+
+def _begun(model: Path) -> "tuple[Weights, str]":
+    """The model's weights, and its SHA-256."""
+    from operator_side.train_export import weights_in
+
+    try:
+        data = model.read_bytes()
+        return weights_in(data), hashlib.sha256(data).hexdigest()
+    except OSError as error:
+        raise ConfigError(f"--start {model}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise ConfigError(f"--start {model}: {error}; name a model that `sightline train` made") from None
 
 
 def _sharing(batch: int, processes: int) -> int:

@@ -56,9 +56,10 @@ def _made(card: Card) -> list[str]:
     training = card.training
     thresholds = ", ".join(f"{label} {one:.2f}" for label, one in zip(LABELS, card.thresholds, strict=True))
     steps = " ".join(f"--steps {one}" for one in training.rounds)
+    start = " --start MODEL" if training.start else ""
     return [
         f"`sightline train --scenes {card.scenes} {steps} --batch {training.batch} "
-        f"--seed {training.seed} --device {card.device} --jobs {training.jobs}`", "",
+        f"--seed {training.seed} --device {card.device} --jobs {training.jobs}{start}`", "",
         f"- Scenes: seeds 0 to {card.scenes - 1}, floors and walls of the families {_families(TRAINED)}; from seed "
         f"{LATER_FROM} up {_families(TRAINED_LATER)}; from {HARDER_FROM} up {_families(TRAINED_HARDER)}, with more "
         "legs and more boxes of the ball's colour. Defects are drawn anew each time a scene is shown; from the third "
@@ -66,6 +67,7 @@ def _made(card: Card) -> list[str]:
         f"- Steps: {' and '.join(map(str, training.rounds))} of {training.batch} cut-outs (the last "
         f"{100 * (1 - WHOLE_FROM):.0f} % of a round half as many whole pictures), AdamW, learning rate "
         f"{training.rate:g} at first, half of that in each round that follows, weights averaged.",
+        *([f"- The last round began from MODEL, of SHA-256 `{training.start}`."] if training.start else []),
         f"- Thresholds: {thresholds}, chosen on {card.validated} scenes a column of the seeds from {VALIDATED_FROM}, "
         f"with floors and walls of other families: {_families(VALIDATED)}.",
     ]

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import onnx
+from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
 
 from operator_side.train_network import (
@@ -75,6 +76,30 @@ def onnx_bytes(weights: Weights, properties: dict[str, str]) -> bytes:
     helper.set_model_props(model, {"labels": json.dumps(LABELS), **properties})
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())
+
+
+def weights_in(data: bytes) -> Weights:
+    """Those that `onnx_bytes` made a file of. Raises ValueError for a file of another network."""
+    try:
+        model = onnx.load_from_string(data)
+    except DecodeError:
+        raise ValueError("it is no ONNX model") from None
+    held = {one.name: numpy_helper.to_array(one) for one in model.graph.initializer}
+    weights: Weights = {}
+    channels = {"image": COLOURS}
+    for layer in network():
+        channels[layer.name] = layer.channels
+        if layer.kind in ("add", "add-up"):
+            continue
+        each = 1 if layer.kind == "depthwise" else channels[layer.takes[0]]
+        shape = (layer.channels, each, layer.kernel, layer.kernel)
+        weight, bias = (held.get(f"{layer.name}.{part}", np.zeros(0)) for part in ("weight", "bias"))
+        if weight.size != np.prod(shape) or bias.size != layer.channels:
+            raise ValueError(f"it has no layer `{layer.name}` of {layer.channels} channels")
+        if layer.takes[0] == "image":
+            weight = weight.reshape(layer.channels, layer.kernel, layer.kernel, COLOURS).transpose(0, 3, 1, 2)
+        weights[f"{layer.name}.weight"], weights[f"{layer.name}.bias"] = weight.reshape(shape), bias
+    return weights
 
 
 def _image(graph: Graph) -> str:

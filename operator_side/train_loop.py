@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from operator_side.train_module import Network, Weights, folded
+from operator_side.train_module import Network, Weights, begin_from, folded
 from operator_side.train_network import OUTPUTS, TAUGHT
 from operator_side.train_rounds import Training
 from operator_side.train_samples import CUT_PX, WHOLE_PX, Sample, sample
@@ -44,6 +44,16 @@ def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
     _checkpoint(folder / CHECKPOINT, _made_by(scenes, training), device)  # what it cannot go on from is said once
     with _helpers(scenes, training, folder):
         return _trained(scenes, training, device, folder, say)
+
+
+def start_from(weights: Weights, scenes: DrawnScenes, training: Training, folder: Path) -> None:
+    """Leave a checkpoint of these weights where the last round begins, unless a training has gone on from there."""
+    if (folder / CHECKPOINT).exists():
+        return
+    torch.manual_seed(training.seed)
+    state = _State(scenes, training, torch.device("cpu"))
+    state.begin(weights, _batch(scenes, replace(training, jobs=1), training.last_from, 0))
+    state.save(folder / CHECKPOINT, training.last_from)
 
 
 @contextmanager
@@ -130,12 +140,21 @@ class _State:
     """Network, optimiser and average."""
 
     def __init__(self, scenes: DrawnScenes, training: Training, device: Any) -> None:
-        self._made_by = _made_by(scenes, training)
+        self._training, self._made_by = training, _made_by(scenes, training)
         self._device = device
         self.network = Network().to(device=device, memory_format=torch.channels_last).train()
         self._optimiser = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay)
         self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimiser, training.rate_at)
-        self.average = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
+        self.average = self._copied()
+
+    def _copied(self) -> dict[str, Any]:
+        return {name: value.detach().clone() for name, value in self.network.state_dict().items()}
+
+    def begin(self, weights: Weights, batch: list[Sample]) -> None:
+        """Take those weights over, for the last round."""
+        begin_from(self.network, weights, self._on_device([one.image for one in batch]))
+        self.average = self._copied()
+        self._schedule.last_epoch = self._training.last_from
 
     def learn(self, step: int, batch: list[Sample]) -> float:
         """One step; its loss."""

@@ -1,6 +1,7 @@
 """The network's table as a PyTorch module, and its weights as arrays with the normalisation folded in. Pure (PyTorch).
 """
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,40 @@ class Network(nn.Module):  # type: ignore[misc]
             second = takes[1] if layer.kind == "add" else nn.functional.interpolate(takes[1], scale_factor=2)
             return torch.relu(takes[0] + second)
         return getattr(self, _key(layer))(takes[0])
+
+
+def begin_from(network: Network, weights: Weights, images: Any) -> None:
+    """Give a new network what `folded` gave, and each normalisation what it sees on these pictures, uint8 (N, 3, H, W):
+    what comes out stays the same. The maps of `TAUGHT` are not among the weights and begin anew."""
+    hooks = []
+    with torch.no_grad():
+        for layer in network.layers:
+            module = getattr(network, _key(layer), None)
+            if module is None:
+                continue
+            weight, bias = (torch.tensor(weights[f"{layer.name}.{part}"]) for part in ("weight", "bias"))
+            if layer.kind == "head":
+                module.weight[:OUTPUTS], module.bias[:OUTPUTS] = weight, bias
+                continue
+            module[0].weight.copy_(weight)
+            module[1].bias.copy_(bias)
+            hooks.append(module[1].register_forward_hook(partial(_settle, module[0])))
+        network.eval()(images)
+        network.train()
+    for hook in hooks:
+        hook.remove()
+
+
+def _settle(convolution: Any, normal: Any, given: tuple[Any], _: Any) -> None:
+    """Let the normalisation undo what it does to these values, and the convolution's weights be as large as it expects.
+    """
+    mean, variance = given[0].mean((0, 2, 3)), given[0].var((0, 2, 3))
+    spread = (variance + normal.eps).sqrt()
+    convolution.weight /= spread[:, None, None, None]
+    normal.running_mean.copy_(mean / spread)
+    normal.running_var.copy_(variance / spread**2)
+    normal.weight.copy_((variance / spread**2 + normal.eps).sqrt() * spread)
+    normal.bias += mean
 
 
 def _key(layer: Layer) -> str:

@@ -39,11 +39,18 @@ class Training:
     seed: int = 1
     jobs: int = 1
     """Processes that share each batch; a GPU takes it whole."""
+    start: str = ""
+    """SHA-256 of the model that the last round began from, if the rounds before it were not of this training."""
 
     @property
     def steps(self) -> int:
         """Of all rounds."""
         return sum(self.rounds)
+
+    @property
+    def last_from(self) -> int:
+        """The last round's first step."""
+        return self.steps - self.rounds[-1]
 
     def rate_at(self, step: int) -> float:
         """The learning rate by `rate`: up, then down along a cosine, in each round."""

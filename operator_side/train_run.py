@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from operator_side.train_card import Card, card_text
-from operator_side.train_export import shifted
-from operator_side.train_loop import train
+from operator_side.train_export import Weights, shifted
+from operator_side.train_loop import start_from, train
 from operator_side.train_rounds import Training
 from operator_side.train_scenes import drawn_scenes
 from operator_side.train_shipping import chosen, judged, written
@@ -31,12 +31,16 @@ class TrainOptions:
     """Scenes of each column that choose the thresholds."""
     judged: int
     """Scenes of each column that the model card's table is of."""
+    start: Weights | None = None
+    """What the last round begins from, in place of the rounds before it."""
 
 
 def run_training(options: TrainOptions, say: Callable[[str], None], progress: Progress) -> Path:
     """Everything, in order; the model's path. What a run that was cut left in the folder is gone on with."""
     with progress(options.scenes, "scenes") as advance:
         scenes = drawn_scenes(options.out, options.scenes, options.jobs, advance)
+    if options.start is not None:
+        start_from(options.start, scenes, options.training, options.out)
     weights = train(scenes, options.training, options.device, options.out, say)
     say("thresholds are being chosen on scenes of other seeds")
     thresholds = chosen(options.out / "unchosen.onnx", weights, options.validated, options.jobs)

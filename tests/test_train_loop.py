@@ -10,18 +10,21 @@ pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
 import cv2
+import onnx
 import torch
 
 from operator_side import cli
-from operator_side.train_export import onnx_bytes
+from operator_side.train_export import onnx_bytes, weights_in
 from operator_side.train_loop import train
-from operator_side.train_module import Network, folded
+from operator_side.train_module import Network, begin_from, folded
 from operator_side.train_network import AGAINST, OUTPUTS
 from operator_side.train_rounds import Training
 from operator_side.train_samples import CUT_PX
 from operator_side.train_scenes import DrawnScenes
 from protocol.errors import ConfigError, HardwareError
 from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX, Truth
+from tests.train_rig import weights
+from vision_side.detect.onnx_detector import SHIPPED
 
 
 def scenes(count=4):
@@ -113,6 +116,49 @@ def test_the_graph_gives_what_the_module_gives(tmp_path):
     net.setInput(image, "image")
     scores = net.forward(["boxes", "scores", "labels"])[1].reshape(-1)
     assert scores.max() == pytest.approx(float(heat.max()), abs=1e-3)
+
+
+def test_a_network_that_begins_from_a_file_gives_what_the_file_gives():
+    network, given = Network(), weights()
+    images = torch.randint(0, 256, (4, 3, HEIGHT_PX, WIDTH_PX), dtype=torch.uint8)
+    begin_from(network, weights_in(onnx_bytes(given, {})), images)
+    assert network.training and np.allclose(network.layer_head.bias[:OUTPUTS].detach(), given["head.bias"])
+    again = folded(network.state_dict())
+    for name, value in given.items():
+        if not name.startswith("head."):  # whose first row has what it learned of other things taken off
+            assert again[name] == pytest.approx(value, abs=1e-4), name
+    with torch.no_grad():
+        seen_by_batch = network(images)
+        seen_by_itself = network.eval()(images)
+    assert seen_by_batch == pytest.approx(seen_by_itself, abs=1e-2), "the normalisation knows what it will see"
+
+
+def test_the_last_round_alone_is_trained_from_a_file(tmp_path, capsys):
+    sizes = {"scenes": 8, "batch": 4, "jobs": 1, "validated": 5, "judged": 5}
+    arguments = [part for name, value in sizes.items() for part in (f"--{name}", str(value))]
+    model, digest = SHIPPED, hashlib.sha256(SHIPPED.read_bytes()).hexdigest()
+    command = ["train", "--out", str(tmp_path), *arguments, "--steps", "70", "--steps", "2", "--start", str(model)]
+    assert cli.run(command) == 0
+    assert capsys.readouterr().out.startswith("goes on at step 70 of 72\n")
+    card = (tmp_path / "sightline.md").read_text("utf-8")
+    assert "--jobs 1 --start MODEL`" in card and f"began from MODEL, of SHA-256 `{digest}`" in card
+    begun, ended = (weights_in(one.read_bytes()) for one in (model, tmp_path / "sightline.onnx"))
+    assert begun["half.weight"] == pytest.approx(ended["half.weight"], rel=0.2, abs=0.02)
+    assert not np.array_equal(begun["half.weight"], ended["half.weight"])
+    assert cli.run([*command[:-2]]) == 2
+    assert "other settings" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no model", "other"])
+def test_a_start_that_is_no_model_of_this_network_is_one_line(content, tmp_path, capsys):
+    path = tmp_path / "begin.onnx"
+    if content == "other":
+        content = onnx.ModelProto(graph=onnx.GraphProto(name="another")).SerializeToString()
+    if content is not None:
+        path.write_bytes(content)
+    assert cli.run(["train", "--out", str(tmp_path / "out"), "--start", str(path)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert f"--start {path}" in error and "\n" not in error and not (tmp_path / "out").exists()
 
 
 def test_cut_outs_halve_as_evenly_as_pictures():
