@@ -79,7 +79,7 @@ def onnx_bytes(weights: Weights, properties: dict[str, str]) -> bytes:
 
 
 def weights_in(data: bytes) -> Weights:
-    """Those that `onnx_bytes` made a file of. Raises ValueError for a file of another network."""
+    """Those that `onnx_bytes` made a file of. Raises ValueError for a file of another network, or that is broken."""
     try:
         model = onnx.load_from_string(data)
     except DecodeError:
@@ -96,6 +96,8 @@ def weights_in(data: bytes) -> Weights:
         weight, bias = (held.get(f"{layer.name}.{part}", np.zeros(0)) for part in ("weight", "bias"))
         if weight.size != np.prod(shape) or bias.size != layer.channels:
             raise ValueError(f"it has no layer `{layer.name}` of {layer.channels} channels")
+        if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+            raise ValueError(f"its layer `{layer.name}` holds what is no number")
         if layer.takes[0] == "image":
             weight = weight.reshape(layer.channels, layer.kernel, layer.kernel, COLOURS).transpose(0, 3, 1, 2)
         weights[f"{layer.name}.weight"], weights[f"{layer.name}.bias"] = weight.reshape(shape), bias

@@ -59,7 +59,8 @@ class Network(nn.Module):  # type: ignore[misc]
 
 def begin_from(network: Network, weights: Weights, images: Any) -> None:
     """Give a new network what `folded` gave, and each normalisation what it sees on these pictures, uint8 (N, 3, H, W):
-    what comes out stays the same. The maps of `TAUGHT` are not among the weights and begin anew."""
+    what comes out stays the same. The maps of `TAUGHT` are not among the weights and begin anew; the thresholds that a
+    file's head has worked in are learned away."""
     hooks = []
     with torch.no_grad():
         for layer in network.layers:

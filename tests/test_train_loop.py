@@ -149,14 +149,17 @@ def test_the_last_round_alone_is_trained_from_a_file(tmp_path, capsys):
     assert "other settings" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no model", "other"])
+@pytest.mark.parametrize("content", [None, b"", b"no model", "other", "not finite"])
 def test_a_start_that_is_no_model_of_this_network_is_one_line(content, tmp_path, capsys):
     path = tmp_path / "begin.onnx"
     if content == "other":
         content = onnx.ModelProto(graph=onnx.GraphProto(name="another")).SerializeToString()
+    if content == "not finite":
+        content = onnx_bytes({**weights(), "eighth.bias": np.full(64, np.nan, np.float32)}, {})
     if content is not None:
         path.write_bytes(content)
-    assert cli.run(["train", "--out", str(tmp_path / "out"), "--start", str(path)]) == 2
+    little = ["--scenes", "8", "--steps", "1", "--jobs", "1", "--validated", "5", "--judged", "5"]  # should it be taken
+    assert cli.run(["train", "--out", str(tmp_path / "out"), *little, "--start", str(path)]) == 2
     error = capsys.readouterr().err.strip()
     assert f"--start {path}" in error and "\n" not in error and not (tmp_path / "out").exists()
 
