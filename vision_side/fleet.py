@@ -14,11 +14,13 @@ from protocol.channels import Channel
 from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.config import VisionConfig
 from vision_side.counts import Counts
-from vision_side.detect.choice import configured_detector
+from vision_side.detect.around import close_detector
+from vision_side.detect.choice import configured_detector, waits
 from vision_side.detect.port import Detector
 from vision_side.service import Say, Service, open_service
 
 _LONGEST_WAIT_S = 0.2
+_SLACK_S = 0.5
 
 
 class Site(Protocol):
@@ -78,22 +80,33 @@ class _Belled:
 
 
 class Fleet:
-    """A service for each robot that is heard. One turn gives every robot with something new its turn."""
+    """A service for each robot that is heard. One turn gives every robot with something new its turn.
+
+    Where they look through eyes elsewhere, each robot has its own, on a thread of its own: an answer that one of them
+    waits for keeps no other waiting.
+    """
 
     def __init__(self, config: VisionConfig, site: Site, say: Say, eyes: Detector | None = None) -> None:
-        """`eyes` look for every robot; None for those that the configuration names."""
+        """`eyes` look for every robot, or for the first of those with their own; None for those of `config`."""
         self._config, self._site, self._say = config, site, say
+        self._apart = waits(config)
         self._eyes = eyes or configured_detector(config)
-        self._bell = threading.Event()
+        self._bell, self._ending = threading.Event(), threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._own: list[Detector | None] = []
+        self._failed: Exception | None = None
         self.services: dict[str, Service] = {}
         site.on_news(self._bell.set)
 
     def serve(self, ending: threading.Event) -> None:
         """Until `ending` is set."""
-        while not ending.is_set():
-            self._bell.wait(_LONGEST_WAIT_S)
-            self._bell.clear()
-            self.turn()
+        try:
+            while not ending.is_set():
+                self._bell.wait(_LONGEST_WAIT_S)
+                self._bell.clear()
+                self.turn()
+        finally:
+            self._end()
         for robot, service in self.services.items():
             skipped = dict(service.skipped) or "none"
             self._say(f"vision: {robot}: ended after {service.answered} frames; skipped: {skipped}")
@@ -103,16 +116,44 @@ class Fleet:
         return [service.counts() for service in list(self.services.values())]
 
     def turn(self) -> None:
-        """Answer at most one frame of each robot: whatever came meanwhile waits one round, whoever sends more."""
+        """Welcome who is new, and answer at most one frame of each robot that has no thread of its own: whatever came
+        meanwhile waits one round, whoever sends more."""
         for robot in self._site.robots():
             if robot not in self.services:
                 self._welcome(robot)
-            self.services[robot].turn(0.0)
+            if not self._apart:
+                self.services[robot].turn(0.0)
+        if self._failed is not None:
+            raise self._failed
 
     def _welcome(self, robot: str) -> None:
         config = self._config.model_copy(update={"robot": robot})
-        link = _Belled(self._site.link(robot), self._bell)
-        self.services[robot] = open_service(config, link, self._of(robot), self._eyes)
+        link = self._site.link(robot)
+        if not self._apart:
+            self.services[robot] = open_service(config, _Belled(link, self._bell), self._of(robot), self._eyes)
+            return
+        if self.services:
+            self._own.append(configured_detector(config))
+        eyes = self._own[-1] if self._own else self._eyes
+        service = self.services[robot] = open_service(config, link, self._of(robot), eyes)
+        self._threads.append(threading.Thread(target=self._serve_one, args=(service,), name=robot, daemon=True))
+        self._threads[-1].start()
+
+    def _serve_one(self, service: Service) -> None:
+        """What a robot's own thread does; what ends it ends all."""
+        try:
+            while not self._ending.is_set():
+                service.turn(_LONGEST_WAIT_S)
+        except Exception as error:
+            self._failed = error
+            self._bell.set()
+
+    def _end(self) -> None:
+        self._ending.set()
+        for thread in self._threads:
+            thread.join(_LONGEST_WAIT_S + self._config.detector.deadline_s + _SLACK_S)
+        for eyes in self._own:
+            close_detector(eyes)
 
     def _of(self, robot: str) -> Say:
         return lambda line: self._say(line.replace("vision: ", f"vision: {robot}: ", 1))

@@ -274,7 +274,7 @@ def _endpoints(config: VisionConfig) -> str:
 
 
 def _say(line: str) -> None:
-    print(line, flush=True)
+    print(f"{line}\n", end="", flush=True)  # as one piece: several threads may have something to say
 
 
 @contextmanager

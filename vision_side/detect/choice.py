@@ -87,6 +87,13 @@ def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
     return Tracked(detector) if one.tracked else detector
 
 
+def waits(config: VisionConfig) -> bool:
+    """Whether one of the configured detectors waits for somebody else, so that others should not wait for it."""
+    one = config.detector
+    kinds = [kind for kind in (one.kind, one.fallback, one.shadow) if kind and kind != BOXES]
+    return any(getattr(FAMILY.load(split(kind)[0]), "waits", False) for kind in kinds)
+
+
 def check_device(config: VisionConfig) -> None:
     """Raise ConfigError where a device is asked for that nothing configured can run on."""
     one = config.detector

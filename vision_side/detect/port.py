@@ -107,8 +107,9 @@ class Detector(Protocol):
 
     A class of this kind has a pydantic `Config` and is built as `Plugin(config)`. It may have `news()`, which returns
     lines for a person that were not returned before, few and short; `maker`, who its results will name; `attach(link)`,
-    called with each robot's link before its first frame, for who hears something else of it; and `close()`, called
-    once, when nobody will ask again.
+    called with each robot's link before its first frame, for who hears something else of it; `close()`, called once,
+    when nobody will ask again; and, on the class, `waits = True` where it waits for somebody else: each robot of a
+    fleet then has one of its own, on a thread of its own.
     """
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:

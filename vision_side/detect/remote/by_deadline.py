@@ -7,7 +7,7 @@ other in one place; an answer that comes too late is nobody's.
 import threading
 from collections import Counter
 from collections.abc import Sequence
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
 
 from pydantic import Field
 
@@ -51,6 +51,8 @@ class Pending:
 
 class ByDeadline:
     """A `Detector` over another one, which is used on one thread only and closed there."""
+
+    waits: ClassVar[bool] = True
 
     def __init__(self, inner: Detector, max_pixels: int = MAX_PIXELS) -> None:
         """Security limit: pictures of more than `max_pixels` are not decoded."""

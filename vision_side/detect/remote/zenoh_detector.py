@@ -6,8 +6,7 @@
 Nothing is sent: robot and service meet by themselves. Here it is waited, by the deadline, for what cites the frame.
 """
 
-from collections.abc import Sequence
-from typing import Final
+from typing import ClassVar, Final
 
 from protocol.channels import DETECTIONS, FRAME
 from protocol.codec import decode
@@ -20,7 +19,6 @@ from vision_side.detect.labels import clean_label
 from vision_side.detect.port import DetectFrame, DetectionResult, Maker, result_of
 from vision_side.detect.remote.asking import REMOTE, FrameByFrame, left_s
 from vision_side.detect.remote.boxes_read import MIN_SCORE, hash_of, read_boxes
-from vision_side.detect.remote.by_robot import ByRobot, Expected
 from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
 ROLE: Final = "detector"
@@ -58,6 +56,8 @@ class _Heard:
 class ZenohDetector(FrameByFrame):
     """The detector `zenoh`: waits for one source's boxes on the links that vision has to its robots."""
 
+    waits: ClassVar[bool] = True
+
     class Config(Settings):
         """Whose boxes."""
 
@@ -68,19 +68,10 @@ class ZenohDetector(FrameByFrame):
         super().__init__(f"zenoh ({config.source})")
         self._config = config
         self._heard: dict[str, _Heard] = {}
-        self._beside = ByRobot(self.detect)
 
     def attach(self, link: Link) -> None:
         """Hear what is said of its robot."""
         self._heard[link.robot] = _Heard(link, self._config.source)
-
-    def ask(self, frames: Sequence[DetectFrame], deadline_us: int) -> Expected:
-        """Begin to wait for boxes of `frames`, beside who asks."""
-        return self._beside.ask(frames, deadline_us)
-
-    def close(self) -> None:
-        """Wait no longer beside anybody."""
-        self._beside.close()
 
     def _ask(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
         return self._wait(self._of(frame.robot), frame, deadline_us)
