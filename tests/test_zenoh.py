@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,9 +18,10 @@ from protocol.messages import FrameHeader
 from protocol.transports.endpoints import check_endpoint, with_send_buffer
 from protocol.transports.link_rules import NOT_A_PUT
 from protocol.transports.port_owner import port_owner
-from protocol.transports.zenoh import open_zenoh
+from protocol.transports.zenoh import ZenohLink, open_zenoh
 from protocol.transports.zenoh_around import list_robots
 from protocol.transports.zenoh_session import open_session
+from protocol.transports.zenoh_site import open_site
 from tests.link_rigs import free_endpoint, until
 
 NO_ENDPOINTS = (
@@ -233,3 +235,18 @@ def test_a_close_while_others_publish_is_silent(monkeypatch):
 def _publish_until(link, over):
     while not over.is_set():
         link.publish(FRAME, b"{}", bytes(60_000))
+
+
+@pytest.mark.parametrize("opened", [partial(open_zenoh, "r1", role="robot"), partial(open_site, "r*", role="vision")])
+def test_who_closes_lets_go_of_the_session_at_once(opened):
+    """See `GONE` for what happens where the collector frees it instead."""
+    end = opened(listen=[free_endpoint()])
+    links = [end] if isinstance(end, ZenohLink) else [end.link("r1"), end.link("r2")]
+    for link in links:
+        link.latest(FRAME)
+        link.has_listener(TWIST)
+    session = end._session
+    end.close()
+    assert sys.getrefcount(session) == 2, "this test's own, and the question's"
+    assert not any(link.publish(STATUS, b"{}", b"{}") or link.has_listener(TWIST) or link.peers() for link in links)
+    end.close()

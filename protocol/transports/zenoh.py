@@ -23,7 +23,7 @@ from protocol.transports.link_rules import NOT_A_PUT, LinkRules
 from protocol.transports.presence import Peer
 from protocol.transports.secured import ROBOT, secured_for
 from protocol.transports.zenoh_presence import Here, ask
-from protocol.transports.zenoh_session import open_session
+from protocol.transports.zenoh_session import GONE, open_session
 
 if TYPE_CHECKING:
     import zenoh
@@ -225,6 +225,7 @@ class ZenohLink:
         # borrowed", a RuntimeError); the session's close, which runs last in any case, ends it.
         with suppress(zenoh.ZError, RuntimeError):
             self._ending.close()
+        self._session = GONE
 
 
 class _Outlet:

@@ -37,6 +37,21 @@ _KNOCK_S: Final = 0.3
 RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
 
+class _Gone:
+    """In place of a session that is closed; asked for anything, it raises ZError as that one would."""
+
+    def __getattr__(self, name: str) -> Any:
+        import zenoh
+
+        raise zenoh.ZError("the session is closed")
+
+
+GONE: Final[Any] = _Gone()
+"""Who closes a session lets go of it at once. To free a router's stops every Python thread for up to 10 s where another
+session of the process hears something meanwhile (eclipse-zenoh 1.10.2 waits for a task with the interpreter's lock in
+hand), and if it is part of a cycle, the collector does that at any later time."""
+
+
 def open_session(
     listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: Secured | None = None
 ) -> zenoh.Session:

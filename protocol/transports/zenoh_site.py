@@ -21,7 +21,7 @@ from protocol.transports.link_rules import LinkRules
 from protocol.transports.secured import secured_for
 from protocol.transports.zenoh import ZenohLink
 from protocol.transports.zenoh_presence import Here
-from protocol.transports.zenoh_session import open_session
+from protocol.transports.zenoh_session import GONE, open_session
 
 if TYPE_CHECKING:
     import zenoh
@@ -90,6 +90,7 @@ class ZenohSite:
     def close(self) -> None:
         """Close all links and the session."""
         self._ending.close()
+        self._session = GONE
 
     def __enter__(self) -> Self:
         return self
