@@ -16,10 +16,10 @@ from protocol.errors import ConfigError, HardwareError
 if TYPE_CHECKING:  # it needs the extra
     from operator_side.train_export import Weights
 
-STEPS = [15_000, 14_000, 13_000, 14_000]
-SCENES = 80_000
+STEPS = [15_000, 14_000, 13_000, 14_000, 20_000]
+SCENES = 100_000
 BATCH = 32
-VALIDATED = 2000
+VALIDATED = 5000
 """These are those of the model that ships, so that the same command makes it again; a test compares."""
 OUT = Path("runs/train")
 _STEPS = "Of one round; say it again for one more, which starts the learning rate anew and takes in more scenes."

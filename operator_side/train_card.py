@@ -7,7 +7,7 @@ from operator_side.score_detectors_bounds import judge
 from operator_side.score_detectors_text import check_lines, markdown
 from operator_side.score_scenes import Report
 from operator_side.train_export import MOST_BOXES, OPSET
-from operator_side.train_rounds import WHOLE_FROM, Training
+from operator_side.train_rounds import LEAST_SHARE, WHOLE_FROM, Training
 from sim.scene_textures import JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED
 from sim.scenes import HARDER_FROM, HEIGHT_PX, LABELS, LATER_FROM, VALIDATED_FROM, WIDTH_PX
 
@@ -66,7 +66,8 @@ def _made(card: Card) -> list[str]:
         "round on a third of the pictures are clear, and a third are dim, blurred and coarse at once.",
         f"- Steps: {' and '.join(map(str, training.rounds))} of {training.batch} cut-outs (the last "
         f"{100 * (1 - WHOLE_FROM):.0f} % of a round half as many whole pictures), AdamW, learning rate "
-        f"{training.rate:g} at first, half of that in each round that follows, weights averaged.",
+        f"{training.rate:g} at first, half of that in each round that follows down to {training.rate * LEAST_SHARE:g}, "
+        "weights averaged.",
         *([f"- The last round began from MODEL, of SHA-256 `{training.start}`."] if training.start else []),
         f"- Thresholds: {thresholds}, chosen on {card.validated} scenes a column of the seeds from {VALIDATED_FROM}, "
         f"with floors and walls of other families: {_families(VALIDATED)}.",

@@ -7,9 +7,9 @@ import numpy as np
 
 from operator_side.score_detectors import Found, Judged
 
-MOST_FALSE: Final = 0.03
+MOST_FALSE: Final = 0.02
 """Of false alarms and of wrong objects, in every column. A judge allows 5 of a hundred frames without a ball: what is
-at 3 % by nature has more than that once in twelve such hundreds."""
+at 2 % by nature has more than that once in sixty such hundreds, at 3 % once in twelve."""
 _TRIED: Final = tuple(round(float(one), 2) for one in np.arange(0.06, 0.95, 0.01))
 _OTHERWISE: Final = 0.3  # for a label that no scene showed
 

@@ -8,6 +8,8 @@ _WARM_UP: Final = 100
 """Steps, at the begin of each round."""
 _LEAST_RATE: Final = 0.01
 """Of a round's highest, at its end."""
+LEAST_SHARE: Final = 1 / 8
+"""Of the first round's rate, for any round's highest: with less, a late round hardly moves."""
 WHOLE_FROM: Final = 0.8
 """From this part of a round on, whole pictures in place of cut-outs."""
 
@@ -31,8 +33,8 @@ class Training:
     """What stands in the model card."""
 
     rounds: tuple[int, ...]
-    """Steps of each. A round has the learning rate up and down again, half as high as the round before, and takes in as
-    many scenes more."""
+    """Steps of each. A round has the learning rate up and down again, half as high as the round before but
+    no less than `LEAST_SHARE`, and takes in as many scenes more."""
     batch: int = 32
     rate: float = 3e-3
     decay: float = 1e-4
@@ -55,10 +57,11 @@ class Training:
     def rate_at(self, step: int) -> float:
         """The learning rate by `rate`: up, then down along a cosine, in each round."""
         number, within, steps = self._place(step)
+        highest = max(LEAST_SHARE, 0.5**number)
         if within < _WARM_UP:
-            return float(0.5**number * (within + 1) / _WARM_UP)
+            return highest * (within + 1) / _WARM_UP
         done = min(1.0, (within - _WARM_UP) / max(1, steps - _WARM_UP))
-        return float(0.5**number * (_LEAST_RATE + (1 - _LEAST_RATE) * 0.5 * (1 + math.cos(math.pi * done))))
+        return highest * (_LEAST_RATE + (1 - _LEAST_RATE) * 0.5 * (1 + math.cos(math.pi * done)))
 
     def shown_at(self, step: int, scenes: int) -> Shown:
         """Which of so many scenes are shown then."""
