@@ -8,6 +8,7 @@ import pytest
 
 from protocol.channels import ACK, FRAME, STATUS, TWIST
 from protocol.codec import encode
+from protocol.config import Config
 from protocol.messages import FrameHeader, Stamp, State, Status
 from protocol.transports.memory import MemoryNetwork
 from protocol.transports.zenoh import open_zenoh
@@ -127,24 +128,54 @@ def test_with_a_fallback_every_robot_is_steered(shown, eyes):
     assert min(shares.values()) > 0.7, shares
 
 
-def test_what_ends_one_robots_thread_ends_the_vision(monkeypatch):
-    def fail(service, wait_s):
-        raise RuntimeError("out of threads")
+class Quiet:
+    """A site with robots that say nothing."""
 
-    monkeypatch.setattr(Service, "turn", fail)
-    fleet = Fleet(VisionConfig(robot="r*", detector=DetectorConfig(kind="zenoh")), OneRobot(), lambda line: None)
-    with pytest.raises(RuntimeError, match="out of threads"):
-        fleet.serve(threading.Event())
-
-
-class OneRobot:
-    """A site with one robot that says nothing."""
+    def __init__(self, count):
+        self._robots = [f"r{number}" for number in range(count)]
 
     def robots(self):
-        return ["r1"]
+        return self._robots
 
     def on_news(self, callback):
         pass
 
     def link(self, robot):
         return MemoryNetwork().link(robot, role="vision")
+
+
+def test_what_ends_one_robots_thread_ends_the_vision(monkeypatch):
+    def fail(service, wait_s):
+        raise RuntimeError("out of threads")
+
+    monkeypatch.setattr(Service, "turn", fail)
+    fleet = Fleet(VisionConfig(robot="r*", detector=DetectorConfig(kind="zenoh")), Quiet(1), lambda line: None)
+    with pytest.raises(RuntimeError, match="out of threads"):
+        fleet.serve(threading.Event())
+
+
+class Hanging:
+    """Eyes elsewhere that take their time to end."""
+
+    Config = Config
+    waits = True
+
+    def __init__(self, config):
+        pass
+
+    def detect(self, frames, deadline_us):
+        return [None for _ in frames]
+
+    def close(self):
+        time.sleep(1.0)
+
+
+def test_eyes_that_hang_at_the_end_hang_beside_one_another():
+    kind, over = f"{__name__}:Hanging", threading.Event()
+    fleet = Fleet(VisionConfig(robot="r*", detector=DetectorConfig(kind=kind)), Quiet(8), lambda line: None)
+    thread = threading.Thread(target=fleet.serve, args=(over,), daemon=True)
+    thread.start()
+    assert until(lambda: len(fleet.services) == 8)
+    over.set()
+    thread.join(3)
+    assert not thread.is_alive(), "seven of them, one after the other, take 7 s"

@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -20,7 +22,6 @@ from vision_side.detect.port import Detector
 from vision_side.service import Say, Service, open_service
 
 _LONGEST_WAIT_S = 0.2
-_SLACK_S = 0.5
 
 
 class Site(Protocol):
@@ -93,7 +94,6 @@ class Fleet:
         self._eyes = eyes or configured_detector(config)
         self._bell, self._ending = threading.Event(), threading.Event()
         self._threads: list[threading.Thread] = []
-        self._own: list[Detector | None] = []
         self._failed: Exception | None = None
         self.services: dict[str, Service] = {}
         site.on_news(self._bell.set)
@@ -132,28 +132,28 @@ class Fleet:
         if not self._apart:
             self.services[robot] = open_service(config, _Belled(link, self._bell), self._of(robot), self._eyes)
             return
-        if self.services:
-            self._own.append(configured_detector(config))
-        eyes = self._own[-1] if self._own else self._eyes
-        service = self.services[robot] = open_service(config, link, self._of(robot), eyes)
-        self._threads.append(threading.Thread(target=self._serve_one, args=(service,), name=robot, daemon=True))
+        own = configured_detector(config) if self.services else None
+        service = self.services[robot] = open_service(config, link, self._of(robot), own or self._eyes)
+        self._threads.append(threading.Thread(target=self._serve_one, args=(service, own), name=robot, daemon=True))
         self._threads[-1].start()
 
-    def _serve_one(self, service: Service) -> None:
-        """What a robot's own thread does; what ends it ends all."""
+    def _serve_one(self, service: Service, own: Detector | None) -> None:
+        """What a robot's thread does, its `own` eyes closed at its end. What fails ends all."""
         try:
-            while not self._ending.is_set():
-                service.turn(_LONGEST_WAIT_S)
+            with ExitStack() as ending:
+                ending.callback(close_detector, own)
+                while not self._ending.is_set():
+                    service.turn(_LONGEST_WAIT_S)
         except Exception as error:
             self._failed = error
             self._bell.set()
 
     def _end(self) -> None:
+        """Robots' threads end together; one whose eyes hang is left behind."""
         self._ending.set()
+        until_s = time.monotonic() + _LONGEST_WAIT_S + self._config.detector.deadline_s
         for thread in self._threads:
-            thread.join(_LONGEST_WAIT_S + self._config.detector.deadline_s + _SLACK_S)
-        for eyes in self._own:
-            close_detector(eyes)
+            thread.join(max(0.0, until_s - time.monotonic()))
 
     def _of(self, robot: str) -> Say:
         return lambda line: self._say(line.replace("vision: ", f"vision: {robot}: ", 1))
