@@ -9,7 +9,7 @@ _WARM_UP: Final = 100
 _LEAST_RATE: Final = 0.01
 """Of a round's highest, at its end."""
 LEAST_SHARE: Final = 1 / 8
-"""Of the first round's rate, for any round's highest: with less, a late round hardly moves."""
+"""Of the first round's rate, for any round's highest: that of the fourth, which still gained by it."""
 WHOLE_FROM: Final = 0.8
 """From this part of a round on, whole pictures in place of cut-outs."""
 
