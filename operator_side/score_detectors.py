@@ -142,6 +142,11 @@ class Found:
             elif not any(overlap(own, box) > 0 for box in scene.unclear):
                 self.marks.append((one.score, False))
 
+    def take(self, more: "Found") -> None:
+        """What was found of this label in other frames."""
+        self.objects += more.objects
+        self.marks += more.marks
+
     def average_precision(self) -> float | None:
         """AP50: the area under precision by recall, precision never rising again; None without objects."""
         if not self.objects:

@@ -1,15 +1,17 @@
 """Trained weights into the file that ships: thresholds chosen, golden answer kept, judged. Shell (files, processes)."""
 
 import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
 from operator_side.score_detectors import Found, Judged
-from operator_side.score_scenes import LABELLED, Report, Subject, detections, score_scenes, shown, verdict
+from operator_side.score_scenes import LABELLED, LIGHT_SHARE, Report, Subject, detections, score_scenes, shown, verdict
 from operator_side.train_choice import ball_threshold, label_threshold
 from operator_side.train_export import Weights, onnx_bytes
-from sim.scenes import COLUMNS, LABELS, THINGS, VALIDATED_FROM
+from sim.scenes import COLUMNS, LABELS, THINGS, VALIDATED_FROM, Column
 from vision_side.config import VisionConfig
 from vision_side.decode import Picture
 from vision_side.detect.choice import choose_detector
@@ -20,7 +22,13 @@ from vision_side.detect.onnx_reading import fit_picture, form_of, read_outputs
 
 COUNTS_FROM: Final = 0.5
 """The score from which a detection counts, once each label's threshold has been worked into the model."""
+Progress = Callable[[int, str], AbstractContextManager[Callable[[int], None]]]
+"""Of how many, and of what; what it gives is told of each few that are done."""
+
 _ALL: Final = 0.02  # scores below are noise, and are not looked at when thresholds are chosen
+_ASKED: Final = (*COLUMNS.values(), THINGS)
+_SLICE: Final = 250
+"""Scenes that one process looks at before it says so."""
 
 
 def written(path: Path, weights: Weights) -> None:
@@ -37,34 +45,39 @@ def written(path: Path, weights: Weights) -> None:
     beside.replace(path)
 
 
-def chosen(path: Path, weights: Weights, frames: int, jobs: int) -> tuple[float, ...]:
+def chosen(path: Path, weights: Weights, frames: int, jobs: int, progress: Progress) -> tuple[float, ...]:
     """Each label's threshold, by `frames` scenes a column; the model without any goes to `path`."""
     path.write_bytes(onnx_bytes(weights, {"min_score": str(_ALL)}))
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        labelled = pool.submit(_labelled, path, frames)
-        shown_balls = {name: pool.submit(_balls, path, name, frames) for name in COLUMNS}
-        found, balls = labelled.result(), {name: one.result() for name, one in shown_balls.items()}
+    last = VALIDATED_FROM + frames
+    slices = [range(first, min(first + _SLICE, last)) for first in range(VALIDATED_FROM, last, _SLICE)]
+    balls: dict[str, list[Judged]] = {name: [] for name in COLUMNS}
+    found = {label: Found() for label in LABELLED}
+    with (progress(frames * (len(COLUMNS) + 1), "scenes that choose") as advance,
+          ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool):
+        for done in as_completed([pool.submit(_seen, path, column, one) for column in _ASKED for one in slices]):
+            column, verdicts, marks = done.result()
+            if column in balls:
+                balls[column] += verdicts
+            for label, more in marks.items():
+                found[label].take(more)
+            advance(len(verdicts))
     return tuple(ball_threshold(balls) if label == "ball" else label_threshold(found[label]) for label in LABELS)
 
 
-def _balls(path: Path, column: str, frames: int) -> list[Judged]:
-    """What is to be said of each scene of one column."""
-    seeds = range(VALIDATED_FROM, VALIDATED_FROM + frames)
-    return [verdict(seen.answers[0], seen.scene) for seen in shown(COLUMNS[column], seeds, [_subject(path)], 1)]
-
-
-def _labelled(path: Path, frames: int) -> dict[str, Found]:
-    """What was found of the labels other than the ball's."""
-    found = {label: Found() for label in LABELLED}
-    for seen in shown(THINGS, range(VALIDATED_FROM, VALIDATED_FROM + frames), [_subject(path)], 1):
+def _seen(path: Path, column: Column, seeds: Sequence[int]) -> tuple[str, list[Judged], dict[str, Found]]:
+    """The column's name, what is to be said of each scene's ball, and of lights and legs where those are asked for."""
+    verdicts, found = [], {label: Found() for label in LABELLED if column == THINGS}
+    for seen in shown(column, seeds, [_subject(path)], 1):
+        verdicts.append(verdict(seen.answers[0], seen.scene))
         for label, marks in found.items():
             marks.add(label, detections(seen.answers[0]), seen.scene)
-    return found
+    return column.name, verdicts, found
 
 
-def judged(path: Path, frames: int) -> Report:
+def judged(path: Path, frames: int, progress: Progress) -> Report:
     """On the seeds that only judges use."""
-    return score_scenes([_subject(path)], frames)
+    with progress(int((len(COLUMNS) + LIGHT_SHARE) * frames), "scenes that judge") as advance:
+        return score_scenes([_subject(path)], frames, each=lambda _: advance(1))
 
 
 def _subject(path: Path) -> Subject:

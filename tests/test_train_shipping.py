@@ -1,6 +1,8 @@
 """From trained weights to the file and its card, by weights that mean nothing."""
 
 import hashlib
+from contextlib import contextmanager
+from functools import partial
 
 import pytest
 
@@ -18,15 +20,24 @@ from vision_side.detect.choice import choose_detector
 from vision_side.detect.onnx_header import read_onnx_header
 
 
+@contextmanager
+def told(counts, total, what):
+    """What progress is told, under its name."""
+    counts[what] = [total]
+    yield counts[what].append
+
+
 def test_weights_become_a_file_with_thresholds_and_a_card_that_is_true_of_it(tmp_path):
-    thresholds = chosen(tmp_path / "unchosen.onnx", weights(), 5, 2)
+    counts = {}
+    thresholds = chosen(tmp_path / "unchosen.onnx", weights(), 5, 2, partial(told, counts))
     assert len(thresholds) == len(LABELS) and all(0.05 < one < 0.96 for one in thresholds)
     model = tmp_path / "model.onnx"
     written(model, shifted(weights(), thresholds))
     header = read_onnx_header(model.read_bytes())
     assert header.metadata["min_score"] == "0.5" and "golden" in header.metadata
     choose_detector(f"onnx:{model}", {}, VisionConfig())  # its own answer to the known picture is checked on the way
-    report = judged(model, 5)
+    report = judged(model, 5, partial(told, counts))
+    assert len(counts) == 2 and all(told[0] == sum(told[1:]) > 0 for told in counts.values())
     assert set(report.columns) == set(COLUMNS) and report.columns["blur"]["onnx"].frames == 5
     digest = hashlib.sha256(model.read_bytes()).hexdigest()
     training = Training((7, 3), batch=6, seed=5, jobs=2)
