@@ -1,11 +1,16 @@
 """Checks and figures as text. Pure."""
 
+from typing import Final
+
 from operator_side.score import Check
 
+_WHOLE_FROM: Final = 999.5  # three digits of what is more have an exponent
 
 def number(value: float | None) -> str:
-    """Three digits; `never` for what did not happen."""
-    return "never" if value is None else f"{value:.3g}"
+    """Three digits, or all before the point; `never` for what did not happen."""
+    if value is None:
+        return "never"
+    return f"{value:.3g}" if abs(value) < _WHOLE_FROM else f"{value:.0f}"
 
 
 def check_line(check: Check) -> str:
