@@ -1,4 +1,5 @@
-"""How long one `Pipeline.step` takes: hot, paced as a camera paces it, and the decode alone. Shell (a clock)."""
+"""How long one `Pipeline.step` takes: hot, paced as a camera paces it, and the decode alone; and how long the learned
+detector does. Shell (a clock)."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -13,9 +14,14 @@ import numpy as np
 from protocol.messages import CameraModel, FrameHeader
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
+from vision_side.detect.onnx_detector import OnnxDetector, read_model
+from vision_side.detect.onnx_engine import open_engine
+from vision_side.detect.onnx_reading import fit_picture
+from vision_side.detect.port import NO_DEADLINE, DetectFrame
 from vision_side.pipeline import Frame, Pipeline
 
 BOUNDS_US = {(320, 240): 350.0, (640, 480): 800.0}
+LEARNED_BOUND_US = 2000.0
 _JPEG_BYTES = {(320, 240): 12_000, (640, 480): 46_000}
 _PICTURES = 24
 _WARM_UP = 24
@@ -44,6 +50,39 @@ class StepTime:
 def time_steps(frames: int = 300, paced_frames: int = 60) -> list[StepTime]:
     """Medians over `frames` frames of each size, and over `paced_frames` at 30 a second."""
     return [_time_size(size, frames, paced_frames) for size in BOUNDS_US]
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedTime:
+    """The detector `onnx` as it ships on one thread at 320x240, hot, medians.
+
+    `network_us`: the network alone, overlaps removed and boxes decoded; the bound holds for this. `whole_us`: from JPEG
+    to detections. `decode_us`: the JPEG's decode alone, of which it should be so many times as much on any machine.
+    """
+
+    engine: str
+    network_us: float
+    whole_us: float
+    decode_us: float
+
+
+def time_learned(frames: int = 300) -> LearnedTime:
+    """Raises ConfigError without a model that runs here."""
+    size = (320, 240)
+    pictures, decoder = _pictures(*size), Decoder(*size, size[0] * size[1])
+    config = OnnxDetector.Config(device="cpu")
+    detector, model = OnnxDetector(config), read_model(config)
+    engine = open_engine(model.path, model.header, "cpu", config.threads)
+    asked = [DetectFrame("r1", one.header, one.jpeg, decoder) for one in islice(_frames(pictures), _WARM_UP + frames)]
+    pixels = [fit_picture(decoder.decode(jpeg), model.form)[0].copy() for jpeg in pictures]
+    engine_us, whole_us, decode_us = (
+        _median_us(call, inputs) for call, inputs in (
+            (engine.run, islice(cycle(pixels), _WARM_UP + frames)),
+            (lambda one: detector.detect([one], NO_DEADLINE), asked),
+            (decoder.decode, islice(cycle(pictures), frames)),
+        )
+    )
+    return LearnedTime(engine.name, engine_us, whole_us, decode_us)
 
 
 def _time_size(size: tuple[int, int], frames: int, paced_frames: int) -> StepTime:

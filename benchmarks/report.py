@@ -26,7 +26,8 @@ _HEAD: Final = (
     "# Performance\n\nWritten by `sightline bench report`, section by section; each says when and on what machine it "
     "was measured. Shared machines are noisy: read medians and ratios, not third digits."
 )
-_PACKAGES: Final = ("eclipse-zenoh", "pydantic", "numpy", "opencv-python-headless", "simplejpeg", "pybullet")
+_PACKAGES: Final = ("eclipse-zenoh", "pydantic", "numpy", "opencv-python-headless", "simplejpeg", "onnxruntime",
+                    "pybullet")
 
 
 def sections_named(names: Sequence[str]) -> tuple[Section, ...]:
@@ -130,4 +131,4 @@ def _row(check: dict[str, Any], with_median: bool) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    return "none" if value is None else f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"

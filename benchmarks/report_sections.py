@@ -60,7 +60,12 @@ SECTIONS: Final = (
     Section("odometry", "Odometry", "Against the simulated world's truth.", ("bench", "odometry")),
     Section("gate", "Gate", "One command judged and one step decided.", ("bench", "gate")),
     Section("messages", "Messages", "Encode and decode, hot.", ("bench", "codec")),
-    Section("vision", "Vision", "`Pipeline.step`, decoding included, hot, one thread.", ("bench", "pipeline")),
+    Section(
+        "vision",
+        "Vision",
+        "`Pipeline.step`, decoding included, and the learned detector's network: hot, one thread.",
+        ("bench", "pipeline"),
+    ),
     Section(
         "loop",
         "The whole loop",

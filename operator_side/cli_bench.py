@@ -52,9 +52,9 @@ def gate(*, as_json: Json = False) -> int:
 
 
 def pipeline(*, as_json: Json = False) -> int:
-    """Picture in, command out: decode, detect, track, steer."""
+    """Picture in, command out: decode, detect, track, steer. And the learned detector's network."""
     with needs("vision"):
-        from benchmarks.pipeline import time_steps
+        from benchmarks.pipeline import LEARNED_BOUND_US, time_learned, time_steps
     from operator_side.score import Check
 
     checks = [
@@ -62,6 +62,11 @@ def pipeline(*, as_json: Json = False) -> int:
               one.median_us, "us", one.bound_us, one.median_us <= one.bound_us and one.phase == "tracking")
         for one in time_steps()
     ]
+    eyes = time_learned()
+    checks.append(Check(
+        f"onnx at 320x240, network alone, {eyes.engine} (with decode {eyes.whole_us:.0f}, decode {eyes.decode_us:.0f})",
+        eyes.network_us, "us", LEARNED_BOUND_US, eyes.network_us <= LEARNED_BOUND_US,
+    ))
     return print_checks(checks, as_json)
 
 

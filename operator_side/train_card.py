@@ -85,7 +85,8 @@ def _judged(card: Card) -> list[str]:
         f"{report.frames} scenes a column, seeds {report.first_seed} to {last}: floors and walls of the families "
         f"{_families(JUDGED)}, and light from heights that training never saw. `sightline score detectors onnx "
         f"--frames {report.frames} --demand` shows it again. What the columns and figures mean: "
-        "docs/learned-detector.md.", "", markdown(report), "", *_demanded(report),
+        "docs/learned-detector.md. `ms p50` is of a machine that may have had other work: `sightline bench pipeline` "
+        "measures time.", "", markdown(report), "", *_demanded(report),
     ]
 
 
