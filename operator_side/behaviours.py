@@ -3,9 +3,8 @@
 A picture is of the first seed. The page says which command wrote it; no figure in it is typed by hand.
 """
 
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from operator_side.score import Score, score
 from operator_side.score_course import figures_of
 from operator_side.score_runs import Case, run_of
 from operator_side.speed_runs import SpeedRun, speed_run, speed_wishes
+from operator_side.worker_pool import worker_pool
 
 Progress = Callable[[int], AbstractContextManager[Callable[[], None]]]
 
@@ -27,10 +27,7 @@ def write_page(page: Path, seeds: Sequence[int], jobs: int, progress: Progress, 
     wishes = speed_wishes(seeds[0]) if any(row.scenario == "thymio" for row in rows) else []
     pictures = page.parent / page.stem
     pictures.mkdir(parents=True, exist_ok=True)
-    with (
-        progress(len(wanted) + len(wishes)) as advance,
-        ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool,
-    ):
+    with progress(len(wanted) + len(wishes)) as advance, worker_pool(jobs) as pool:
         runs = {pool.submit(_run, case, _picture(pictures, case, seeds)): case for case in wanted}
         drives = [pool.submit(speed_run, wish) for wish in wishes]
         everything: list[Future[Any]] = [*runs, *drives]

@@ -3,9 +3,8 @@
 Each run is a process's own, so that they share the machine's cores; a run itself repeats bit for bit.
 """
 
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, field
 from itertools import groupby, product
 from typing import Any, Final
@@ -15,6 +14,7 @@ from operator_side.scenario_settings import robot_of, vision_config
 from operator_side.score import Check, Score, median_and_worst, score
 from operator_side.score_bounds import judge
 from operator_side.score_course import figures_of
+from operator_side.worker_pool import worker_pool
 from protocol.errors import ConfigError
 from sim.look import look_named
 from sim.scenario import Scenario, load_scenario
@@ -133,15 +133,11 @@ def run_of(case: Case) -> tuple[Scenario, Run]:
 def run_cases(wanted: Sequence[Case], jobs: int, on_done: Callable[[Case], None]) -> ScoreReport:
     """Run `wanted` on `jobs` processes, in any order, and judge them. `on_done` is called as each is done."""
     results: dict[Case, tuple[Score, list[str]]] = {}
-    with ProcessPoolExecutor(min(jobs, len(wanted)), multiprocessing.get_context("spawn")) as pool:
+    with worker_pool(min(jobs, len(wanted))) as pool:
         futures = {pool.submit(run_case, case): case for case in wanted}
-        try:
-            for future in as_completed(futures):
-                results[futures[future]] = future.result()
-                on_done(futures[future])
-        except BaseException:  # Ctrl-C or a failed run: what has not begun is not worth waiting for
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        for future in as_completed(futures):
+            results[futures[future]] = future.result()
+            on_done(futures[future])
     runs = [(case, results[case][0]) for case in wanted]
     news: dict[str, list[str]] = {}
     for case in wanted:

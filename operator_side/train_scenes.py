@@ -2,9 +2,8 @@
 
 import hashlib
 import json
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from operator_side.worker_pool import worker_pool
 from protocol.errors import ConfigError
 from sim.scene_render import SceneRenderer
 from sim.scenes import HEIGHT_PX, VALIDATED_FROM, WIDTH_PX, Box, Truth, trained_column
@@ -82,8 +82,7 @@ def _draw_all(pictures: Path, notes: Path, count: int, jobs: int, advance: Calla
     shape = (count, HEIGHT_PX, WIDTH_PX, 3)
     np.lib.format.open_memmap(pictures, "w+", np.uint8, shape).flush()
     rows: list[dict[str, Any]] = [{} for _ in range(count)]
-    # Spawned, since a forked child would share PyBullet's state; workers write straight into the file.
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+    with worker_pool(jobs) as pool:  # they write straight into the file
         waiting = [pool.submit(_draw, pictures, range(first, min(first + _SLICE, count)))
                    for first in range(0, count, _SLICE)]
         for done in as_completed(waiting):

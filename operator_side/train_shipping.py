@@ -1,8 +1,7 @@
 """Trained weights into the file that ships: thresholds chosen, golden answer kept, judged. Shell (files, processes)."""
 
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
@@ -11,6 +10,7 @@ from operator_side.score_detectors import Found, Judged
 from operator_side.score_scenes import LABELLED, LIGHT_SHARE, Report, Subject, detections, score_scenes, shown, verdict
 from operator_side.train_choice import ball_threshold, label_threshold
 from operator_side.train_export import Weights, onnx_bytes
+from operator_side.worker_pool import worker_pool
 from sim.scenes import COLUMNS, LABELS, THINGS, VALIDATED_FROM, Column
 from vision_side.config import VisionConfig
 from vision_side.decode import Picture
@@ -27,7 +27,7 @@ Progress = Callable[[int, str], AbstractContextManager[Callable[[int], None]]]
 
 _ALL: Final = 0.02  # scores below are noise, and are not looked at when thresholds are chosen
 _ASKED: Final = (*COLUMNS.values(), THINGS)
-_SLICE: Final = 250
+_SLICE: Final = 100
 """Scenes that one process looks at before it says so."""
 
 
@@ -53,7 +53,7 @@ def chosen(path: Path, weights: Weights, frames: int, jobs: int, progress: Progr
     balls: dict[str, list[Judged]] = {name: [] for name in COLUMNS}
     found = {label: Found() for label in LABELLED}
     with (progress(frames * (len(COLUMNS) + 1), "scenes that choose") as advance,
-          ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool):
+          worker_pool(jobs) as pool):
         for done in as_completed([pool.submit(_seen, path, column, one) for column in _ASKED for one in slices]):
             column, verdicts, marks = done.result()
             if column in balls:

@@ -1,0 +1,23 @@
+"""Work on several processes that is interrupted."""
+
+import time
+
+import pytest
+
+from operator_side.worker_pool import worker_pool
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_what_has_not_begun_is_dropped_when_it_is_over(error):
+    with pytest.raises(error), worker_pool(1) as pool:
+        waiting = [pool.submit(time.sleep, 0.05) for _ in range(100)]
+        waiting[0].result()
+        raise error
+    done = [not one.cancelled() for one in waiting]
+    assert done[0] and sum(done) < 20 and all(one.done() for one in waiting)
+
+
+def test_all_is_done_when_nothing_happens():
+    with worker_pool(2) as pool:
+        waiting = [pool.submit(pow, 2, number) for number in range(20)]
+    assert [one.result() for one in waiting] == [2**number for number in range(20)]
