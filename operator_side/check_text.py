@@ -6,6 +6,7 @@ from operator_side.score import Check
 
 _WHOLE_FROM: Final = 999.5  # three digits of what is more have an exponent
 
+
 def number(value: float | None) -> str:
     """Three digits, or all before the point; `never` for what did not happen."""
     if value is None:
