@@ -1,6 +1,7 @@
 """Work on several processes that ends when it is told to. Shell (processes)."""
 
 import multiprocessing
+import signal
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -8,12 +9,13 @@ from contextlib import contextmanager
 
 @contextmanager
 def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """So many, for as long as the context lasts. Left by Ctrl-C or an error, what has not begun never does: a pool by
-    itself would first do all of it.
+    """So many, for as long as the context lasts. Left by an error, what has not begun never does: a pool by itself
+    would first do all of it. Ctrl-C at the terminal, which every process hears, ends them at once.
 
     Spawned, since a forked child would share PyBullet's state.
     """
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+    at_once = (signal.SIGINT, signal.SIG_DFL)  # an exception would only end what each does now, and begin the next
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), signal.signal, at_once) as pool:
         try:
             yield pool
         except BaseException:

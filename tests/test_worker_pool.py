@@ -1,6 +1,8 @@
 """Work on several processes that is interrupted."""
 
+import signal
 import time
+from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 
@@ -15,6 +17,13 @@ def test_what_has_not_begun_is_dropped_when_it_is_over(error):
         raise error
     done = [not one.cancelled() for one in waiting]
     assert done[0] and sum(done) < 20 and all(one.done() for one in waiting)
+
+
+def test_ctrl_c_ends_what_has_begun_and_what_was_to_be_next():
+    with worker_pool(1) as pool:
+        for one in [pool.submit(signal.raise_signal, signal.SIGINT), pool.submit(time.sleep, 30)]:
+            with pytest.raises(BrokenProcessPool):
+                one.result(timeout=10)
 
 
 def test_all_is_done_when_nothing_happens():
