@@ -7,6 +7,7 @@ from concurrent.futures.process import BrokenProcessPool
 import pytest
 
 from operator_side.worker_pool import worker_pool
+from protocol.errors import HardwareError
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
@@ -24,6 +25,11 @@ def test_ctrl_c_ends_what_has_begun_and_what_was_to_be_next():
         for one in [pool.submit(signal.raise_signal, signal.SIGINT), pool.submit(time.sleep, 30)]:
             with pytest.raises(BrokenProcessPool):
                 one.result(timeout=10)
+
+
+def test_a_process_that_something_else_ended_is_one_line_that_says_what_helps():
+    with pytest.raises(HardwareError, match=r"of 2\) was ended .*--jobs 1"), worker_pool(2) as pool:
+        pool.submit(signal.raise_signal, signal.SIGTERM).result(timeout=10)
 
 
 def test_all_is_done_when_nothing_happens():
