@@ -60,9 +60,11 @@ class LearnedTime:
 
     `network_us`: the network alone, overlaps removed and boxes decoded; the bound holds for this. `alone_us`: of its
     rounds, the best. `whole_us`: from JPEG to detections. `decode_us`: the JPEG's decode alone, its best round.
+    `found`: that there was a ball in each of the pictures.
     """
 
     engine: str
+    found: bool
     network_us: float
     alone_us: float
     whole_us: float
@@ -78,10 +80,11 @@ def time_learned(frames: int = 600) -> LearnedTime:
     engine = open_engine(model.path, model.header, "cpu", config.threads)
     asked = [DetectFrame("r1", one.header, one.jpeg, decoder) for one in islice(_frames(pictures), frames)]
     pixels = [fit_picture(decoder.decode(jpeg), model.form)[0].copy() for jpeg in pictures]
+    found = all(seen and seen.detections for one in asked[:_PICTURES] for seen in detector.detect([one], NO_DEADLINE))
     network_us = _took_us(engine.run, islice(cycle(pixels), frames))
     whole_us = _took_us(lambda one: detector.detect([one], NO_DEADLINE), asked)
     decode_us = _took_us(decoder.decode, islice(cycle(pictures), frames))
-    return LearnedTime(engine.name, median(network_us), _alone(network_us), median(whole_us), _alone(decode_us))
+    return LearnedTime(engine.name, found, median(network_us), _alone(network_us), median(whole_us), _alone(decode_us))
 
 
 def _time_size(size: tuple[int, int], frames: int, paced_frames: int) -> StepTime:
@@ -121,9 +124,9 @@ def _took_us(call: Callable[[Any], object], inputs: Iterable[Any]) -> list[float
 
 
 def _alone(took_us: list[float]) -> float:
-    """The least median of the rounds: what it takes when the machine is least disturbed. Neighbours that share a core
-    make all of this slower by a third for most of the time, and no counter shows them. (The least is what Python's
-    `timeit` says to look at, for the same reason.)
+    """The least median of the rounds: what it takes when the machine is least disturbed. On a shared machine the same
+    work was seen to take a third longer in most half-seconds, for which no counter gave a reason. (Python's `timeit`
+    says to look at the least, too.)
     """
     return min(median(took_us[first : first + _ROUND]) for first in range(0, len(took_us), _ROUND))
 

@@ -69,7 +69,7 @@ def pipeline(*, as_json: Json = False) -> int:
     checks.append(Check(
         f"onnx at 320x240, network only, hot (best round {eyes.alone_us:.0f}, from JPEG to boxes {eyes.whole_us:.0f}, "
         f"decode {eyes.decode_us:.0f}; {eyes.engine})",
-        eyes.network_us, "us", LEARNED_BOUND_US, eyes.network_us <= LEARNED_BOUND_US,
+        eyes.network_us, "us", LEARNED_BOUND_US, eyes.network_us <= LEARNED_BOUND_US and eyes.found,
     ))
     return print_checks(checks, as_json)
 
