@@ -52,8 +52,7 @@ def chosen(path: Path, weights: Weights, frames: int, jobs: int, progress: Progr
     slices = [range(first, min(first + _SLICE, last)) for first in range(VALIDATED_FROM, last, _SLICE)]
     balls: dict[str, list[Judged]] = {name: [] for name in COLUMNS}
     found = {label: Found() for label in LABELLED}
-    with (progress(frames * (len(COLUMNS) + 1), "scenes that choose") as advance,
-          worker_pool(jobs) as pool):
+    with progress(frames * len(_ASKED), "scenes that choose") as advance, worker_pool(jobs) as pool:
         for done in as_completed([pool.submit(_seen, path, column, one) for column in _ASKED for one in slices]):
             column, verdicts, marks = done.result()
             if column in balls:
