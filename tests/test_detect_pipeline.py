@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from protocol.messages import MAX_DETECTED_BOXES, FrameHeader
+from protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER, FrameHeader
 from tests.detector_rig import Bench, Told, box
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.config import DetectorConfig, TargetConfig, VisionConfig
 from vision_side.decode import Decoder
-from vision_side.detect.checking import checked
+from vision_side.detect.checking import asked, checked
 from vision_side.detect.local import Hsv
-from vision_side.detect.port import Circle, DetectFrame, Maker, result_of
+from vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Maker, result_of
 from vision_side.pipeline import NO_ANSWER, Frame, Pipeline
 
 MODEL = camera()
@@ -80,6 +80,9 @@ class Strange:
         lambda one: [replace(one, detections=(replace(box(1), circle=Circle(math.nan, 9.0, 1.0)),))],
         lambda one: [replace(one, detections=(replace(box(1), track_id=-1),))],
         lambda one: [replace(one, detections=(box(1),) * (MAX_DETECTED_BOXES + 1))],
+        lambda one: [replace(one, device=None)], lambda one: [replace(one, model_hash=None)],
+        lambda one: [replace(one, detector=7)],
+        lambda one: [replace(one, compute_us=None)], lambda one: [replace(one, compute_us=math.nan)],
         lambda one: [], lambda one: [one, one], lambda one: None, lambda one: ["boxes"], lambda one: 1 / 0,
     ],
 )  # fmt: skip
@@ -90,13 +93,38 @@ def test_nonsense_is_no_answer_and_counted(change) -> None:
     assert strange.skipped == {NO_ANSWER: 1}
 
 
+@pytest.mark.parametrize(("told_us", "us"), [
+    (1234.5, 1234), (np.int64(7), 7), (np.float32(9.0), 9), (2**60, MAX_INTEGER), (-3, 0),
+])  # fmt: skip
+def test_however_a_plug_in_counts_its_time_it_can_be_reported(told_us, us) -> None:
+    bench = Bench(VisionConfig(), Strange(lambda one: [replace(one, compute_us=told_us)]))
+    bench.frame()
+    assert bench.report().inference_us == us
+
+
+class OfOneOdd:
+    """Fails for every batch that holds a certain robot's frame, which a plug-in should not."""
+
+    def detect(self, frames, deadline_us):
+        if any(one.robot == "odd" for one in frames):
+            raise RuntimeError("an odd picture")
+        return [result_of(one, (), Maker("mine", "", "cpu")) for one in frames]
+
+
+def test_what_fails_for_one_robots_frame_costs_no_other_robot_its_answer() -> None:
+    decoder = Decoder(320, 240, 10**6)
+    frames = [DetectFrame(robot, frame(1).header, BALL, decoder) for robot in ("r1", "odd", "r2")]
+    first, odd, second = asked(OfOneOdd(), frames, NO_DEADLINE)
+    assert (first.robot, second.robot) == ("r1", "r2") and "an odd picture" in odd
+
+
 def test_boxes_beyond_the_picture_are_cut_and_those_outside_left_out() -> None:
-    asked = DetectFrame("r1", frame(1).header, BALL, Decoder(320, 240, 10**6))
-    found = result_of(asked, (box(-20), box(500), box(100)), Maker("x"))
-    inside = checked(asked, found).detections
+    one = DetectFrame("r1", frame(1).header, BALL, Decoder(320, 240, 10**6))
+    found = result_of(one, (box(-20), box(500), box(100)), Maker("x"))
+    inside = checked(one, found).detections
     assert [(one.x1_px, one.x2_px) for one in inside] == [(0, 20), (100, 140)]
-    whole = result_of(asked, (box(100),), Maker("x"))
-    assert checked(asked, whole) is whole
+    whole = result_of(one, (box(100),), Maker("x"))
+    assert checked(one, whole) is whole
 
 
 def test_a_picture_is_decoded_once_for_all_who_share_it() -> None:

@@ -6,6 +6,7 @@ The detector may be a plug-in or another machine; whatever it says, no more than
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Real
 from typing import Final
 
 from protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER
@@ -24,6 +25,8 @@ def asked(detector: Detector, frames: Sequence[DetectFrame], deadline_us: int) -
         if len(results) != len(frames):
             raise ValueError(f"{len(results)} results for {len(frames)} frames")
     except Exception as error:  # a plug-in's own
+        if len(frames) > 1:  # whose frame it failed for is not known, and should cost no other robot its answer
+            return [asked(detector, [one], deadline_us)[0] for one in frames]
         return [_why(error)] * len(frames)
     return [_answer(frame, result) for frame, result in zip(frames, results, strict=True)]
 
@@ -40,7 +43,7 @@ def _why(error: Exception) -> str:
 
 
 def checked(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
-    """`result` with its boxes clipped to the picture, those outside of it left out.
+    """`result` with its boxes clipped to the picture, those outside of it left out, its time in whole microseconds.
 
     Raises ValueError, with the reason, for what is no answer to `frame`.
     """
@@ -52,9 +55,25 @@ def checked(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
     found = result.detections
     if len(found) > MAX_DETECTED_BOXES:  # the wire's own bound: which of more are the best is for the detector to say
         raise ValueError(f"{len(found)} boxes; {MAX_DETECTED_BOXES} is the most")
+    took_us = _checked_maker(result)
     inside = tuple(part for one in found if (part := _checked(one, frame.width_px, frame.height_px)))
     unchanged = len(found) == len(inside) and all(one is part for one, part in zip(found, inside, strict=True))
-    return result if unchanged else replace(result, detections=inside)
+    if unchanged and took_us is result.compute_us:
+        return result
+    return replace(result, detections=inside, compute_us=took_us)
+
+
+def _checked_maker(result: DetectionResult) -> int:
+    """Who looked is said in text. Returns how long it took as the wire has it; plug-ins count in any kind of number."""
+    for what in ("detector", "model_hash", "device"):
+        if not isinstance(getattr(result, what), str):
+            raise ValueError(f"its {what} is {getattr(result, what)!r}, which is no text")
+    took_us = result.compute_us
+    if type(took_us) is int and 0 <= took_us <= MAX_INTEGER:
+        return took_us
+    if not isinstance(took_us, Real) or math.isnan(took_us):
+        raise ValueError(f"it took {took_us!r} microseconds")
+    return int(min(max(took_us, 0), MAX_INTEGER))
 
 
 def _checked(one: Detection, width_px: int, height_px: int) -> Detection | None:

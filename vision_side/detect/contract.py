@@ -177,8 +177,8 @@ def _keeps_its_name(detector: Detector, _make: Make, seed: int) -> str:
             return f"detector {result.detector!r} on {result.device!r}"
         if not _HASH.fullmatch(result.model_hash):
             return f"model hash {result.model_hash!r} is not hexadecimal"
-        if result.compute_us < 0:
-            return f"it took {result.compute_us} us"
+        if not isinstance(result.compute_us, int) or result.compute_us < 0:
+            return f"it took {result.compute_us!r} us, which is no whole number"
     return ""
 
 
