@@ -25,7 +25,8 @@ Counter = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
 Percent = Annotated[int, Field(ge=0, le=100)]
 Microseconds = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
 Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
-PixelCount = Annotated[int, Field(ge=16, le=8192)]
+LEAST_SIDE_PX, MOST_SIDE_PX = 16, 8192
+PixelCount = Annotated[int, Field(ge=LEAST_SIDE_PX, le=MOST_SIDE_PX)]
 """Width or height of a picture."""
 Planar = tuple[Number, Number]
 """(linear_mps, angular_rad_s)."""

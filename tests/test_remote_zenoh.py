@@ -6,6 +6,7 @@ from collections import Counter
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from operator_side.around_text import as_object, lines
@@ -17,6 +18,7 @@ from protocol.transports.zenoh_around import peers_at
 from protocol.transports.zenoh_site import open_site
 from tests.link_rigs import free_endpoint, until
 from tests.remote_rig import BALL_JPEG, GREY_JPEG, frame, within
+from tests.vision_rig import jpeg_of
 from vision_side.config import DetectorConfig, HsvConfig
 from vision_side.decode import Decoder
 from vision_side.detect.local import Hsv
@@ -147,6 +149,15 @@ def test_a_bad_picture_and_a_bad_header_get_no_answer_and_are_counted(bench):
     assert _result(robot, detector) is not None
 
 
+@pytest.mark.parametrize("size", [(1, 1), (15, 400), (8200, 16)])
+def test_a_picture_of_no_cameras_size_is_refused_before_any_detector_sees_it(bench, size):
+    robot, odd = bench.robot("r1"), bench.robot("r2")
+    detector = bench.detector("r1")
+    odd.frame(jpeg_of(np.full((size[1], size[0], 3), 128, np.uint8)))
+    assert until(lambda: "r2" in (of := bench.service.tallies()) and of["r2"].refused == 1)
+    assert until(lambda: _result(robot, detector)) and len(bench.words) == 2, bench.words
+
+
 class Faulty:
     """Does what a plug-in should not, one thing for each frame; then it looks."""
 
@@ -264,6 +275,18 @@ def test_anothers_boxes_are_not_even_looked_at(pair):
     asked = frame(3)
     robot.say(asked, BOX, source="guest")
     assert waiting.detect([asked], within(0.1)) == [None] and waiting.refused == {"LATE": 1}
+
+
+def test_boxes_of_a_frame_that_never_was_are_let_go_when_others_come(pair):
+    robot, waiting = pair
+    robot.say(frame(3), BOX, seq=10**9, t_us=10**12)
+    assert until(lambda: waiting.detect([frame(3)], within(0.05)) == [None] and waiting.refused["OTHER_FRAME"])
+    for seq in range(4, 8):
+        robot.say(frame(seq), BOX)
+        time.sleep(0.05)
+        waiting.detect([frame(seq)], within(0.05))
+    robot.say(frame(8), BOX)
+    assert waiting.detect([frame(8)], within(1.0))[0], "one message must not blind it for good"
 
 
 def test_boxes_of_a_newer_frame_end_the_waiting_and_are_kept_for_it(pair):

@@ -22,6 +22,8 @@ from protocol.codec import decode, encode
 from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
 from protocol.messages import (
+    LEAST_SIDE_PX,
+    MOST_SIDE_PX,
     DetectedBox,
     DetectedCircle,
     Detections,
@@ -193,7 +195,11 @@ class DetectorService:
         except WireError:
             self._tally(turn).refused += 1
             return None
-        return self._decoders.frame(turn.robot, header, jpeg, (size.width_px, size.height_px))
+        sides = size.width_px, size.height_px
+        if min(sides) < LEAST_SIDE_PX or max(sides) > MOST_SIDE_PX:  # whose boxes the wire could not say
+            self._tally(turn).refused += 1
+            return None
+        return self._decoders.frame(turn.robot, header, jpeg, sides)
 
     def _refuse(self, turn: Turn[Message], why: str, late: bool = False) -> None:
         """Count it; the first is told: the others are in the tallies."""

@@ -48,9 +48,9 @@ class _Heard:
         link.subscribe(DETECTIONS, self.slot.put)
 
     def take(self, wait_s: float) -> Message | None:
-        """The newest boxes."""
-        message, self.kept = self.kept or self.slot.take(wait_s), None
-        return message
+        """The newest boxes. What was kept gives way to what came since: it may be of a frame that will never be."""
+        kept, self.kept = self.kept, None
+        return self.slot.take(0.0) or kept or self.slot.take(wait_s)
 
 
 class ZenohDetector(FrameByFrame):
