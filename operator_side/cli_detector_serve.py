@@ -43,10 +43,12 @@ def serve(
     use_form(log, "detector")
     if name in _ELSEWHERE:
         raise ConfigError(f"detector {name!r} is boxes that somebody else finds: serve one that looks itself, e.g. hsv")
-    options = {"robot": robot or "*", "listen": tuple(listen) if listen else None,
+    options = {"robot": robot, "listen": tuple(listen) if listen else None,
                "connect": tuple(connect) if connect else None, "secure": secure, "detector.kind": name,
                "detector.device": device}
-    loaded: Any = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ).config
+    given = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
+    everybody = {} if given.origin(("robot",)) != "default" else {"robot": "*"}
+    loaded: Any = given.config.model_copy(update=everybody)
     with needs("vision"):
         from vision_side.detect.around import close_detector
         from vision_side.detect.choice import choose_detector, configured_detector

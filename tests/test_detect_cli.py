@@ -9,6 +9,7 @@ import pytest
 
 from operator_side import cli, cli_detector
 from tests.onnx_rig import brightness_model, without_gpu
+from vision_side import detector_service
 from vision_side.detect import onnx_detector
 
 BROKEN = '''
@@ -123,6 +124,15 @@ def test_a_device_that_is_not_there_ends_the_service_with_3(capsys, tmp_path: Pa
     code, out, err = run(capsys, "detector", "--serve", f"onnx:{path}", "--device", "cuda",
                          "--connect", "tcp/127.0.0.1:1")
     assert (code, out) == (3, "") and "--device auto" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "robot"), [((), "*"), (("--set", "robot=r2"), "r2"), (("--set", "robot=r2", "--robot", "r3*"), "r3*")]
+)
+def test_whom_it_serves_is_configured_as_all_else(capsys, monkeypatch, given: tuple[str, ...], robot: str) -> None:
+    served = []
+    monkeypatch.setattr(detector_service, "run", lambda config, *_: served.append(config.robot) or 0)
+    assert run(capsys, "detector", "--serve", "hsv", *given)[0] == 0 and served == [robot]
 
 
 def test_the_group_alone_shows_its_help(capsys) -> None:
