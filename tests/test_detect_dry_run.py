@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from protocol.clock import monotonic_us
 from protocol.config import Config as Settings
 from protocol.transports.memory import MemoryNetwork
 from tests.detector_rig import BALL, MODEL
@@ -69,6 +70,16 @@ class Camera:
     def read(self, timeout_s):
         self.t_us += 33_333
         return Capture(BALL, self.t_us)
+
+
+def test_a_detector_has_as_long_as_when_it_drives():
+    watching = Watching(CONFIG, Camera(), lambda _line: None)
+    heard, step = [], watching._pipeline.step
+    watching._pipeline.step = lambda frame: heard.append(frame.deadline_us) or step(frame)
+    before_us = monotonic_us()
+    watching.turn()
+    patience_us = CONFIG.detector.deadline_s * 1e6
+    assert before_us + patience_us <= heard[0] <= monotonic_us() + patience_us
 
 
 def test_in_the_pictures_of_a_camera_of_this_machine():

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
+from protocol.clock import monotonic_us
 from protocol.errors import HardwareError
 from protocol.messages import CameraModel, FrameHeader
 from protocol.transports.link import Link
@@ -113,6 +114,7 @@ class Watching:
 
     def __init__(self, config: VisionConfig, camera: LocalCamera, say: Say) -> None:
         self._camera, self._say = camera, say
+        self._patience_us = round(config.detector.deadline_s * 1e6)
         self._pipeline = Pipeline(config, camera.model, eyes=configured_detector(config))
         self._telling = Telling(say)
         self._tell_news()
@@ -132,7 +134,8 @@ class Watching:
             self._complain("")
             self._seq += 1
             header = FrameHeader(session=self._session, seq=self._seq, t_us=picture.t_us)
-            self._telling.step(self._pipeline.step(Frame(header, picture.jpeg)), time.monotonic())
+            frame = Frame(header, picture.jpeg, monotonic_us() + self._patience_us)
+            self._telling.step(self._pipeline.step(frame), time.monotonic())
             self._tell_news()
 
     def _tell_news(self) -> None:
