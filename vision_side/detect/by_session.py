@@ -6,8 +6,9 @@ from typing import Final, Generic, TypeVar
 
 Memory = TypeVar("Memory")
 
-MAX_ROBOTS: Final = 64
-"""Of which something is remembered; the robot that was not seen for the longest is forgotten first."""
+MAX_ROBOTS: Final = 256
+"""Of which something is remembered, as many as a site meets: with fewer, robots that take turns would each be forgotten
+just before theirs. The robot that was not seen for the longest is forgotten first."""
 
 
 class BySession(Generic[Memory]):
