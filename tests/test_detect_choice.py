@@ -3,19 +3,24 @@
 import re
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from protocol.clock import monotonic_us
 from protocol.config import Config as Settings
 from protocol.errors import ConfigError, HardwareError
+from protocol.messages import FrameHeader
 from tests.onnx_rig import brightness_model, without_gpu
 from vision_side import plugin_choice
 from vision_side.config import DetectorConfig, VisionConfig
+from vision_side.decode import Decoder
 from vision_side.detect.choice import FAMILY, GROUP, choose_detector, configured_detector, is_plain, split
 from vision_side.detect.colour_filter import ColourFilter
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.local import Adaptive, Hsv
 from vision_side.detect.onnx_detector import OnnxDetector
-from vision_side.detect.port import result_of
+from vision_side.detect.port import DetectFrame, result_of
 from vision_side.detect.shadow import Shadowed
 from vision_side.detect.tracked import Tracked
 
@@ -98,6 +103,16 @@ def test_what_is_around_it_is_built_from_the_inside_out() -> None:
     tracked = made._eyes[0]
     assert isinstance(tracked, Tracked) and isinstance(tracked.inner, ColourFilter)
     assert isinstance(tracked.inner.inner, LabelFilter) and isinstance(tracked.inner.inner.inner, Hsv)
+
+
+def test_a_fallback_lets_pass_what_vision_lets_pass() -> None:
+    large = (2000, 1200)
+    jpeg = cv2.imencode(".jpg", np.full((large[1], large[0], 3), 120, np.uint8))[1].tobytes()
+    made = configured_detector(config(fallback="adaptive").model_copy(update={"max_pixels": 3_000_000}))
+    header = FrameHeader(session="0000abcd", seq=1, t_us=1)
+    (result,) = made.detect([DetectFrame("r1", header, jpeg, Decoder(*large, 3_000_000))], monotonic_us() + 2_000_000)
+    made.close()
+    assert result.detector == "hsv" and made.switched == 0
 
 
 @pytest.mark.parametrize(

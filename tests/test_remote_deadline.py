@@ -1,5 +1,6 @@
 """Newest only, by the deadline, and what drives while the remote does not answer."""
 
+import math
 import threading
 import time
 
@@ -12,7 +13,7 @@ from vision_side.config import HsvConfig
 from vision_side.detect.local import Hsv
 from vision_side.detect.own_decoders import MAX_DECODERS, OwnDecoders
 from vision_side.detect.port import Detection, Maker, result_of
-from vision_side.detect.remote.by_deadline import RAISED, ByDeadline
+from vision_side.detect.remote.by_deadline import FAILED, ByDeadline
 from vision_side.detect.remote.fallback import GOOD_ANSWERS, RESERVE_US, Fallback
 
 
@@ -91,7 +92,23 @@ def test_what_raises_is_no_answer_and_the_next_is_one(by_deadline, held):
     assert by_deadline.detect([frame(1)], within(2)) == [None]
     held.raises = False
     assert by_deadline.detect([frame(2)], within(2))[0].seq == 2
-    assert by_deadline.refused == {RAISED: 1}
+    assert by_deadline.refused == {FAILED: 1}
+    (line,) = by_deadline.news()
+    assert "RuntimeError: a plug-in's fault" in line
+
+
+def test_nonsense_is_no_answer_and_the_first_is_told():
+    class Strange:
+        def detect(self, frames, deadline_us):
+            beyond = (Detection(1, 2, math.nan, 4, 0.9, "ball"),)
+            return [result_of(one, beyond, Maker("strange")) for one in frames]
+
+    own = Held("own")
+    fallback = Fallback(Strange(), own)
+    assert [_who(fallback, seq) for seq in range(1, 20)] == [["own"]] * 19, "and none of it is a good answer"
+    assert [line for line in fallback.news() if "a number that is none" in line], "why is said"
+    assert fallback.news() == []
+    fallback.close()
 
 
 def test_pixels_of_a_frame_nobody_waits_for_any_more_do_not_get_into_the_next():

@@ -14,6 +14,7 @@ from vision_side.detect.labels import LONGEST_LABEL, is_label
 from vision_side.detect.port import Circle, DetectFrame, Detection, DetectionResult, Detector, clipped
 
 _LONGEST_WHY: Final = 160
+SILENT: Final = "the detector gave no answer in time"
 _FURTHEST_PX: Final = 1e6
 """As for any number on the wire."""
 
@@ -33,7 +34,7 @@ def asked(detector: Detector, frames: Sequence[DetectFrame], deadline_us: int) -
 
 def _answer(frame: DetectFrame, result: DetectionResult | None) -> DetectionResult | str:
     try:
-        return checked(frame, result) if result is not None else "the detector gave no answer in time"
+        return checked(frame, result) if result is not None else SILENT
     except Exception as error:  # of what may be no result at all
         return _why(error)
 

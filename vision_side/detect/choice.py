@@ -58,7 +58,7 @@ def configured_detector(config: VisionConfig) -> Detector | None:
     if one.fallback:
         from vision_side.detect.remote.fallback import Fallback
 
-        detector = Fallback(detector, choose_detector(one.fallback, {}, config))
+        detector = Fallback(detector, choose_detector(one.fallback, {}, config), max_pixels=config.max_pixels)
     detector = _narrowed(detector, config)
     if one.shadow:
         from vision_side.detect.shadow import Shadowed

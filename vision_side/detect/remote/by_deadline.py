@@ -14,6 +14,8 @@ from pydantic import Field
 from protocol.clock import monotonic_us
 from protocol.transports.link import LatestSlot, Link
 from vision_side.detect.around import attach_detector, close_detector, news_of
+from vision_side.detect.checking import SILENT, asked
+from vision_side.detect.news import News
 from vision_side.detect.own_decoders import OwnDecoders
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
 from vision_side.detect.remote.asking import LONGEST_WAIT_S, left_s
@@ -21,8 +23,8 @@ from vision_side.detect.remote.asking import LONGEST_WAIT_S, left_s
 Results = list[DetectionResult | None]
 PixelBound = Annotated[int, Field(ge=256, le=4096 * 4096)]
 MAX_PIXELS: Final = 1920 * 1080
-RAISED: Final = "RAISED"
-"""Counted beside what the inner detector refuses: it raised, which no detector should."""
+FAILED: Final = "FAILED"
+"""Counted beside what the inner detector refuses: it raised or gave what is no answer, which no detector should."""
 _CLOSE_S: Final = 1.0
 
 
@@ -58,7 +60,8 @@ class ByDeadline:
         """Security limit: pictures of more than `max_pixels` are not decoded."""
         self._inner = inner
         self._decoders = OwnDecoders(max_pixels)
-        self._raised: Counter[str] = Counter()
+        self._failed: Counter[str] = Counter()
+        self._news = News()
         self._asked: LatestSlot[Pending | None] = LatestSlot()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._work, name="detector", daemon=True)
@@ -66,8 +69,8 @@ class ByDeadline:
 
     @property
     def refused(self) -> Counter[str]:
-        """What the inner one refused, if it counts that, and how often it raised."""
-        return Counter(getattr(self._inner, "refused", Counter())) + self._raised
+        """What the inner one refused, if it counts that, and how often it raised or gave what is no answer."""
+        return Counter(getattr(self._inner, "refused", Counter())) + self._failed
 
     @property
     def overtaken(self) -> int:
@@ -90,8 +93,8 @@ class ByDeadline:
         attach_detector(self._inner, link)
 
     def news(self) -> list[str]:
-        """What the inner one has to say."""
-        return news_of(self._inner)
+        """What the inner one has to say, and that it failed."""
+        return [*news_of(self._inner), *self._news.take()]
 
     def close(self) -> None:
         """End the thread; one that hangs is left behind."""
@@ -108,11 +111,16 @@ class ByDeadline:
         close_detector(self._inner)
 
     def _answer(self, pending: Pending) -> None:
-        try:
-            frames = [self._decoders.again(one, at) for at, one in enumerate(pending.frames)]
-            results = self._inner.detect(frames, pending.deadline_us)
-        except Exception:  # a plug-in's fault must not end the thread: nobody would ever be answered again
-            self._raised[RAISED] += 1
-            results = [None] * len(pending.frames)
+        frames = [self._decoders.again(one, at) for at, one in enumerate(pending.frames)]
+        results = asked(self._inner, frames, pending.deadline_us)
+        for why in results:
+            if isinstance(why, str) and why is not SILENT:
+                self._fail(why)
         if not pending.over:
-            pending.answer(results)
+            pending.answer([None if isinstance(one, str) else one for one in results])
+
+    def _fail(self, why: str) -> None:
+        """Count it; the first is told."""
+        if not self._failed:
+            self._news.add(why)
+        self._failed[FAILED] += 1

@@ -14,7 +14,7 @@ from vision_side.detect.around import attach_detector, close_detector, news_of
 from vision_side.detect.by_session import MAX_ROBOTS
 from vision_side.detect.news import News
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
-from vision_side.detect.remote.by_deadline import ByDeadline
+from vision_side.detect.remote.by_deadline import MAX_PIXELS, ByDeadline
 
 GOOD_ANSWERS: Final = 10
 """In a row; a third of a second at 30 fps."""
@@ -51,9 +51,11 @@ class Remote(Detector, Protocol):
 class Fallback:
     """A `Detector` over two."""
 
-    def __init__(self, first: Detector, second: Detector, good_answers: int = GOOD_ANSWERS) -> None:
-        """A `first` that cannot be asked without waiting is asked on a thread of its own."""
-        self._first: Remote = first if isinstance(first, Remote) else ByDeadline(first)
+    def __init__(
+        self, first: Detector, second: Detector, good_answers: int = GOOD_ANSWERS, max_pixels: int = MAX_PIXELS
+    ) -> None:
+        """A `first` that cannot be asked without waiting is asked on a thread of its own, about up to `max_pixels`."""
+        self._first: Remote = first if isinstance(first, Remote) else ByDeadline(first, max_pixels)
         self._second = second
         self._news = News()
         self._good_answers = good_answers
@@ -105,7 +107,7 @@ class Fallback:
         if len(self._good) > MAX_ROBOTS:  # who was switched first begins anew with the first one
             self._good.popitem(last=False)
         self.switched += 1
-        self._news.add(f"the remote detector is late or silent for {robot}: own eyes drive on")
+        self._news.add(f"the first detector is late or silent for {robot}: own eyes drive on")
 
     def _filled(self, results: Results, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
         """The second one's results where the first had none."""
@@ -139,5 +141,5 @@ class Fallback:
             self._good[robot] = self._good[robot] + 1 if good[robot] else 0
             if self._good[robot] >= self._good_answers:
                 del self._good[robot]
-                self._news.add(f"the remote detector gave {self._good_answers} good answers for {robot}: it drives "
+                self._news.add(f"the first detector gave {self._good_answers} good answers for {robot}: it drives "
                                "again")
