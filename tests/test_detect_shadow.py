@@ -1,6 +1,7 @@
 """The shadow: it sees what the driving detector sees, never steers, and takes over when it is told to."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -107,6 +108,20 @@ def test_it_takes_over_when_told_for_that_robot_only_and_gives_back(pair) -> Non
     assert "promoted" in both.shadow_text("r1") and "promoted" not in both.shadow_text("r2")
     assert both.promote("r1", False) == ""
     assert names(both.detect([frame(3)], NO_DEADLINE)) == ["one"]
+
+
+def test_who_drives_a_robot_of_a_fleet_looks_on_at_none_which_it_would_keep_waiting(pair) -> None:
+    driving, shadow, both = pair
+    both.detect([frame(1), frame(1, "r2")], NO_DEADLINE)
+    assert until(lambda: both.promote("r1", True) == "" and len(shadow.seen) == 2)
+    driving.seen.clear(), shadow.seen.clear()
+    for seq in range(2, 20):
+        assert names(both.detect([frame(seq), frame(seq, "r2")], NO_DEADLINE)) == ["two", "one"]
+    time.sleep(0.1)
+    assert {robot for robot, _ in driving.seen} == {"r2"} and {robot for robot, _ in shadow.seen} == {"r1"}
+    assert both.promote("r2", True) == "", "it answers, as it drives the other"
+    both.detect([frame(20), frame(20, "r2")], NO_DEADLINE)
+    assert until(lambda: {"r1", "r2"} == {robot for robot, _ in driving.seen}), "now the other one looks on at both"
 
 
 def test_who_does_not_answer_is_not_promoted(pair) -> None:

@@ -1,7 +1,8 @@
 """A second detector beside the driving one: it looks at the same frames and never steers, until it is promoted. Shell.
 
 It has a thread and a decoder of its own and sees the newest frame only, so it delays no answer: only while a promotion
-takes effect may one frame wait for what it is looking at.
+takes effect may one frame wait for what it is looking at. Where each of the two drives some robots of a fleet, neither
+looks on.
 """
 
 import threading
@@ -35,6 +36,7 @@ class _Pair:
     agreement: Agreement
     promoted: bool = False
     answered_us: int | None = None
+    seen_us: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +54,7 @@ class Shadowed:
     def __init__(self, driving: Detector, shadow: Detector, name: str, max_pixels: int) -> None:
         self._eyes = (driving, shadow)
         self._locks = (threading.Lock(), threading.Lock())  # one caller at a time, also while they change places
+        self._answered_us: list[int | None] = [None, None]
         self._name = name
         self._pairs: OrderedDict[str, _Pair] = OrderedDict()
         self._decoders = OwnDecoders(max_pixels)
@@ -71,8 +74,9 @@ class Shadowed:
                 answers = self._ask(promoted, [frames[index] for index in mine], deadline_us)
                 for index, answer in zip(mine, answers, strict=True):
                     results[index] = answer
-        for frame, result in zip(frames, results, strict=True):
-            self._put(_Task(frame, result, self._pair(frame).promoted))
+        if not self._both_drive():
+            for frame, result in zip(frames, results, strict=True):
+                self._put(_Task(frame, result, self._pair(frame).promoted))
         return results
 
     def attach(self, link: Link) -> None:
@@ -114,7 +118,10 @@ class Shadowed:
 
     def _ask(self, shadow: bool, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         with self._locks[shadow]:
-            return self._eyes[shadow].detect(frames, deadline_us)
+            results = self._eyes[shadow].detect(frames, deadline_us)
+        if any(results):
+            self._answered_us[shadow] = monotonic_us()
+        return results
 
     def _pair(self, frame: DetectFrame) -> _Pair:
         """A robot that starts anew keeps who drives it; what was counted begins anew."""
@@ -123,6 +130,7 @@ class Shadowed:
             pair = _Pair(frame.header.session, Agreement())
         elif pair.session != frame.header.session:
             pair.session, pair.agreement = frame.header.session, Agreement()
+        pair.seen_us = monotonic_us()
         self._pairs[frame.robot] = pair
         self._pairs.move_to_end(frame.robot)
         if len(self._pairs) > MAX_ROBOTS:
@@ -130,7 +138,14 @@ class Shadowed:
         return pair
 
     def _is_fit(self, pair: _Pair) -> bool:
-        return pair.answered_us is not None and monotonic_us() - pair.answered_us <= _FRESH_US
+        """By its looks at this robot; where it looks on at none, by those at the robots that it drives."""
+        answered_us = self._answered_us[True] if self._both_drive() else pair.answered_us
+        return answered_us is not None and monotonic_us() - answered_us <= _FRESH_US
+
+    def _both_drive(self) -> bool:
+        """Whether one drives some of the robots that were just here, and the other one others."""
+        since_us = monotonic_us() - _FRESH_US
+        return len({one.promoted for one in self._pairs.values() if one.seen_us >= since_us}) > 1
 
     def _put(self, task: _Task) -> None:
         """The newest frame of each robot waits; an older one that was not looked at yet is left out."""
