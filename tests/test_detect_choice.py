@@ -120,6 +120,9 @@ def test_a_fallback_lets_pass_what_vision_lets_pass() -> None:
     [
         ({"kind": "hsw"}, "no detector called 'hsw'; did you mean 'hsv'"),
         ({"kind": "nowhere:Eyes"}, "'nowhere:Eyes' cannot be loaded"),
+        ({"kind": "onx:ball"}, "No module named 'onx'; did you mean 'onnx'?"),
+        ({"kind": "onx:models/ball.onnx"}, "no detector called 'onx:models/ball.onnx'; did you mean 'onnx'?"),
+        ({"kind": "http://box/detect"}, "no detector called 'http://box/detect'; did you mean 'oip+http'?; there are"),
         ({"kind": f"{__name__}:Gone"}, "cannot be loaded"),
         ({"kind": f"{__name__}:NoConfig"}, "no pydantic model called Config"),
         ({"kind": "hsv:red"}, "takes nothing after its name, not 'red'"),

@@ -7,6 +7,7 @@ Names are those of a built-in table, those of a group of entry points, or, from 
 
 import difflib
 import importlib
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from protocol.errors import ConfigError
 from vision_side.config import VisionConfig
 
 LONGEST_DETAIL: Final = 160
+_CLASS: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
+"""`package.module:Name`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +44,18 @@ class Family:
         try:
             if kind in others:
                 return others[kind].load()
-            if where is not None or ":" in kind:
+            if where is not None or _CLASS.fullmatch(kind):
                 return _imported(where or kind)
         except Exception as error:  # whatever a plug-in's own import raises
-            raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {error}"[:LONGEST_DETAIL]) from None
-        names = self.names()
-        nearest = difflib.get_close_matches(kind, names, n=1)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-        raise ConfigError(f"no {self.noun} called {kind!r}{hint}; there are {', '.join(names)}, or package.module:Name")
+            hint = "" if where or kind in others else self._hint(kind)
+            raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {error}"[:LONGEST_DETAIL] + hint) from None
+        hint, there = self._hint(kind), ", ".join(self.names())
+        raise ConfigError(f"no {self.noun} called {kind!r}{hint}; there are {there}, or package.module:Name")
+
+    def _hint(self, kind: str) -> str:
+        """Which name is nearest; what stands after one is no part of it."""
+        nearest = difflib.get_close_matches(kind.partition(":")[0], self.names(), n=1)
+        return f"; did you mean {nearest[0]!r}?" if nearest else ""
 
     def settings(self, kind: str, plugin: Any, options: Mapping[str, Any], config: VisionConfig) -> Any:
         """The checked `Config` of `plugin`. Raises ConfigError, one line, for a wrong option."""
