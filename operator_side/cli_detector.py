@@ -91,10 +91,10 @@ def _shipped_model() -> str:
 
 def _problem(load: Callable[[], Any]) -> str:
     try:
-        load()
+        plugin = load()
     except ConfigError as error:
         return str(error)
-    return ""
+    return str(plugin.unusable()) if hasattr(plugin, "unusable") else ""
 
 
 def check(

@@ -11,6 +11,7 @@ from operator_side import cli, cli_detector
 from tests.onnx_rig import brightness_model, without_gpu
 from vision_side import detector_service
 from vision_side.detect import onnx_detector
+from vision_side.detect.remote import oip_grpc
 
 BROKEN = '''
 from vision_side.detect.local import Hsv
@@ -41,6 +42,12 @@ def test_every_detector_is_listed_with_whether_it_can_be_used(capsys) -> None:
     assert listed["hsv"] == {"name": "hsv", "usable": True, "why": ""}
     code, out, _ = run(capsys, "detector", "list")
     assert code == 0 and "adaptive     ok" in out
+
+
+def test_a_list_says_what_has_to_be_installed_first(capsys, monkeypatch) -> None:
+    monkeypatch.setattr(oip_grpc, "find_spec", lambda name: None)
+    code, out, _ = run(capsys, "detector", "list")
+    assert code == 0 and "oip+grpc     grpcio is not installed: pip install 'sightline[grpc]'" in out
 
 
 def test_a_detector_that_keeps_its_promises_passes(capsys) -> None:

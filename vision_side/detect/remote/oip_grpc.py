@@ -1,5 +1,6 @@
 """`oip+grpc://HOST/MODEL`: a model of an inference server over gRPC; needs the extra `grpc`. Shell."""
 
+from importlib.util import find_spec
 from typing import Any, Final
 
 from protocol.errors import ConfigError
@@ -28,6 +29,7 @@ _OPTIONS: Final = (
     ("grpc.enable_http_proxy", 0),
     ("grpc.enable_retries", 0),
 )
+_NO_GRPC: Final = "grpcio is not installed: pip install 'sightline[grpc]', or use oip+http://"
 _REASONS: Final = {"DEADLINE_EXCEEDED": Reason.LATE, "UNAVAILABLE": Reason.UNREACHABLE,
                    "RESOURCE_EXHAUSTED": Reason.TOO_LARGE, "INTERNAL": Reason.MALFORMED}
 
@@ -40,7 +42,7 @@ class GrpcServer:
         try:
             import grpc
         except ImportError:
-            raise ConfigError("grpcio is not installed: pip install 'sightline[grpc]', or use oip+http://") from None
+            raise ConfigError(_NO_GRPC) from None
         host = f"[{address.host}]" if ":" in address.host else address.host
         self._failed = grpc.RpcError
         self._channel = grpc.insecure_channel(f"{host}:{address.port}", options=_OPTIONS)
@@ -88,6 +90,11 @@ class OipGrpc(ByDeadline):
     """The detector `oip+grpc://HOST[:PORT]/MODEL[/VERSION]`."""
 
     Config = OipSettings
+
+    @staticmethod
+    def unusable() -> str:
+        """Why it cannot be used here, for lists; empty if it can."""
+        return "" if find_spec("grpc") else _NO_GRPC
 
     def __init__(self, config: OipSettings) -> None:
         """Raises ConfigError for an address that is none, or without grpcio. Connects with the first frame."""
