@@ -71,6 +71,21 @@ def test_one_connection_is_kept_and_made_again_when_the_server_let_go_of_it():
         assert _ask(detector, seq=10) and not detector.refused, "the kept connection is over, another one is made"
 
 
+def test_what_a_server_says_unasked_answers_no_later_frame():
+    def twice(request):
+        yield http_reply(said(box(x1=1.0)))
+        time.sleep(0.02)
+        yield http_reply(said(box(x1=1.0)))
+
+    with Server(twice) as server:
+        detector = _asking(server)
+        assert _ask(detector, seq=1)
+        time.sleep(0.1)
+        server.answer = lambda request: http_reply(said(box(x1=99.0)))
+        assert [_ask(detector, seq=seq).detections[0].x1_px for seq in (2, 3, 4)] == [99.0] * 3
+        assert server.connections == 2 and not detector.refused
+
+
 MILLION = b'{"width_px":320,"height_px":240,"boxes":[' + b",".join([b"{}"] * 1_000_000) + b"]}"
 BOMB = gzip.compress(bytes(64 << 20))
 HOSTILE = {

@@ -63,7 +63,7 @@ class HttpExchange:
 
     def _exchange(self, method: str, head: bytes, body: bytes, until_us: int) -> Reply:
         """Over the kept connection; once more over a new one if the server had let go of that meanwhile."""
-        kept = self._socket is not None
+        kept = self._is_kept()
         try:
             return self._once(method, head, body, until_us)
         except NoAnswerError as error:
@@ -91,6 +91,21 @@ class HttpExchange:
             raise self._unreachable(error) from None
         except (http.client.HTTPException, ValueError) as error:
             raise NoAnswerError(Reason.MALFORMED, f"not HTTP: {type(error).__name__}: {error}") from None
+
+    def _is_kept(self) -> bool:
+        """Whether the last connection can be used again. Bytes that wait on it answer nothing that will be asked."""
+        if self._socket is None:
+            return False
+        self._socket.setblocking(False)
+        try:
+            self._socket.recv(1, socket.MSG_PEEK)
+        except BlockingIOError:
+            return True
+        except OSError:
+            pass
+        self.close()
+        self.lost += 1
+        return False
 
     def _connect(self, until_us: int) -> socket.socket:
         if monotonic_us() < self._not_before_us:
