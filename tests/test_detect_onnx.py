@@ -162,7 +162,7 @@ class _FakeRuntime:
         pass
 
     class InferenceSession:
-        def __init__(self, path: str, options: object, providers: list[str]) -> None:
+        def __init__(self, path: str, options: object, providers: list[str], enable_fallback: int) -> None:
             self.asked = providers
 
         def disable_fallback(self) -> None:
@@ -177,6 +177,28 @@ class _FakeRuntime:
     @staticmethod
     def get_available_providers() -> list[str]:
         return ["CUDAExecutionProvider", "CPUExecutionProvider"]
+
+
+class _FailingRuntime(_FakeRuntime):
+    """One whose GPU cannot even be asked; its own fallback prints that where JSON may be expected."""
+
+    class InferenceSession(_FakeRuntime.InferenceSession):
+        def __init__(self, path: str, options: object, providers: list[str], enable_fallback: int) -> None:
+            if providers != ["CPUExecutionProvider"] and enable_fallback:
+                print("EP Error")
+            elif providers != ["CPUExecutionProvider"]:
+                raise RuntimeError("CUDA failure 100: no CUDA-capable device is detected")
+
+
+def test_a_gpu_that_fails_prints_nothing_and_is_said_as_everything_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", _FailingRuntime)
+    path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1])
+    header = read_onnx_header(path.read_bytes())
+    with pytest.raises(HardwareError, match="on cpu instead"):
+        open_engine(path, header, "cuda", 1)
+    assert open_engine(path, header, "auto", 1).device == "cpu" and capsys.readouterr().out == ""
 
 
 def test_a_listed_gpu_that_the_model_did_not_get_is_not_believed(

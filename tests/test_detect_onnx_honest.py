@@ -27,8 +27,8 @@ class _Dying:
         pass
 
     class InferenceSession:
-        def __init__(self, path, options, providers):
-            self.falls_back, self.on, self.lost = True, providers, False
+        def __init__(self, path, options, providers, enable_fallback):
+            self.falls_back, self.on, self.lost = bool(enable_fallback), providers, False
 
         def disable_fallback(self):
             self.falls_back = False

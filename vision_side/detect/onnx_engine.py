@@ -76,7 +76,7 @@ class _Runtime:
         options.inter_op_num_threads = 1
         options.log_severity_level = _ERRORS_ONLY
         providers = [PROVIDERS[one] for one in _BEHIND[wanted] if PROVIDERS[one] in available]
-        self._session = runtime.InferenceSession(str(path), options, providers=providers)
+        self._session = _session(runtime, path, options, providers)
         self._session.disable_fallback()  # or a GPU that is lost later becomes the CPU without a word
         got = self._session.get_providers()[0]
         self.device = _DEVICES.get(got, got)
@@ -87,6 +87,16 @@ class _Runtime:
     def run(self, pixels: NDArray[Any]) -> Arrays:
         """All outputs."""
         return dict(zip(self._outputs, self._session.run(self._outputs, {self._input: pixels}), strict=True))
+
+
+def _session(runtime: Any, path: Path, options: Any, providers: list[str]) -> Any:
+    """On the CPU where the others fail; ONNX Runtime would do that by itself, and print it where our output goes."""
+    try:
+        return runtime.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
+    except (RuntimeError, ValueError):
+        if len(providers) == 1:
+            raise
+    return runtime.InferenceSession(str(path), options, providers=[PROVIDERS["cpu"]], enable_fallback=0)
 
 
 def _why_cpu(wanted: str) -> str:
