@@ -22,7 +22,7 @@ from vision_side.detect.checking import beside_the_box
 from vision_side.detect.golden import difference
 from vision_side.detect.port import NO_DEADLINE, DetectFrame, DetectionResult, Detector
 
-SIZES: Final = ((320, 240), (640, 480), (97, 61), (16, 16), (1280, 720))
+SIZES: Final = ((320, 240), (640, 480), (97, 61), (16, 16), (1280, 720), (641, 481))
 LATE_S: Final = 0.25
 """For an answer to a frame whose deadline is over: nobody waits for it any longer."""
 _MAX_PIXELS: Final = 1920 * 1080

@@ -13,7 +13,7 @@ from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveEye
 from vision_side.detect.by_session import BySession
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.labels import Label
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, PictureDetector, result_of
+from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, PictureDetector, clipped, result_of
 
 _CPU: Final = "cpu"
 
@@ -89,8 +89,13 @@ def timed_together(
     started_ns = time.perf_counter_ns()
     found = iter(look(there) if there else [])
     each_us = (time.perf_counter_ns() - started_ns) // 1000 // max(1, len(there))
-    return [None if picture is None else result_of(frame, next(found), maker, each_us)
+    return [None if picture is None else result_of(frame, _inside(frame, next(found)), maker, each_us)
             for frame, picture in zip(frames, pictures, strict=True)]
+
+
+def _inside(frame: DetectFrame, found: Sequence[Detection]) -> list[Detection]:
+    """A picture of odd size that was decoded at half scale is a pixel larger than the encoded one."""
+    return [part for one in found if (part := clipped(one, frame.width_px, frame.height_px))]
 
 
 def _picture_of(frame: DetectFrame) -> Picture | None:
