@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,6 +34,17 @@ HERE, NEAR, AWAY = (10, 10, 50, 50), (14, 8, 52, 50), (200, 10, 240, 50)
 def test_what_counts_is_what_would_be_steered_by(mine: tuple, other: tuple, words: str) -> None:
     what = differs(result(1, *mine), result(1, *other, name="onnx"))
     assert words in what if words else not what
+
+
+@pytest.mark.parametrize(("boxes", "wanted", "agree"), [
+    ((("light-red", AWAY), ("ball", NEAR)), "", True), ((("legs", NEAR),), "", False),
+    ((("ball", AWAY), ("cup", NEAR)), "cup", True), ((("ball", NEAR),), "cup", False),
+])  # fmt: skip
+def test_what_is_not_followed_is_no_disagreement(boxes: tuple, wanted: str, agree: bool) -> None:
+    found = tuple(Detection(*box, 0.9, label) for label, box in boxes)
+    mine = replace(result(1), detections=(Detection(*HERE, 0.9, wanted or "target"),))
+    assert (differs(mine, replace(result(1), detections=found), wanted) == "") is agree
+    assert differs(result(1), replace(result(1), detections=(Detection(*NEAR, 0.9, "legs"),))) == ""
 
 
 def test_disagreement_is_told_now_and_then_only() -> None:

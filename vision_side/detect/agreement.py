@@ -1,11 +1,12 @@
 """Do two detectors see the same? Counted frame by frame, told in one line now and then. Pure.
 
-The clock is the frames' capture time. What counts is what would be steered by: the surest detection of each.
+The clock is the frames' capture time. What counts is what would be followed: the surest detection of each that may be.
 """
 
 from collections import deque
 from typing import Final
 
+from vision_side.detect.labels import may_be_followed
 from vision_side.detect.overlap import corners, overlap
 from vision_side.detect.port import Detection, DetectionResult
 
@@ -20,7 +21,9 @@ LEAST_OVERLAP: Final = 0.3
 class Agreement:
     """Of one robot's frames, in one session."""
 
-    def __init__(self) -> None:
+    def __init__(self, wanted: str = "") -> None:
+        """`wanted` is the label of what is followed, if one is configured."""
+        self._wanted = wanted
         self.compared = self.differed = 0
         self._window: deque[bool] = deque(maxlen=WINDOW)
         self._told_us: int | None = None
@@ -32,7 +35,7 @@ class Agreement:
 
     def add(self, driving: DetectionResult, shadow: DetectionResult) -> str:
         """One frame. Returns the line that tells how they differ, where it is time for one."""
-        what = differs(driving, shadow)
+        what = differs(driving, shadow, self._wanted)
         self.compared += 1
         self.differed += bool(what)
         self._window.append(not what)
@@ -43,9 +46,10 @@ class Agreement:
                 f"{len(self._window)} frames")
 
 
-def differs(driving: DetectionResult, shadow: DetectionResult) -> str:
-    """What the surest detections of two results of one frame disagree on; empty if they do not. Labels do not count."""
-    mine, other = next(iter(driving.detections), None), next(iter(shadow.detections), None)
+def differs(driving: DetectionResult, shadow: DetectionResult, wanted: str = "") -> str:
+    """What the surest detections of two results of one frame disagree on, of those that may be followed; empty if on
+    nothing. What they are called does not count."""
+    mine, other = _surest(driving, wanted), _surest(shadow, wanted)
     if mine is None and other is None:
         return ""
     if mine is None:
@@ -55,6 +59,10 @@ def differs(driving: DetectionResult, shadow: DetectionResult) -> str:
     if overlap(corners(mine), corners(other)) >= LEAST_OVERLAP:
         return ""
     return f"{driving.detector} sees {_where(mine)}, {shadow.detector} {_where(other)}"
+
+
+def _surest(result: DetectionResult, wanted: str) -> Detection | None:
+    return next((one for one in result.detections if may_be_followed(one.label, wanted)), None)
 
 
 def _where(one: Detection | None) -> str:

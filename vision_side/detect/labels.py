@@ -10,6 +10,15 @@ Label = Annotated[str, Field(min_length=1, max_length=LONGEST_LABEL)]
 """One that is configured."""
 
 
+_NO_TARGETS: Final = ("legs", "light")
+"""What other missions are for; a model that knows balls may know these too."""
+
+
+def may_be_followed(label: str, wanted: str) -> bool:
+    """Whether what is called `label` is followed: what is `wanted`, if anything is; else all but lights and legs."""
+    return label == wanted if wanted else not label.startswith(_NO_TARGETS)
+
+
 def is_label(text: str) -> bool:
     """Whether it can be said as it is."""
     return 0 < len(text) <= LONGEST_LABEL and text.isprintable()

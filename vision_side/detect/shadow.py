@@ -51,11 +51,12 @@ class _Task:
 class Shadowed:
     """A detector that drives, and one that could."""
 
-    def __init__(self, driving: Detector, shadow: Detector, name: str, max_pixels: int) -> None:
+    def __init__(self, driving: Detector, shadow: Detector, name: str, max_pixels: int, wanted: str = "") -> None:
+        """`wanted` is the label of what is followed, if one is configured."""
         self._eyes = (driving, shadow)
         self._locks = (threading.Lock(), threading.Lock())  # one caller at a time, also while they change places
         self._answered_us: list[int | None] = [None, None]
-        self._name = name
+        self._name, self._wanted = name, wanted
         self._pairs: OrderedDict[str, _Pair] = OrderedDict()
         self._decoders = OwnDecoders(max_pixels)
         self._news = News()
@@ -93,7 +94,7 @@ class Shadowed:
             return f"{self._name} does not answer, so it cannot drive"
         if pair.promoted is not shadow:
             pair.promoted = shadow
-            pair.agreement, pair.answered_us = Agreement(), None
+            pair.agreement, pair.answered_us = Agreement(self._wanted), None
         return ""
 
     def shadow_text(self, robot: str) -> str:
@@ -127,9 +128,9 @@ class Shadowed:
         """A robot that starts anew keeps who drives it; what was counted begins anew."""
         pair = self._pairs.get(frame.robot)
         if pair is None:
-            pair = _Pair(frame.header.session, Agreement())
+            pair = _Pair(frame.header.session, Agreement(self._wanted))
         elif pair.session != frame.header.session:
-            pair.session, pair.agreement = frame.header.session, Agreement()
+            pair.session, pair.agreement = frame.header.session, Agreement(self._wanted)
         pair.seen_us = monotonic_us()
         self._pairs[frame.robot] = pair
         self._pairs.move_to_end(frame.robot)

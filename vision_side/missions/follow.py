@@ -10,6 +10,7 @@ from protocol.config import Config as Settings
 from protocol.messages import STILL, CameraModel, FrameHeader, Pose, Twist
 from vision_side.config import BoxesConfig, LatencyConfig, SearchConfig, SteerConfig, TargetConfig, TrackConfig
 from vision_side.detect.boxes import locate_box
+from vision_side.detect.labels import may_be_followed
 from vision_side.detect.port import Detection
 from vision_side.foretell import Foretelling, Motion
 from vision_side.missions.port import Plan, View
@@ -17,8 +18,6 @@ from vision_side.search import Search
 from vision_side.sphere import Sighting, locate
 from vision_side.steer import Aim, Steer
 from vision_side.track import Target, Track, from_odometry
-
-_NO_TARGETS = ("legs", "light")  # what other missions are for; a model that knows balls may know these too
 
 
 class Follow:
@@ -80,9 +79,7 @@ class Follow:
     def _is_meant(self, one: Detection, view: View) -> bool:
         """By its label. Somebody else's boxes were chosen when they came."""
         label = self._config.target.label
-        if label:
-            return one.label == label
-        return view.picture is None or not one.label.startswith(_NO_TARGETS)
+        return (view.picture is None and not label) or may_be_followed(one.label, label)
 
     def _sightings(self, places: list[Sighting | None]) -> list[Sighting]:
         target = self._config.target
