@@ -1,6 +1,6 @@
 """How good a detector's answers are: each frame's verdict, and the figures over many. Pure.
 
-A frame's answer is what somebody who follows a ball would steer by: the surest detection called `ball` or `target`.
+A frame's answer is what somebody who follows a ball would steer by: the surest detection that is called a ball.
 Going for another object is the unsafe failure, and is counted by itself.
 """
 
@@ -38,10 +38,12 @@ def ball_of(scene: Scene) -> Truth | None:
     return next((one for one in scene.truths if one.label == "ball"), None)
 
 
-def judged(detections: Sequence[Detection] | None, scene: Scene, compute_us: int | None = None) -> Judged:
-    """The verdict on one frame; None is no answer, which is no hit."""
+def judged(
+    detections: Sequence[Detection] | None, scene: Scene, compute_us: int | None = None, balls: Sequence[str] = ASKED
+) -> Judged:
+    """The verdict on one frame; None is no answer, which is no hit. `balls` is what a ball may be called."""
     ball = ball_of(scene)
-    asked = [one for one in detections or () if one.label in ASKED]
+    asked = [one for one in detections or () if one.label in balls]
     if not asked:
         return Judged(ball is not None, "none", compute_us=compute_us)
     best = asked[0]  # detectors give the best first, each by its own measure

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 
 from operator_side.score import Check
-from operator_side.score_detectors import Figures
+from operator_side.score_detectors import ASKED, Figures
 from operator_side.score_scenes import Report
 
 _HEAD = ("column", "detector", "hits", "missed", "wrong object", "false alarms", "centre p50 / p95 px", "ms p50")
+_MOST_LABELS = 3
 
 
 def rows(report: Report) -> list[tuple[str, ...]]:
@@ -57,9 +58,17 @@ def _value(check: Check) -> str:
 
 
 def silence_lines(report: Report) -> list[str]:
-    """One for each detector that did not always answer."""
-    return [" ".join(f"{name}: no answer to {one.scenes} of {one.of} scenes, which count as missed: {one.why}".split())
-            for name, one in report.silent.items()]
+    """One for each detector that did not always answer, and for each that calls things what nobody asks for."""
+    silent = [f"{name}: no answer to {one.scenes} of {one.of} scenes, which count as missed: {one.why}"
+              for name, one in report.silent.items()]
+    calls = [f"{name}: not counted is what it calls {_some(labels)}; a ball is {' or '.join(ASKED)}, and target.label"
+             for name, labels in report.uncounted.items()]
+    return [" ".join(line.split()) for line in (*silent, *calls)]
+
+
+def _some(labels: Sequence[str]) -> str:
+    more = f" and {len(labels) - _MOST_LABELS} more" if len(labels) > _MOST_LABELS else ""
+    return ", ".join(map(repr, labels[:_MOST_LABELS])) + more
 
 
 def _line(cells: Sequence[str]) -> str:

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from operator_side.score_detectors import Figures, Found, Judged, figures, judged, precisions
+from operator_side.score_detectors import ASKED, Figures, Found, Judged, figures, judged, precisions
 from protocol.messages import FrameHeader
 from sim.scene_defects import as_seen
 from sim.scene_render import SceneRenderer
@@ -36,6 +36,8 @@ class Subject:
 
     name: str
     detector: Detector
+    balls: tuple[str, ...] = ASKED
+    """What it may call a ball."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,8 @@ class Report:
     made_by: dict[str, dict[str, str]]
     silent: dict[str, Silence]
     """Who did not always answer. No answer counts as missed, which the figures do not tell from having seen nothing."""
+    uncounted: dict[str, list[str]]
+    """Who saw what nobody asks for, and what they called it: the labels of another model, as like as not."""
 
     def to_dict(self) -> dict[str, Any]:
         """For --json."""
@@ -83,10 +87,11 @@ def subjects(
     needs is missing, and HardwareError for a device that is not there.
     """
     settings, given, asked = config or VisionConfig(), options or {}, list[Subject]()
+    balls = (*ASKED, settings.target.label) if settings.target.label else ASKED
     with ExitStack() as ending:
         ending.callback(close_subjects, asked)
         for name in dict.fromkeys(names):
-            asked.append(Subject(name, choose_detector(name, given.get(name, {}), settings)))
+            asked.append(Subject(name, choose_detector(name, given.get(name, {}), settings), balls))
         ending.pop_all()
     return asked
 
@@ -133,7 +138,7 @@ def score_scenes(
         for seen in shown(COLUMNS[name], seeds, asked, looks):
             each(seen)
             for count, result, why in zip(counts, seen.answers, seen.whys, strict=True):
-                count.verdicts[name].append(verdict(result, seen.scene))
+                count.verdicts[name].append(verdict(result, seen.scene, count.balls))
                 count.note(result, why)
     for seen in shown(THINGS, range(first_seed, first_seed + int(LIGHT_SHARE * frames)), asked, looks):
         each(seen)
@@ -147,6 +152,7 @@ def score_scenes(
         {one.name: precisions(one.found) for one in counts},
         {one.name: one.made_by for one in counts if one.made_by},
         {one.name: one.silence() for one in counts if one.unanswered},
+        {one.name: sorted(one.uncounted) for one in counts if one.uncounted},
     )
 
 
@@ -159,12 +165,14 @@ class _Count:
         self.found = {label: Found() for label in LABELLED}
         self.made_by: dict[str, str] = {}
         self.scenes = self.unanswered = 0
-        self._detector, self._why = subject.detector, ""
+        self.uncounted: set[str] = set()
+        self.balls, self._detector, self._why = subject.balls, subject.detector, ""
 
     def note(self, result: DetectionResult | None, why: str) -> None:
         self.scenes += 1
         if result is not None:
             self.made_by = {"device": result.device, "model_hash": result.model_hash}
+            self.uncounted.update(one.label for one in result.detections if one.label not in {*LABELS, *self.balls})
         else:
             self.unanswered += 1
             self._why = self._why or why
@@ -180,6 +188,6 @@ def detections(result: DetectionResult | None) -> tuple[Detection, ...]:
     return () if result is None else result.detections
 
 
-def verdict(result: DetectionResult | None, scene: Scene) -> Judged:
-    """Of one answer."""
-    return judged(None, scene) if result is None else judged(result.detections, scene, result.compute_us)
+def verdict(result: DetectionResult | None, scene: Scene, balls: Sequence[str] = ASKED) -> Judged:
+    """Of one answer; `balls` is what a ball may be called."""
+    return judged(None, scene) if result is None else judged(result.detections, scene, result.compute_us, balls)

@@ -29,7 +29,7 @@ EVERY = dict.fromkeys(LABELLED, (300, 0.8))
 def report(precision=None, **columns):
     of = {name: {"onnx": GOOD} for name in COLUMNS}
     of |= {name.replace("_", " "): {"onnx": one} for name, one in columns.items()}
-    return Report(900_000, 500, of, {"onnx": EVERY if precision is None else precision}, {}, {})
+    return Report(900_000, 500, of, {"onnx": EVERY if precision is None else precision}, {}, {}, {})
 
 
 def failed(one):
@@ -153,6 +153,20 @@ def test_a_plug_in_that_gives_no_answer_is_scored_and_said_in_one_line(capsys, e
         assert why in line
         assert judged["columns"]["nominal"][f"eyes_of_a_test:{name}"]["missed"] == 1
         assert getattr(eyes, name).closed == 1
+
+
+def test_who_calls_a_ball_something_else_is_told_why_it_has_no_hits(capsys, eyes, monkeypatch):
+    def named(frame):
+        return result_of(frame, [Detection(1, 1, 9, 9, 0.9, f"cup {n}") for n in range(5)], Maker("eyes"))
+
+    monkeypatch.setattr(eyes.Eyes, "answer", staticmethod(named))
+    _, out, err = told(capsys, NAME, "--json")
+    assert json.loads(out)["uncounted"] == {NAME: [f"cup {n}" for n in range(5)]}
+    assert err.startswith(f"{NAME}: not counted is what it calls 'cup 0', 'cup 1', 'cup 2' and 2 more; a ball is ball")
+    assert err.count("\n") == 1
+    assert told(capsys, "hsv", "--json")[2] == ""
+    _, out, err = told(capsys, NAME, "--json", "--set", "target.label=cup 3")
+    assert "cup 3" not in err and json.loads(out)["columns"]["nominal"][NAME]["missed"] == 0
 
 
 def test_who_cannot_be_asked_here_says_why(capsys):
