@@ -20,7 +20,8 @@ STEPS = [15_000, 14_000, 13_000, 14_000, 20_000]
 SCENES = 100_000
 BATCH = 32
 VALIDATED = 5000
-"""These are those of the model that ships, so that the same command makes it again; a test compares."""
+"""These are those of the model that ships, so that the same command makes one of its kind; a test compares. (That one's
+rounds were trained one by one, the last from the file before, as its card says.)"""
 OUT = Path("runs/train")
 _STEPS = "Of one round; say it again for one more, which starts the learning rate anew and takes in more scenes."
 _START = "A model that this command made: train the last round alone, from there on."
@@ -43,8 +44,8 @@ def train(
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What trains.")] = "cpu",
     jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Processes [default: one per core].")] = None,
     start: Annotated[Path | None, typer.Option(metavar="MODEL", help=_START)] = None,
-    validated: Annotated[int, typer.Option(min=5, help="Scenes of each column that choose thresholds.")] = VALIDATED,
-    judged: Annotated[int, typer.Option(min=5, help="Scenes of each column for the card's table.")] = 500,
+    validated: Annotated[int, typer.Option(min=5, max=100_000, help="Scenes a column for thresholds.")] = VALIDATED,
+    judged: Annotated[int, typer.Option(min=5, help="Scenes a column for the card's table.")] = 500,
 ) -> None:
     """Draw labelled scenes, train the detector, write sightline.onnx and its card. Cut off, it goes on where it was."""
     with needs("train"):
@@ -56,7 +57,8 @@ def train(
                             "build, or take --device cpu")
     processes = jobs or os.cpu_count() or 1
     weights, digest = _begun(start) if start else (None, "")
-    training = Training(tuple(steps), batch, seed=seed, jobs=_sharing(batch, processes), start=digest)
+    sharing = _sharing(batch, processes) if device == "cpu" else 1
+    training = Training(tuple(steps), batch, seed=seed, jobs=sharing, start=digest)
     options = TrainOptions(out, scenes, training, device, processes, validated, judged, weights)
     try:
         out.mkdir(parents=True, exist_ok=True)

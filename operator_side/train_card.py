@@ -30,7 +30,7 @@ class Card:
 def card_text(card: Card) -> str:
     """Markdown."""
     return "\n".join([
-        "# The detector that comes with Sightline", "",
+        "# A detector of balls, traffic lights and legs", "",
         f"Finds {', '.join(f'`{label}`' for label in LABELS)} in a picture: a heat-map network of {card.parameters} "
         f"numbers, {card.size_bytes} bytes, ONNX opset {OPSET}.", "",
         f"SHA-256 `{card.sha256}`", "", *_input(), "", "## How it was made", "", *_made(card), "",
@@ -59,7 +59,8 @@ def _made(card: Card) -> list[str]:
     start = " --start MODEL" if training.start else ""
     return [
         f"`sightline train --scenes {card.scenes} {steps} --batch {training.batch} "
-        f"--seed {training.seed} --device {card.device} --jobs {training.jobs}{start}`", "",
+        f"--seed {training.seed} --device {card.device} --jobs {training.jobs} --validated {card.validated}"
+        f"{start}`", "",
         f"- Scenes: seeds 0 to {card.scenes - 1}, floors and walls of the families {_families(TRAINED)}; from seed "
         f"{LATER_FROM} up {_families(TRAINED_LATER)}; from {HARDER_FROM} up {_families(TRAINED_HARDER)}, with more "
         "legs and more boxes of the ball's colour. Defects are drawn anew each time a scene is shown; from the third "
@@ -83,8 +84,8 @@ def _judged(card: Card) -> list[str]:
     last = report.first_seed + report.frames - 1
     return [
         f"{report.frames} scenes a column, seeds {report.first_seed} to {last}: floors and walls of the families "
-        f"{_families(JUDGED)}, and light from heights that training never saw. `sightline score detectors onnx "
-        f"--frames {report.frames} --demand` shows it again. What the columns and figures mean: "
+        f"{_families(JUDGED)}, and light from heights that training never saw. `sightline score detectors onnx:FILE "
+        f"--frames {report.frames} --demand` shows it again (`onnx` is the file that comes along). What it all means: "
         "docs/learned-detector.md. `ms p50` is of a machine that may have had other work: `sightline bench pipeline` "
         "measures time.", "", markdown(report), "", *_demanded(report),
     ]

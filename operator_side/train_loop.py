@@ -38,9 +38,10 @@ _SAY_EVERY: Final = 50
 
 def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
           say: Callable[[str], None]) -> Weights:
-    """Train, or go on from the checkpoint in `folder`; the averaged weights, normalisation folded in."""
-    if device != "cpu" or training.jobs == 1:
-        return _trained(scenes, replace(training, jobs=1), device, folder, say)
+    """Train, or go on from the checkpoint in `folder`; the averaged weights, normalisation folded in. More than one
+    process only on the CPU."""
+    if training.jobs == 1:
+        return _trained(scenes, training, device, folder, say)
     _checkpoint(folder / CHECKPOINT, _made_by(scenes, training), device)  # what it cannot go on from is said once
     with _helpers(scenes, training, folder):
         return _trained(scenes, training, device, folder, say)

@@ -13,7 +13,7 @@ import cv2
 import onnx
 import torch
 
-from operator_side import cli
+from operator_side import cli, train_run
 from operator_side.train_export import onnx_bytes, weights_in
 from operator_side.train_loop import train
 from operator_side.train_module import Network, begin_from, folded
@@ -22,7 +22,7 @@ from operator_side.train_rounds import Training
 from operator_side.train_samples import CUT_PX
 from operator_side.train_scenes import DrawnScenes
 from protocol.errors import ConfigError, HardwareError
-from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX, Truth
+from sim.scenes import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED_FROM, WIDTH_PX, Truth
 from tests.train_rig import weights
 from vision_side.detect.onnx_detector import SHIPPED
 
@@ -141,7 +141,7 @@ def test_the_last_round_alone_is_trained_from_a_file(tmp_path, capsys):
     assert cli.run(command) == 0
     assert capsys.readouterr().out.startswith("goes on at step 70 of 72\n")
     card = (tmp_path / "sightline.md").read_text("utf-8")
-    assert "--jobs 1 --start MODEL`" in card and f"began from MODEL, of SHA-256 `{digest}`" in card
+    assert "--jobs 1 --validated 5 --start MODEL`" in card and f"began from MODEL, of SHA-256 `{digest}`" in card
     begun, ended = (weights_in(one.read_bytes()) for one in (model, tmp_path / "sightline.onnx"))
     assert begun["half.weight"] == pytest.approx(ended["half.weight"], rel=0.2, abs=0.02)
     assert not np.array_equal(begun["half.weight"], ended["half.weight"])
@@ -162,6 +162,21 @@ def test_a_start_that_is_no_model_of_this_network_is_one_line(content, tmp_path,
     assert cli.run(["train", "--out", str(tmp_path / "out"), *little, "--start", str(path)]) == 2
     error = capsys.readouterr().err.strip()
     assert f"--start {path}" in error and "\n" not in error and not (tmp_path / "out").exists()
+
+
+def test_a_gpu_takes_each_batch_whole(tmp_path, monkeypatch):
+    """Also where a training begins from a file, whose checkpoint says so."""
+    asked = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(train_run, "run_training", lambda options, *_: asked.append(options) or tmp_path / "m.onnx")
+    for device, jobs in (("cuda", 1), ("cpu", 4)):
+        assert cli.run(["train", "--out", str(tmp_path), "--device", device, "--jobs", "4"]) == 0
+        assert (asked[-1].training.jobs, asked[-1].jobs) == (jobs, 4)
+
+
+def test_thresholds_are_not_chosen_on_scenes_of_the_judges(tmp_path, capsys):
+    assert cli.run(["train", "--out", str(tmp_path), "--validated", str(JUDGED_FROM - VALIDATED_FROM + 1)]) == 2
+    assert "--validated" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_cut_outs_halve_as_evenly_as_pictures():
