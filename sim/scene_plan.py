@@ -1,6 +1,7 @@
 """What stands where in a labelled scene: a seed and a column in, a plan out. Pure."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -34,6 +35,7 @@ _TRAINED_LIGHT_DEG = ((10.0, 30.0), (50.0, 85.0))
 _HIGHEST_M, _LOWEST_M = 1.5, 0.04  # of the lens above the floor
 _HALF_OCCLUDED = 0.5
 _LAMPS_HIGH_M = 0.26  # of the simulated light's housing
+_TRIES = 50
 
 
 def plan_scene(seed: int, column: Column) -> ScenePlan:
@@ -61,12 +63,29 @@ def plan_scene(seed: int, column: Column) -> ScenePlan:
     )
 
 
-def without_what_hides(plan: ScenePlan) -> ScenePlan:
-    """The scene without anything nearer than the ball, for when too much of it is hidden."""
-    balls = [one for one in plan.solids if one.label == "ball"]
-    near_m = min(math.dist(one.at_m, (0, 0, 0)) for one in balls)
-    kept = [one for one in plan.solids if one in balls or math.dist(one.at_m, (0, 0, 0)) > near_m + _reach(one)]
-    return replace(plan, solids=tuple(kept))
+def with_more_of_the_ball(plan: ScenePlan) -> Iterator[ScenePlan]:
+    """What to draw where too much of the ball is hidden, one after the other until enough of it shows: the scene
+    without what is nearer, with its boxes of the ball's colour elsewhere, and at last without those that are nearer."""
+    (ball,) = (one for one in plan.solids if one.label == "ball")
+    alike = [one for one in plan.solids if one.is_like_ball]
+    others = [one for one in plan.solids if one not in alike and (one == ball or not _is_nearer(one, ball))]
+    yield replace(plan, solids=(*others, *alike))
+    draw = np.random.default_rng([plan.seed, 13])
+    for _ in range(_TRIES if alike else 0):
+        elsewhere = [_like(draw, plan.lens, plan.floor_m, ball, _width_px(plan.lens, ball)) for _ in alike]
+        yield replace(plan, solids=(*others, *elsewhere))
+    yield replace(plan, solids=(*others, *(one for one in alike if not _is_nearer(one, ball))))
+
+
+def _is_nearer(one: Solid, ball: Solid) -> bool:
+    """Whether a part of it may be."""
+    return math.dist(one.at_m, (0, 0, 0)) <= math.dist(ball.at_m, (0, 0, 0)) + _reach(one)
+
+
+def _width_px(lens: Lens, ball: Solid) -> float:
+    """Of the ball, in the middle of the picture: what `_ball` drew."""
+    radius_m, away_m = ball.size_m[0] / 2, float(np.dot(ball.at_m, lens.axes()[:, 2]))
+    return 2 * radius_m * lens.focal_px / math.sqrt(away_m * away_m - radius_m * radius_m)
 
 
 def _reach(one: Solid) -> float:
@@ -101,7 +120,7 @@ def _like(draw: Random, lens: Lens, floor_m: float, ball: Solid, width_px: float
     at = (middle[0], middle[1], floor_m + sides[2] / 2)
     colour = tuple(float(np.clip(part * draw.uniform(0.96, 1.04), 0, 1)) for part in ball.colour)
     return Solid("box", at, (sides[0], sides[1], sides[2]), (colour[0], colour[1], colour[2]),
-                 draw.uniform(0, math.tau))
+                 draw.uniform(0, math.tau), is_like_ball=True)
 
 
 def _on_floor(draw: Random, lens: Lens, floor_m: float, span_m: Span) -> Point:

@@ -13,7 +13,7 @@ from sim.camera import FAR_M, NEAR_M, NOTHING_DEPTH
 from sim.engine import pybullet
 from sim.light import LIT, Light, Part, State, colour_of
 from sim.scene_backdrop import backdrop
-from sim.scene_plan import plan_scene, without_what_hides
+from sim.scene_plan import plan_scene, with_more_of_the_ball
 from sim.scenes import (
     HEIGHT_PX,
     MOST_HIDDEN,
@@ -53,14 +53,17 @@ class SceneRenderer:
         pybullet.disconnect(physicsClientId=self._client)
 
     def scene(self, seed: int, column: Column) -> Scene:
-        """The scene of that seed. Where it is to judge or to choose, a ball shows at least what `MOST_HIDDEN` leaves.
+        """The scene of that seed. Where it is to judge or to choose, a ball shows at least what `MOST_HIDDEN` leaves,
+        and boxes of its colour stay.
 
         In training one that shows less is unclear, and nothing is learned there.
         """
         plan = plan_scene(seed, column)
         drawn = self._drawn(plan)
-        if seed >= VALIDATED_FROM and _has_ball(plan.solids) and not _has_ball(drawn.truths):
-            drawn = self._drawn(without_what_hides(plan))
+        if seed >= VALIDATED_FROM and _has_ball(plan.solids):
+            more = with_more_of_the_ball(plan)
+            while not _has_ball(drawn.truths) and (another := next(more, None)):
+                drawn = self._drawn(another)
         return drawn
 
     def _drawn(self, plan: ScenePlan) -> Scene:

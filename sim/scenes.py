@@ -140,6 +140,8 @@ class Solid:
     label: str = ""
     step: float = 0.0
     """Of legs: how far they are in their stride."""
+    is_like_ball: bool = False
+    """A box of the ball's own colour, which its column is named for."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -128,6 +128,7 @@ def test_boxes_are_exact_and_no_ball_is_hidden_too_far(renderer):
     for seed in range(JUDGED_FROM, JUDGED_FROM + 60):
         scene = renderer.scene(seed, COLUMNS["same-colour boxes"])
         assert sum(one.label == "ball" for one in scene.truths) == (seed % 5 != 0), "an answer here is no false alarm"
+        assert sum(one.is_like_ball for one in scene.plan.solids) == 2, "the column is named for them"
         for one in scene.truths:
             assert one.label in LABELS
             assert 0 <= one.box[0] < one.box[2] <= WIDTH_PX and 0 <= one.box[1] < one.box[3] <= HEIGHT_PX
