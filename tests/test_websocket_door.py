@@ -9,13 +9,8 @@ from websockets.sync.client import connect
 
 from protocol.transports.websocket_dialects import BAD_FRAMING
 from protocol.transports.websocket_endpoints import host_problem, origin_problem
-from protocol.transports.websocket_listen import (
-    CROSS_SITE,
-    MAX_CLIENTS,
-    MAX_HANDSHAKES,
-    TOO_MANY_CLIENTS,
-    WRONG_SUBPROTOCOL,
-)
+from protocol.transports.websocket_listen import CROSS_SITE, TOO_MANY_CLIENTS, WRONG_SUBPROTOCOL
+from protocol.transports.websocket_places import MAX_CLIENTS, MAX_HANDSHAKES
 from tests.link_rigs import hail, until
 from tests.websocket_rig import V1, Robot, upgrade
 
@@ -75,7 +70,7 @@ def test_other_hosts_are_a_problem(hosts):
 
 
 def test_more_clients_than_the_limit_are_sent_away(robot):
-    guests = [hail(robot.endpoint) for _ in range(MAX_CLIENTS - 1)]  # one place is the healthy peer's
+    guests = [hail(robot.endpoint, role="teleop") for _ in range(MAX_CLIENTS - 1)]  # one place is the healthy peer's
     with pytest.raises(InvalidStatus) as refusal:
         connect(robot.endpoint, **V1)
     assert refusal.value.response.status_code == 503

@@ -14,7 +14,7 @@ from operator_side.faults.rows_processes import AGAIN_S, BUSY, SETTLED_S, busy_p
 from operator_side.faults.sampler import Hole
 from operator_side.score import Check
 from protocol.clock import monotonic_us
-from protocol.transports.websocket_listen import MAX_CLIENTS
+from protocol.transports.websocket_places import MAX_CLIENTS
 from robot_side.limits import TICK_US
 
 CROWDED_S: Final = 6.0

@@ -32,7 +32,7 @@ from protocol.transports.websocket_framing import Packet
 from protocol.transports.websocket_legacy import Client, LegacyToRobot, LegacyToVision
 from protocol.transports.websocket_listen import Keys, Listener
 from protocol.transports.websocket_outbox import Post
-from protocol.transports.websocket_peer import Peer, greet
+from protocol.transports.websocket_peer import Peer, Settle, greet
 from protocol.transports.websocket_seat import Seat
 from protocol.transports.websocket_wants import Wants
 from protocol.transports.websocket_wire import Wire
@@ -187,9 +187,9 @@ class WebSocketLink:
         """Listen on `doors` and begin to connect to `far`. Raises what `open_websocket` does."""
         refuse, keys = self._rules.refuse, Keys(secure, self._rules.role)
         for end in doors:
-            self._listeners.append(Listener(end, partial(self._serve, end, True), refuse, self._tell, keys))
+            self._listeners.append(Listener(end, partial(self._serve, end), refuse, self._tell, keys))
         for end in far:
-            self._dialers.append(Dialer(end, partial(self._serve, end, False), refuse, keys))
+            self._dialers.append(Dialer(end, partial(self._serve, end), refuse, keys))
 
     def wait_connected(self, timeout_s: float) -> None:
         """Wait for the first peer. Raises LinkError with the reason if there is none."""
@@ -205,15 +205,20 @@ class WebSocketLink:
 
     # --- peers, on threads of their own ------------------------------------------------------------------------------
 
-    def _serve(self, end: Endpoint, listening: bool, wire: Wire) -> None:
-        """Speak with one peer until it is gone. Raises PeerError or ConnectionClosed if it says no proper hello."""
-        dialect = self._dialect(end, listening, "{}:{}".format(*wire.address))
+    def _serve(self, end: Endpoint, wire: Wire, settle: Settle | None = None) -> None:
+        """Speak with one peer until it is gone; `settle` gives it a place where this end listens.
+
+        Raises PeerError or ConnectionClosed if it says no proper hello.
+        """
+        dialect = self._dialect(end, settle is not None, "{}:{}".format(*wire.address))
         with self._joining:
             told, hello, wanted_bytes = self._wants.told, self._wants.hello(), self._wants.bound()
         peer = Peer(wire, dialect, self._heed)
         peer.limit(wanted_bytes)
         if isinstance(dialect, V1):
-            greet(wire, dialect, hello, listening)
+            greet(wire, dialect, hello, settle)
+        elif settle is not None:
+            settle("")
         if self._join(peer, told):
             try:
                 peer.run(self._deliver, self._rules.refuse)

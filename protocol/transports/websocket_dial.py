@@ -139,5 +139,5 @@ class Dialer:
 
 
 def _is_final(closed: ConnectionClosed) -> bool:
-    """Whether trying again is of no use: anything but a peer that is just going away."""
-    return closed.rcvd is not None and closed.rcvd.code not in (1000, 1001)
+    """Whether trying again is of no use: anything but a peer that is just going away, or has no place just now."""
+    return closed.rcvd is not None and closed.rcvd.code not in (1000, 1001, 1013)

@@ -83,7 +83,8 @@ class V1:
 
     def __init__(self, robot: str, role: str) -> None:
         self._robot, self._role = robot, role
-        self._peer_role = ""
+        self.peer_role = ""
+        """As its hello says."""
         self.wants: tuple[str, ...] = ()
 
     @property
@@ -107,7 +108,7 @@ class V1:
             self.accept(message)
             return []
         try:
-            return [unpack(message, self._robot, self._peer_role)]
+            return [unpack(message, self._robot, self.peer_role)]
         except WireError as error:
             raise PeerError(BAD_FRAMING, 1007, error.detail) from None
 
@@ -122,4 +123,4 @@ class V1:
             raise PeerError(BAD_HELLO, 1008, f"this text is no hello: {error.detail}") from None
         if hello.robot != self._robot:
             raise PeerError(OTHER_ROBOT, 1008, f"this is robot {self._robot}, not {hello.robot}")
-        self._peer_role, self.wants = hello.role, hello.wants
+        self.peer_role, self.wants = hello.role, hello.wants

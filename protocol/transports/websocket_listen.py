@@ -8,8 +8,10 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
+from protocol.transports.secured import certificate_role
 from protocol.transports.websocket_access import (
     NO_TOKEN,
     NOT_LISTED,
@@ -23,7 +25,8 @@ from protocol.transports.websocket_door import listening_socket
 from protocol.transports.websocket_endpoints import Endpoint, host_problem, origin_problem
 from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
 from protocol.transports.websocket_keys import read_tokens
-from protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS, count_end
+from protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS, Settle, count_end
+from protocol.transports.websocket_places import Place, Places, may_act
 from protocol.transports.websocket_tls import listening_context, shake_hands
 from protocol.transports.websocket_wire import CLOSE_S, Wire
 
@@ -32,17 +35,12 @@ if TYPE_CHECKING:
     from websockets.server import ServerProtocol
     from websockets.typing import Subprotocol
 
-MAX_CLIENTS: Final = 16
-"""Security limit: open connections of one endpoint."""
-MAX_HANDSHAKES: Final = 16
-"""Security limit: connections beyond these that have not yet said what they are; more are closed unheard."""
-
 CROSS_SITE: Final = "CROSS_SITE"
 """Counted for a browser's request from another site, or under a name that is not this machine's."""
 WRONG_SUBPROTOCOL: Final = "WRONG_SUBPROTOCOL"
 """Counted for a client that does not offer `sightline.v1`."""
 TOO_MANY_CLIENTS: Final = "TOO_MANY_CLIENTS"
-"""Counted for a client over the limit."""
+"""Counted for a client over a limit of `websocket_places`."""
 NO_TLS: Final = "NO_TLS"
 """Counted for a client of wss:// that does not agree on TLS."""
 
@@ -62,13 +60,14 @@ class Listener:
     def __init__(
         self,
         endpoint: Endpoint,
-        serve: Callable[[Wire], None],
+        serve: Callable[[Wire, Settle], None],
         refuse: Callable[[str], None],
         tell: Callable[[str], None],
         keys: Keys,
     ) -> None:
         """`serve` is called for each client and returns when it is gone; it may raise PeerError to drop it.
 
+        It calls what it is given with the role in the client's hello, which raises PeerError if there is no place.
         `tell` writes one line to the log. Raises LinkError if the endpoint cannot be listened on, ConfigError if it
         would be open to anybody, or if `keys` lack what it needs.
         """
@@ -79,9 +78,8 @@ class Listener:
         self._door = listening_socket(endpoint)
         self._alarm, self._bell = socket.socketpair()
         self._counting = threading.Lock()
-        self._threads: set[threading.Thread] = set()
+        self._places = Places()
         self._wires: set[Wire] = set()
-        self._admitted = 0
         # Daemons: no client keeps a finished process alive.
         self._acceptor = threading.Thread(target=self._accept_all, name="websocket-listen", daemon=True)
         self._acceptor.start()
@@ -102,36 +100,33 @@ class Listener:
         waiting.register(self._alarm, select.POLLIN)
         while not any(descriptor == self._alarm.fileno() for descriptor, _ in waiting.poll()):
             try:
-                self._welcome(self._door.accept()[0])
+                near, address = self._door.accept()
+                self._welcome(near, address[0])
             except OSError:  # gone again, or no descriptor left
                 time.sleep(_PAUSE_S)
         for end in (self._door, self._alarm, self._bell):
             end.close()
 
-    def _welcome(self, near: socket.socket) -> None:
-        thread = threading.Thread(target=self._handle, args=(near,), name="websocket-peer", daemon=True)
-        with self._counting:
-            full = len(self._threads) >= MAX_CLIENTS + MAX_HANDSHAKES
-            if not full:
-                self._threads.add(thread)
-        if full:
-            self._turn_away(TOO_MANY_CLIENTS, near.getpeername()[0], "too many connections at once")
+    def _welcome(self, near: socket.socket, address: str) -> None:
+        place = self._places.knock(address)
+        if place is None:
+            self._turn_away(TOO_MANY_CLIENTS, address, "too many connections at once")
             near.close()
         else:
-            thread.start()
+            arguments = near, place
+            threading.Thread(target=self._handle, args=arguments, name="websocket-peer", daemon=True).start()
 
     def _turn_away(self, counted: str, address: str, why: str) -> None:
         self._refuse(counted)
         self._tell(f"{self._endpoint.text}: turned {address or 'a client'} away: {why}")
 
-    def _handle(self, near: socket.socket) -> None:
+    def _handle(self, near: socket.socket, place: Place) -> None:
         try:
             secured = self._secured(near)
             if secured is not None:
-                self._welcome_on(secured)
+                self._welcome_on(secured, place)
         finally:
-            with self._counting:
-                self._threads.discard(threading.current_thread())
+            self._places.leave(place)
 
     def _secured(self, near: socket.socket) -> socket.socket | None:
         """`near`, with TLS where that is asked for; None for a client that does not agree."""
@@ -146,7 +141,7 @@ class Listener:
             near.close()
             return None
 
-    def _welcome_on(self, near: socket.socket) -> None:
+    def _welcome_on(self, near: socket.socket, place: Place) -> None:
         from websockets.server import ServerProtocol
 
         protocol = ServerProtocol(max_size=MAX_HELLO_BYTES, **PROTOCOL_OPTIONS)
@@ -156,18 +151,18 @@ class Listener:
         with self._counting:
             self._wires.add(wire)
         try:
-            self._speak(wire, protocol)
+            self._speak(wire, protocol, place)
         finally:
             wire.shut()
             with self._counting:
                 self._wires.discard(wire)
 
-    def _speak(self, wire: Wire, protocol: ServerProtocol) -> None:
+    def _speak(self, wire: Wire, protocol: ServerProtocol, place: Place) -> None:
         from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
         try:
             if self._shake_hands(wire, protocol):
-                self._count_in(wire)
+                self._serve(wire, partial(self._settle, wire, place))
         except PeerError as error:
             self._turn_away(error.counted, wire.address[0], str(error))
             wire.close(error.code, str(error))
@@ -177,12 +172,12 @@ class Listener:
         except (InvalidHandshake, TimeoutError):
             pass
 
-    def _count_in(self, wire: Wire) -> None:
-        try:
-            self._serve(wire)
-        finally:
-            with self._counting:
-                self._admitted -= 1
+    def _settle(self, wire: Wire, place: Place, role: str) -> None:
+        """Give it a client's place. Where no token says what it may do, its hello does. Raises PeerError for none."""
+        granted = grant_of(certificate_role(role)) if wire.granted is None else wire.granted
+        problem = self._places.settle(place, self._endpoint.legacy is not None or may_act(granted))
+        if problem:
+            raise PeerError(TOO_MANY_CLIENTS, 1013, problem)
 
     def _shake_hands(self, wire: Wire, protocol: ServerProtocol) -> bool:
         """Whether the client came in; else it has been told why not."""
@@ -200,14 +195,9 @@ class Listener:
 
     def _answer(self, wire: Wire, protocol: ServerProtocol, request: Request) -> Response:
         address = wire.address[0]
-        refusal = self._refusal(wire, address, request)
-        with self._counting:
-            if refusal is None and self._admitted >= MAX_CLIENTS:
-                refusal = TOO_MANY_CLIENTS, 503, f"{MAX_CLIENTS} clients are connected, which is the limit"
-            if refusal is None:
-                response = protocol.accept(request)
-                self._admitted += response.status_code == 101
-                return response
+        refusal = self._refusal(wire, address, request) or self._crowding(wire)
+        if refusal is None:
+            return protocol.accept(request)
         self._turn_away(refusal[0], address, refusal[2])
         return protocol.reject(refusal[1], refusal[2] + "\n")
 
@@ -228,6 +218,11 @@ class Listener:
                 return NO_TOKEN, 401, "show the token of your role: Authorization: Bearer TOKEN, or --secure DIR"
             wire.granted = grant_of(role)
         return None
+
+    def _crowding(self, wire: Wire) -> tuple[str, int, str] | None:
+        """The same, for want of a place: told by HTTP where that is known before the hello."""
+        problem = self._places.problem(wire.granted is None or may_act(wire.granted))
+        return (TOO_MANY_CLIENTS, 503, problem) if problem else None
 
     def _select(self, offered: Sequence[Subprotocol]) -> Subprotocol:
         from websockets.exceptions import NegotiationError

@@ -32,6 +32,9 @@ SILENT: Final = "SILENT"
 NOT_GRANTED: Final = "NOT_GRANTED"
 """Counted for a message that the role of the sender's token may not publish."""
 
+Settle = Callable[[str], None]
+"""Gives a client of that role a place; raises PeerError if there is none."""
+
 logging.getLogger("sightline.websocket").addHandler(logging.NullHandler())  # else Python prints to the terminal
 
 _TICK_US: Final = 250_000  # how late a ping may be, and silence be noticed
@@ -165,9 +168,9 @@ class Peer:
         return pieces, self._dialect.text
 
 
-def greet(wire: Wire, dialect: V1, hello: str, listening: bool) -> None:
-    """Exchange hellos; who connects speaks first."""
-    if not listening:
+def greet(wire: Wire, dialect: V1, hello: str, settle: Settle | None) -> None:
+    """Exchange hellos; who connects, and so gives no place, speaks first."""
+    if settle is None:
         wire.say(hello)
     try:
         answer = wire.receive_one(time.monotonic() + OPEN_S)
@@ -176,7 +179,8 @@ def greet(wire: Wire, dialect: V1, hello: str, listening: bool) -> None:
     if not isinstance(answer, str):
         raise PeerError(BAD_HELLO, 1003, "the first message must be a hello, as text")
     dialect.accept(answer)
-    if listening:
+    if settle is not None:
+        settle(dialect.peer_role)
         wire.say(hello)
 
 
