@@ -66,6 +66,15 @@ class Scribe:
     def _print(line: str) -> None:
         try:
             if line:
-                print(line, flush=True)
+                print(_shown(line), flush=True)
         except OSError:  # whoever read has gone: what is still buffered must not spoil the exit either
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            with suppress(Exception):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        except Exception:  # whatever a line does to a stream, this thread also keeps the STOP mark
+            return
+
+
+def _shown(line: str) -> str:
+    """`line` in letters that the terminal has: peers choose some of them. A stream of no encoding takes all."""
+    encoding = getattr(sys.stdout, "encoding", None)
+    return line.encode(encoding, "backslashreplace").decode(encoding) if encoding else line

@@ -1,0 +1,67 @@
+"""What a terminal cannot show, or refuses, ends neither the log nor the keeping of the STOP mark."""
+
+import io
+import json
+import sys
+
+import pytest
+
+from protocol.log_lines import JsonLines
+from robot_side.latch import StopLatch
+from robot_side.scribe import Scribe
+from tests.link_rigs import until
+
+
+class Refusing(io.StringIO):
+    """A stream that fails as no stream should."""
+
+    def write(self, _text):
+        raise ZeroDivisionError
+
+
+class Gone(io.StringIO):
+    """A pipe whose reader has gone, without a descriptor to put anything in its place."""
+
+    def write(self, _text):
+        raise BrokenPipeError
+
+
+@pytest.fixture
+def latch(tmp_path):
+    return StopLatch(tmp_path, "r1")
+
+
+@pytest.fixture
+def scribe(latch, monkeypatch):
+    """With the real one's thread, but whatever stream the test puts in its place."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    scribe = Scribe(latch)
+    yield scribe
+    scribe.close()
+
+
+def test_a_letter_that_the_terminal_has_not_is_shown_as_its_code(latch, scribe):
+    written = io.BytesIO()
+    sys.stdout = io.TextIOWrapper(written, encoding="ascii", errors="strict")
+    scribe.say("AnswerHeader is of version 'é'")
+    scribe.say("and then \udce9")
+    scribe.keep(True)
+    assert until(latch.is_set)
+    assert until(lambda: written.getvalue().count(b"\n") == 2)
+    assert written.getvalue().decode("ascii").splitlines() == ["AnswerHeader is of version '\\xe9'", "and then \\udce9"]
+
+
+def test_a_log_of_objects_keeps_every_letter(scribe):
+    written = io.StringIO()
+    sys.stdout = JsonLines(written, "robot", "info")
+    scribe.say("AnswerHeader is of version 'é'")
+    assert until(written.getvalue)
+    assert json.loads(written.getvalue())["message"] == "AnswerHeader is of version 'é'"
+
+
+@pytest.mark.parametrize("stream", [Refusing(), Gone(), None], ids=["refusing", "gone", "none"])
+def test_a_stream_that_fails_in_any_way_costs_lines_only(latch, scribe, stream):
+    sys.stdout = stream
+    scribe.say("a line")
+    scribe.keep(True)
+    assert until(latch.is_set)
