@@ -1,6 +1,7 @@
 """Who takes whose place at a robot's WebSocket: no crowd of viewers, and no idle stranger, shuts out who says STOP."""
 
 import socket
+import threading
 from contextlib import ExitStack
 
 import pytest
@@ -145,3 +146,21 @@ def test_idle_strangers_take_only_the_places_of_their_own_address(robot):
         assert until(lambda: robot.refused == {TOO_MANY_CLIENTS: expected}, 1)
         hail(robot.endpoint, role="operator").close()
         robot.still_serves()
+
+
+def test_a_thread_that_cannot_start_costs_one_client_and_no_place(robot, monkeypatch):
+    start, failed = threading.Thread.start, []
+
+    def starts_late(thread) -> None:
+        if thread.name == "websocket-peer" and len(failed) < 2 * MAX_HANDSHAKES_OF_ONE:
+            failed.append(thread)
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", starts_late)
+    for _ in range(2 * MAX_HANDSHAKES_OF_ONE):
+        with socket.create_connection(robot.address, 3) as near:
+            assert near.recv(1) == b""  # closed, not left to wait
+    assert robot.refused == {TOO_MANY_CLIENTS: 2 * MAX_HANDSHAKES_OF_ONE}
+    hail(robot.endpoint).close()
+    robot.still_serves()

@@ -109,12 +109,20 @@ class Listener:
 
     def _welcome(self, near: socket.socket, address: str) -> None:
         place = self._places.knock(address)
-        if place is None:
-            self._turn_away(TOO_MANY_CLIENTS, address, "too many connections at once")
-            near.close()
-        else:
-            arguments = near, place
-            threading.Thread(target=self._handle, args=arguments, name="websocket-peer", daemon=True).start()
+        if place is not None and self._is_begun(near, place):
+            return
+        near.close()
+        self._turn_away(TOO_MANY_CLIENTS, address, "too many connections at once")
+
+    def _is_begun(self, near: socket.socket, place: Place) -> bool:
+        """Whether a thread of its own has taken over; a machine may have none left."""
+        thread = threading.Thread(target=self._handle, args=(near, place), name="websocket-peer", daemon=True)
+        try:
+            thread.start()
+        except RuntimeError:
+            self._places.leave(place)
+            return False
+        return True
 
     def _turn_away(self, counted: str, address: str, why: str) -> None:
         self._refuse(counted)
