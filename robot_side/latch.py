@@ -1,8 +1,13 @@
 """The STOP state on disk, so that a restart cannot clear it. Shell (a file)."""
 
+import errno
+import os
 from pathlib import Path
+from typing import Final
 
 from protocol.errors import ConfigError
+
+_NO_SYNC: Final = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)  # of a folder, on some file systems in user space
 
 
 class StopLatch:
@@ -20,8 +25,21 @@ class StopLatch:
         return self._path.exists()
 
     def keep(self, stopped: bool) -> None:
-        """Write or remove the mark."""
+        """Write or remove the mark; once this returns not even a power cut changes it. May wait for the disk."""
         if stopped:
-            self._path.touch()
+            with self._path.open("ab") as mark:
+                os.fsync(mark.fileno())
         else:
             self._path.unlink(missing_ok=True)
+        self._sync_folder()
+
+    def _sync_folder(self) -> None:
+        """The mark is an entry in its folder, which is not written with the file."""
+        folder = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)
+        except OSError as error:
+            if error.errno not in _NO_SYNC:
+                raise
+        finally:
+            os.close(folder)
