@@ -5,15 +5,16 @@ import threading
 
 import pytest
 
-from protocol.channels import FRAME, REPLY, REQUEST, SCAN, STATUS, TWIST
+from protocol.channels import CHANNELS, DETECTIONS, FRAME, REPLY, REQUEST, SCAN, STATUS, TWIST
 from protocol.codec import encode
 from protocol.legacy import encode_picture
 from protocol.messages import Request
 from protocol.transports.link import Message
+from protocol.transports.secured import ROLE_SOURCES
 from protocol.transports.websocket import open_websocket
 from protocol.transports.websocket_dialects import V1
 from protocol.transports.websocket_legacy import Client, LegacyOptions, LegacyToVision
-from protocol.transports.websocket_outbox import Outbox, Post
+from protocol.transports.websocket_outbox import MAX_MADE_UP_SOURCES, Outbox, Post
 from protocol.transports.websocket_seat import Seat
 from tests.link_rigs import until
 from tests.websocket_rig import free_ws
@@ -79,6 +80,31 @@ def test_requests_that_cannot_be_read_share_one_place():
     for payload in (b"", b"{}", b"stop", bytes(REQUEST.max_payload_bytes)):
         outbox.put(Post(Message(REQUEST, "teleop", b"", payload)))
     assert [post.message.payload for post in taken(outbox)] == [bytes(REQUEST.max_payload_bytes)]
+
+
+@pytest.mark.parametrize("channel", [one for one in CHANNELS.values() if one.passed_on], ids=lambda one: one.name)
+def test_whoever_makes_up_sources_gets_few_places_and_takes_none_of_the_roles(channel):
+    outbox = Outbox()
+    for number in range(1000):
+        outbox.put(Post(Message(channel, f"s{number}", b"", b"old")))
+    for source in ROLE_SOURCES:
+        outbox.put(Post(Message(channel, source, b"", b"new")))
+    outbox.put(Post(Message(channel, "s0", b"", b"new")))  # it has its place
+    assert +outbox.dropped == {channel.name: 1000 - MAX_MADE_UP_SOURCES + 1}
+    got = {post.message.source: post.message.payload for post in taken(outbox)}
+    assert set(got) > ROLE_SOURCES
+    assert len(got) == MAX_MADE_UP_SOURCES + len(ROLE_SOURCES)
+    assert got["s0"] == b"new"
+    outbox.put(Post(Message(channel, "s999", b"", b"new")))
+    assert outbox.waiting  # places that were left are free again
+
+
+def test_no_number_of_sources_keeps_a_request_back():
+    outbox, count = Outbox(), 100
+    for number in range(count):
+        outbox.put(Post(Message(DETECTIONS, f"s{number}", b"", b"")))
+        outbox.put(request("stop", source=f"s{number}"))
+    assert [post.message.channel for post in taken(outbox)][:count] == [REQUEST] * count
 
 
 def test_a_publication_is_written_once_for_all_who_are_sent_the_same():

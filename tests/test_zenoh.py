@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from protocol.channels import FRAME, STATUS, TWIST
+from protocol.channels import DETECTIONS, FRAME, STATUS, TWIST
 from protocol.codec import encode
 from protocol.errors import ConfigError, LinkError
 from protocol.messages import FrameHeader
 from protocol.transports.endpoints import check_endpoint, with_send_buffer
 from protocol.transports.link_rules import NOT_A_PUT
 from protocol.transports.port_owner import port_owner
-from protocol.transports.zenoh import ZenohLink, open_zenoh
+from protocol.transports.zenoh import MAX_KEPT_PUBLISHERS, ZenohLink, open_zenoh
 from protocol.transports.zenoh_around import list_robots
 from protocol.transports.zenoh_session import open_session
 from protocol.transports.zenoh_site import open_site
@@ -150,6 +150,20 @@ def test_a_delete_is_no_message():
         stranger.delete("sightline/r1/twist/vision")
         assert until(lambda: robot.refused[NOT_A_PUT] == 1)
         assert twists.take() is None
+
+
+def test_whoever_makes_up_sources_is_passed_on_and_leaves_little_behind():
+    endpoint, heard = free_endpoint(), []
+    with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as peer:
+        peer.subscribe(DETECTIONS, lambda message: heard.append(message.source))
+        robot.publish(DETECTIONS, b"", b"{}", "vision")
+        assert until(lambda: robot.publish(DETECTIONS, b"", b"{}", "vision") and heard)
+        heard.clear()
+        sources = [f"s{number}" for number in range(5 * MAX_KEPT_PUBLISHERS)]
+        for source in (*sources, "detector"):
+            assert robot.publish(DETECTIONS, b"", b"{}", source)
+        assert until(lambda: set(heard) >= {*sources, "detector"})
+        assert len(robot._outlets) == MAX_KEPT_PUBLISHERS + 1
 
 
 def test_list_robots_gives_the_newest_status_of_each():

@@ -24,6 +24,8 @@ SOURCES: Final[dict[str, tuple[str, ...]]] = {
 }
 """Role of a certificate -> the sources it may speak as towards a robot. A detector says what it sees and no more, a
 viewer nothing, not even `ack`."""
+ROLE_SOURCES: Final = frozenset(source for sources in SOURCES.values() for source in sources)
+"""The sources that a role speaks as; any other is made up by its peer, and possible only on a link without keys."""
 ROLES: Final = (ROBOT, *SOURCES)
 PRESENCE: Final = "sightline-presence"
 """Where peers say that they are there (`protocol.transports.presence`): beside `sightline/`, the keys of channels."""

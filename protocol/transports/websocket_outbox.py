@@ -7,11 +7,15 @@ from collections import Counter
 from collections.abc import Hashable
 from typing import Final, Protocol
 
-from protocol.channels import CHANNELS, REQUEST, Priority
+from protocol.channels import CHANNELS, REQUEST, Channel, Priority
 from protocol.codec import decode
 from protocol.errors import WireError
 from protocol.messages import Request
 from protocol.transports.link import Message
+from protocol.transports.secured import ROLE_SOURCES
+
+MAX_MADE_UP_SOURCES: Final = 16
+"""Security limit: places of one channel for sources that are no role's."""
 
 _RANKS: Final = {priority: rank for rank, priority in enumerate(Priority, start=2)}
 _HELLO_RANK: Final = 0
@@ -52,6 +56,9 @@ class Post:
 class Outbox:
     """A place for each channel and source, one for a hello, and for requests one for each verb.
 
+    Where others choose the source, on what is passed on, few of those that are no role's have a place at a time; more
+    are left out. None gives way to another made-up one, and a role's source always has its own: nobody is starved by
+    who makes up names. Requests are never left out.
     Only a newer message of its own place replaces one: a STOP makes room for nothing but another STOP. The most urgent
     is taken first, a STOP before everything but the hello.
     """
@@ -60,15 +67,23 @@ class Outbox:
         self._lock = threading.Lock()
         self._places: dict[tuple[str, str, str], Post | str] = {}
         self.dropped = Counter(dict.fromkeys(CHANNELS, 0))  # never grows, so that others may read it meanwhile
-        """Publications replaced by a newer one before they were sent, by channel."""
+        """Publications replaced by a newer one before they were sent, or left out, by channel."""
 
     def put(self, post: Post) -> None:
-        """Replace what is in the message's place; never blocks."""
+        """Replace what is in the message's place, if it has one; never blocks."""
         message = post.message
         place = (message.channel.name, message.source, _verb(message) if message.channel is REQUEST else "")
         with self._lock:
-            self.dropped[place[0]] += place in self._places
-            self._places[place] = post
+            has_place = self._has_place(place, message.channel)
+            self.dropped[place[0]] += place in self._places or not has_place
+            if has_place:
+                self._places[place] = post
+
+    def _has_place(self, place: tuple[str, str, str], channel: Channel) -> bool:
+        if not channel.passed_on or place[1] in ROLE_SOURCES or place in self._places:
+            return True
+        made_up = (name == channel.name and source not in ROLE_SOURCES for name, source, _ in self._places)
+        return sum(made_up) < MAX_MADE_UP_SOURCES
 
     def put_hello(self, text: str) -> None:
         """A hello goes before everything else."""

@@ -14,14 +14,14 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from protocol.channels import FRAME, Channel, pattern_for
 from protocol.transports.endpoints import check_endpoints
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.link_rules import NOT_A_PUT, LinkRules
 from protocol.transports.presence import Peer
-from protocol.transports.secured import ROBOT, secured_for
+from protocol.transports.secured import ROBOT, ROLE_SOURCES, secured_for
 from protocol.transports.zenoh_presence import Here, ask
 from protocol.transports.zenoh_session import GONE, open_session
 
@@ -32,6 +32,8 @@ CLOSE_S: Final = 1.5
 """A close that takes longer is left to a daemon thread, so that no process hangs on a dead peer."""
 EXPRESS_UP_TO_BYTES: Final = 4096
 """Channels bounded by this are sent at once, never batched."""
+MAX_KEPT_PUBLISHERS: Final = 32
+"""Security limit: beyond them only those of our own role and of the roles there are stay; peers make up sources."""
 
 
 def open_zenoh(
@@ -113,7 +115,10 @@ class ZenohLink:
         if not self.connected:
             return False
         try:
-            self._outlet(key, channel).publisher.put(payload, attachment=header or None)
+            if self._is_kept(key, source):
+                self._outlet(key, channel).publisher.put(payload, attachment=header or None)
+            else:  # it passes all the same, so that nobody starves another, and leaves nothing behind
+                self._session.put(key, payload, attachment=header or None, **_options(channel))
         except zenoh.ZError:  # closed meanwhile
             return False
         return True
@@ -200,6 +205,11 @@ class ZenohLink:
         header, payload = _parts(sample)
         self._rules.deliver(channel, str(sample.key_expr), header, payload, callback)
 
+    def _is_kept(self, key: str, source: str) -> bool:
+        """Whether the publisher on `key` stays: a relay is given sources without number by who makes them up."""
+        is_ours = source in ("", self._rules.role) or source in ROLE_SOURCES
+        return is_ours or key in self._outlets or len(self._outlets) < MAX_KEPT_PUBLISHERS
+
     def _outlet(self, key: str, channel: Channel) -> _Outlet:
         """The publisher on `key`, declared at its first use and kept."""
         outlet = self._outlets.get(key)
@@ -228,6 +238,19 @@ class ZenohLink:
         self._session = GONE
 
 
+def _options(channel: Channel) -> dict[str, Any]:
+    """How Zenoh is to carry `channel`."""
+    import zenoh
+
+    return {
+        "encoding": channel.encoding,
+        "congestion_control": zenoh.CongestionControl.DROP,
+        "priority": getattr(zenoh.Priority, channel.priority.value),
+        "express": channel.max_payload_bytes <= EXPRESS_UP_TO_BYTES,
+        "allowed_destination": zenoh.Locality.REMOTE,
+    }
+
+
 class _Outlet:
     """A publisher and whether anybody matches it, kept up to date by Zenoh's thread."""
 
@@ -235,14 +258,7 @@ class _Outlet:
         import zenoh
 
         self._changed: bool | None = None
-        self.publisher = session.declare_publisher(
-            key,
-            encoding=channel.encoding,
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=getattr(zenoh.Priority, channel.priority.value),
-            express=channel.max_payload_bytes <= EXPRESS_UP_TO_BYTES,
-            allowed_destination=zenoh.Locality.REMOTE,
-        )
+        self.publisher = session.declare_publisher(key, **_options(channel))
         ending.callback(self.publisher.undeclare)
         listener = self.publisher.declare_matching_listener(zenoh.handlers.Callback(self._note, indirect=False))
         ending.callback(listener.undeclare)
