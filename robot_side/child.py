@@ -1,11 +1,13 @@
 """The driver's hold on its network process: start it, talk to it without ever waiting for it, start it again. Shell."""
 
+import json
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from typing import Final
 
 from protocol.config import Config
 from protocol.messages import SessionId
@@ -20,6 +22,11 @@ _LONGEST_BACKOFF_US = 2_000_000
 _WEDGED_US = 2_000_000
 _STARTS_WITHIN_US = 30_000_000  # a first start reads its packages from a slow card
 _END_S = 1.0
+_CHILD: Final = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from robot_side.network import main; main()"
+)
+"""It looks for modules where the driver does: neither first in the folder that it starts in, where a file of the user's
+may be called as one of Python's, nor in another copy of this package than the driver's."""
 
 
 class Setup(Config):
@@ -78,8 +85,7 @@ class NetworkChild:
             setup = Setup(config=self._config, session=self._session, first_seq=first_seq)
             ours.send(setup.model_dump_json().encode())
             ends = (theirs.fileno(), their_aside.fileno())
-            command = [sys.executable, "-m", "robot_side.network", *map(str, ends)]
-            self._process = subprocess.Popen(command, pass_fds=ends, stdin=subprocess.DEVNULL)
+            self._process = subprocess.Popen(_command(ends), pass_fds=ends, stdin=subprocess.DEVNULL)
             undo.pop_all()
         self.socket, self._aside = ours, aside
         self.restarts += 1
@@ -150,6 +156,11 @@ class NetworkChild:
             time.sleep(0.01)
         self._process.kill()
         self._process.wait()
+
+
+def _command(ends: Sequence[int]) -> list[str]:
+    folders = [one for one in sys.path if isinstance(one, str)]  # Python ignores all else that a plug-in puts there
+    return [sys.executable, "-P", "-c", _CHILD, *map(str, ends), json.dumps(folders)]
 
 
 def _send(end: socket.socket | None, packet: bytes) -> None:

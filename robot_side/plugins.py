@@ -51,7 +51,7 @@ def _load(group: str, kind: str) -> Any:
             return known[kind].load()
         if ":" in kind:
             if str(Path.cwd()) not in sys.path:  # a class of one's own lies where the robot is started
-                sys.path.insert(0, str(Path.cwd()))
+                sys.path.append(str(Path.cwd()))  # last: a file there is not to stand in for what is installed
             module, _, name = kind.partition(":")
             return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
