@@ -3,7 +3,7 @@
     python -m operator_side.faults.crowd viewers|handshakes ENDPOINT LEDGER
 
 It stands for other people's machines, so it takes little of this one's processor. Whoever is turned away or dropped
-comes again, for ever.
+comes again, for ever. The first of the viewers watch with an operator's role, for whom places are kept.
 """
 
 import os
@@ -22,6 +22,8 @@ from protocol.codec import encode
 from protocol.transports.websocket_dial import Dialer
 from protocol.transports.websocket_endpoints import parse_endpoint
 from protocol.transports.websocket_framing import MAX_BLOCK_BYTES, Hello
+from protocol.transports.websocket_peer import OPEN_S
+from protocol.transports.websocket_places import KEPT_PLACES
 
 if TYPE_CHECKING:
     from protocol.transports.websocket_wire import Wire
@@ -38,17 +40,19 @@ _BEGUN: Final = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgr"
 
 
 class Viewer:
-    """One viewer; `reads` is False for the one that takes nothing out of its connection."""
+    """One viewer; `reads` is False for the one that takes nothing but the hello out of its connection."""
 
-    def __init__(self, ledger: Ledger, *, reads: bool) -> None:
+    def __init__(self, ledger: Ledger, role: str, *, reads: bool) -> None:
         self._ledger, self._reads = ledger, reads
-        self._hello = encode(Hello(robot="r1", session=secrets.token_hex(4), wants=(FRAME.name,))).decode("ascii")
+        hello = Hello(robot="r1", role=role, session=secrets.token_hex(4), wants=(FRAME.name,))
+        self._hello = encode(hello).decode("ascii")
         self.admitted = False
 
     def watch(self, wire: "Wire") -> None:
         """Say hello and take pictures, until the robot has had enough."""
         wire.protocol.max_message_size = MAX_BLOCK_BYTES + FRAME.max_payload_bytes
         wire.say(self._hello)
+        wire.receive_one(time.monotonic() + OPEN_S)  # the robot's, which says that there is a place
         self.admitted = True
         self._ledger.note(ADMITTED)
         if not self._reads:
@@ -63,7 +67,8 @@ class Viewer:
 
 def view(endpoint: str, ledger: Ledger) -> None:
     """All viewers, for ever."""
-    viewers = [Viewer(ledger, reads=number > 0) for number in range(VIEWERS)]
+    roles = ["operator"] * KEPT_PLACES + ["viewer"] * (VIEWERS - KEPT_PLACES)
+    viewers = [Viewer(ledger, role, reads=number != KEPT_PLACES) for number, role in enumerate(roles)]
     dialers = [Dialer(parse_endpoint(endpoint), viewer.watch, lambda _reason: None) for viewer in viewers]
     waiting = list(zip(viewers, dialers, strict=True))
     while waiting:
