@@ -12,6 +12,9 @@ export const SUBPROTOCOL = "sightline.v1";
 export const MAX_HELLO_BYTES = 1024;
 export const MAX_BLOCK_BYTES = 576;
 export const MAX_REASON_BYTES = 123; // RFC 6455, 5.5
+const MAX_MADE_UP_SOURCES = 16; // security limit: of one channel, messages that wait and whose source is no role's
+const ROLE_SOURCES = new Set(["vision", "operator", "teleop", "detector"]);
+const PASSED_ON = new Set(["detections", "mission", "report", "overlay", "preview"]); // their sources others choose
 
 const UTF8 = new TextDecoder("utf-8", { fatal: true, ignoreBOM: true });
 const LATIN1 = new TextDecoder("latin1");
@@ -160,8 +163,15 @@ export class Outbox {
   /** @param {string} name channel, "" for a hello @param {string} source @param {string|Uint8Array} message */
   put(name, source, message) {
     const slot = `${name}/${source}`;
-    this.dropped += this.slots.has(slot) ? 1 : 0;
-    this.slots.set(slot, { urgency: name === "" ? -1 : CHANNELS[name].urgency, message });
+    const isCrowded = !this.slots.has(slot) && this.isCrowded(name, source);
+    this.dropped += this.slots.has(slot) || isCrowded ? 1 : 0;
+    if (!isCrowded) this.slots.set(slot, { name, source, urgency: name === "" ? -1 : CHANNELS[name].urgency, message });
+  }
+
+  isCrowded(name, source) {
+    if (!PASSED_ON.has(name) || ROLE_SOURCES.has(source)) return false;
+    const madeUp = [...this.slots.values()].filter((slot) => slot.name === name && !ROLE_SOURCES.has(slot.source));
+    return madeUp.length >= MAX_MADE_UP_SOURCES;
   }
 
   /** @returns {string|Uint8Array|undefined} */

@@ -127,6 +127,19 @@ test("the outbox keeps the newest of each channel and source, the most urgent le
   assert.equal(outbox.dropped, 1);
 });
 
+test("whoever makes up sources gets few places, and takes none of the roles'", () => {
+  const outbox = new Outbox();
+  for (let number = 0; number < 1000; number += 1) outbox.put("detections", `s${number}`, "old");
+  for (const source of ["vision", "detector", "s0"]) outbox.put("detections", source, "new");
+  for (let number = 0; number < 20; number += 1) outbox.put("request", `s${number}`, "stop");
+  const taken = [];
+  for (let message = outbox.take(); message !== undefined; message = outbox.take()) taken.push(message);
+  assert.deepEqual(taken.slice(0, 20), Array(20).fill("stop"));
+  assert.equal(taken.filter((message) => message === "old").length, 15);
+  assert.equal(taken.filter((message) => message === "new").length, 3);
+  assert.equal(outbox.dropped, 1000 - 16 + 1);
+});
+
 const ADMITTED = [
   [["Host", "127.0.0.1:9090"], true],
   [["Host", "[::1]:9090"], true],
