@@ -101,6 +101,6 @@ def _problem(settings: type[BaseModel], error: ValidationError) -> str:
 
 def _imported(path: str) -> Any:
     if str(Path.cwd()) not in sys.path:  # a class of one's own lies where vision is started
-        sys.path.insert(0, str(Path.cwd()))
+        sys.path.append(str(Path.cwd()))  # last: a file there is not to stand in for what is installed
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)
