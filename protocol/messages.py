@@ -28,8 +28,7 @@ Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 LEAST_SIDE_PX, MOST_SIDE_PX = 16, 8192
 PixelCount = Annotated[int, Field(ge=LEAST_SIDE_PX, le=MOST_SIDE_PX)]
 """Width or height of a picture."""
-Planar = tuple[Number, Number]
-"""(linear_mps, angular_rad_s)."""
+Planar = tuple[Number, Number]  # (linear_mps, angular_rad_s)
 Pose = tuple[Number, Number, Number]
 """(x_m, y_m, yaw_rad) in the odometry frame."""
 
