@@ -32,6 +32,10 @@ from robot_side.supervision import ServiceManager, become_punctual
 
 _SHUTDOWN_US = 2_000_000
 _WATCHDOG_PERIOD_US = 100_000
+# Whatever a key or a terminal can send ends the driver by way of zero, Ctrl-\ and Ctrl-Z too: one that is killed or
+# held up on the spot leaves the wheels turning. Nor may a terminal that it is in the background of hold it up.
+ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
+IGNORED = (signal.SIGTTIN, signal.SIGTTOU)
 _MIN_TICK_US = 2_000  # a flood of commands must not become a flood of motor writes
 _WARNING = (
     "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
@@ -40,7 +44,7 @@ _WARNING = (
 
 
 def run(config: RobotConfig) -> int:
-    """Run the robot until SIGTERM, SIGINT or SIGHUP; the wheels are at zero when it returns.
+    """Run the robot until one of the ENDING signals; the wheels are at zero when it returns.
 
     Raises ConfigError, HardwareError or LinkError before anything could move.
     """
@@ -92,8 +96,10 @@ class Driver:
         self._refusals = RefusalLog()
         self._counted: Counter[str] = Counter()
         self.child = NetworkChild(config, self._driving.session, self.scribe.say)
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        for number in ENDING:
             signal.signal(number, self._on_signal)
+        for number in IGNORED:
+            signal.signal(number, signal.SIG_IGN)
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         self._ending_since_us = self._ending_since_us or monotonic_us()

@@ -36,6 +36,7 @@ _CAMERA_TIMEOUT_S = 0.2
 _CAMERA_RETRY_S = 0.5
 _LONGEST_NAP_S = 0.1
 _LEAVES_WITHIN_S = 3.0
+_KEYS = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP)  # Ctrl-C, Ctrl-\ and Ctrl-Z
 
 
 class Network:
@@ -200,7 +201,8 @@ def _run(driver: ParentDriver) -> None:
 def main() -> None:
     """Entry of the child process: argv[1] and argv[2] are the sockets' descriptors."""
     use_form(None, "robot")
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the driver ends us, after zero
+    for number in _KEYS:  # they reach the whole group; the driver ends us, after zero
+        signal.signal(number, signal.SIG_IGN)
     driver = ParentDriver(*(socket.socket(fileno=int(number)) for number in sys.argv[1:3]))
     code = 1
     try:

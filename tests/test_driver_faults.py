@@ -11,7 +11,7 @@ import pytest
 from protocol.config import Config
 from robot_side import ipc
 from robot_side.config import PluginChoice, RobotConfig
-from robot_side.driver import Driver, run
+from robot_side.driver import ENDING, IGNORED, Driver, run
 from robot_side.latch import StopLatch
 from robot_side.limits import SafetyConfig
 from robot_side.ports import WheelAngles
@@ -53,7 +53,7 @@ def driver(tmp_path):
         state_dir=tmp_path,
         safety=SafetyConfig(auto_arm=True),
     )
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    handlers = {number: signal.getsignal(number) for number in (*ENDING, *IGNORED)}
     BrokenDrive.fails = BrokenDrive.reading = None
     made = Driver(config, BrokenDrive(), None)
     yield made
@@ -103,7 +103,7 @@ def test_however_the_loop_ends_the_motors_are_told_zero(tmp_path, monkeypatch):
         raise ZeroDivisionError
 
     monkeypatch.setattr(Driver, "loop", breaks)
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    handlers = {number: signal.getsignal(number) for number in (*ENDING, *IGNORED)}
     with pytest.raises(ZeroDivisionError):
         run(config)
     assert BrokenDrive.told == (0.0, 0.0)

@@ -14,7 +14,7 @@ from protocol.transports.link import Message
 from robot_side import ipc
 from robot_side.child import NetworkChild
 from robot_side.config import RobotConfig
-from robot_side.driver import Driver
+from robot_side.driver import ENDING, IGNORED, Driver
 from robot_side.limits import SafetyConfig
 from robot_side.parent import ParentDriver
 
@@ -49,7 +49,7 @@ def ends(tmp_path):
 
 @pytest.fixture
 def driver(tmp_path, ends):
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    handlers = {number: signal.getsignal(number) for number in (*ENDING, *IGNORED)}
     config = RobotConfig(state_dir=tmp_path, safety=SafetyConfig(auto_arm=True))
     made = Driver(config, StillDrive(), None)
     made.child = ends[0]

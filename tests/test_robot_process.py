@@ -17,6 +17,7 @@ from tests.link_rigs import until
 from tests.robot_process import RobotProcess, Vision, driving, stop_after
 
 BOUND_S, BOUND_M = 0.7, 0.25
+KEYS = [signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP]  # Ctrl-C, Ctrl-\, Ctrl-Z
 
 
 def test_it_drives_on_fresh_answers_and_stops_when_they_end(tmp_path):
@@ -49,13 +50,39 @@ def test_the_wheels_stop_when_the_network_process_dies_or_hangs(tmp_path, number
         assert driving(robot), "it is started again, and the robot drives without help"
 
 
-def test_shutdown_is_after_zero_and_leaves_nothing(tmp_path):
+@pytest.mark.parametrize("number", KEYS)
+def test_a_key_at_the_terminal_does_not_reach_the_network_process(tmp_path, number):
+    """The terminal tells every process of the group; the driver ends its child, after zero."""
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
         assert driving(robot)
-        network = robot.network_pid()
-        robot.process.terminate()
+        network, since = robot.network_pid(), monotonic_us()
+        robot.kill_network(number)
+        time.sleep(0.8)
+        assert robot.network_pid() == network
+        assert min(left for t, left, _ in robot.motor_rows() if t >= since) >= 10.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTTIN, signal.SIGTTOU])
+def test_a_terminal_that_it_is_in_the_background_of_does_not_stop_it(tmp_path, number):
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
+        assert driving(robot)
+        for pid in (robot.process.pid, robot.network_pid()):
+            os.kill(pid, number)
+        time.sleep(0.5)
+        assert vision.status().state is State.ACTIVE and robot.speed() >= 10.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, *KEYS])
+def test_shutdown_is_after_zero_and_leaves_nothing(tmp_path, number):
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
+        assert driving(robot)
+        network, since = robot.network_pid(), monotonic_us()
+        for pid in (robot.process.pid, network) if number in KEYS else (robot.process.pid,):
+            os.kill(pid, number)
         assert robot.process.wait(3) == 0
         assert robot.speed() == 0.0
+        seconds, metres = stop_after(robot.motor_rows(), since)
+        assert seconds <= BOUND_S and metres <= BOUND_M
         with pytest.raises(ProcessLookupError):
             os.kill(network, 0)
         with socket.socket() as probe:
