@@ -54,6 +54,15 @@ class _Near:
         return 0.0, self.limit_mps / self.turning
 
 
+def _met_m(scan: Ranges, range_m: float) -> float | None:
+    """How far away a ray met something: inf for nothing, None if it does not say. Too close to measure is as near."""
+    if range_m == math.inf:
+        return range_m
+    if range_m == 0 or range_m > scan.range_max_m:
+        return None
+    return max(range_m, scan.range_min_m)
+
+
 class RangeGuard:
     """Holds what the newest scan forbids, and cuts twists with it."""
 
@@ -63,15 +72,16 @@ class RangeGuard:
         self._near: list[_Near] = []
 
     def see(self, scan: Ranges) -> None:
-        """Take a scan. One with a nan is a broken sensor's and is not taken: soon it counts as an obstacle."""
-        if any(map(math.isnan, scan.ranges_m)):
+        """Take a scan. One with a nan, or of which no ray says anything, is none: soon it counts as an obstacle."""
+        met_m = [_met_m(scan, range_m) for range_m in scan.ranges_m]
+        if any(map(math.isnan, scan.ranges_m)) or all(range_m is None for range_m in met_m):
             return
         self._scan_us = scan.t_us
-        angles = (scan.angle_min_rad + index * scan.angle_increment_rad for index in range(len(scan.ranges_m)))
+        angles = (scan.angle_min_rad + index * scan.angle_increment_rad for index in range(len(met_m)))
         self._near = [
             self._inequality(self._config.sensor_x_m + range_m * math.cos(angle_rad), range_m * math.sin(angle_rad))
-            for range_m, angle_rad in zip(scan.ranges_m, angles, strict=True)
-            if scan.range_min_m <= range_m <= scan.range_max_m
+            for range_m, angle_rad in zip(met_m, angles, strict=True)
+            if range_m is not None and range_m < math.inf
         ]
 
     def _inequality(self, x_m: float, y_m: float) -> _Near:

@@ -34,9 +34,19 @@ class WheelAngles:
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """One turn of a range sensor: `ranges_m[i]` is seen at `angle_min_rad + i * angle_increment_rad`, inf = nothing.
+    """One turn of a range sensor: `ranges_m[i]` is what it meets at `angle_min_rad + i * angle_increment_rad`.
 
     Angles are about the robot's x axis, counter-clockwise positive; distances from the sensor.
+
+        range_min_m to range_max_m    something, so far away
+        below range_min_m, but not 0  something, too close to measure: an obstacle at range_min_m
+        inf                           nothing, as far as the sensor sees: free
+        0, or above range_max_m       no echo; the ray says nothing: no obstacle, and no free way either
+        nan                           a broken scan
+
+    A scan with a nan, or of which no ray says anything (one without rays, too), is none. A plug-in whose device tells
+    these cases otherwise translates: one that writes 0 also for what is too close gives half of `range_min_m` there.
+    Where the robot's own parts are in the way it gives 0.
     """
 
     t_us: int

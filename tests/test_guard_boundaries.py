@@ -205,12 +205,49 @@ def box(**changes):
 
 @pytest.mark.parametrize(
     ("range_m", "counts"),
-    [(0.59, False), (0.6, True), (0.61, True), (0.7, True), (0.71, False), (math.inf, False)],
-)
-def test_only_ranges_that_the_sensor_can_measure_count(range_m, counts):
+    [
+        (-math.inf, True), (1e-9, True), (0.59, True), (0.6, True), (0.61, True), (0.7, True), (0.71, False),
+        (math.inf, False), (0.0, False), (-0.0, False),
+    ],
+)  # fmt: skip
+def test_what_a_ray_met_counts_also_too_close_to_measure(range_m, counts):
     guard = box()
-    guard.see(scan([range_m], least_m=0.6, most_m=0.7))
+    guard.see(scan([math.inf, range_m], least_m=0.6, most_m=0.7))
     assert (cut(guard, 3.0) != (3.0, 0.0)) == counts
+
+
+@pytest.mark.parametrize("range_m", [1e-9, 0.3, 0.9999, 1.0])
+def test_what_is_too_close_to_measure_is_as_far_as_the_least_range(range_m):
+    guard = box()
+    guard.see(scan([range_m], least_m=1.0))
+    assert cut(guard, 3.0) == near(0.5, 0.0) and cut(guard, -3.0) == (-3.0, 0.0)
+
+
+@pytest.mark.parametrize("ranges_m", [[], [0.0], [0.0, -0.0, 0.0], [0.71], [0.0, 0.71]])
+def test_a_scan_in_which_no_ray_says_anything_is_not_taken(ranges_m):
+    guard = box(max_scan_age_ms=50)
+    guard.see(scan([0.65], least_m=0.6, most_m=0.7))
+    guard.see(scan(ranges_m, t_us=10_000, least_m=0.6, most_m=0.7))
+    assert guard.is_fresh(50_000) and not guard.is_fresh(50_001)
+    assert cut(guard, 3.0) != (3.0, 0.0), "what the last one forbids holds"
+
+
+@pytest.mark.parametrize("range_m", [0.3, 0.6, 0.7, math.inf])
+def test_one_ray_that_says_something_is_a_scan(range_m):
+    guard = box(max_scan_age_ms=50)
+    guard.see(scan([0.0, range_m, 0.71], least_m=0.6, most_m=0.7))
+    assert guard.is_fresh(50_000)
+
+
+@pytest.mark.parametrize("most_m", [math.inf, math.nan])
+def test_a_sensor_without_a_greatest_range_sees_nothing_at_inf(most_m):
+    guard = box()
+    guard.see(scan([math.inf, math.inf], each_rad=1.0, most_m=most_m))
+    assert cut(guard, 3.0, 1.0) == (3.0, 1.0)
+    guard.see(scan([1.0, math.inf], each_rad=1.0, most_m=most_m))
+    assert cut(guard, 3.0) == near(0.5, 0.0)
+    guard.see(scan([1e308, 1e308], each_rad=1.0, most_m=most_m))
+    assert cut(guard, 3.0, 1.0) == (3.0, 1.0)
 
 
 @pytest.mark.parametrize("at", [0, 1])
@@ -256,7 +293,8 @@ def test_a_new_scan_replaces_the_last():
     guard.see(scan([0.6]))
     guard.see(scan([50.0]))
     assert cut(guard, 3.0) == (3.0, 0.0)
-    guard.see(scan([]))
+    guard.see(scan([0.6]))
+    guard.see(scan([math.inf]))
     assert cut(guard, 3.0) == (3.0, 0.0)
 
 

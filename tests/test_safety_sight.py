@@ -92,6 +92,33 @@ def test_the_guard_slows_towards_what_it_sees_and_only_towards_it():
     assert guard_with([]).limit(AHEAD, 0) == AHEAD
 
 
+def test_what_comes_so_close_that_it_cannot_be_measured_keeps_the_robot_stopped():
+    guard = guard_with([(0, 0.09)])
+    rig = Rig(guard=guard)
+    rig.now_us = 0
+    rig.armed()
+    for range_m in (0.09, 0.06, 0.05, 0.0499, 0.03, 0.001):
+        for _ in range(25):
+            guard.see(scan(rig.now_us, [(0, range_m)]))
+            rig.drive(20, 0.5)
+            assert rig.gate.applied == STILL, range_m
+    assert rig.gate.reason == "an obstacle is near"
+    assert rig.drive(20, -0.3).gate.applied.linear_mps < 0.0, "away from it is free"
+
+
+def test_a_sensor_that_sees_nothing_at_all_any_more_is_silent():
+    """Covered, or its laser dead: zeros, where an open hall would be inf."""
+    guard = guard_with([])
+    rig = Rig(guard=guard)
+    rig.now_us = 0
+    rig.armed().drive(240)
+    assert rig.gate.applied.linear_mps > 0.2
+    for _ in range(25):
+        guard.see(scan(rig.now_us, [(bearing_deg, 0.0) for bearing_deg in range(360)]))
+        rig.drive(20, 0.5)
+    assert rig.gate.applied == STILL and rig.gate.reason == "the range sensor is silent"
+
+
 def test_a_scan_with_a_nan_is_not_believed():
     guard = guard_with([])
     guard.see(scan(300_000, [(0, math.nan)]))

@@ -187,7 +187,7 @@ def test_the_guard_cuts_last_and_the_ramp_goes_on_from_there():
 
 def test_a_silent_sensor_stops_at_once_and_says_so():
     rig = guarded()
-    rig.gate._guard.see(Ranges(rig.now_us - 5_000_001, 0.0, 0.0, 0.05, 8.0, array.array("f", [])))
+    rig.gate._guard.see(Ranges(rig.now_us - 5_000_001, 0.0, 0.0, 0.05, 8.0, array.array("f", [math.inf])))
     rig.offer(0.5)
     assert rig.step() == Decision(STILL, A, "the range sensor is silent")
 
