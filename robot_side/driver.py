@@ -182,12 +182,20 @@ class Driver:
             raise
         except Exception as error:  # a plug-in is foreign code; a reading may be no number
             self._driving.gate.fault(f"{error or type(error).__name__}")
-            speeds = self._driving.tick(monotonic_us(), None, None)
+            speeds = self._without_sensors()
         try:
             self._drive.set(*speeds)
             self._obeyed = True
         except Exception as error:
             self._driving.gate.fault(f"{error or type(error).__name__}")
+
+    def _without_sensors(self) -> tuple[float, float]:
+        """The gate's way to zero; zero at once if the gate cannot be stepped either, for this loop must not end."""
+        try:
+            return self._driving.tick(monotonic_us(), None, None)
+        except Exception as error:
+            self._driving.gate.halt(f"{error or type(error).__name__}")
+            return 0.0, 0.0
 
     def _scanned(self) -> Ranges | None:
         """The newest scan. Raises DeadZoneError for a sensor that the guard must not rely on."""

@@ -7,7 +7,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 
 from protocol.errors import WireError
-from protocol.messages import AnswerHeader, Echo, Twist
+from protocol.messages import AnswerHeader, Echo, State, Twist
 from protocol.refusals import Refusal
 
 _KEPT_PER_CHANNEL = 256  # 8 s of 30 fps frames; anything older is STALE long before
@@ -36,6 +36,15 @@ class Accepted:
     echo_us: int
     arrival_us: int
     life_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the wheels do now, and why."""
+
+    twist: Twist
+    state: State
+    reason: str
 
 
 class IssuedRecord:

@@ -6,13 +6,12 @@ Liveness is the accepted command: refused commands, acks and open connections re
 
 import math
 from collections import Counter
-from dataclasses import dataclass
 
 from protocol.errors import WireError
 from protocol.messages import STILL, AnswerHeader, Holder, LastRefusal, Request, RequestHeader, State, Twist, Verb
 from protocol.refusals import CLAMPED, Refusal
 from robot_side.guard import RangeGuard
-from robot_side.judge import Accepted, FreshnessRecord, IssuedRecord, SequenceRecord, Verdict
+from robot_side.judge import Accepted, Decision, FreshnessRecord, IssuedRecord, SequenceRecord, Verdict
 from robot_side.lease import HUMANS, RANKS, Lease
 from robot_side.limits import Ramp, SafetyConfig, age_factor, clamp_twist
 from robot_side.states import Event, after, is_armed
@@ -20,15 +19,6 @@ from robot_side.states import Event, after, is_armed
 _GUEST = Holder(source="guest", session="00000000")
 _MAX_REQUEST_AGE_US = 2_000_000  # an `arm` that a link kept back must not arm when it is delivered at last
 _NEEDS_NO_ECHO = (Verb.STOP, Verb.DISARM, Verb.RELEASE)
-
-
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """What the wheels do now, and why."""
-
-    twist: Twist
-    state: State
-    reason: str
 
 
 class SafetyGate:
@@ -199,6 +189,12 @@ class SafetyGate:
     def fault(self, reason: str) -> None:
         """The drive failed: wheels to zero until `reset`."""
         self._leave(Event.FAULT, reason)
+
+    def halt(self, reason: str) -> None:
+        """As `fault`, and without a ramp: the caller, who could not step this, has told the wheels zero."""
+        self.fault(reason)
+        self._ramp.force(STILL)
+        self.applied = STILL
 
     def disarm(self, reason: str = "disarmed") -> str:
         """Wheels to zero; commands are judged but not obeyed. Always granted."""

@@ -9,6 +9,7 @@ import time
 import pytest
 
 from protocol.config import Config
+from protocol.messages import Twist
 from robot_side import ipc
 from robot_side.config import PluginChoice, RobotConfig
 from robot_side.driver import ENDING, IGNORED, Driver, run
@@ -78,6 +79,25 @@ def test_a_reading_that_is_no_number_stops_the_robot_not_the_loop(driver, readin
         driver._tick(1_000_000 + tick * 20_000, punctual=False)
         list(driver._driving.messages(1_000_000 + tick * 20_000))
     assert BrokenDrive.told == (0.0, 0.0)
+
+
+def test_a_gate_that_cannot_be_stepped_is_a_fault_with_the_wheels_at_zero(driver, monkeypatch):
+    """Neither with the sensors nor without: nothing that it holds may end the loop."""
+    driver._driving.gate.applied = Twist(linear_mps=0.3, angular_rad_s=0.0)
+    driver._driving.gate._ramp.force(driver._driving.gate.applied)
+    driver._tick(20_000, punctual=False)
+    assert BrokenDrive.told != (0.0, 0.0)
+
+    def breaks(*_):
+        raise ValueError("no such twist")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(driver._driving, "tick", breaks)
+        driver._tick(40_000, punctual=False)
+        assert BrokenDrive.told == (0.0, 0.0)
+        assert driver._driving.gate.state == "FAULT" and "no such twist" in driver._driving.gate.reason
+    driver._tick(60_000, punctual=False)
+    assert BrokenDrive.told == (0.0, 0.0), "it does not take up the speed of before"
 
 
 @pytest.mark.parametrize("error", [OSError("unplugged"), ValueError("what"), RuntimeError()])

@@ -74,6 +74,18 @@ def test_reset_waits_for_the_wheels(state):
     assert rig.request(Verb.RESET) and rig.gate.state is D
 
 
+@pytest.mark.parametrize(("state", "after"), [(A, F), (S, S)])
+def test_a_gate_that_cannot_be_stepped_stands_at_once(state, after):
+    rig = Rig().armed().drive(400)
+    if state is S:
+        rig.gate.stop("STOP by test")
+    rig.gate.halt("broken")
+    assert (rig.gate.state, rig.gate.reason) == (after, "STOP by test" if state is S else "broken")
+    assert rig.gate.applied == STILL
+    assert rig.step().twist == STILL, "nor is the speed of before taken up"
+    assert rig.request(Verb.RESET) and rig.gate.state is D
+
+
 @pytest.mark.parametrize("verb", [Verb.ARM, Verb.RESET])
 def test_arm_and_reset_are_not_for_others_beside_a_human(verb):
     rig = Rig()
