@@ -67,11 +67,11 @@ class IssuedRecord:
         return next(reversed(self._times.get(channel, OrderedDict({-1: 0}))))
 
     def deny_earlier(self) -> None:
-        """From now on no request may cite a status issued before: somebody has just said STOP or disarm."""
+        """From now on no request may cite a status issued before: somebody has just ended what it was asked for."""
         self._denied_seq = self.last_seq("status")
 
     def check_request(self, echo: Echo | None, now_us: int, max_age_us: int) -> None:
-        """Raise WireError unless `echo` names a status issued since the last STOP or disarm and young enough."""
+        """Raise WireError unless `echo` names a status young enough, and issued since requests were last denied."""
         if echo is None or echo.channel != "status":
             raise WireError(Refusal.MALFORMED, "what lets a robot move again must cite a status")
         self.age_us(echo, now_us, max_age_us)

@@ -182,13 +182,13 @@ class SafetyGate:
 
     def stop(self, reason: str = "STOP") -> str:
         """Latch STOPPED: wheels to zero and held until `reset`. Always granted."""
-        self._leave(Event.STOP, reason)
-        self.issued.deny_earlier()
+        self._end(Event.STOP, reason)
         return "STOPPED"
 
     def fault(self, reason: str) -> None:
         """The drive failed: wheels to zero until `reset`."""
-        self._leave(Event.FAULT, reason)
+        if after(self.state, Event.FAULT) is not self.state:  # once: one that lasts does not stand against a reset
+            self._end(Event.FAULT, reason)
 
     def halt(self, reason: str) -> None:
         """As `fault`, and without a ramp: the caller, who could not step this, has told the wheels zero."""
@@ -198,9 +198,7 @@ class SafetyGate:
 
     def disarm(self, reason: str = "disarmed") -> str:
         """Wheels to zero; commands are judged but not obeyed. Always granted."""
-        self._leave(Event.DISARM, reason)
-        self.issued.deny_earlier()
-        self.arms_itself = False
+        self._end(Event.DISARM, reason)
         return "disarmed"
 
     def reset(self, who: Holder, now_us: int) -> str:
@@ -245,7 +243,7 @@ class SafetyGate:
         self._lease.drop()
         self._command = None
         if who.source in HUMANS:
-            self._leave(Event.HUMAN_LOST, "the person driving let go; arm again")
+            self._end(Event.HUMAN_LOST, "the person driving let go; arm again")
         return "released"
 
     def holder(self, now_us: int) -> Holder | None:
@@ -274,7 +272,7 @@ class SafetyGate:
         """Before anybody else may take the lease: a tick later a successor's command would have hidden the loss."""
         if self._lease.lost_human(now_us):
             self._lease.drop()
-            self._leave(Event.HUMAN_LOST, "the person driving was lost; arm again")
+            self._end(Event.HUMAN_LOST, "the person driving was lost; arm again")
 
     def _arm_by_itself(self, now_us: int) -> None:
         if self.arms_itself and self.state is State.DISARMED and not self._missing_to_arm(now_us):
@@ -283,6 +281,12 @@ class SafetyGate:
     def _begin(self, reason: str, now_us: int) -> None:
         self._command, self._hold_since_us = None, now_us
         self._go(Event.ARM, reason)
+
+    def _end(self, event: Event, reason: str) -> None:
+        """As `_leave`; and, armed or not, neither a request from before nor auto_arm takes it up again."""
+        self._leave(event, reason)
+        self.issued.deny_earlier()
+        self.arms_itself = False
 
     def _leave(self, event: Event, reason: str, *, auto: bool = False) -> None:
         """Go where the wheels are off. `auto`: auto_arm may take it up again without a person."""

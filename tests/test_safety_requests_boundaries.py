@@ -237,3 +237,62 @@ def test_arming_by_a_person_does_not_switch_auto_arm_on():
     rig.silence(10_400)
     assert rig.gate.state is D
     assert rig.drive(400).gate.state is D
+
+
+# --- what was asked before ---------------------------------------------------------------------------------------
+
+
+def ask(rig, verb=Verb.ARM):
+    """A request as it goes out, to be delivered later or once more: it cites a status of now."""
+    rig._frame += 1
+    rig.gate.issued.add("status", rig._frame, rig.now_us)
+    cited = Echo(channel="status", session=ROBOT, seq=rig._frame, t_us=rig.now_us)
+    return RequestHeader(source="operator", session=OTHER, seq=rig._frame, echo=cited), Request(id=1, verb=verb)
+
+
+def stale(rig, asked):
+    with pytest.raises(WireError) as caught:
+        rig.gate.request(*asked, rig.now_us)
+    return caught.value.reason is Refusal.STALE
+
+
+@pytest.mark.parametrize("how", LEAVING)
+def test_what_was_asked_before_a_person_ended_it_does_not_arm_again(how):
+    rig = Rig().armed().drive(100, 0.2)
+    asked = ask(rig)
+    assert rig.gate.request(*asked, rig.now_us) == "already armed"
+    LEAVING[how](rig)
+    rig.silence(500)
+    rig.request(Verb.RESET)
+    rig.drive(100)
+    assert stale(rig, asked) and rig.gate.state is D
+    assert rig.request(Verb.ARM) == "armed"
+
+
+@pytest.mark.parametrize("how", ["stop", "disarm", "release", "lost"])
+def test_nor_where_the_robot_was_not_armed(how):
+    rig = Rig().drive(100)
+    asked = ask(rig)
+    LEAVING[how](rig)
+    rig.request(Verb.RESET)
+    rig.drive(100)
+    assert stale(rig, asked) and rig.gate.state is D
+
+
+@pytest.mark.parametrize("how", ["release", "lost"])
+def test_a_human_who_is_lost_before_the_robot_is_armed_ends_auto_arm(how):
+    rig = Rig(auto_arm=True)
+    LEAVING[how](rig)
+    assert rig.gate.state is D
+    assert rig.drive(400).gate.state is D
+    assert rig.request(Verb.ARM) == "armed"
+
+
+def test_a_drive_that_goes_on_failing_does_not_stand_against_a_reset():
+    rig = Rig()
+    for state in (S, F):
+        rig.gate.stop() if state is S else rig.gate.fault("broken")
+        asked = ask(rig, Verb.RESET)
+        rig.gate.fault("broken")
+        assert rig.gate.state is state
+        assert rig.gate.request(*asked, rig.now_us) == "reset; arm to drive"

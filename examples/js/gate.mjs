@@ -193,7 +193,9 @@ export class Gate {
 
   /** The drive failed: wheels to zero until `reset`. */
   fault(reason) {
-    if (this.state !== "STOPPED") this.leave("FAULT", reason);
+    if (this.state === "STOPPED" || this.state === "FAULT") return;
+    this.issued.denyEarlier();
+    this.leave("FAULT", reason);
   }
 
   disarm(reason) {
@@ -268,6 +270,7 @@ export class Gate {
   }
 
   loseHuman(reason) {
+    this.issued.denyEarlier();
     this.armsItself = false;
     if (this.armed) this.leave("DISARMED", reason);
   }
