@@ -13,7 +13,7 @@ import pytest
 
 from protocol.errors import ConfigError, HardwareError
 from robot_side.config import PluginChoice
-from robot_side.hardware.buffer_time import Clocks, captured_us
+from robot_side.hardware.buffer_time import Clocks, StampClock
 from robot_side.hardware.v4l2_camera import V4l2Camera
 from robot_side.hardware.v4l2_device import whole_jpeg
 from robot_side.hardware.v4l2_trouble import check_device, device_owner, not_opened
@@ -136,6 +136,9 @@ def test_a_model_of_another_size_is_refused_and_the_device_given_back(opened):
 # --- times -------------------------------------------------------------------------------------------------------
 
 
+NOW = Clocks(monotonic_us=10_000_000, boot_us=500_000_000, day_us=1_700_000_000_000_000)
+
+
 @pytest.mark.parametrize("clock", [time.monotonic, time.time, lambda: time.clock_gettime(time.CLOCK_BOOTTIME)])
 def test_the_buffers_time_is_told_on_the_monotonic_clock(opened, clock):
     camera = opened(FakeDevice(clock=lambda: clock() - 0.040))
@@ -163,8 +166,34 @@ def test_without_a_time_of_its_own_a_picture_is_as_old_as_configured(opened):
     ],
 )
 def test_a_stamp_is_read_on_the_clock_it_was_taken_from(stamp_us, expected_us):
-    now = Clocks(monotonic_us=10_000_000, boot_us=500_000_000, day_us=1_700_000_000_000_000)
-    assert captured_us(stamp_us, now, 30_000) == expected_us
+    assert StampClock(30_000).captured_us(stamp_us, NOW) == expected_us
+
+
+@pytest.mark.parametrize("clock_us", [NOW.monotonic_us, NOW.boot_us, NOW.day_us])
+@pytest.mark.parametrize("age_us", [0, 2_000_000, 2_000_001, 9_000_000])
+def test_once_a_stamp_has_told_the_clock_it_is_believed_however_old(clock_us, age_us):
+    stamps = StampClock(30_000)
+    stamps.captured_us(clock_us - 10_000, NOW)
+    assert stamps.captured_us(clock_us - age_us, NOW) == NOW.monotonic_us - age_us
+    assert stamps.captured_us(clock_us - 10_000, NOW) == NOW.monotonic_us - 10_000, "and is not forgotten"
+
+
+def test_a_stamp_from_the_future_of_its_clock_is_of_another_or_tells_nothing():
+    """Monotonic time and time since boot are one until the machine is first put to sleep."""
+    stamps = StampClock(30_000)
+    awake = Clocks(monotonic_us=9_000_000, boot_us=9_000_000, day_us=1_700_000_000_000_000)
+    assert stamps.captured_us(8_990_000, awake) == 8_990_000
+    assert stamps.captured_us(NOW.boot_us - 10_000, NOW) == 9_990_000
+    assert stamps.captured_us(NOW.boot_us - 3_000_000, NOW) == 7_000_000
+    assert stamps.captured_us(NOW.boot_us + 1, NOW) == 9_970_000
+
+
+def test_pictures_that_waited_for_a_process_that_was_held_up_are_not_young(opened):
+    delay_s = [0.040]
+    camera = opened(FakeDevice(clock=lambda: time.monotonic() - delay_s[0]))
+    assert age_of(next_picture(camera)) < 0.140
+    delay_s[0] = 5.0
+    eventually(lambda: age_of(next_picture(camera)) > 4.9, 2.0)
 
 
 # --- faults while driving ----------------------------------------------------------------------------------------

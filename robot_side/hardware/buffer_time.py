@@ -6,7 +6,7 @@ monotonic clock, some with the clock of the day or with the time since boot; som
 
 from dataclasses import dataclass
 
-_OLDEST_US = 2_000_000  # what seems older than this was stamped by another clock
+_OLDEST_US = 2_000_000  # until its clock is known, what seems older than this was stamped by another
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,14 +18,22 @@ class Clocks:
     day_us: int
 
 
-def captured_us(stamp_us: int, now: Clocks, delay_us: int) -> int:
-    """Monotonic time of capture of a buffer stamped `stamp_us` and read `now`.
+class StampClock:
+    """Which clock a device stamps with. One for each opening of a device: another may be plugged in."""
 
-    The first clock on which the stamp lies in the last two seconds is taken to be its clock; if there is none, the
-    picture is taken to be `delay_us` old.
-    """
-    for clock_us in (now.monotonic_us, now.boot_us, now.day_us):
-        age_us = clock_us - stamp_us
-        if 0 <= age_us <= _OLDEST_US:
-            return now.monotonic_us - age_us
-    return now.monotonic_us - delay_us
+    def __init__(self, delay_us: int) -> None:
+        """`delay_us`: how old a picture is taken to be whose stamp tells nothing."""
+        self._delay_us = delay_us
+        self._known: int | None = None
+
+    def captured_us(self, stamp_us: int, now: Clocks) -> int:
+        """Monotonic time of capture of a buffer stamped `stamp_us` and read `now`.
+
+        The first clock on which a stamp lies in the last two seconds is the device's. From then on its stamps are
+        believed, however old the pictures have grown in the driver's queue, unless one is from that clock's future.
+        """
+        ages_us = [clock_us - stamp_us for clock_us in (now.monotonic_us, now.boot_us, now.day_us)]
+        if self._known is None or ages_us[self._known] < 0:
+            self._known = next((at for at, age_us in enumerate(ages_us) if 0 <= age_us <= _OLDEST_US), self._known)
+        age_us = -1 if self._known is None else ages_us[self._known]
+        return now.monotonic_us - (age_us if age_us >= 0 else self._delay_us)

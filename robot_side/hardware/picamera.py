@@ -10,7 +10,7 @@ from pydantic import Field
 
 from protocol.errors import ConfigError, HardwareError
 from protocol.jpeg import JpegSize
-from robot_side.hardware.buffer_time import captured_us
+from robot_side.hardware.buffer_time import StampClock
 from robot_side.hardware.lens import LensConfig, camera_model
 from robot_side.hardware.newest import Newest
 from robot_side.hardware.pace import read_clocks
@@ -43,6 +43,7 @@ class PiCamera:
     def __init__(self, config: PiCameraConfig) -> None:
         self._config = config
         self._newest = Newest()
+        self._stamps = StampClock(round(config.delay_ms * 1000))
         self._heard_s = time.monotonic()
         self.model = camera_model(config, JpegSize(config.width_px, config.height_px, 3))
         self._camera = _opened(config)
@@ -70,7 +71,7 @@ class PiCamera:
         """On the encoder's thread: store and return. Its times count from its first picture's sensor time."""
         first_us = getattr(self._encoder, "firsttimestamp", None)
         stamp_us = 0 if first_us is None or since_first_us is None else first_us + since_first_us
-        t_us = captured_us(stamp_us, read_clocks(), round(self._config.delay_ms * 1000))
+        t_us = self._stamps.captured_us(stamp_us, read_clocks())
         self._heard_s = time.monotonic()
         self._newest.put(Picture(jpeg, t_us))
 

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from protocol.errors import ConfigError, HardwareError
 from protocol.jpeg import JpegSize
-from robot_side.hardware.buffer_time import captured_us
+from robot_side.hardware.buffer_time import StampClock
 from robot_side.hardware.lens import LensConfig
 from robot_side.hardware.pace import read_clocks
 from robot_side.hardware.v4l2_trouble import check_device, not_opened
@@ -74,6 +74,7 @@ class Device:
         self._config = config
         self.wish = (100, 100)
         """Shares of the configured quality and side lengths; for YUYV, whose pictures are encoded here."""
+        self._stamps = StampClock(round(config.delay_ms * 1000))
         self._capture = opening(config.device)
         try:
             self._pin_format()
@@ -120,9 +121,7 @@ class Device:
     def picture(self) -> Picture | None:
         """The capture last waited for; None if it was damaged on its way."""
         cv2 = _opencv()
-        t_us = captured_us(
-            round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1000), read_clocks(), round(self._config.delay_ms * 1000)
-        )
+        t_us = self._stamps.captured_us(round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1000), read_clocks())
         done, data = self._capture.retrieve()
         if not done:
             return None
