@@ -162,7 +162,7 @@ class SafetyGate:
         self._go(Event.OLD, reason)
         if now_us - self._hold_since_us > self.config.disarm_after_hold_s * 1e6:
             reason = f"disarmed after {self.config.disarm_after_hold_s:g} s without commands"
-            self._leave(Event.EXPIRED, reason, auto=True)
+            self._leave(Event.EXPIRED, reason)
         return STILL
 
     # --- what people ask -----------------------------------------------------------------------------------------
@@ -288,11 +288,10 @@ class SafetyGate:
         self.issued.deny_earlier()
         self.arms_itself = False
 
-    def _leave(self, event: Event, reason: str, *, auto: bool = False) -> None:
-        """Go where the wheels are off. `auto`: auto_arm may take it up again without a person."""
+    def _leave(self, event: Event, reason: str) -> None:
+        """Go where the wheels are off; auto_arm, where it is on, may take it up again."""
         if after(self.state, event) is not self.state:
             self._command, self._live_commands = None, 0
-            self.arms_itself = self.arms_itself and auto
             self._go(event, reason)
 
     def _go(self, event: Event, reason: str) -> None:

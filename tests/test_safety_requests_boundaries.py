@@ -226,6 +226,12 @@ def test_what_a_person_ended_does_not_arm_by_itself_again(how):
     assert rig.drive(400).gate.state is A, "a person armed: unattended again"
 
 
+def test_a_robot_that_starts_stopped_does_not_arm_by_itself():
+    rig = Rig(auto_arm=True, stopped=True)
+    rig.request(Verb.RESET)
+    assert rig.drive(400).gate.state is D
+
+
 def test_disarming_a_disarmed_gate_ends_auto_arm():
     rig = Rig(auto_arm=True)
     rig.request(Verb.DISARM, echo=False)
