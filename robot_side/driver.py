@@ -23,7 +23,7 @@ from robot_side.config import RobotConfig
 from robot_side.dead_zone import DeadZoneError, check_dead_zone
 from robot_side.driving import Driving
 from robot_side.latch import StopLatch
-from robot_side.limits import TICK_US
+from robot_side.limits import MIN_TICK_US, TICK_US
 from robot_side.plugins import build
 from robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
 from robot_side.refusal_log import RefusalLog
@@ -36,7 +36,6 @@ _WATCHDOG_PERIOD_US = 100_000
 # held up on the spot leaves the wheels turning. Nor may a terminal that it is in the background of hold it up.
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 IGNORED = (signal.SIGTTIN, signal.SIGTTOU)
-_MIN_TICK_US = 2_000  # a flood of commands must not become a flood of motor writes
 _WARNING = (
     "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
     "(docs/safety.md)"
@@ -116,7 +115,7 @@ class Driver:
                 self._driving.tick_late_max_us = max(self._driving.tick_late_max_us, now_us - deadline_us)
                 deadline_us = max(deadline_us + TICK_US, now_us)
                 self._tick(now_us, punctual=True)
-            elif arrived and now_us - self._ticked_us >= _MIN_TICK_US:
+            elif arrived and now_us - self._ticked_us >= MIN_TICK_US:
                 self._tick(now_us, punctual=False)
             elif arrived:
                 self._answer()

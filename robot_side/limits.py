@@ -11,6 +11,8 @@ from protocol.messages import STILL, Twist
 
 TICK_US = 20_000
 """The driver's period: 50 Hz."""
+MIN_TICK_US = 2_000
+"""It also ticks when commands arrive, but no more often: a flood of them must not become a flood of motor writes."""
 STOP_TIME_BOUND_US = 700_000
 STOP_DISTANCE_BOUND_M = 0.25
 
@@ -141,9 +143,11 @@ class Ramp:
 
 @dataclass(frozen=True, slots=True)
 class StopBound:
-    """After the last valid command, from top speed: when the speed starts to fall, is zero, and the way until then."""
+    """After the last valid command, from top speed: when the speed told starts to fall (`falls_us`), when it is zero
+    (`ramped_us`), when the wheels stand (`zero_us`), and the way until then."""
 
     falls_us: int
+    ramped_us: int
     zero_us: int
     distance_m: float
 
@@ -151,18 +155,35 @@ class StopBound:
 def stop_bound(config: SafetyConfig) -> StopBound:
     """The stop that `config` implies, by running its own ramp: the worst case, a command on a frame of age zero.
 
+    The driver steps the ramp once a tick, and down to every MIN_TICK_US while commands arrive. The worse of both
+    counts: the ramp is slower in short steps.
+    """
+    long, short = _stop(config, TICK_US), _stop(config, MIN_TICK_US)
+    return StopBound(
+        max(long.falls_us, short.falls_us), max(long.ramped_us, short.ramped_us), max(long.zero_us, short.zero_us),
+        max(long.distance_m, short.distance_m),
+    )
+
+
+def _stop(config: SafetyConfig, step_us: int) -> StopBound:
+    """The stop with a ramp that is stepped every `step_us`.
+
     One tick is added for the phase of the driver's loop, and the motors follow with their lag. `zero_us` is when the
     ramp is at zero and the wheels, by their lag, below 2 % of top speed.
     """
     ramp, top = Ramp(config), Twist(linear_mps=config.max_linear_mps, angular_rad_s=config.max_angular_rad_s)
     ramp.force(top)
-    now_us, falls_us, wheels_mps, distance_m = 0, 0, config.max_linear_mps, 0.0
+    lag_s = config.motor_lag_ms / 1000
+    lags_on = math.exp(-step_us / 1e6 / lag_s) if lag_s else 0.0
+    now_us, falls_us, ramped_us, wheels_mps, distance_m = 0, 0, 0, config.max_linear_mps, 0.0
     twist = top
     while (twist != STILL or wheels_mps > 0.02 * top.linear_mps) and now_us < 2 * _LONGEST_STEP_US:
-        now_us += TICK_US
+        now_us += step_us
         factor = age_factor(config, now_us) if now_us <= config.silence_ms * 1000 else 0.0
-        twist = ramp.step(clamp_twist(top, factor * top.linear_mps, factor * top.angular_rad_s), TICK_US)
+        twist = ramp.step(clamp_twist(top, factor * top.linear_mps, factor * top.angular_rad_s), step_us)
         falls_us = falls_us or (now_us if twist.linear_mps < top.linear_mps else 0)
-        wheels_mps += (twist.linear_mps - wheels_mps) * min(1.0, TICK_US / max(TICK_US, config.motor_lag_ms * 1000))
-        distance_m += wheels_mps * TICK_US / 1e6
-    return StopBound(falls_us + TICK_US, now_us + TICK_US, distance_m + top.linear_mps * TICK_US / 1e6)
+        ramped_us = ramped_us or (now_us if twist == STILL else 0)
+        before_mps, wheels_mps = wheels_mps, twist.linear_mps + (wheels_mps - twist.linear_mps) * lags_on
+        distance_m += twist.linear_mps * step_us / 1e6 + (before_mps - wheels_mps) * lag_s
+    distance_m += top.linear_mps * TICK_US / 1e6
+    return StopBound(falls_us + TICK_US, (ramped_us or now_us) + TICK_US, now_us + TICK_US, distance_m)

@@ -1,10 +1,13 @@
 """Every number of the gate's limits: just inside, at it, just outside. The expected values are worked out by hand."""
 
+import math
+
 import pytest
 from pydantic import ValidationError
 
 from protocol.messages import STILL
 from robot_side.limits import (
+    MIN_TICK_US,
     STOP_DISTANCE_BOUND_M,
     STOP_TIME_BOUND_US,
     TICK_US,
@@ -25,7 +28,7 @@ def test_the_defaults_are_as_documented():
     assert SafetyConfig().max_age_us == 400_000
     assert SafetyConfig.model_validate({}) == SafetyConfig()
     assert config(zero_speed_age_ms=401).max_age_us == 401_000
-    assert (TICK_US, STOP_TIME_BOUND_US, STOP_DISTANCE_BOUND_M) == (20_000, 700_000, 0.25)
+    assert (TICK_US, MIN_TICK_US, STOP_TIME_BOUND_US, STOP_DISTANCE_BOUND_M) == (20_000, 2_000, 700_000, 0.25)
 
 
 def field_errors(field, value):
@@ -81,7 +84,7 @@ def test_a_configuration_that_stops_late_is_refused_with_its_bound():
 )
 def test_the_stop_bound_itself_is_allowed_and_no_more(monkeypatch, zero_us, distance_m, allowed):
     monkeypatch.setitem(
-        SafetyConfig._stops_in_time.__globals__, "stop_bound", lambda _: StopBound(0, zero_us, distance_m)
+        SafetyConfig._stops_in_time.__globals__, "stop_bound", lambda _: StopBound(0, 0, zero_us, distance_m)
     )
     try:
         SafetyConfig()
@@ -148,25 +151,35 @@ def test_a_limit_above_zero_is_not(limits):
 # --- the stop that a configuration implies -----------------------------------------------------------------------
 
 
-def stop_by_hand(settings):
-    """The stop worked out on its own: tick by tick, the ramp's numbers written out for full slices."""
+def mean_share(span_ms, lag_ms):
+    """Share of a first lag that is left on the average over `span_ms`, and at its end."""
+    if lag_ms == 0:
+        return 0.0, 0.0
+    return -math.expm1(-span_ms / lag_ms) * lag_ms / span_ms, math.exp(-span_ms / lag_ms)
+
+
+def stop_by_hand(settings, step_ms):
+    """The stop worked out on its own: step by step, the lag as the mean over each."""
     speeds, ways = [settings.max_linear_mps, settings.max_angular_rad_s], 0.0
     axes = [AxisRamp(settings.max_acceleration_mps2, settings.max_jerk_mps3)]
     axes.append(AxisRamp(settings.max_acceleration_rad_s2, settings.max_jerk_rad_s3))
     for axis, speed in zip(axes, speeds, strict=True):
         axis.force(speed)
-    wheels, falls_ms, ms = speeds[0], None, 0
+    wheels, falls_ms, ramped_ms, ms = speeds[0], None, None, 0
+    mean, end = mean_share(step_ms, settings.motor_lag_ms)
     while ((axes[0].speed, axes[1].speed) != (0.0, 0.0) or wheels > 0.02 * speeds[0]) and ms < 2000:
-        ms += 20
+        ms += step_ms
         span = settings.zero_speed_age_ms - settings.full_speed_age_ms
         share = min(1.0, max(0.0, (settings.zero_speed_age_ms - ms) / span)) if ms <= settings.silence_ms else 0.0
         for axis, speed in zip(axes, speeds, strict=True):
-            axis.step(speed * share, 0.02)
+            axis.step(speed * share, step_ms / 1000)
         if falls_ms is None and axes[0].speed < speeds[0]:
             falls_ms = ms
-        wheels += (axes[0].speed - wheels) * min(1.0, 20 / max(20, settings.motor_lag_ms))
-        ways += wheels * 0.02
-    return falls_ms + 20, ms + 20, ways + speeds[0] * 0.02
+        if ramped_ms is None and (axes[0].speed, axes[1].speed) == (0.0, 0.0):
+            ramped_ms = ms
+        ways += (axes[0].speed + (wheels - axes[0].speed) * mean) * step_ms / 1000
+        wheels = axes[0].speed + (wheels - axes[0].speed) * end
+    return falls_ms + 20, (ramped_ms or ms) + 20, ms + 20, ways + speeds[0] * 0.02
 
 
 @pytest.mark.parametrize(
@@ -193,15 +206,25 @@ def stop_by_hand(settings):
 )
 def test_the_stop_bound_is_what_its_own_ramp_does(changes):
     settings = config(**changes)
-    falls_ms, zero_ms, distance_m = stop_by_hand(settings)
+    falls_ms, ramped_ms, zero_ms, distance_m = map(max, stop_by_hand(settings, 20), stop_by_hand(settings, 2))
     bound = stop_bound(settings)
-    assert (bound.falls_us, bound.zero_us) == (falls_ms * 1000, zero_ms * 1000)
+    assert (bound.falls_us, bound.ramped_us, bound.zero_us) == (falls_ms * 1000, ramped_ms * 1000, zero_ms * 1000)
     assert bound.distance_m == pytest.approx(distance_m, rel=1e-12)
 
 
 def test_the_stop_bound_of_the_defaults():
     bound = stop_bound(SafetyConfig())
-    assert (bound.falls_us, bound.zero_us) == (180_000, 540_000) and bound.distance_m == pytest.approx(0.1718, abs=1e-4)
+    assert (bound.falls_us, bound.ramped_us, bound.zero_us) == (180_000, 506_000, 590_000)
+    assert bound.distance_m == pytest.approx(0.1959, abs=1e-4)
+
+
+@pytest.mark.parametrize("changes", [
+    {"max_jerk_mps3": 6.0},  # 762 ms
+    {"max_linear_mps": 0.6, "max_acceleration_mps2": 3.0, "max_jerk_mps3": 10.0},  # 0.277 m
+])
+def test_a_stop_that_is_too_long_only_step_by_short_step_is_refused(changes):
+    with pytest.raises(ValidationError, match="after its last command"):
+        SafetyConfig(**changes)
 
 
 def test_a_stop_that_takes_for_ever_is_given_up_after_two_seconds():

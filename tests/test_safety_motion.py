@@ -52,6 +52,34 @@ def test_silence_stops_within_the_bounds(linear, angular, ticks_ms, age_ms):
     assert way_m <= STOP_DISTANCE_BOUND_M
 
 
+TUNED = [
+    {},
+    {"max_jerk_mps3": 8.0, "max_linear_mps": 0.4},
+    {"max_linear_mps": 0.55, "max_acceleration_mps2": 3.0, "max_jerk_mps3": 12.0},
+    {"max_linear_mps": 0.12, "max_angular_rad_s": 0.6, "motor_lag_ms": 80},
+]
+
+
+@pytest.mark.parametrize("step_ms", [2, 20])
+@pytest.mark.parametrize("changes", TUNED, ids=str)
+def test_the_stop_bound_holds_for_motors_that_lag_however_often_the_gate_is_stepped(changes, step_ms):
+    """It is stepped every 2 ms while commands arrive, be they refused."""
+    rig = Rig(**changes).armed()
+    config = rig.gate.config
+    rig.drive(1_500, config.max_linear_mps, config.max_angular_rad_s)
+    rig.offer(config.max_linear_mps, config.max_angular_rad_s)
+    bound, last_us, wheels_mps, way_m = stop_bound(config), rig.now_us, rig.gate.applied.linear_mps, 0.0
+    assert wheels_mps == pytest.approx(config.max_linear_mps)
+    while rig.gate.applied != STILL or wheels_mps > 0.02 * config.max_linear_mps:
+        for _ in range(step_ms * 4):
+            wheels_mps += (rig.gate.applied.linear_mps - wheels_mps) * -math.expm1(-0.25 / config.motor_lag_ms)
+            way_m += wheels_mps * 0.25e-3
+        rig.step(step_ms)
+        ramped = rig.gate.applied == STILL
+        assert ramped or rig.now_us - last_us < bound.ramped_us
+    assert rig.now_us - last_us <= bound.zero_us and way_m <= bound.distance_m
+
+
 def test_the_default_configuration_keeps_its_bound_with_room():
     bound = stop_bound(SafetyConfig())
     assert bound.falls_us <= 340_000 and bound.zero_us <= 600_000 and bound.distance_m <= 0.2

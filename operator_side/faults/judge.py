@@ -24,7 +24,7 @@ _FASTER_MPS: Final = 0.005
 _AT_REST_MPS: Final = 0.01
 """A wheel is at zero when its motor is told zero and its rim moves slower than this: 2 % of top speed, as in the
 bound that the robot computes for itself."""
-_RAMPED_OUT_US: Final = stop_bound(SafetyConfig()).zero_us + TICK_US
+_RAMPED_OUT_US: Final = stop_bound(SafetyConfig()).ramped_us + 2 * TICK_US
 """Age of a frame at which even the ramp that it left behind is at its end, by the robot's own limits."""
 
 
