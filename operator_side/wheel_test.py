@@ -14,6 +14,7 @@ from typing import Final
 
 from protocol.errors import ConfigError
 from robot_side.config import PluginChoice, RobotConfig
+from robot_side.driver import ENDING
 from robot_side.plugins import build, configured
 from robot_side.ports import Drive
 
@@ -73,7 +74,7 @@ def try_wheels(config: RobotConfig, ask: Ask | None, say: Say) -> bool:
 
 @contextmanager
 def opened_drive(config: RobotConfig) -> Iterator[Drive]:
-    """The robot's drive, at zero and closed at the end, be it Ctrl-C, a signal, a terminal that hangs up or a fault.
+    """The robot's drive, at zero and closed at the end, be it Ctrl-C, Ctrl-Z, a signal, a hung-up terminal or a fault.
 
     Motors keep their last speed when a program just dies, so whatever can be caught is.
     """
@@ -81,7 +82,7 @@ def opened_drive(config: RobotConfig) -> Iterator[Drive]:
     def end(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before = {number: signal.signal(number, end) for number in ENDING}
     try:
         drive: Drive = build("drives", config.motors)
         try:

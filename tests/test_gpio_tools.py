@@ -10,6 +10,7 @@ import pytest
 from operator_side import cli, cli_robot_tools, wheel_test
 from protocol.errors import ConfigError
 from robot_side.config import PluginChoice, RobotConfig
+from robot_side.driver import ENDING
 from tests.link_rigs import until
 from tests.terminal_rig import Terminal
 
@@ -91,6 +92,16 @@ def test_a_drive_that_fails_in_the_middle_is_told_zero_and_closed(monkeypatch, r
     with pytest.raises(ZeroDivisionError):
         wheel_test.try_wheels(config, None, lambda _line: None)
     assert told(log)[-1] == (0.0, 0.0) and len(told(log)) == 3
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_whatever_a_key_or_a_terminal_sends_ends_with_zero(monkeypatch, robot, number):
+    config, log = robot
+    before = signal.getsignal(number)
+    monkeypatch.setattr(wheel_test.time, "sleep", lambda _s: signal.raise_signal(number))
+    with pytest.raises(KeyboardInterrupt):
+        wheel_test.try_wheels(config, None, lambda _line: None)
+    assert told(log)[-1] == (0.0, 0.0) and signal.getsignal(number) is before
 
 
 @pytest.mark.parametrize(("arguments", "says"), [
