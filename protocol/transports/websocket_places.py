@@ -16,8 +16,8 @@ KEPT_PLACES: Final = 4
 """Security limit: of these, for who may steer or ask."""
 MAX_HANDSHAKES: Final = 16
 """Security limit: connections beyond these that have not yet said what they are; more are closed unheard."""
-MAX_HANDSHAKES_OF_ONE: Final = 4
-"""Security limit: of these, from one address."""
+MAX_HANDSHAKES_OF_ONE: Final = 8
+"""Security limit: of these, from one address. A browser opens up to six connections to one host at a time."""
 
 _SAID_BY_WHO_ACTS: Final = (TWIST.name, REQUEST.name, FRAME.name)
 
