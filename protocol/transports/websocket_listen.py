@@ -111,8 +111,8 @@ class Listener:
         place = self._places.knock(address)
         if place is not None and self._is_begun(near, place):
             return
-        near.close()
         self._turn_away(TOO_MANY_CLIENTS, address, "too many connections at once")
+        near.close()
 
     def _is_begun(self, near: socket.socket, place: Place) -> bool:
         """Whether a thread of its own has taken over; a machine may have none left."""
