@@ -134,7 +134,8 @@ def test_the_viewer_watches_steers_and_stops_a_robot(tmp_path, whose):
         place = (endpoint, "r1") if isinstance(robot, RobotProcess) else (robot.endpoint, "js1")
         script = str(ROOT / "tests" / "javascript_viewer.mjs")
         with JsProcess(tmp_path, script, *place, flags=("--experimental-websocket", "--no-warnings")) as viewer:
-            assert viewer.process.wait(20) == 0, viewer.output()
+            assert until(lambda: viewer.process.poll() is not None, 20), viewer.output() + robot.output()
+            assert viewer.process.returncode == 0, viewer.output()
             lines = viewer.output().splitlines()
     assert [line for line in lines if not line.startswith("link: no")] == [
         "link: connected", "target", "driving", "reply: STOPPED", "stopped; frames: many; skipped: {}",
