@@ -277,16 +277,23 @@ def test_anothers_boxes_are_not_even_looked_at(pair):
     assert waiting.detect([asked], within(0.1)) == [None] and waiting.refused == {"LATE": 1}
 
 
-def test_boxes_of_a_frame_that_never_was_are_let_go_when_others_come(pair):
+@pytest.mark.parametrize("ahead_us", [10**12, 900_000])
+def test_boxes_of_a_frame_that_never_was_do_not_stand_in_the_way_for_long(pair, ahead_us):
     robot, waiting = pair
-    robot.say(frame(3), BOX, seq=10**9, t_us=10**12)
+    robot.say(frame(3), BOX, seq=10**9, t_us=frame(3).header.t_us + ahead_us)
     assert until(lambda: waiting.detect([frame(3)], within(0.05)) == [None] and waiting.refused["OTHER_FRAME"])
-    for seq in range(4, 8):
-        robot.say(frame(seq), BOX)
+    seq = 3 + ahead_us // 33_333 + 1 if ahead_us < 10**6 else 4  # once the frames are past it, at once if it is far off
+    robot.say(frame(seq), BOX)
+    assert waiting.detect([frame(seq)], within(1.0))[0], "one message must not blind it for good"
+
+
+def test_who_lags_behind_gets_the_boxes_that_were_kept_for_it_though_newer_ones_came(pair):
+    robot, waiting = pair
+    for said, asked, is_answered in ((5, 4, False), (6, 5, True)):
+        robot.say(frame(said), BOX)
         time.sleep(0.05)
-        waiting.detect([frame(seq)], within(0.05))
-    robot.say(frame(8), BOX)
-    assert waiting.detect([frame(8)], within(1.0))[0], "one message must not blind it for good"
+        answer = waiting.detect([frame(asked)], within(0.5))[0]
+        assert (answer is not None) is is_answered, (asked, waiting.refused)
 
 
 def test_boxes_of_a_newer_frame_end_the_waiting_and_are_kept_for_it(pair):

@@ -23,6 +23,9 @@ from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
 ROLE: Final = "detector"
 """The source under which a detector service speaks."""
+_NEWER_US: Final = 1_000_000
+"""Boxes of a frame so much newer than the one asked about are kept for it; of what claims to be from later it may never
+come, and one such message would stand in the way of all others."""
 
 
 class _OfSource(LatestSlot[Message]):
@@ -48,9 +51,9 @@ class _Heard:
         link.subscribe(DETECTIONS, self.slot.put)
 
     def take(self, wait_s: float) -> Message | None:
-        """The newest boxes. What was kept gives way to what came since: it may be of a frame that will never be."""
-        kept, self.kept = self.kept, None
-        return self.slot.take(0.0) or kept or self.slot.take(wait_s)
+        """The newest boxes."""
+        message, self.kept = self.kept or self.slot.take(wait_s), None
+        return message
 
 
 class ZenohDetector(FrameByFrame):
@@ -107,7 +110,7 @@ def _cites(message: Message, frame: DetectFrame) -> tuple[DetectionsHeader, bool
     echo, asked = header.echo, frame.header
     if header.source != message.source or echo is None or echo.channel != FRAME.name or echo.session != asked.session:
         raise NoAnswerError(Reason.OTHER_FRAME, "boxes of no frame of this robot's session, or not of who says so")
-    if echo.seq > asked.seq and echo.t_us > asked.t_us:
+    if echo.seq > asked.seq and asked.t_us < echo.t_us <= asked.t_us + _NEWER_US:
         return header, True
     if (echo.seq, echo.t_us) != (asked.seq, asked.t_us):
         reason = Reason.LATE if echo.seq < asked.seq else Reason.OTHER_FRAME
