@@ -107,7 +107,10 @@ class ByDeadline:
             pending = self._asked.take(LONGEST_WAIT_S)
             if pending is not None and not pending.over:
                 pending.begun = True
-                self._answer(pending)
+                try:
+                    self._answer(pending)
+                except Exception as error:  # no memory for another decoder: this thread must not end by it
+                    self._fail(f"{type(error).__name__}: {error}")
         close_detector(self._inner)
 
     def _answer(self, pending: Pending) -> None:
