@@ -9,8 +9,9 @@ from robot_side.limits import TICK_US, SafetyConfig, stop_bound
 _LATE_US: Final = 2 * TICK_US
 """A decision holds for a tick; who notes a twist may hear it a little after the robot."""
 _OLD_US: Final = SafetyConfig().zero_speed_age_ms * 1000 + _LATE_US
-_RAMPED_OUT_US: Final = stop_bound(SafetyConfig()).ramped_us + 2 * _LATE_US
-"""Age of a frame at which even the ramp that it left behind is at its end; its answer and the zero may both be late."""
+_RAMPED_OUT_US: Final = (stop_bound(SafetyConfig()).ramped_us + 2 * _LATE_US) // TICK_US * TICK_US
+"""Age of a frame, in whole ticks, at which even the ramp that it left behind is at its end; its answer and the zero may
+both be late."""
 _FASTER_RAD_S: Final = 0.15
 """Less is no gain of speed: turning a twist into wheel speeds rounds."""
 
