@@ -61,7 +61,8 @@ class SafetyConfig(Config):
             raise ValueError(
                 f"with these limits the robot stops {bound.zero_us // 1000} ms and {bound.distance_m:.3f} m after its "
                 f"last command; allowed are {STOP_TIME_BOUND_US // 1000} ms and {STOP_DISTANCE_BOUND_M} m. Lower "
-                "max_linear_mps, max_angular_rad_s or silence_ms, or raise the accelerations if the robot can brake so"
+                "max_linear_mps, max_angular_rad_s, full_speed_age_ms or silence_ms, or raise accelerations and jerks "
+                "if the robot can brake so"
             )
         return self
 
