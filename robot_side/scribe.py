@@ -1,4 +1,4 @@
-"""Disk and terminal for the driver's loop, on a thread of its own: neither may hold the wheels up. Shell.
+"""Disk and terminal for the driver's loop, on threads of their own: neither may hold the wheels up. Shell.
 
 A full disk, a terminal that hung up or a reader that does not read costs a line or a mark, never a tick.
 """
@@ -7,6 +7,7 @@ import os
 import queue
 import sys
 import threading
+import time
 from contextlib import suppress
 from typing import Final
 
@@ -19,21 +20,29 @@ _STACK_BYTES: Final = 256 * 1024
 
 
 class Scribe:
-    """Prints lines, and keeps the STOP latch as it was last wanted: a level, tried again until it is kept."""
+    """Prints lines, and keeps the STOP latch as it was last wanted: a level, tried again until it is kept.
+
+    Each on a thread of its own, so that a terminal that nobody reads does not hold up the mark.
+    """
 
     def __init__(self, latch: StopLatch) -> None:
         self._latch = latch
-        self._wanted = self._kept = latch.is_set()
+        self._wanted = latch.is_set()
+        self._kept: bool | None = self._wanted
+        """What is on disk; None where that is not known: a write failed half-way."""
+        self._asked = threading.Event()
         self._lines: queue.Queue[str] = queue.Queue(_LINES_WAITING)
         self._closing = False
         threading.stack_size(_STACK_BYTES)  # the driver locks its memory, a stack of the usual 8 MB with it
-        self._thread = threading.Thread(target=self._write_all, name="scribe", daemon=True)
-        self._thread.start()
+        self._threads = [threading.Thread(target=work, name=name, daemon=True)
+                         for name, work in (("latch", self._keep_all), ("scribe", self._print_all))]
+        for thread in self._threads:
+            thread.start()
 
     def keep(self, stopped: bool) -> None:
         """Want the latch so; never waits."""
         self._wanted = stopped
-        self.say("")
+        self._asked.set()
 
     def say(self, line: str) -> None:
         """Print `line` soon; dropped when nobody has read for long. An empty line only wakes the thread."""
@@ -42,13 +51,21 @@ class Scribe:
 
     def close(self) -> None:
         """Write what waits, for a second at most."""
+        ends_s = time.monotonic() + _CLOSE_S
         self._closing = True
+        self._asked.set()
         self.say("")
-        self._thread.join(_CLOSE_S)
+        for thread in self._threads:
+            thread.join(max(0.0, ends_s - time.monotonic()))
 
-    def _write_all(self) -> None:
-        while not (self._closing and self._lines.empty() and self._kept == self._wanted):
+    def _keep_all(self) -> None:
+        while not (self._closing and self._kept == self._wanted):
+            self._asked.wait(_RETRY_S)
+            self._asked.clear()
             self._keep()
+
+    def _print_all(self) -> None:
+        while not (self._closing and self._lines.empty()):
             with suppress(queue.Empty):
                 self._print(self._lines.get(timeout=_RETRY_S))
 
@@ -57,10 +74,11 @@ class Scribe:
         if wanted == self._kept:
             return
         try:
+            self._kept = None
             self._latch.keep(wanted)
             self._kept = wanted
         except OSError as error:
-            self._print(f"the STOP mark is not kept over a restart: {error.strerror}; is the disk full or read-only?")
+            self.say(f"the STOP mark is not kept over a restart: {error.strerror}; is the disk full or read-only?")
 
     @staticmethod
     def _print(line: str) -> None:
@@ -70,7 +88,7 @@ class Scribe:
         except OSError:  # whoever read has gone: what is still buffered must not spoil the exit either
             with suppress(Exception):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        except Exception:  # whatever a line does to a stream, this thread also keeps the STOP mark
+        except Exception:  # whatever a line does to a stream, the next one may be shown
             return
 
 

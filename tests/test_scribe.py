@@ -1,8 +1,10 @@
 """What a terminal cannot show, or refuses, ends neither the log nor the keeping of the STOP mark."""
 
+import errno
 import io
 import json
 import sys
+import threading
 
 import pytest
 
@@ -24,6 +26,19 @@ class Gone(io.StringIO):
 
     def write(self, _text):
         raise BrokenPipeError
+
+
+class Stuck(io.StringIO):
+    """A terminal that is held by Ctrl-S."""
+
+    def __init__(self):
+        super().__init__()
+        self.reached, self.read = threading.Event(), threading.Event()
+
+    def write(self, text):
+        self.reached.set()
+        self.read.wait(20)
+        return super().write(text)
 
 
 @pytest.fixture
@@ -65,3 +80,37 @@ def test_a_stream_that_fails_in_any_way_costs_lines_only(latch, scribe, stream):
     scribe.say("a line")
     scribe.keep(True)
     assert until(latch.is_set)
+
+
+def test_a_terminal_that_nobody_reads_does_not_hold_up_the_mark(latch, scribe):
+    sys.stdout = stuck = Stuck()
+    scribe.say("a line")
+    assert stuck.reached.wait(5)
+    scribe.keep(True)
+    marked = until(latch.is_set)
+    stuck.read.set()
+    scribe.close()  # before the stream goes: `print` of Python 3.11 does not hold it
+    assert marked
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_a_mark_that_failed_half_way_is_written_again(latch, scribe, monkeypatch, stopped):
+    """The first step, writing or removing it, is done then, and nobody knows it."""
+    scribe.keep(not stopped)
+    assert until(lambda: latch.is_set() is not stopped)
+    with monkeypatch.context() as broken:
+        broken.setattr(StopLatch, "_sync_folder", failing := Failing())
+        scribe.keep(stopped)
+        assert until(lambda: failing.times)
+        scribe.keep(not stopped)
+        assert until(lambda: latch.is_set() is not stopped)
+
+
+class Failing:
+    """A folder that cannot be written through."""
+
+    times = 0
+
+    def __call__(self):
+        self.times += 1
+        raise OSError(errno.EIO, "Input/output error")
