@@ -112,6 +112,19 @@ def test_viewers_without_number_leave_room_for_who_says_stop(robot):
         robot.still_serves()
 
 
+def test_who_is_closed_unheard_for_idle_connections_beside_it_tries_again(robot):
+    address = ("127.0.0.1", int(robot.endpoint.rpartition(":")[2]))
+    with ExitStack() as ending:
+        for _ in range(MAX_HANDSHAKES_OF_ONE):
+            ending.enter_context(socket.create_connection(address))
+        with pytest.raises(LinkError, match="it hangs up without an answer: it has too many connections at once"):
+            open_websocket("r1", connect=robot.endpoint, role="operator", timeout_s=0.5)
+        gone = threading.Timer(0.5, ending.pop_all().close)
+        gone.start()
+        with open_websocket("r1", connect=robot.endpoint, role="operator", timeout_s=5):
+            gone.join()
+
+
 def test_a_viewer_for_whom_there_is_no_place_is_told_and_tries_again(robot):
     with ExitStack() as ending:
         viewers = [ending.enter_context(hail(robot.endpoint)) for _ in range(WATCHERS)]

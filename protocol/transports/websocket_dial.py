@@ -81,7 +81,10 @@ class Dialer:
         except PeerError as error:
             self._turned_away(str(error), True)
         except InvalidHandshake as error:
-            self._turned_away(f"what answers there is no Sightline WebSocket ({type(error).__name__})", True)
+            what = f"what answers there is no Sightline WebSocket ({type(error).__name__})"
+            if isinstance(error.__cause__, EOFError):  # a listener says nothing to one connection too many
+                what = "it hangs up without an answer: it has too many connections at once, or is no Sightline WebSocket"
+            self._turned_away(what, not isinstance(error.__cause__, EOFError))
         except ssl.SSLError as error:
             why = getattr(error, "verify_message", "") or error.reason or type(error).__name__
             self._turned_away(f"no TLS with it: {why}; is the ca.pem of --secure its authority's?", True)
