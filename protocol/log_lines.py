@@ -10,7 +10,9 @@ from __future__ import annotations
 import io
 import json
 import os
+import select
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Final, TextIO
 
@@ -20,6 +22,9 @@ ENV_NAME: Final = "SIGHTLINE_LOG"
 FORMS: Final = ("text", "json")
 _LONGEST_LINE: Final = 10_000
 """More without an end is no line of a log; it is cut there."""
+
+_LONGEST_TOLD: Final = 512
+"""Letters that fit into what a pipe takes at once, 4096 bytes, however they are written."""
 
 
 class JsonLines(io.TextIOBase):
@@ -81,3 +86,15 @@ def use_form(form: str | None, service: str) -> None:
     if chosen == "json" and not isinstance(sys.stdout, JsonLines):
         sys.stdout = JsonLines(sys.stdout, service, "info")
         sys.stderr = JsonLines(sys.stderr, service, "warning")
+
+
+def tell(line: str, stream: TextIO | None = None) -> None:
+    """Print `line`, to stderr unless told otherwise, without ever waiting: a held terminal or a full pipe costs it."""
+    stream = stream or sys.stderr
+    try:
+        takes = bool(select.select([], [stream], [], 0)[1])
+    except (OSError, TypeError, ValueError):  # no descriptor: a buffer in memory, or nothing at all
+        takes = stream is not None
+    if takes:
+        with suppress(OSError, ValueError):  # whoever read has gone
+            print(line[:_LONGEST_TOLD], file=stream, flush=True)

@@ -17,7 +17,7 @@ from protocol.channels import ACK, FRAME, REQUEST, TWIST
 from protocol.clock import monotonic_us
 from protocol.codec import encode
 from protocol.errors import HardwareError, SightlineError, WireError
-from protocol.log_lines import use_form
+from protocol.log_lines import tell, use_form
 from protocol.transports.link import Link, Message
 from protocol.transports.opening import open_link
 from protocol.transports.relay import Relay
@@ -90,12 +90,12 @@ class Network:
             picture = self._camera.read(_CAMERA_TIMEOUT_S)
         except HardwareError as error:
             if not self._camera_fault:
-                print(f"camera: {error}", file=sys.stderr, flush=True)
+                tell(f"camera: {error}")
             self._camera_fault = str(error)
             time.sleep(_CAMERA_RETRY_S)
             return None
         if self._camera_fault and picture is not None:
-            print("camera: back", flush=True)
+            tell("camera: back", sys.stdout)
             self._camera_fault = ""
         return picture
 

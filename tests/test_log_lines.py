@@ -1,15 +1,18 @@
 """A service's lines as JSON: every line an object, whole however it is written, and a child speaks alike."""
 
+import fcntl
 import io
 import json
+import os
 import subprocess
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.log_lines import ENV_NAME, JsonLines, as_json, use_form
+from protocol.log_lines import ENV_NAME, JsonLines, as_json, tell, use_form
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 
@@ -63,3 +66,37 @@ def test_both_processes_of_a_robot_speak_json(tmp_path, monkeypatch):
         assert until(lambda: "robot r1: on" in robot.output(), 20)
         network = next(line for line in robot.output().splitlines() if "robot r1: on" in line)
     assert json.loads(network)["service"] == "robot"
+
+
+@pytest.fixture
+def pipe():
+    """A small one, both ends; the second is a text stream."""
+    reader, writer = os.pipe()
+    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
+    with suppress(BrokenPipeError), open(reader, "rb") as read, open(writer, "w") as written:
+        yield read, written
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_line_is_told_until_nobody_reads_and_again_once_somebody_does(pipe, wrapped):
+    read, written = pipe
+    stream = JsonLines(written, "robot", "info") if wrapped else written
+    for number in range(50):
+        tell(f"{number} " + 600 * "\u00e9", stream)
+    assert read.read1(1 << 16).startswith(b'{"time"' if wrapped else b"0 ")
+    tell("heard", stream)
+    assert b"heard" in read.read1(1 << 16)
+
+
+def test_a_line_for_nobody_at_all_is_dropped(pipe, monkeypatch):
+    read, written = pipe
+    read.close()
+    tell("gone", written)
+    monkeypatch.setattr(sys, "stderr", None)
+    tell("nowhere")
+
+
+def test_a_buffer_in_memory_takes_every_line(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    tell("kept")
+    assert sys.stderr.getvalue() == "kept\n"

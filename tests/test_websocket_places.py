@@ -1,8 +1,10 @@
 """Who takes whose place at a robot's WebSocket: no crowd of viewers, and no idle stranger, shuts out who says STOP."""
 
+import os
 import socket
+import sys
 import threading
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 import pytest
 from websockets.exceptions import InvalidStatus
@@ -123,6 +125,23 @@ def test_who_is_closed_unheard_for_idle_connections_beside_it_tries_again(robot)
         gone.start()
         with open_websocket("r1", connect=robot.endpoint, role="operator", timeout_s=5):
             gone.join()
+
+
+def test_a_log_that_nobody_reads_shuts_nobody_out(robot, monkeypatch):
+    address = ("127.0.0.1", int(robot.endpoint.rpartition(":")[2]))
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writer, bytes(4096))
+    os.set_blocking(writer, True)
+    with open(reader, "rb"), ExitStack() as ending:
+        monkeypatch.setattr(sys, "stderr", open(writer, "w"))  # noqa: SIM115
+        for _ in range(MAX_HANDSHAKES_OF_ONE + 1):
+            ending.enter_context(socket.create_connection(address))
+        assert until(lambda: robot.refused[TOO_MANY_CLIENTS])
+        ending.close()
+        open_websocket("r1", connect=robot.endpoint, role="operator", timeout_s=5).close()
 
 
 def test_a_viewer_for_whom_there_is_no_place_is_told_and_tries_again(robot):

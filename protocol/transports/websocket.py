@@ -10,7 +10,6 @@ they do not hear one another.
 from __future__ import annotations
 
 import secrets
-import sys
 import threading
 import time
 from collections import Counter
@@ -22,6 +21,7 @@ from typing import Final, Self
 from protocol.channels import FRAME, TWIST, Channel, parse_key
 from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, LinkError
+from protocol.log_lines import tell
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.link_rules import INEXACT_KEY, LinkRules
 from protocol.transports.websocket_dial import Dialer
@@ -277,7 +277,7 @@ class WebSocketLink:
         with self._joining:
             line = self._log.line(text, monotonic_us())
         if line:
-            print(line, file=sys.stderr, flush=True)
+            tell(line)
 
     def _deliver(self, peer: Peer, packet: Packet) -> None:
         parsed = parse_key(packet.key)
