@@ -114,6 +114,13 @@ def test_viewers_without_number_leave_room_for_who_says_stop(robot):
         robot.still_serves()
 
 
+def test_a_guest_may_steer_and_is_no_viewer(robot):
+    with ExitStack() as ending:
+        for _ in range(WATCHERS):
+            ending.enter_context(hail(robot.endpoint, role="viewer", wants=["status"]))
+        open_websocket("r1", connect=robot.endpoint, role="guest", timeout_s=1).close()
+
+
 def test_who_is_closed_unheard_for_idle_connections_beside_it_tries_again(robot):
     address = ("127.0.0.1", int(robot.endpoint.rpartition(":")[2]))
     with ExitStack() as ending:

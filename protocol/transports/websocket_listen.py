@@ -44,6 +44,7 @@ TOO_MANY_CLIENTS: Final = "TOO_MANY_CLIENTS"
 NO_TLS: Final = "NO_TLS"
 """Counted for a client of wss:// that does not agree on TLS."""
 
+_GUEST: Final = "guest"  # shows a viewer's certificate, and may steer where no keys are asked for
 _PAUSE_S: Final = 0.1  # after an accept that failed, e.g. without descriptors left
 
 
@@ -183,7 +184,8 @@ class Listener:
     def _settle(self, wire: Wire, place: Place, role: str) -> None:
         """Give it a client's place. Where no token says what it may do, its hello does. Raises PeerError for none."""
         granted = grant_of(certificate_role(role)) if wire.granted is None else wire.granted
-        problem = self._places.settle(place, self._endpoint.legacy is not None or may_act(granted))
+        claims = wire.granted is None and role == _GUEST
+        problem = self._places.settle(place, self._endpoint.legacy is not None or claims or may_act(granted))
         if problem:
             raise PeerError(TOO_MANY_CLIENTS, 1013, problem)
 
