@@ -16,6 +16,8 @@ MIN_TICK_US = 2_000
 STOP_TIME_BOUND_US = 700_000
 STOP_DISTANCE_BOUND_M = 0.25
 
+_AT_REST = 0.02
+"""Of top speed."""
 _SLICE_US = 20_000
 _LONGEST_STEP_US = 1_000_000
 
@@ -170,21 +172,24 @@ def _stop(config: SafetyConfig, step_us: int) -> StopBound:
     """The stop with a ramp that is stepped every `step_us`.
 
     One tick is added for the phase of the driver's loop, and the motors follow with their lag. `zero_us` is when the
-    ramp is at zero and the wheels, by their lag, below 2 % of top speed.
+    ramp is at zero and the robot, by that lag, below 2 % of top speed both ahead and in turning.
     """
     ramp, top = Ramp(config), Twist(linear_mps=config.max_linear_mps, angular_rad_s=config.max_angular_rad_s)
     ramp.force(top)
     lag_s = config.motor_lag_ms / 1000
     lags_on = math.exp(-step_us / 1e6 / lag_s) if lag_s else 0.0
-    now_us, falls_us, ramped_us, wheels_mps, distance_m = 0, 0, 0, config.max_linear_mps, 0.0
-    twist = top
-    while (twist != STILL or wheels_mps > 0.02 * top.linear_mps) and now_us < 2 * _LONGEST_STEP_US:
+    now_us, falls_us, ramped_us, distance_m = 0, 0, 0, 0.0
+    twist, wheels_mps, turning_rad_s = top, top.linear_mps, top.angular_rad_s
+    while now_us < 2 * _LONGEST_STEP_US and (
+        twist != STILL or wheels_mps > _AT_REST * top.linear_mps or turning_rad_s > _AT_REST * top.angular_rad_s
+    ):
         now_us += step_us
         factor = age_factor(config, now_us) if now_us <= config.silence_ms * 1000 else 0.0
         twist = ramp.step(clamp_twist(top, factor * top.linear_mps, factor * top.angular_rad_s), step_us)
         falls_us = falls_us or (now_us if twist.linear_mps < top.linear_mps else 0)
         ramped_us = ramped_us or (now_us if twist == STILL else 0)
         before_mps, wheels_mps = wheels_mps, twist.linear_mps + (wheels_mps - twist.linear_mps) * lags_on
+        turning_rad_s = twist.angular_rad_s + (turning_rad_s - twist.angular_rad_s) * lags_on
         distance_m += twist.linear_mps * step_us / 1e6 + (before_mps - wheels_mps) * lag_s
     distance_m += top.linear_mps * TICK_US / 1e6
     return StopBound(falls_us + TICK_US, (ramped_us or now_us) + TICK_US, now_us + TICK_US, distance_m)

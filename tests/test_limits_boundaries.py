@@ -165,9 +165,10 @@ def stop_by_hand(settings, step_ms):
     axes.append(AxisRamp(settings.max_acceleration_rad_s2, settings.max_jerk_rad_s3))
     for axis, speed in zip(axes, speeds, strict=True):
         axis.force(speed)
-    wheels, falls_ms, ramped_ms, ms = speeds[0], None, None, 0
+    wheels, falls_ms, ramped_ms, ms = list(speeds), None, None, 0
     mean, end = mean_share(step_ms, settings.motor_lag_ms)
-    while ((axes[0].speed, axes[1].speed) != (0.0, 0.0) or wheels > 0.02 * speeds[0]) and ms < 2000:
+    while ((axes[0].speed, axes[1].speed) != (0.0, 0.0)
+           or any(one > 0.02 * top for one, top in zip(wheels, speeds, strict=True))) and ms < 2000:
         ms += step_ms
         span = settings.zero_speed_age_ms - settings.full_speed_age_ms
         share = min(1.0, max(0.0, (settings.zero_speed_age_ms - ms) / span)) if ms <= settings.silence_ms else 0.0
@@ -177,8 +178,8 @@ def stop_by_hand(settings, step_ms):
             falls_ms = ms
         if ramped_ms is None and (axes[0].speed, axes[1].speed) == (0.0, 0.0):
             ramped_ms = ms
-        ways += (axes[0].speed + (wheels - axes[0].speed) * mean) * step_ms / 1000
-        wheels = axes[0].speed + (wheels - axes[0].speed) * end
+        ways += (axes[0].speed + (wheels[0] - axes[0].speed) * mean) * step_ms / 1000
+        wheels = [axis.speed + (one - axis.speed) * end for axis, one in zip(axes, wheels, strict=True)]
     return falls_ms + 20, (ramped_ms or ms) + 20, ms + 20, ways + speeds[0] * 0.02
 
 
@@ -196,6 +197,7 @@ def stop_by_hand(settings, step_ms):
         {"silence_ms": 120, "full_speed_age_ms": 300},
         {"silence_ms": 200, "full_speed_age_ms": 200},
         {"max_angular_rad_s": 10.0, "max_acceleration_rad_s2": 15.0},
+        {"max_angular_rad_s": 10.0, "max_acceleration_rad_s2": 30.0, "motor_lag_ms": 100},
         {"max_linear_mps": 0.1, "max_acceleration_mps2": 1.0, "max_jerk_mps3": 5.0},
         {"full_speed_age_ms": 20, "zero_speed_age_ms": 100},
         {"max_linear_mps": 1.5, "max_acceleration_mps2": 9.0, "max_jerk_mps3": 130.0},
@@ -221,8 +223,9 @@ def test_the_stop_bound_of_the_defaults():
 @pytest.mark.parametrize("changes", [
     {"max_jerk_mps3": 6.0},  # 762 ms
     {"max_linear_mps": 0.6, "max_acceleration_mps2": 3.0, "max_jerk_mps3": 10.0},  # 0.277 m
+    {"max_angular_rad_s": 10.0, "max_acceleration_rad_s2": 28.0},  # 708 ms until it does not turn
 ])
-def test_a_stop_that_is_too_long_only_step_by_short_step_is_refused(changes):
+def test_a_stop_that_is_too_long_step_by_short_step_or_in_turning_is_refused(changes):
     with pytest.raises(ValidationError, match=r"after its last command.* full_speed_age_ms .* jerks"):
         SafetyConfig(**changes)
 

@@ -57,6 +57,7 @@ TUNED = [
     {"max_jerk_mps3": 8.0, "max_linear_mps": 0.4},
     {"max_linear_mps": 0.55, "max_acceleration_mps2": 3.0, "max_jerk_mps3": 12.0},
     {"max_linear_mps": 0.12, "max_angular_rad_s": 0.6, "motor_lag_ms": 80},
+    {"max_angular_rad_s": 9.0, "max_acceleration_rad_s2": 30.0},
 ]
 
 
@@ -68,11 +69,16 @@ def test_the_stop_bound_holds_for_motors_that_lag_however_often_the_gate_is_step
     config = rig.gate.config
     rig.drive(1_500, config.max_linear_mps, config.max_angular_rad_s)
     rig.offer(config.max_linear_mps, config.max_angular_rad_s)
-    bound, last_us, wheels_mps, way_m = stop_bound(config), rig.now_us, rig.gate.applied.linear_mps, 0.0
+    bound, last_us, way_m = stop_bound(config), rig.now_us, 0.0
+    wheels_mps, turning_rad_s = rig.gate.applied.linear_mps, rig.gate.applied.angular_rad_s
     assert wheels_mps == pytest.approx(config.max_linear_mps)
-    while rig.gate.applied != STILL or wheels_mps > 0.02 * config.max_linear_mps:
+    assert turning_rad_s == pytest.approx(config.max_angular_rad_s)
+    follows = -math.expm1(-0.25 / config.motor_lag_ms)
+    while (rig.gate.applied != STILL or wheels_mps > 0.02 * config.max_linear_mps
+           or turning_rad_s > 0.02 * config.max_angular_rad_s):
         for _ in range(step_ms * 4):
-            wheels_mps += (rig.gate.applied.linear_mps - wheels_mps) * -math.expm1(-0.25 / config.motor_lag_ms)
+            wheels_mps += (rig.gate.applied.linear_mps - wheels_mps) * follows
+            turning_rad_s += (rig.gate.applied.angular_rad_s - turning_rad_s) * follows
             way_m += wheels_mps * 0.25e-3
         rig.step(step_ms)
         ramped = rig.gate.applied == STILL
