@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from protocol.clock import monotonic_us
 from protocol.messages import FrameHeader
 from tests.detector_rig import BALL, Bench
 from tests.link_rigs import until
@@ -16,11 +17,16 @@ from vision_side.detect.agreement import TELL_US, Agreement, differs
 from vision_side.detect.local import Hsv
 from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Maker, result_of
 from vision_side.detect.shadow import Shadowed
+from vision_side.missions.choice import configured
 
 
 def result(t_us: int, *boxes: tuple[float, float, float, float], name: str = "hsv") -> DetectionResult:
     found = tuple(Detection(*box, 0.9, "ball") for box in boxes)
     return DetectionResult("r1", "0000abcd", 1, t_us, 320, 240, found, name)
+
+
+def anything(_label: str) -> bool:
+    return True
 
 
 HERE, NEAR, AWAY = (10, 10, 50, 50), (14, 8, 52, 50), (200, 10, 240, 50)
@@ -32,26 +38,43 @@ HERE, NEAR, AWAY = (10, 10, 50, 50), (14, 8, 52, 50), (200, 10, 240, 50)
      ((HERE,), (), "onnx nothing"), ((), (HERE,), "hsv nothing")],
 )
 def test_what_counts_is_what_would_be_steered_by(mine: tuple, other: tuple, words: str) -> None:
-    what = differs(result(1, *mine), result(1, *other, name="onnx"))
+    what = differs(result(1, *mine), result(1, *other, name="onnx"), anything)
     assert words in what if words else not what
 
 
-@pytest.mark.parametrize(("boxes", "wanted", "agree"), [
-    ((("light-red", AWAY), ("ball", NEAR)), "", True), ((("legs", NEAR),), "", False),
-    ((("ball", AWAY), ("cup", NEAR)), "cup", True), ((("ball", NEAR),), "cup", False),
+MISSIONS = {
+    "follow": VisionConfig(), "cup": VisionConfig.model_validate({"target": {"label": "cup"}}),
+    "legs": VisionConfig.model_validate({"mission": {"kind": "legs"}}),
+    "whatever": VisionConfig.model_validate({"mission": {"kind": "legs", "options": {"label": ""}}}),
+    "band": VisionConfig.model_validate({"mission": {"kind": "band"}}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("mission", "mine", "boxes", "agree"), [
+    ("follow", "target", (("light-red", AWAY), ("ball", NEAR)), True), ("follow", "ball", (("legs", NEAR),), False),
+    ("cup", "cup", (("ball", AWAY), ("cup", NEAR)), True), ("cup", "cup", (("ball", NEAR),), False),
+    ("cup", "cup", (("target", NEAR),), True),
+    ("legs", "legs", (("ball", NEAR),), False), ("legs", "legs", (("ball", AWAY), ("legs", NEAR)), True),
+    ("legs", "legs", (("legs", AWAY),), False), ("whatever", "legs", (("ball", AWAY),), False),
+    ("band", "ball", (("light-red", NEAR),), True),
 ])  # fmt: skip
-def test_what_is_not_followed_is_no_disagreement(boxes: tuple, wanted: str, agree: bool) -> None:
+def test_what_the_mission_does_not_go_by_is_no_disagreement(mission: str, mine: str, boxes: tuple, agree: bool) -> None:
+    goes_by = configured(MISSIONS[mission]).goes_by
     found = tuple(Detection(*box, 0.9, label) for label, box in boxes)
-    mine = replace(result(1), detections=(Detection(*HERE, 0.9, wanted or "target"),))
-    assert (differs(mine, replace(result(1), detections=found), wanted) == "") is agree
-    assert differs(result(1), replace(result(1), detections=(Detection(*NEAR, 0.9, "legs"),))) == ""
+    driving = replace(result(1), detections=(Detection(*HERE, 0.9, mine),))
+    assert (differs(driving, replace(result(1), detections=found), goes_by) == "") is agree
+
+
+def test_what_a_mission_does_not_go_by_counts_as_nothing() -> None:
+    legs = replace(result(1), detections=(Detection(*NEAR, 0.9, "legs"),))
+    assert differs(result(1), legs, configured(VisionConfig()).goes_by) == ""
 
 
 def test_disagreement_is_told_now_and_then_only() -> None:
     agreement, lines = Agreement(), []
     for index in range(600):  # 20 s
         other = () if index % 2 else (HERE,)
-        lines.append(agreement.add(result(index * 33_333, HERE), result(index * 33_333, *other, name="onnx")))
+        lines.append(agreement.add(result(index * 33_333, HERE), result(index * 33_333, *other, name="onnx"), anything))
     told = [line for line in lines if line]
     assert len(told) == 1 + 600 * 33_333 // TELL_US
     assert "50%" in told[-1]
@@ -97,6 +120,7 @@ def test_the_shadow_sees_the_frames_and_never_answers_them(pair) -> None:
     for seq in range(1, 6):
         assert names(both.detect([frame(seq)], NO_DEADLINE)) == ["one"]
         assert until(lambda seq=seq: ("r1", seq) in shadow.seen)
+        both.go_by("r1", anything)
     assert until(lambda: both.shadow_text("r1") == "shadow 0% agree")
     assert any("two" in line and "one" in line for line in both.news())
 
@@ -136,6 +160,43 @@ def test_who_drives_a_robot_of_a_fleet_looks_on_at_none_which_it_would_keep_wait
     assert until(lambda: {"r1", "r2"} == {robot for robot, _ in driving.seen}), "now the other one looks on at both"
 
 
+def test_no_robot_waits_for_looks_at_others_once_both_drive(pair) -> None:
+    """Those that waited are left out; only the look that is under way is waited for."""
+    _, shadow, both = pair
+    fleet = [f"r{number}" for number in range(8)]
+    both.detect([frame(1, robot) for robot in fleet], NO_DEADLINE)
+    assert until(lambda: len(shadow.seen) == 8)
+    shadow.gate.clear()
+    both.detect([frame(2, robot) for robot in fleet], NO_DEADLINE)
+    assert both.promote("r0", True) == ""
+    both.detect([frame(3, robot) for robot in fleet[1:]], NO_DEADLINE)
+    shadow.gate.set()
+    assert names(both.detect([frame(3, "r0")], NO_DEADLINE)) == ["two"]
+    time.sleep(0.1)
+    assert [seq for _, seq in shadow.seen[8:]] in ([2, 3], [3])
+    assert both.shadow_text("r0") == "promoted; shadow looks on at none: both drive"
+    assert both.shadow_text("r1") == "shadow looks on at none: both drive"
+
+
+def test_in_a_large_fleet_the_last_look_at_a_robot_counts_however_long_ago(pair, monkeypatch) -> None:
+    _, shadow, both = pair
+    for robot in ("r1", "r2"):
+        both.detect([frame(1, robot)], NO_DEADLINE)
+        assert until(lambda robot=robot: (robot, 1) in shadow.seen)
+    shadow.answers = False
+    both.detect([frame(2, "r2")], NO_DEADLINE)
+    assert until(lambda: ("r2", 2) in shadow.seen)
+    shadow.answers, now_us = True, monotonic_us() + 2_900_000
+    monkeypatch.setattr("vision_side.detect.shadow.monotonic_us", lambda: now_us)
+    both.detect([frame(2, "r3")], NO_DEADLINE)
+    assert until(lambda: ("r3", 2) in shadow.seen)
+    now_us += 2_900_000
+    assert until(lambda: both.promote("r1", True) == "")
+    assert "does not answer" in both.promote("r2", True)
+    now_us += 200_000
+    assert "does not answer" in both.promote("r3", True)
+
+
 def test_who_does_not_answer_is_not_promoted(pair) -> None:
     _, shadow, both = pair
     shadow.answers = False
@@ -168,6 +229,7 @@ def test_a_person_promotes_it_live_and_the_report_says_who_looks() -> None:
     bench = Bench(VisionConfig(), eyes)
     try:
         bench.frame()
+        bench.frame()
         report = bench.report()
         assert (report.detector.split(",")[0], report.device) == ("hsv", "cpu")
         assert until(lambda: eyes.shadow_text("r1") == "shadow 0% agree")
@@ -197,5 +259,5 @@ def test_the_configuration_builds_it() -> None:
 
 
 def test_grey_pictures_agree_on_nothing() -> None:
-    assert differs(result(1), result(1, name="onnx")) == ""
+    assert differs(result(1), result(1, name="onnx"), anything) == ""
     assert np.isfinite(Agreement().share)

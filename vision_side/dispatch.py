@@ -60,7 +60,10 @@ class Dispatch:
             refused = refused or _ENDED
         eyes, looked = (pipeline.eyes, pipeline.looked) if pipeline else (None, None)
         self.tell_news(eyes)
-        beside = eyes.shadow_text(self._link.robot) if isinstance(eyes, Shadowed) else ""
+        beside = ""
+        if pipeline is not None and isinstance(eyes, Shadowed):
+            eyes.go_by(self._link.robot, pipeline.mission.goes_by)
+            beside = eyes.shadow_text(self._link.robot)
         plain = pipeline.detector if pipeline else None
         took_us = plain.took_us if isinstance(plain, Clocked) else None
         report = self._reporter.due(now_s, self._mission, seen, asked, refused, looked=looked, beside=beside,

@@ -1,12 +1,13 @@
 """Do two detectors see the same? Counted frame by frame, told in one line now and then. Pure.
 
-The clock is the frames' capture time. What counts is what would be followed: the surest detection of each that may be.
+The clock is the frames' capture time. What counts is what would be steered by: the surest detection of each that the
+mission may go by.
 """
 
 from collections import deque
+from collections.abc import Callable
 from typing import Final
 
-from vision_side.detect.labels import may_be_followed
 from vision_side.detect.overlap import corners, overlap
 from vision_side.detect.port import Detection, DetectionResult
 
@@ -16,14 +17,14 @@ TELL_US: Final = 5_000_000
 """Between two lines, however much the two disagree."""
 LEAST_OVERLAP: Final = 0.3
 """Boxes of one thing by two detectors: one draws the ball, the other its shadow too."""
+GoesBy = Callable[[str], bool]
+"""Whether a mission may go by what has this label."""
 
 
 class Agreement:
-    """Of one robot's frames, in one session."""
+    """Of one robot's frames, in one session and one mission."""
 
-    def __init__(self, wanted: str = "") -> None:
-        """`wanted` is the label of what is followed, if one is configured."""
-        self._wanted = wanted
+    def __init__(self) -> None:
         self.compared = self.differed = 0
         self._window: deque[bool] = deque(maxlen=WINDOW)
         self._told_us: int | None = None
@@ -33,9 +34,9 @@ class Agreement:
         """Of the newest frames, those in which both saw the same; 1 before there are any."""
         return sum(self._window) / len(self._window) if self._window else 1.0
 
-    def add(self, driving: DetectionResult, shadow: DetectionResult) -> str:
+    def add(self, driving: DetectionResult, shadow: DetectionResult, goes_by: GoesBy) -> str:
         """One frame. Returns the line that tells how they differ, where it is time for one."""
-        what = differs(driving, shadow, self._wanted)
+        what = differs(driving, shadow, goes_by)
         self.compared += 1
         self.differed += bool(what)
         self._window.append(not what)
@@ -46,10 +47,10 @@ class Agreement:
                 f"{len(self._window)} frames")
 
 
-def differs(driving: DetectionResult, shadow: DetectionResult, wanted: str = "") -> str:
-    """What the surest detections of two results of one frame disagree on, of those that may be followed; empty if on
-    nothing. What they are called does not count."""
-    mine, other = _surest(driving, wanted), _surest(shadow, wanted)
+def differs(driving: DetectionResult, shadow: DetectionResult, goes_by: GoesBy) -> str:
+    """What the surest detections of two results of one frame disagree on, of those that a mission may go by; empty if
+    on nothing. What else they are called does not count."""
+    mine, other = _surest(driving, goes_by), _surest(shadow, goes_by)
     if mine is None and other is None:
         return ""
     if mine is None:
@@ -61,8 +62,8 @@ def differs(driving: DetectionResult, shadow: DetectionResult, wanted: str = "")
     return f"{driving.detector} sees {_where(mine)}, {shadow.detector} {_where(other)}"
 
 
-def _surest(result: DetectionResult, wanted: str) -> Detection | None:
-    return next((one for one in result.detections if may_be_followed(one.label, wanted)), None)
+def _surest(result: DetectionResult, goes_by: GoesBy) -> Detection | None:
+    return next((one for one in result.detections if goes_by(one.label)), None)
 
 
 def _where(one: Detection | None) -> str:

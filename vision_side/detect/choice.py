@@ -64,7 +64,7 @@ def configured_detector(config: VisionConfig) -> Detector | None:
         from vision_side.detect.shadow import Shadowed
 
         second = _narrowed(choose_detector(one.shadow, one.shadow_options, config), config)
-        detector = Shadowed(detector, second, one.shadow, config.max_pixels, config.target.label)
+        detector = Shadowed(detector, second, one.shadow, config.max_pixels)
     return detector
 
 

@@ -2,14 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
 
 from vision_side.detect.around import Around
+from vision_side.detect.labels import COLOURED
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
-
-COLOURED: Final = "target"
-"""What the colour detectors call what they find. It always counts: one of them may be the fallback, or the shadow."""
-
 
 class LabelFilter(Around):
     """A detector that leaves out what another one finds under other labels."""

@@ -8,12 +8,12 @@ looks on.
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from protocol.clock import monotonic_us
 from protocol.transports.link import Link
-from vision_side.detect.agreement import Agreement
+from vision_side.detect.agreement import Agreement, GoesBy
 from vision_side.detect.around import attach_detector, close_detector, news_of
 from vision_side.detect.by_session import MAX_ROBOTS
 from vision_side.detect.checking import checked
@@ -33,9 +33,12 @@ class _Pair:
     """What is known of one robot."""
 
     session: str
-    agreement: Agreement
+    agreement: Agreement = field(default_factory=Agreement)
+    goes_by: GoesBy | None = None
+    """What the mission may go by; None until somebody says so."""
     promoted: bool = False
-    answered_us: int | None = None
+    answered: bool = False
+    """The last frame that the one that looks on was shown."""
     seen_us: int = 0
 
 
@@ -51,12 +54,11 @@ class _Task:
 class Shadowed:
     """A detector that drives, and one that could."""
 
-    def __init__(self, driving: Detector, shadow: Detector, name: str, max_pixels: int, wanted: str = "") -> None:
-        """`wanted` is the label of what is followed, if one is configured."""
+    def __init__(self, driving: Detector, shadow: Detector, name: str, max_pixels: int) -> None:
         self._eyes = (driving, shadow)
         self._locks = (threading.Lock(), threading.Lock())  # one caller at a time, also while they change places
         self._answered_us: list[int | None] = [None, None]
-        self._name, self._wanted = name, wanted
+        self._name = name
         self._pairs: OrderedDict[str, _Pair] = OrderedDict()
         self._decoders = OwnDecoders(max_pixels)
         self._news = News()
@@ -75,9 +77,9 @@ class Shadowed:
                 answers = self._ask(promoted, [frames[index] for index in mine], deadline_us)
                 for index, answer in zip(mine, answers, strict=True):
                     results[index] = answer
-        if not self._both_drive():
-            for frame, result in zip(frames, results, strict=True):
-                self._put(_Task(frame, result, self._pair(frame).promoted))
+        both_drive = self._both_drive()
+        for frame, result in zip(frames, results, strict=True):
+            self._put(None if both_drive else _Task(frame, result, self._pair(frame).promoted))
         return results
 
     def attach(self, link: Link) -> None:
@@ -94,14 +96,22 @@ class Shadowed:
             return f"{self._name} does not answer, so it cannot drive"
         if pair.promoted is not shadow:
             pair.promoted = shadow
-            pair.agreement, pair.answered_us = Agreement(self._wanted), None
+            pair.agreement, pair.answered = Agreement(), False
         return ""
+
+    def go_by(self, robot: str, goes_by: GoesBy) -> None:
+        """What the robot's mission may go by: the two are compared by that. What was counted by another is forgotten."""
+        pair = self._pairs.get(robot)
+        if pair is not None and pair.goes_by != goes_by:
+            pair.goes_by, pair.agreement = goes_by, Agreement()
 
     def shadow_text(self, robot: str) -> str:
         """Who looks on, and how often it sees the same."""
         pair = self._pairs.get(robot)
         agreement = pair.agreement if pair else Agreement()
         share = f"{agreement.share:.0%} agree" if agreement.compared else "no answer yet"
+        if self._both_drive():
+            share = "looks on at none: both drive"
         return f"{'promoted; ' if pair and pair.promoted else ''}shadow {share}"
 
     def news(self) -> list[str]:
@@ -128,9 +138,9 @@ class Shadowed:
         """A robot that starts anew keeps who drives it; what was counted begins anew."""
         pair = self._pairs.get(frame.robot)
         if pair is None:
-            pair = _Pair(frame.header.session, Agreement(self._wanted))
+            pair = _Pair(frame.header.session)
         elif pair.session != frame.header.session:
-            pair.session, pair.agreement = frame.header.session, Agreement(self._wanted)
+            pair.session, pair.agreement = frame.header.session, Agreement()
         pair.seen_us = monotonic_us()
         self._pairs[frame.robot] = pair
         self._pairs.move_to_end(frame.robot)
@@ -139,18 +149,22 @@ class Shadowed:
         return pair
 
     def _is_fit(self, pair: _Pair) -> bool:
-        """By its looks at this robot; where it looks on at none, by those at the robots that it drives."""
-        answered_us = self._answered_us[True] if self._both_drive() else pair.answered_us
-        return answered_us is not None and monotonic_us() - answered_us <= _FRESH_US
+        """By its last look at this robot, which in a large fleet is a while ago, and that it answers anybody at all."""
+        answered_us = self._answered_us[True]
+        is_there = answered_us is not None and monotonic_us() - answered_us <= _FRESH_US
+        return is_there and (pair.answered or self._both_drive())
 
     def _both_drive(self) -> bool:
         """Whether one drives some of the robots that were just here, and the other one others."""
         since_us = monotonic_us() - _FRESH_US
         return len({one.promoted for one in self._pairs.values() if one.seen_us >= since_us}) > 1
 
-    def _put(self, task: _Task) -> None:
-        """The newest frame of each robot waits; an older one that was not looked at yet is left out."""
+    def _put(self, task: _Task | None) -> None:
+        """The newest frame of each robot waits; an older one that was not looked at yet is left out. None: all are."""
         with self._bell:
+            if task is None:
+                self._tasks.clear()
+                return
             self._tasks[task.frame.robot] = task
             if len(self._tasks) > MAX_ROBOTS:
                 self._tasks.popitem(last=False)
@@ -169,12 +183,18 @@ class Shadowed:
                 self._news.add(f"{self._name} failed: {type(error).__name__}: {error}"[:160])
 
     def _compare(self, task: _Task) -> None:
-        frame = self._decoders.again(task.frame)
-        answer = self._ask(not task.promoted, [frame], monotonic_us() + _PATIENCE_US)[0]
-        pair = self._pairs.get(frame.robot)
-        if answer is None or pair is None or pair.promoted is not task.promoted:
+        frame, pair = self._decoders.again(task.frame), self._pairs.get(task.frame.robot)
+        if pair is None or pair.promoted is not task.promoted:
             return
-        answer, pair.answered_us = checked(frame, answer), monotonic_us()
-        line = pair.agreement.add(task.result, answer) if task.result is not None else ""
+        answer = self._ask(not task.promoted, [frame], monotonic_us() + _PATIENCE_US)[0]
+        if pair.promoted is not task.promoted:
+            return
+        pair.answered = False
+        if answer is None:
+            return
+        answer, pair.answered = checked(frame, answer), True
+        if task.result is None or pair.goes_by is None:
+            return
+        line = pair.agreement.add(task.result, answer, pair.goes_by)
         if line:
             self._news.add(f"shadow: {line}")

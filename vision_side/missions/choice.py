@@ -12,7 +12,8 @@ from typing import Any, Final
 from protocol.errors import ConfigError
 from protocol.messages import CameraModel
 from protocol.mission_messages import MissionRequest
-from vision_side.config import VisionConfig
+from vision_side.config import TargetConfig, VisionConfig
+from vision_side.detect.labels import may_be_followed
 from vision_side.missions.port import Mission
 from vision_side.plugin_choice import Family
 
@@ -50,6 +51,13 @@ class Chosen:
     def needs_camera(self) -> bool:
         """Whether another camera model means to begin anew."""
         return bool(getattr(self.plugin, "needs_camera", True))
+
+    def goes_by(self, label: str) -> bool:
+        """Whether it may go by what has this label, as far as its configuration tells: a `label`, or a `target`."""
+        own, target = getattr(self.config, "label", None), getattr(self.config, "target", None)
+        if isinstance(own, str):
+            return own in ("", label)
+        return may_be_followed(label, target.label) if isinstance(target, TargetConfig) else True
 
     def build(self, camera: CameraModel) -> Mission:
         """A new one, that knows nothing yet."""
