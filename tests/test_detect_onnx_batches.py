@@ -54,12 +54,28 @@ def test_what_is_no_picture_is_left_out_and_no_run_is_too_large(tmp_path: Path, 
 
 
 @NEEDS_RUNTIME
-def test_outputs_for_fewer_pictures_are_no_answer(tmp_path: Path, monkeypatch) -> None:
+def test_a_model_that_cannot_do_with_many_pictures_is_given_fewer(tmp_path: Path, monkeypatch) -> None:
+    """Its outputs are for two at most, whatever its input says; so it is for what a GPU's memory does not hold."""
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1)
     run = eye._engine.run
     monkeypatch.setattr(eye._engine, "run", lambda pixels: run(pixels[:2]), raising=False)
+    runs = counted(eye, monkeypatch)
+    frames = [grey(level, seq) for seq, level in enumerate([*LEVELS, 90, 180])]
+    results = eye.detect(frames, NO_DEADLINE)
+    assert [one.seq for one in results] == [0, 1, 2, 3, 4] and runs == [5, 2, 2, 1]
+    *_, told = eye.news()
+    assert "fails on 5 pictures at once, from now on at most 2: " in told and "for 5 pictures" in told
+    assert all(eye.detect(frames, NO_DEADLINE)) and runs[4:] == [2, 2, 1] and not eye.news()
+
+
+@NEEDS_RUNTIME
+def test_an_engine_that_fails_on_every_picture_is_told_of_and_gives_no_answer(tmp_path: Path, monkeypatch) -> None:
+    eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1)
+    eye.news()
+    monkeypatch.setattr(eye._engine, "run", None, raising=False)
     assert eye.detect([grey(level) for level in LEVELS], NO_DEADLINE) == [None] * 3
-    assert "for 3 pictures" in eye.news()[-1]
+    assert ["at once" in line for line in eye.news()] == [True, False]
+    assert eye.detect([grey(level) for level in LEVELS], NO_DEADLINE) == [None] * 3 and not eye.news()
 
 
 def test_opencv_is_asked_about_one_after_the_other(tmp_path: Path, monkeypatch) -> None:

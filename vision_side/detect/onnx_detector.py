@@ -75,7 +75,7 @@ class OnnxDetector:
         while len(results) < len(frames):
             some = frames[len(results) : len(results) + self._at_once]
             is_late = monotonic_us() > deadline_us
-            results += [None] * len(some) if is_late else self._looked(some)
+            results += [None] * len(some) if is_late else self._looked(some, deadline_us)
         return results
 
     def news(self) -> list[str]:
@@ -83,14 +83,19 @@ class OnnxDetector:
         news, self._news = self._news, []
         return news
 
-    def _looked(self, frames: Sequence[DetectFrame]) -> list[DetectionResult | None]:
+    def _looked(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         try:
             return timed_together(frames, self.maker, self._seen)
         except Exception as error:  # an engine that fails on a picture gives no answer, and says so once
+            if len(frames) > 1:  # too many for its memory, or more than the model's inside takes
+                self._at_once = len(frames) // 2
+                self._news.append(f"{self.maker.detector} fails on {len(frames)} pictures at once, from now on at most "
+                                  f"{self._at_once}: {str(error)[:120]}")
+                return self.detect(frames, deadline_us)
             if not self._failed:
                 self._news.append(f"{self.maker.detector} gives no answer: {str(error)[:160]}")
             self._failed = True
-            return [None] * len(frames)
+            return [None]
 
     def _seen(self, pictures: Sequence[Picture]) -> list[Sequence[Detection]]:
         together = _found(self._engine, pictures, self._form, self._min_score)
