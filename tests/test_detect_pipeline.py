@@ -11,7 +11,7 @@ from tests.detector_rig import Bench, Told, box
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.config import DetectorConfig, TargetConfig, VisionConfig
 from vision_side.decode import Decoder
-from vision_side.detect.checking import asked, checked
+from vision_side.detect.checking import SILENT, asked, checked
 from vision_side.detect.local import Hsv
 from vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Maker, result_of
 from vision_side.pipeline import NO_ANSWER, Frame, Pipeline
@@ -81,7 +81,8 @@ class Strange:
         lambda one: [replace(one, detections=(replace(box(1), track_id=-1),))],
         lambda one: [replace(one, detections=(box(1),) * (MAX_DETECTED_BOXES + 1))],
         lambda one: [replace(one, device=None)], lambda one: [replace(one, model_hash=None)],
-        lambda one: [replace(one, detector=7)],
+        lambda one: [replace(one, detector=7)], lambda one: [replace(one, detector="ball\udce9.onnx")],
+        lambda one: [replace(one, device="\x1b[2J")],
         lambda one: [replace(one, compute_us=None)], lambda one: [replace(one, compute_us=math.nan)],
         lambda one: [], lambda one: [one, one], lambda one: None, lambda one: ["boxes"], lambda one: 1 / 0,
     ],
@@ -91,6 +92,15 @@ def test_nonsense_is_no_answer_and_counted(change) -> None:
     answer = strange.step(frame(1))
     assert answer.twist is None and answer.seen.phase == "no answer" and answer.seen.note
     assert strange.skipped == {NO_ANSWER: 1}
+
+
+def test_whatever_a_plug_in_raises_can_be_reported() -> None:
+    def raises(_one):
+        raise OSError("ball\udce9.onnx\x1b[2J is gone")
+
+    bench = Bench(VisionConfig(), Strange(raises))
+    bench.frame()
+    assert bench.report().note == "the detector's answer is none: OSError: ball?.onnx?[2J is gone"
 
 
 @pytest.mark.parametrize(("told_us", "us"), [
@@ -116,6 +126,21 @@ def test_what_fails_for_one_robots_frame_costs_no_other_robot_its_answer() -> No
     frames = [DetectFrame(robot, frame(1).header, BALL, decoder) for robot in ("r1", "odd", "r2")]
     first, odd, second = asked(OfOneOdd(), frames, NO_DEADLINE)
     assert (first.robot, second.robot) == ("r1", "r2") and "an odd picture" in odd
+
+
+def test_nobody_is_asked_frame_by_frame_once_the_time_is_over() -> None:
+    class Slow(OfOneOdd):
+        calls = 0
+
+        def detect(self, frames, deadline_us):
+            self.calls += 1
+            return super().detect(frames, deadline_us)
+
+    decoder, slow = Decoder(320, 240, 10**6), Slow()
+    frames = [DetectFrame(robot, frame(1).header, BALL, decoder) for robot in ("r1", "odd", "r2", "r3")]
+    clock = iter([100, 101, 102, 103])
+    first, odd, *late = asked(slow, frames, 101, lambda: next(clock))
+    assert first.robot == "r1" and "an odd picture" in odd and late == [SILENT, SILENT] and slow.calls == 3
 
 
 def test_boxes_beyond_the_picture_are_cut_and_those_outside_left_out() -> None:
@@ -146,6 +171,9 @@ def test_what_is_followed_is_neither_a_light_nor_legs_unless_asked_for() -> None
     assert pipeline(Told(seen)).step(frame(1)).seen.target is None
     asked = pipeline(Told(seen), target=TargetConfig(label="legs")).step(frame(1)).seen
     assert asked.target is not None and asked.target.label == "legs"
+    coloured = [*seen, box(140, 100, label="target")]  # a fallback's, say
+    asked = pipeline(Told(coloured), target=TargetConfig(label="ball")).step(frame(1)).seen
+    assert asked.target is not None and asked.target.label == "target"
     both = pipeline(Told([*seen, box(140, 100)])).step(frame(1)).seen
     assert both.target is not None and both.target.label == "ball"
 

@@ -7,6 +7,7 @@ import time
 import pytest
 
 from protocol.clock import monotonic_us
+from protocol.errors import ConfigError
 from tests.link_rigs import until
 from tests.remote_rig import GREY_JPEG, frame, within
 from vision_side.config import HsvConfig
@@ -139,6 +140,12 @@ def test_ever_new_robots_leave_no_more_decoders_than_there_may_be():
     for number in range(2 * MAX_DECODERS):
         assert decoders.again(frame(1, robot=f"r{number}")).picture().bgr.shape == (240, 320, 3)
     assert len(decoders._decoders) == MAX_DECODERS
+
+
+def test_what_fails_to_close_is_told_by_who_closes_it(held, monkeypatch):
+    monkeypatch.setattr(type(held), "close", lambda _self: 1 / 0)
+    with pytest.raises(ConfigError, match=r"close\(\) raises ZeroDivisionError"):
+        ByDeadline(held).close()
 
 
 def test_close_ends_the_thread_and_what_is_inside(held):

@@ -176,7 +176,7 @@ class DetectorService:
         if not frames:
             return
         deadline_us = min(turn.arrived_us for turn, _ in frames) + self._serving.deadline_us
-        results = asked(self._detector, [frame for _, frame in frames], deadline_us)
+        results = asked(self._detector, [frame for _, frame in frames], deadline_us, monotonic_us)
         ended_us = monotonic_us()
         each_us = (ended_us - began_us) / len(frames)
         self._each_us += (each_us - self._each_us) * (_SMOOTHING if self._each_us else 1.0)

@@ -4,7 +4,7 @@ The detector may be a plug-in or another machine; whatever it says, no more than
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from numbers import Real
 from typing import Final
@@ -19,15 +19,20 @@ _FURTHEST_PX: Final = 1e6
 """As for any number on the wire."""
 
 
-def asked(detector: Detector, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | str]:
-    """What `detector` sees in each frame, or why that is no answer; whatever a plug-in does ends here."""
+def asked(
+    detector: Detector, frames: Sequence[DetectFrame], deadline_us: int, clock: Callable[[], int] = lambda: 0
+) -> list[DetectionResult | str]:
+    """What `detector` sees in each frame, or why that is no answer; whatever a plug-in does ends here.
+
+    Where it fails on several frames, it is asked about each, as long as `clock` is not past the deadline.
+    """
     try:
         results = detector.detect(frames, deadline_us)
         if len(results) != len(frames):
             raise ValueError(f"{len(results)} results for {len(frames)} frames")
     except Exception as error:  # a plug-in's own
         if len(frames) > 1:  # whose frame it failed for is not known, and should cost no other robot its answer
-            return [asked(detector, [one], deadline_us)[0] for one in frames]
+            return [SILENT if clock() > deadline_us else asked(detector, [one], deadline_us)[0] for one in frames]
         return [_why(error)] * len(frames)
     return [_answer(frame, result) for frame, result in zip(frames, results, strict=True)]
 
@@ -40,7 +45,8 @@ def _answer(frame: DetectFrame, result: DetectionResult | None) -> DetectionResu
 
 
 def _why(error: Exception) -> str:
-    return f"the detector's answer is none: {type(error).__name__}: {error}"[:_LONGEST_WHY]
+    why = f"the detector's answer is none: {type(error).__name__}: {error}"[:_LONGEST_WHY]
+    return "".join(letter if letter.isprintable() else "?" for letter in why)
 
 
 def checked(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
@@ -67,8 +73,9 @@ def checked(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
 def _checked_maker(result: DetectionResult) -> int:
     """Who looked is said in text. Returns how long it took as the wire has it; plug-ins count in any kind of number."""
     for what in ("detector", "model_hash", "device"):
-        if not isinstance(getattr(result, what), str):
-            raise ValueError(f"its {what} is {getattr(result, what)!r}, which is no text")
+        text = getattr(result, what)
+        if not isinstance(text, str) or not text.isprintable():
+            raise ValueError(f"its {what} is {text!r}, which is no printable text")
     took_us = result.compute_us
     if type(took_us) is int and 0 <= took_us <= MAX_INTEGER:
         return took_us

@@ -12,6 +12,7 @@ from typing import Annotated, ClassVar, Final
 from pydantic import Field
 
 from protocol.clock import monotonic_us
+from protocol.errors import SightlineError
 from protocol.transports.link import LatestSlot, Link
 from vision_side.detect.around import attach_detector, close_detector, news_of
 from vision_side.detect.checking import SILENT, asked
@@ -64,6 +65,7 @@ class ByDeadline:
         self._news = News()
         self._asked: LatestSlot[Pending | None] = LatestSlot()
         self._ending = threading.Event()
+        self._ended_by: SightlineError | None = None
         self._thread = threading.Thread(target=self._work, name="detector", daemon=True)
         self._thread.start()
 
@@ -97,10 +99,12 @@ class ByDeadline:
         return [*news_of(self._inner), *self._news.take()]
 
     def close(self) -> None:
-        """End the thread; one that hangs is left behind."""
+        """End the thread; one that hangs is left behind. Raises ConfigError if the inner one's `close` fails."""
         self._ending.set()
         self._asked.put(None)
         self._thread.join(_CLOSE_S)
+        if self._ended_by is not None:
+            raise self._ended_by
 
     def _work(self) -> None:
         while not self._ending.is_set():
@@ -111,11 +115,14 @@ class ByDeadline:
                     self._answer(pending)
                 except Exception as error:  # no memory for another decoder: this thread must not end by it
                     self._fail(f"{type(error).__name__}: {error}")
-        close_detector(self._inner)
+        try:
+            close_detector(self._inner)
+        except SightlineError as error:
+            self._ended_by = error
 
     def _answer(self, pending: Pending) -> None:
         frames = [self._decoders.again(one, at) for at, one in enumerate(pending.frames)]
-        results = asked(self._inner, frames, pending.deadline_us)
+        results = asked(self._inner, frames, pending.deadline_us, monotonic_us)
         for why in results:
             if isinstance(why, str) and why is not SILENT:
                 self._fail(why)
