@@ -14,7 +14,7 @@ from typing import Final
 
 from protocol.errors import ConfigError
 from robot_side.config import PluginChoice, RobotConfig
-from robot_side.driver import ENDING
+from robot_side.ending import ENDING
 from robot_side.plugins import build, configured
 from robot_side.ports import Drive
 

@@ -22,6 +22,7 @@ from robot_side.child import NetworkChild
 from robot_side.config import RobotConfig
 from robot_side.dead_zone import DeadZoneError, check_dead_zone
 from robot_side.driving import Driving
+from robot_side.ending import ENDING, IGNORED
 from robot_side.latch import StopLatch
 from robot_side.limits import MIN_TICK_US, TICK_US
 from robot_side.plugins import build
@@ -32,10 +33,6 @@ from robot_side.supervision import ServiceManager, become_punctual
 
 _SHUTDOWN_US = 2_000_000
 _WATCHDOG_PERIOD_US = 100_000
-# Whatever a key or a terminal can send ends the driver by way of zero, Ctrl-\ and Ctrl-Z too: one that is killed or
-# held up on the spot leaves the wheels turning. Nor may a terminal that it is in the background of hold it up.
-ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
-IGNORED = (signal.SIGTTIN, signal.SIGTTOU)
 _WARNING = (
     "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
     "(docs/safety.md)"

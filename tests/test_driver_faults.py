@@ -12,7 +12,8 @@ from protocol.config import Config
 from protocol.messages import Twist
 from robot_side import ipc
 from robot_side.config import PluginChoice, RobotConfig
-from robot_side.driver import ENDING, IGNORED, Driver, run
+from robot_side.driver import Driver, run
+from robot_side.ending import ENDING, IGNORED
 from robot_side.latch import StopLatch
 from robot_side.limits import SafetyConfig
 from robot_side.ports import WheelAngles

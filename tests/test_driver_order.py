@@ -14,7 +14,8 @@ from protocol.transports.link import Message
 from robot_side import ipc
 from robot_side.child import NetworkChild
 from robot_side.config import RobotConfig
-from robot_side.driver import ENDING, IGNORED, Driver
+from robot_side.driver import Driver
+from robot_side.ending import ENDING, IGNORED
 from robot_side.limits import SafetyConfig
 from robot_side.parent import ParentDriver
 

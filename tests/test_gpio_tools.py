@@ -10,7 +10,7 @@ import pytest
 from operator_side import cli, cli_robot_tools, wheel_test
 from protocol.errors import ConfigError
 from robot_side.config import PluginChoice, RobotConfig
-from robot_side.driver import ENDING
+from robot_side.ending import ENDING
 from tests.link_rigs import until
 from tests.terminal_rig import Terminal
 
