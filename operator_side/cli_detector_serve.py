@@ -12,7 +12,7 @@ from protocol.errors import ConfigError
 from protocol.log_lines import use_form
 
 Robots = Annotated[
-    str | None, typer.Option("--robot", metavar="ID", help="A robot's id, or several by * and ? [default: *].")
+    str | None, typer.Option(metavar="ID", help="A robot's id, or several by * and ? [default: the configured or *].")
 ]
 Device = Annotated[str | None, typer.Option("--device", help="auto, cpu, cuda or tensorrt [default: auto].")]
 DeadlineMs = Annotated[
