@@ -73,7 +73,7 @@ def pipe():
     """A small one, both ends; the second is a text stream."""
     reader, writer = os.pipe()
     fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
-    with suppress(BrokenPipeError), open(reader, "rb") as read, open(writer, "w") as written:
+    with suppress(BrokenPipeError), os.fdopen(reader, "rb") as read, os.fdopen(writer, "w") as written:
         yield read, written
 
 

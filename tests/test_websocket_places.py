@@ -142,8 +142,8 @@ def test_a_log_that_nobody_reads_shuts_nobody_out(robot, monkeypatch):
         while True:
             os.write(writer, bytes(4096))
     os.set_blocking(writer, True)
-    with open(reader, "rb"), ExitStack() as ending:
-        monkeypatch.setattr(sys, "stderr", open(writer, "w"))  # noqa: SIM115
+    with os.fdopen(reader, "rb"), ExitStack() as ending:
+        monkeypatch.setattr(sys, "stderr", os.fdopen(writer, "w"))
         for _ in range(MAX_HANDSHAKES_OF_ONE + 1):
             ending.enter_context(socket.create_connection(address))
         assert until(lambda: robot.refused[TOO_MANY_CLIENTS])

@@ -83,7 +83,7 @@ class Dialer:
         except InvalidHandshake as error:
             what = f"what answers there is no Sightline WebSocket ({type(error).__name__})"
             if isinstance(error.__cause__, EOFError):  # a listener says nothing to one connection too many
-                what = "it hangs up without an answer: it has too many connections at once, or is no Sightline WebSocket"
+                what = "it hangs up without an answer: it has too many connections at once, or is no Sightline at all"
             self._turned_away(what, not isinstance(error.__cause__, EOFError))
         except ssl.SSLError as error:
             why = getattr(error, "verify_message", "") or error.reason or type(error).__name__

@@ -7,6 +7,7 @@ from vision_side.detect.around import Around
 from vision_side.detect.labels import COLOURED
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
 
+
 class LabelFilter(Around):
     """A detector that leaves out what another one finds under other labels."""
 

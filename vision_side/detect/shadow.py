@@ -100,7 +100,7 @@ class Shadowed:
         return ""
 
     def go_by(self, robot: str, goes_by: GoesBy) -> None:
-        """What the robot's mission may go by: the two are compared by that. What was counted by another is forgotten."""
+        """What the robot's mission may go by: the two are compared by that. Counting begins anew where it changes."""
         pair = self._pairs.get(robot)
         if pair is not None and pair.goes_by != goes_by:
             pair.goes_by, pair.agreement = goes_by, Agreement()
@@ -111,7 +111,7 @@ class Shadowed:
         agreement = pair.agreement if pair else Agreement()
         share = f"{agreement.share:.0%} agree" if agreement.compared else "no answer yet"
         if self._both_drive():
-            share = "looks on at none: both drive"
+            share = "looks on at none"
         return f"{'promoted; ' if pair and pair.promoted else ''}shadow {share}"
 
     def news(self) -> list[str]:
