@@ -174,8 +174,8 @@ def test_no_robot_waits_for_looks_at_others_once_both_drive(pair) -> None:
     assert names(both.detect([frame(3, "r0")], NO_DEADLINE)) == ["two"]
     time.sleep(0.1)
     assert [seq for _, seq in shadow.seen[8:]] in ([2, 3], [3])
-    assert both.shadow_text("r0") == "promoted; shadow looks on at none: both drive"
-    assert both.shadow_text("r1") == "shadow looks on at none: both drive"
+    assert both.shadow_text("r0") == "promoted; shadow looks on at none"
+    assert both.shadow_text("r1") == "shadow looks on at none"
 
 
 def test_in_a_large_fleet_the_last_look_at_a_robot_counts_however_long_ago(pair, monkeypatch) -> None:
