@@ -44,7 +44,7 @@ class Sheet:
                 _box(picture, (one.x1_px, one.y1_px, one.x2_px, one.y2_px), colour)
                 at = (int(one.x1_px), max(9, int(one.y1_px) - 2))
                 cv2.putText(picture, f"{one.label} {one.score:.2f}", at, _FONT, 0.3, colour, 1, cv2.LINE_AA)
-            said = f"{subject.name}: {verdict(result, seen.scene).verdict}"
+            said = f"{subject.name}: {verdict(result, seen.scene, subject.balls).verdict}"
             cv2.putText(picture, said, (3, 12 + 12 * number), _FONT, 0.36, colour, 1, cv2.LINE_AA)
         return picture
 
