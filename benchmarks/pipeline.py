@@ -1,5 +1,5 @@
-"""How long one `Pipeline.step` takes: hot, paced as a camera paces it, and the decode alone; and how long the learned
-detector does. Shell (a clock)."""
+"""How long one `Pipeline.step` takes: hot, paced as a camera paces it, and the decode alone; and how long the detectors
+`hsv` and `onnx` do. Shell (a clock)."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -14,6 +14,7 @@ import numpy as np
 from protocol.messages import CameraModel, FrameHeader
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
+from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.onnx_detector import OnnxDetector, read_model
 from vision_side.detect.onnx_engine import open_engine
 from vision_side.detect.onnx_reading import fit_picture
@@ -35,7 +36,8 @@ class StepTime:
 
     `median_us`: hot, one frame right after the other; the bound holds for this one. `alone_us`: of its rounds, the
     best. `paced_us`: 30 frames a second with sleep between, when caches and clock speed have to be regained each time.
-    `decode_us`: the decode alone, hot, of the same pictures, which is the floor: its best round.
+    `decode_us`: the decode alone, hot, of the same pictures, which is the floor: its best round. `hsv_us`: the decode
+    and the detector `hsv`, hot, which the bound holds for too, and `hsv_alone_us` of its rounds the best.
     """
 
     width_px: int
@@ -45,6 +47,8 @@ class StepTime:
     alone_us: float
     paced_us: float
     decode_us: float
+    hsv_us: float
+    hsv_alone_us: float
     bound_us: float
     phase: str
 
@@ -60,11 +64,11 @@ class LearnedTime:
 
     `network_us`: the network alone, overlaps removed and boxes decoded; the bound holds for this. `alone_us`: of its
     rounds, the best. `whole_us`: from JPEG to detections. `decode_us`: the JPEG's decode alone, its best round.
-    `found`: that there was a ball in each of the pictures.
+    `missed`: the pictures in which it found no ball.
     """
 
     engine: str
-    found: bool
+    missed: int
     network_us: float
     alone_us: float
     whole_us: float
@@ -80,11 +84,12 @@ def time_learned(frames: int = 600) -> LearnedTime:
     engine = open_engine(model.path, model.header, "cpu", config.threads)
     asked = [DetectFrame("r1", one.header, one.jpeg, decoder) for one in islice(_frames(pictures), frames)]
     pixels = [fit_picture(decoder.decode(jpeg), model.form)[0].copy() for jpeg in pictures]
-    found = all(seen and seen.detections for one in asked[:_PICTURES] for seen in detector.detect([one], NO_DEADLINE))
+    seen = [detector.detect([one], NO_DEADLINE)[0] for one in asked[:_PICTURES]]
     network_us = _took_us(engine.run, islice(cycle(pixels), frames))
     whole_us = _took_us(lambda one: detector.detect([one], NO_DEADLINE), asked)
     decode_us = _took_us(decoder.decode, islice(cycle(pictures), frames))
-    return LearnedTime(engine.name, found, median(network_us), _alone(network_us), median(whole_us), _alone(decode_us))
+    missed = sum(one is None or not one.detections for one in seen)
+    return LearnedTime(engine.name, missed, median(network_us), _alone(network_us), median(whole_us), _alone(decode_us))
 
 
 def _time_size(size: tuple[int, int], frames: int, paced_frames: int) -> StepTime:
@@ -96,8 +101,10 @@ def _time_size(size: tuple[int, int], frames: int, paced_frames: int) -> StepTim
     hot_us = _took_us(pipeline.step, (next(source) for _ in range(frames)))
     paced_us = median(_took_us(pipeline.step, _paced(source, paced_frames)))
     decode_us = _alone(_took_us(decoder.decode, islice(cycle(pictures), frames)))
-    return StepTime(*size, len(pictures[0]), median(hot_us), _alone(hot_us), paced_us, decode_us, BOUNDS_US[size],
-                    phase)
+    hsv = HsvDetector(VisionConfig().hsv)
+    hsv_us = _took_us(lambda jpeg: hsv.detect(decoder.decode(jpeg)), islice(cycle(pictures), frames))
+    return StepTime(*size, len(pictures[0]), median(hot_us), _alone(hot_us), paced_us, decode_us, median(hsv_us),
+                    _alone(hsv_us), BOUNDS_US[size], phase)
 
 
 def _frames(pictures: list[bytes]) -> Iterator[Frame]:

@@ -57,20 +57,23 @@ def pipeline(*, as_json: Json = False) -> int:
         from benchmarks.pipeline import LEARNED_BOUND_US, time_learned, time_steps
     from operator_side.score import Check
 
-    checks = [
-        Check(
-            f"step at {one.width_px}x{one.height_px}, hot (best round {one.alone_us:.0f}, paced {one.paced_us:.0f}, "
+    checks = []
+    for one in time_steps():
+        size = f"{one.width_px}x{one.height_px}"
+        checks.append(Check(
+            f"step at {size}, hot (best round {one.alone_us:.0f}, paced {one.paced_us:.0f}, "
             f"decode {one.decode_us:.0f})",
             one.median_us, "us", one.bound_us, one.median_us <= one.bound_us and one.phase == "tracking",
-        )
-        for one in time_steps()
-    ]
+        ))
+        checks.append(Check(f"hsv at {size}, decoding included, hot (best round {one.hsv_alone_us:.0f})",
+                            one.hsv_us, "us", one.bound_us, one.hsv_us <= one.bound_us))
     eyes = time_learned()
     checks.append(Check(
         f"onnx at 320x240, network only, hot (best round {eyes.alone_us:.0f}, from JPEG to boxes {eyes.whole_us:.0f}, "
         f"decode {eyes.decode_us:.0f}; {eyes.engine})",
-        eyes.network_us, "us", LEARNED_BOUND_US, eyes.network_us <= LEARNED_BOUND_US and eyes.found,
+        eyes.network_us, "us", LEARNED_BOUND_US, eyes.network_us <= LEARNED_BOUND_US,
     ))
+    checks.append(Check("pictures in which onnx finds no ball", eyes.missed, "", 0, eyes.missed == 0))
     return print_checks(checks, as_json)
 
 
