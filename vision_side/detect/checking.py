@@ -32,7 +32,8 @@ def asked(
             raise ValueError(f"{len(results)} results for {len(frames)} frames")
     except Exception as error:  # a plug-in's own
         if len(frames) > 1:  # whose frame it failed for is not known, and should cost no other robot its answer
-            return [SILENT if clock() > deadline_us else asked(detector, [one], deadline_us)[0] for one in frames]
+            why = _why(error)
+            return [why if clock() > deadline_us else asked(detector, [one], deadline_us)[0] for one in frames]
         return [_why(error)] * len(frames)
     return [_answer(frame, result) for frame, result in zip(frames, results, strict=True)]
 
