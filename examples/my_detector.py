@@ -1,7 +1,7 @@
 """A detector of one's own: the brightest spot in the picture. Shell (a clock).
 
-    sightline detector check my_detector:BrightestSpot
-    sightline vision --detector my_detector:BrightestSpot --set detector.options.least=220
+    sightline detector check examples.my_detector:BrightestSpot
+    sightline vision --detector examples.my_detector:BrightestSpot --set detector.options.least=220
 """
 
 import time

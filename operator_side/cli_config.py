@@ -8,6 +8,7 @@ import typer
 from pydantic import BaseModel
 
 from operator_side.cli_services import Sets
+from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from operator_side.settings import model_of
 from operator_side.toml_text import toml_text
@@ -16,6 +17,7 @@ from robot_side.plugins import configured
 from sim.robot_model import load_robot
 from sim.scenario import load_scenario
 from sim.service import SimConfig
+from vision_side.config import VisionConfig
 
 ServiceName = Annotated[str, typer.Argument(metavar="SERVICE", help="robot, vision or sim.")]
 File = Annotated[str | None, typer.Argument(metavar="[FILE]", help="The service's TOML file.")]
@@ -42,7 +44,7 @@ def check(service: ServiceName, file: File = None, profile: Profile = None, sets
 
 
 def _check_names(config: BaseModel) -> None:
-    """What the configuration names: devices with their options, scenario and robot. Opens nothing."""
+    """What the configuration names, with its options: devices, scenario, robot, detectors, missions. Opens none."""
     if isinstance(config, RobotConfig):
         named = {"cameras": config.camera, "drives": config.motors, "range_sensors": config.ranging}
         for group, choice in named.items():
@@ -50,6 +52,26 @@ def _check_names(config: BaseModel) -> None:
                 configured(group, choice)
     if isinstance(config, SimConfig):
         load_robot(config.robot or load_scenario(config.scenario).robot)
+    if isinstance(config, VisionConfig):
+        _check_eyes_and_missions(config)
+
+
+def _check_eyes_and_missions(config: VisionConfig) -> None:
+    with needs("vision"):
+        from vision_side.detect.choice import BOXES, check_choice, check_device, configured_detector
+        from vision_side.missions.choice import choose
+        from vision_side.missions.choice import configured as configured_mission
+    configured_mission(config)
+    for kind, options in config.missions.items():
+        choose(kind, options, config)
+    one = config.detector
+    if one.kind == BOXES:
+        configured_detector(config)
+        return
+    check_device(config)
+    for kind, options in ((one.kind, one.options), (one.fallback, {}), (one.shadow, one.shadow_options)):
+        if kind:
+            check_choice(kind, options, config)
 
 
 def show(

@@ -1,6 +1,7 @@
 """`sightline install robot|vision`: shows the systemd unit, and puts it in place with --yes. Shell."""
 
 import getpass
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +24,7 @@ def install(
         Path | None,
         typer.Option("--config", metavar="FILE", help="Its configuration [default: /etc/sightline/SERVICE.toml]."),
     ] = None,
-    user: Annotated[str, typer.Option(help="Who runs it [default: you].")] = "",
+    user: Annotated[str, typer.Option(help="Who runs it [default: you, by sudo too].")] = "",
     yes: Annotated[bool, typer.Option("--yes", help="Write it and begin, now and whenever the machine does.")] = False,
 ) -> None:
     """Run a service for good, by systemd; where a robot's drive is `gpio`, also what puts its pins low after every end.
@@ -32,7 +33,8 @@ def install(
     """
     program = Path(sys.executable).with_name("sightline")
     file = (config or Path(f"/etc/sightline/{service}.toml")).expanduser().absolute()  # systemd begins elsewhere
-    planned = units.plan(service, program, file, user or getpass.getuser(), units.UNIT_DIR)
+    runs_it = user or os.environ.get("SUDO_USER") or getpass.getuser()
+    planned = units.plan(service, program, file, runs_it, units.UNIT_DIR)
     if not yes:
         _show(planned, _beside(service, program, file) if file.exists() else None)
         if service == "robot" and not file.exists():

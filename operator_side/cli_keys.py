@@ -41,7 +41,8 @@ def init(folder: Folder, host: Hosts = None, days: Days = 825) -> None:
     made = _keys()
     for file in made.make(folder, host or [], days):
         print(f"made {file}")
-    print(f"copy ca.pem and the files of its role to each machine, and ca.key to none; then: --secure {folder}")
+    print("copy ca.pem and the files of its role to each machine, every *.token to a robot that listens on wss://, and "
+          f"ca.key to none; then: --secure {folder}")
 
 
 def add(

@@ -90,6 +90,14 @@ def test_alone_it_shows_its_help(capsys):
         (["config", "check", "robto"], 2, "did you mean 'robot'"),
         (["config", "check", "robot", "no such file.toml"], 2, "no such file.toml"),
         (["config", "check", "vision", "--set", "targt.radius_m=1"], 2, "did you mean 'target.radius_m'"),
+        (["config", "check", "vision", "--set", "mission.kind=folow"], 2, "did you mean 'follow'"),
+        (["config", "check", "vision", "--set", "missions.goto.spede=1"], 2, "'spede'"),
+        (["config", "check", "vision", "--set", "detector.kind=hvs"], 2, "did you mean 'hsv'"),
+        (["config", "check", "vision", "--set", "detector.options.colr=1"], 2, "'colr'"),
+        (["config", "check", "vision", "--set", "detector.fallback=onnx:no.onnx"], 2, "no.onnx"),
+        (["config", "check", "vision", "--set", "detector.shadow=adaptve"], 2, "did you mean 'adaptive'"),
+        (["config", "check", "vision", "--set", "detector.device=cuda"], 2, "no device to choose"),
+        (["config", "check", "vision", "--set", "detector.kind=boxes", "--set", "detector.tracked=true"], 2, "tracked"),
         (["robot", "--robot", "a/b"], 2, "'a/b'"),
         (["robot", "--robot", "*"], 2, "'*'"),
         (["robot", "--listen", "7447"], 2, "tcp/127.0.0.1:7447"),
@@ -160,6 +168,7 @@ def test_config_commands_print_what_a_script_can_read(capsys, tmp_path):
     path.write_text('robot = "r9"\n')
     code, out, _ = run(capsys, "config", "check", "robot", str(path))
     assert (code, str(path) in out) == (0, True)
+    assert run(capsys, "config", "check", "vision", "--set", "detector.kind=boxes")[0] == 0
     code, out, _ = run(capsys, "config", "show", "robot", str(path), "--origin")
     assert code == 0
     assert tomllib.loads(out)["robot"] == "r9"

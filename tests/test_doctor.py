@@ -4,6 +4,7 @@ import json
 import os
 import re
 import socket
+import sys
 
 import pytest
 
@@ -146,6 +147,14 @@ def test_certificates_near_their_end_are_told_with_the_command(capsys, tmp_path)
     assert checks["key robot"]["ok"] and checks["key ca"]["ok"]
     assert not checks["key vision"]["ok"]
     assert checks["key vision"]["fix"] == f"sightline keys add {tmp_path / 'k'} vision"
+
+
+def test_certificates_that_cannot_be_read_here_are_told_with_the_extra(capsys, tmp_path, monkeypatch):
+    keys.make(tmp_path / "k", [])
+    for name in [one for one in sys.modules if one.partition(".")[0] == "cryptography"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    check = _checks(capsys, "--secure", str(tmp_path / "k"))["certificates"]
+    assert not check["ok"] and "pip install 'sightline[secure]'" in str(check)
 
 
 def test_nobody_listening_is_told_apart_from_no_such_name(capsys):

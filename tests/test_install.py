@@ -64,6 +64,12 @@ def test_it_shows_first_and_writes_nothing(capsys, monkeypatch, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_by_sudo_it_runs_as_who_said_so(capsys, monkeypatch):
+    monkeypatch.setenv("SUDO_USER", "pi")
+    assert cli.run(["install", "vision", "--config", str(CONFIG)]) == 0
+    assert "User=pi\n" in capsys.readouterr().out
+
+
 def test_a_file_that_is_named_from_here_is_found_from_anywhere(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     Path("car.toml").write_text(CAR)

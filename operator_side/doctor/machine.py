@@ -14,6 +14,7 @@ from importlib import metadata
 from pathlib import Path
 
 from operator_side.doctor.finding import Finding, trouble
+from operator_side.extras import needs
 from protocol import VERSION
 from protocol.errors import SightlineError
 from protocol.transports.port_owner import port_owner
@@ -169,10 +170,11 @@ def _clock() -> Finding:
 
 
 def _certificates(folder: str) -> Iterator[Finding]:
-    from operator_side import keys
-
     try:
-        certificates = keys.look(Path(folder))
+        with needs("secure"):
+            from operator_side import keys
+
+            certificates = keys.look(Path(folder))
     except SightlineError as error:
         yield trouble("certificates", error)
         return
