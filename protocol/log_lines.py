@@ -10,8 +10,9 @@ from __future__ import annotations
 import io
 import json
 import os
-import select
+import queue
 import sys
+import threading
 from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Final, TextIO
@@ -23,8 +24,9 @@ FORMS: Final = ("text", "json")
 _LONGEST_LINE: Final = 10_000
 """More without an end is no line of a log; it is cut there."""
 
-_LONGEST_TOLD: Final = 512
-"""Letters that fit into what a pipe takes at once, 4096 bytes, however they are written."""
+_LINES_WAITING: Final = 32
+_PATIENCE_S: Final = 0.1
+"""Once, for a line to be read; whoever tells more meanwhile does not wait at all."""
 
 
 class JsonLines(io.TextIOBase):
@@ -88,13 +90,40 @@ def use_form(form: str | None, service: str) -> None:
         sys.stderr = JsonLines(sys.stderr, service, "warning")
 
 
-def tell(line: str, stream: TextIO | None = None) -> None:
-    """Print `line`, to stderr unless told otherwise, without ever waiting: a held terminal or a full pipe costs it."""
-    stream = stream or sys.stderr
-    try:
-        takes = bool(select.select([], [stream], [], 0)[1])
-    except (OSError, TypeError, ValueError):  # no descriptor: a buffer in memory, or nothing at all
-        takes = stream is not None
-    if takes:
-        with suppress(OSError, ValueError):  # whoever read has gone
-            print(line[:_LONGEST_TOLD], file=stream, flush=True)
+class Teller:
+    """Prints on a thread of its own, for who must not wait: a terminal that nobody reads costs lines."""
+
+    def __init__(self) -> None:
+        self._lines: queue.Queue[tuple[str, TextIO, threading.Event]] = queue.Queue(_LINES_WAITING)
+        self._begin = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._stuck = False
+
+    def tell(self, line: str, stream: TextIO | None = None) -> None:
+        """Print `line`, to stderr unless told otherwise: at once, or while nobody reads later, or not at all."""
+        where: TextIO | None = stream or sys.stderr
+        if where is None:
+            return
+        self._be_there()
+        told = threading.Event()
+        with suppress(queue.Full):
+            self._lines.put_nowait((line, where, told))
+            if not self._stuck:
+                self._stuck = not told.wait(_PATIENCE_S)
+
+    def _be_there(self) -> None:
+        with self._begin:
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._print_all, name="teller", daemon=True)
+                self._thread.start()
+
+    def _print_all(self) -> None:
+        while True:
+            line, stream, told = self._lines.get()
+            with suppress(Exception):  # whoever read has gone
+                print(line, file=stream, flush=True)
+            told.set()
+            self._stuck = False
+
+
+tell: Final = Teller().tell

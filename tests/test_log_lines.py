@@ -4,15 +4,17 @@ import fcntl
 import io
 import json
 import os
+import pty
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from datetime import UTC, datetime
 
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.log_lines import ENV_NAME, JsonLines, as_json, tell, use_form
+from protocol.log_lines import ENV_NAME, JsonLines, Teller, as_json, use_form
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 
@@ -68,35 +70,45 @@ def test_both_processes_of_a_robot_speak_json(tmp_path, monkeypatch):
     assert json.loads(network)["service"] == "robot"
 
 
-@pytest.fixture
-def pipe():
-    """A small one, both ends; the second is a text stream."""
-    reader, writer = os.pipe()
-    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
-    with suppress(BrokenPipeError), os.fdopen(reader, "rb") as read, os.fdopen(writer, "w") as written:
+@pytest.fixture(params=["pipe", "terminal"])
+def unread(request):
+    """Both ends of what somebody may read, or not; the second is a text stream."""
+    reader, writer = os.pipe() if request.param == "pipe" else pty.openpty()
+    if request.param == "pipe":
+        fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
+    with suppress(OSError), os.fdopen(reader, "rb", buffering=0) as read, os.fdopen(writer, "w") as written:
         yield read, written
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_a_line_is_told_until_nobody_reads_and_again_once_somebody_does(pipe, wrapped):
-    read, written = pipe
-    stream = JsonLines(written, "robot", "info") if wrapped else written
-    for number in range(50):
-        tell(f"{number} " + 600 * "\u00e9", stream)
-    assert read.read1(1 << 16).startswith(b'{"time"' if wrapped else b"0 ")
-    tell("heard", stream)
-    assert b"heard" in read.read1(1 << 16)
+def test_who_tells_does_not_wait_for_who_reads(unread, wrapped):
+    read, written = unread
+    stream, teller, begin_s = JsonLines(written, "robot", "info") if wrapped else written, Teller(), time.monotonic()
+    for number in range(300):
+        teller.tell(f"{number} " + 100 * "\U0001f600", stream)
+    assert time.monotonic() - begin_s < 2
+    heard = b""
+    while b"heard" not in heard:  # once somebody reads, what waited comes, and what is told then
+        heard += read.read(1 << 16)
+        teller.tell("heard", stream)
+    assert heard.startswith(b'{"time"' if wrapped else b"0 ")
 
 
-def test_a_line_for_nobody_at_all_is_dropped(pipe, monkeypatch):
-    read, written = pipe
-    read.close()
-    tell("gone", written)
+def test_a_line_is_there_at_once_where_somebody_reads(unread):
+    read, written = unread
+    Teller().tell("heard", written)
+    os.set_blocking(read.fileno(), False)
+    assert read.read(99).strip() == b"heard"
+
+
+def test_a_line_for_nobody_at_all_is_dropped(monkeypatch):
+    reader, writer = os.pipe()
+    os.close(reader)
+    teller = Teller()
+    with suppress(BrokenPipeError), os.fdopen(writer, "w") as written:
+        teller.tell("gone", written)
     monkeypatch.setattr(sys, "stderr", None)
-    tell("nowhere")
-
-
-def test_a_buffer_in_memory_takes_every_line(monkeypatch):
+    teller.tell("nowhere")
     monkeypatch.setattr(sys, "stderr", io.StringIO())
-    tell("kept")
+    teller.tell("kept")
     assert sys.stderr.getvalue() == "kept\n"
