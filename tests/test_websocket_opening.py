@@ -7,10 +7,12 @@ import socket
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from operator_side import keys
 from protocol.channels import FRAME, TWIST
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.link import Message
@@ -60,6 +62,29 @@ def test_websockets_that_is_not_installed_is_one_line_with_the_fix(monkeypatch):
     monkeypatch.setitem(sys.modules, "websockets", None)
     with pytest.raises(ConfigError, match=re.escape("pip install 'sightline[websocket]'")):
         open_websocket("r1", connect="ws://127.0.0.1:9090")
+
+
+@pytest.mark.parametrize(("kind", "other"), [("ws", "wss"), ("wss", "ws")])
+def test_who_hangs_up_unheard_is_tried_again(kind, other, tmp_path):
+    """As a listener does that has too many at once; over TLS its end may come before our hello or after."""
+    keys.make(tmp_path / "keys", [])
+    tried = []
+
+    def hang_up():
+        with suppress(OSError):
+            while True:
+                near, _ = door.accept()
+                tried.append(near)
+                near.close()
+
+    with socket.create_server(("127.0.0.1", 0)) as door:
+        threading.Thread(target=hang_up, daemon=True).start()
+        secure = {"secure": str(tmp_path / "keys")} if kind == "wss" else {}
+        endpoint = f"{kind}://127.0.0.1:{door.getsockname()[1]}"
+        with pytest.raises(LinkError, match=f"it hangs up without an answer: .* speaks {other}://|nobody answers"):
+            open_websocket("r1", connect=endpoint, timeout_s=1.5, **secure)
+        door.shutdown(socket.SHUT_RDWR)
+    assert len(tried) >= 3
 
 
 def test_nobody_answering_is_said_in_time():

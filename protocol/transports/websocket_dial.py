@@ -81,10 +81,12 @@ class Dialer:
         except PeerError as error:
             self._turned_away(str(error), True)
         except InvalidHandshake as error:
-            what = f"what answers there is no Sightline WebSocket ({type(error).__name__})"
-            if isinstance(error.__cause__, EOFError):  # a listener says nothing to one connection too many
-                what = "it hangs up without an answer: it has too many connections at once, or is no Sightline at all"
-            self._turned_away(what, not isinstance(error.__cause__, EOFError))
+            if isinstance(error.__cause__, EOFError):
+                self._turned_away(self._hangs_up(), False)
+            else:
+                self._turned_away(f"what answers there is no Sightline WebSocket ({type(error).__name__})", True)
+        except ssl.SSLEOFError:
+            self._turned_away(self._hangs_up(), False)
         except ssl.SSLError as error:
             why = getattr(error, "verify_message", "") or error.reason or type(error).__name__
             self._turned_away(f"no TLS with it: {why}; is the ca.pem of --secure its authority's?", True)
@@ -93,6 +95,11 @@ class Dialer:
         except Exception as error:  # whatever a broken peer makes the library raise, this thread must try again
             self._turned_away(f"{type(error).__name__}: {error}"[:200], False)
         return False
+
+    def _hangs_up(self) -> str:
+        """Of who closes the connection without a byte, as a listener does that has too many at once."""
+        other = "ws://" if self.endpoint.secure else "wss://"
+        return f"it hangs up without an answer: too many connections at once, or it speaks {other}, or is no Sightline"
 
     def _open(self) -> Wire:
         from websockets.client import ClientProtocol
