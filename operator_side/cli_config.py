@@ -59,11 +59,8 @@ def _check_names(config: BaseModel) -> None:
 def _check_eyes_and_missions(config: VisionConfig) -> None:
     with needs("vision"):
         from vision_side.detect.choice import BOXES, check_choice, check_device, configured_detector
-        from vision_side.missions.choice import choose
-        from vision_side.missions.choice import configured as configured_mission
-    configured_mission(config)
-    for kind, options in config.missions.items():
-        choose(kind, options, config)
+        from vision_side.missions.choice import check_choices
+    check_choices(config)
     one = config.detector
     if one.kind == BOXES:
         configured_detector(config)

@@ -168,7 +168,8 @@ def test_config_commands_print_what_a_script_can_read(capsys, tmp_path):
     path.write_text('robot = "r9"\n')
     code, out, _ = run(capsys, "config", "check", "robot", str(path))
     assert (code, str(path) in out) == (0, True)
-    assert run(capsys, "config", "check", "vision", "--set", "detector.kind=boxes")[0] == 0
+    for fine in ("detector.kind=boxes", "missions.goto.sight_m=0.2", "missions.goto-baseline.max_linear_mps=0.05"):
+        assert run(capsys, "config", "check", "vision", "--set", fine)[::2] == (0, "")
     code, out, _ = run(capsys, "config", "show", "robot", str(path), "--origin")
     assert code == 0
     assert tomllib.loads(out)["robot"] == "r9"

@@ -15,7 +15,7 @@ from protocol.mission_messages import MissionRequest
 from vision_side.config import TargetConfig, VisionConfig
 from vision_side.detect.labels import may_be_followed
 from vision_side.missions.port import Mission
-from vision_side.plugin_choice import Family
+from vision_side.plugin_choice import Family, settings_model
 
 BUILT_IN: Final = {
     "follow": "vision_side.missions.follow:Follow",
@@ -74,6 +74,16 @@ def _own_options(kind: str, config: VisionConfig) -> dict[str, Any]:
     """What `config` has for this mission."""
     own = config.mission.options if kind == config.mission.kind else {}
     return {**config.missions.get(kind, {}), **own}
+
+
+def check_choices(config: VisionConfig) -> None:
+    """Raise ConfigError, one line, for what is wrong with the configured mission, or with the options that others have
+    for when somebody asks for them: their waypoints come with the request."""
+    configured(config)
+    for kind, options in config.missions.items():
+        settings = settings_model(_FAMILY.load(kind))
+        missing = {"waypoints": [(0.0, 0.0)]} if settings and "waypoints" in settings.model_fields else {}
+        choose(kind, {**missing, **options}, config)
 
 
 def requested(request: MissionRequest, config: VisionConfig) -> Chosen:
