@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from protocol.clock import monotonic_us
+from protocol.errors import ConfigError
 from protocol.messages import FrameHeader
 from tests.detector_rig import BALL, Bench
 from tests.link_rigs import until
@@ -120,7 +121,6 @@ def test_the_shadow_sees_the_frames_and_never_answers_them(pair) -> None:
     for seq in range(1, 6):
         assert names(both.detect([frame(seq)], NO_DEADLINE)) == ["one"]
         assert until(lambda seq=seq: ("r1", seq) in shadow.seen)
-        both.go_by("r1", anything)
     assert until(lambda: both.shadow_text("r1") == "shadow 0% agree")
     assert any("two" in line and "one" in line for line in both.news())
 
@@ -195,6 +195,29 @@ def test_in_a_large_fleet_the_last_look_at_a_robot_counts_however_long_ago(pair,
     assert "does not answer" in both.promote("r2", True)
     now_us += 200_000
     assert "does not answer" in both.promote("r3", True)
+
+
+def test_who_fails_on_a_robots_frames_is_not_promoted_for_it(pair) -> None:
+    _, shadow, both = pair
+    both.detect([frame(1)], NO_DEADLINE)
+    assert until(lambda: shadow.seen == [("r1", 1)])
+    look = shadow.detect
+    shadow.detect = lambda frames, until_us: look(frames, until_us) if frames[0].robot == "r2" else 1 / 0
+    both.detect([frame(2)], NO_DEADLINE)
+    assert until(lambda: any("failed" in line for line in both.news()))
+    both.detect([frame(2, "r2")], NO_DEADLINE)
+    assert until(lambda: both.promote("r2", True) == "")
+    assert both.promote("r2", False) == "" and "does not answer" in both.promote("r1", True)
+
+
+def test_both_are_closed_whichever_fails_to(pair) -> None:
+    driving, shadow, both = pair
+    closed = []
+    driving.close, shadow.close = lambda: 1 / 0, lambda: closed.append("two")
+    with pytest.raises(ConfigError, match=r"close\(\) raises"):
+        both.close()
+    driving.close = lambda: None
+    assert closed == ["two"]
 
 
 def test_who_does_not_answer_is_not_promoted(pair) -> None:

@@ -15,6 +15,7 @@ from vision_side.detect.colour_filter import ColourFilter
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.port import Detector
 from vision_side.detect.tracked import Tracked
+from vision_side.missions.choice import configured
 from vision_side.plugin_choice import Family, settings_model
 
 BUILT_IN: Final = {
@@ -64,7 +65,7 @@ def configured_detector(config: VisionConfig) -> Detector | None:
         from vision_side.detect.shadow import Shadowed
 
         second = _narrowed(choose_detector(one.shadow, one.shadow_options, config), config)
-        detector = Shadowed(detector, second, one.shadow, config.max_pixels)
+        detector = Shadowed(detector, second, one.shadow, config.max_pixels, configured(config).goes_by)
     return detector
 
 

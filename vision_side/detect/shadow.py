@@ -8,6 +8,7 @@ looks on.
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -33,9 +34,9 @@ class _Pair:
     """What is known of one robot."""
 
     session: str
+    goes_by: GoesBy
+    """What its mission may go by."""
     agreement: Agreement = field(default_factory=Agreement)
-    goes_by: GoesBy | None = None
-    """What the mission may go by; None until somebody says so."""
     promoted: bool = False
     answered: bool = False
     """The last frame that the one that looks on was shown."""
@@ -54,11 +55,14 @@ class _Task:
 class Shadowed:
     """A detector that drives, and one that could."""
 
-    def __init__(self, driving: Detector, shadow: Detector, name: str, max_pixels: int) -> None:
+    def __init__(
+        self, driving: Detector, shadow: Detector, name: str, max_pixels: int, goes_by: GoesBy = lambda _label: True
+    ) -> None:
+        """`goes_by` holds for each robot until `go_by` says what its mission may go by."""
         self._eyes = (driving, shadow)
         self._locks = (threading.Lock(), threading.Lock())  # one caller at a time, also while they change places
         self._answered_us: list[int | None] = [None, None]
-        self._name = name
+        self._name, self._goes_by = name, goes_by
         self._pairs: OrderedDict[str, _Pair] = OrderedDict()
         self._decoders = OwnDecoders(max_pixels)
         self._news = News()
@@ -124,8 +128,9 @@ class Shadowed:
             self._ending = True
             self._bell.notify()
         self._thread.join(_END_S)
-        for eye in self._eyes:
-            close_detector(eye)
+        with ExitStack() as ending:  # both, also where one fails to
+            for eye in self._eyes:
+                ending.callback(close_detector, eye)
 
     def _ask(self, shadow: bool, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         with self._locks[shadow]:
@@ -138,7 +143,7 @@ class Shadowed:
         """A robot that starts anew keeps who drives it; what was counted begins anew."""
         pair = self._pairs.get(frame.robot)
         if pair is None:
-            pair = _Pair(frame.header.session)
+            pair = _Pair(frame.header.session, self._goes_by)
         elif pair.session != frame.header.session:
             pair.session, pair.agreement = frame.header.session, Agreement()
         pair.seen_us = monotonic_us()
@@ -186,14 +191,14 @@ class Shadowed:
         frame, pair = self._decoders.again(task.frame), self._pairs.get(task.frame.robot)
         if pair is None or pair.promoted is not task.promoted:
             return
-        answer = self._ask(not task.promoted, [frame], monotonic_us() + _PATIENCE_US)[0]
-        if pair.promoted is not task.promoted:
-            return
-        pair.answered = False
-        if answer is None:
-            return
-        answer, pair.answered = checked(frame, answer), True
-        if task.result is None or pair.goes_by is None:
+        answer = None
+        try:
+            given = self._ask(not task.promoted, [frame], monotonic_us() + _PATIENCE_US)[0]
+            answer = given and checked(frame, given)
+        finally:
+            if pair.promoted is task.promoted:
+                pair.answered = answer is not None
+        if answer is None or task.result is None or pair.promoted is not task.promoted:
             return
         line = pair.agreement.add(task.result, answer, pair.goes_by)
         if line:
