@@ -2,8 +2,11 @@
 
 import time
 
+import pytest
+
 from protocol.channels import DETECTIONS
 from protocol.codec import encode
+from protocol.errors import ConfigError
 from protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo
 from protocol.transports.link import Message
 from protocol.transports.zenoh_site import MAX_ROBOTS as MOST_AT_A_SITE
@@ -77,6 +80,17 @@ def test_a_memory_is_kept_of_every_robot_that_a_site_meets():
     robots = [f"r{number}" for number in range(MOST_AT_A_SITE)]
     memories = [kept.of(robot, "0000abcd") for robot in robots]
     assert all(kept.of(robot, "0000abcd") is memory for robot, memory in zip(robots, memories, strict=True))
+
+
+def test_both_are_closed_where_the_first_fails_to():
+    class Failing(Held):
+        def close(self):
+            raise OSError("the port is gone")
+
+    second = Held("own")
+    with pytest.raises(ConfigError, match=r"close\(\) raises OSError"):
+        Fallback(Failing("first"), second).close()
+    assert second.closed
 
 
 class Heard:

@@ -107,6 +107,8 @@ class Fleet:
                 self.turn()
         finally:
             self._end()
+        if self._failed is not None:  # in closing
+            raise self._failed
         for robot, service in self.services.items():
             skipped = dict(service.skipped) or "none"
             self._say(f"vision: {robot}: ended after {service.answered} frames; skipped: {skipped}")

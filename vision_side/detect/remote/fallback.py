@@ -6,6 +6,7 @@ itself: one whose frames are not answered changes nothing for the others.
 
 from collections import Counter, OrderedDict
 from collections.abc import Sequence
+from contextlib import ExitStack
 from typing import Final, Protocol, runtime_checkable
 
 from protocol.clock import monotonic_us
@@ -89,9 +90,10 @@ class Fallback:
         attach_detector(self._second, link)
 
     def close(self) -> None:
-        """Close both."""
-        close_detector(self._first)
-        close_detector(self._second)
+        """Close both, also where one fails to."""
+        with ExitStack() as ending:
+            ending.callback(close_detector, self._second)
+            ending.callback(close_detector, self._first)
 
     def news(self) -> list[str]:
         """What both have to say, and which of them drives."""
