@@ -81,8 +81,7 @@ class Strange:
         lambda one: [replace(one, detections=(replace(box(1), track_id=-1),))],
         lambda one: [replace(one, detections=(box(1),) * (MAX_DETECTED_BOXES + 1))],
         lambda one: [replace(one, device=None)], lambda one: [replace(one, model_hash=None)],
-        lambda one: [replace(one, detector=7)], lambda one: [replace(one, detector="ball\udce9.onnx")],
-        lambda one: [replace(one, device="\x1b[2J")],
+        lambda one: [replace(one, detector=7)],
         lambda one: [replace(one, compute_us=None)], lambda one: [replace(one, compute_us=math.nan)],
         lambda one: [], lambda one: [one, one], lambda one: None, lambda one: ["boxes"], lambda one: 1 / 0,
     ],
@@ -92,6 +91,14 @@ def test_nonsense_is_no_answer_and_counted(change) -> None:
     answer = strange.step(frame(1))
     assert answer.twist is None and answer.seen.phase == "no answer" and answer.seen.note
     assert strange.skipped == {NO_ANSWER: 1}
+
+
+def test_a_plug_in_may_be_called_after_any_file() -> None:
+    named = {"detector": "b\u3000ll\udce9.onnx", "device": "\x1b[2J"}
+    bench = Bench(VisionConfig(), Strange(lambda one: [replace(one, **named)]))
+    bench.frame()
+    report = bench.report()
+    assert (report.detector, report.device, report.note) == ("b?ll?.onnx", "?[2J", "")
 
 
 def test_whatever_a_plug_in_raises_can_be_reported() -> None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from numbers import Real
-from typing import Final
+from typing import Any, Final
 
 from protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER
 from vision_side.detect.labels import LONGEST_LABEL, is_label
@@ -46,8 +46,7 @@ def _answer(frame: DetectFrame, result: DetectionResult | None) -> DetectionResu
 
 
 def _why(error: Exception) -> str:
-    why = f"the detector's answer is none: {type(error).__name__}: {error}"[:_LONGEST_WHY]
-    return "".join(letter if letter.isprintable() else "?" for letter in why)
+    return _printable(f"the detector's answer is none: {type(error).__name__}: {error}"[:_LONGEST_WHY])
 
 
 def checked(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
@@ -63,26 +62,34 @@ def checked(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
     found = result.detections
     if len(found) > MAX_DETECTED_BOXES:  # the wire's own bound: which of more are the best is for the detector to say
         raise ValueError(f"{len(found)} boxes; {MAX_DETECTED_BOXES} is the most")
-    took_us = _checked_maker(result)
+    mended = _mended_maker(result)
     inside = tuple(part for one in found if (part := _checked(one, frame.width_px, frame.height_px)))
     unchanged = len(found) == len(inside) and all(one is part for one, part in zip(found, inside, strict=True))
-    if unchanged and took_us is result.compute_us:
+    if unchanged and not mended:
         return result
-    return replace(result, detections=inside, compute_us=took_us)
+    return replace(result, detections=inside, **mended)
 
 
-def _checked_maker(result: DetectionResult) -> int:
-    """Who looked is said in text. Returns how long it took as the wire has it; plug-ins count in any kind of number."""
+def _mended_maker(result: DetectionResult) -> dict[str, Any]:
+    """What is to be said otherwise of who looked, and for how long: printable, and in whole microseconds. A plug-in may
+    be called after any file, and count in any kind of number."""
+    mended: dict[str, Any] = {}
     for what in ("detector", "model_hash", "device"):
         text = getattr(result, what)
-        if not isinstance(text, str) or not text.isprintable():
-            raise ValueError(f"its {what} is {text!r}, which is no printable text")
+        if not isinstance(text, str):
+            raise ValueError(f"its {what} is {text!r}, which is no text")
+        if not text.isprintable():
+            mended[what] = _printable(text)
     took_us = result.compute_us
     if type(took_us) is int and 0 <= took_us <= MAX_INTEGER:
-        return took_us
+        return mended
     if not isinstance(took_us, Real) or math.isnan(took_us):
         raise ValueError(f"it took {took_us!r} microseconds")
-    return int(min(max(took_us, 0), MAX_INTEGER))
+    return mended | {"compute_us": int(min(max(took_us, 0), MAX_INTEGER))}
+
+
+def _printable(text: str) -> str:
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def _checked(one: Detection, width_px: int, height_px: int) -> Detection | None:
