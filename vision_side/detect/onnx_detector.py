@@ -71,31 +71,43 @@ class OnnxDetector:
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """A result for each frame for which there is still time; all at once where the model takes that."""
-        results: list[DetectionResult | None] = []
-        while len(results) < len(frames):
-            some = frames[len(results) : len(results) + self._at_once]
-            is_late = monotonic_us() > deadline_us
-            results += [None] * len(some) if is_late else self._looked(some, deadline_us)
-        return results
+        return self._in_parts(frames, deadline_us, self._at_once)
 
     def news(self) -> list[str]:
         """What it runs on, where that is not what one may think; the first failure."""
         news, self._news = self._news, []
         return news
 
+    def _in_parts(self, frames: Sequence[DetectFrame], deadline_us: int, most: int) -> list[DetectionResult | None]:
+        results: list[DetectionResult | None] = []
+        while len(results) < len(frames):
+            some = frames[len(results) : len(results) + most]
+            is_late = monotonic_us() > deadline_us
+            results += [None] * len(some) if is_late else self._looked(some, deadline_us)
+        return results
+
     def _looked(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         try:
             return timed_together(frames, self.maker, self._seen)
         except Exception as error:  # an engine that fails on a picture gives no answer, and says so once
-            if len(frames) > 1:  # too many for its memory, or more than the model's inside takes
-                self._at_once = len(frames) // 2
-                self._news.append(f"{self.maker.detector} fails on {len(frames)} pictures at once, from now on at most "
-                                  f"{self._at_once}: {str(error)[:120]}")
-                return self.detect(frames, deadline_us)
+            if len(frames) > 1:
+                return self._fewer_at_once(frames, deadline_us, error)
             if not self._failed:
                 self._news.append(f"{self.maker.detector} gives no answer: {str(error)[:160]}")
             self._failed = True
             return [None]
+
+    def _fewer_at_once(
+        self, frames: Sequence[DetectFrame], deadline_us: int, error: Exception
+    ) -> list[DetectionResult | None]:
+        """Too many for its memory, or more than the model's inside takes; where that helps, it stays so."""
+        fewer = len(frames) // 2
+        results = self._in_parts(frames, deadline_us, fewer)
+        if any(results) and fewer < self._at_once:
+            self._at_once = fewer
+            self._news.append(f"{self.maker.detector} fails on {len(frames)} pictures at once, from now on at most "
+                              f"{fewer}: {str(error)[:120]}")
+        return results
 
     def _seen(self, pictures: Sequence[Picture]) -> list[Sequence[Detection]]:
         together = _found(self._engine, pictures, self._form, self._min_score)
