@@ -34,10 +34,10 @@ class Scribe:
         self._lines: queue.Queue[str] = queue.Queue(_LINES_WAITING)
         self._closing = False
         threading.stack_size(_STACK_BYTES)  # the driver locks its memory, a stack of the usual 8 MB with it
-        self._threads = [threading.Thread(target=work, name=name, daemon=True)
-                         for name, work in (("latch", self._keep_all), ("scribe", self._print_all))]
-        for thread in self._threads:
-            thread.start()
+        self._keeper = threading.Thread(target=self._keep_all, name="latch", daemon=True)
+        self._printer = threading.Thread(target=self._print_all, name="scribe", daemon=True)
+        self._keeper.start()
+        self._printer.start()
 
     def keep(self, stopped: bool) -> None:
         """Want the latch so; never waits."""
@@ -55,17 +55,18 @@ class Scribe:
         self._closing = True
         self._asked.set()
         self.say("")
-        for thread in self._threads:
-            thread.join(max(0.0, ends_s - time.monotonic()))
+        self._keeper.join(_CLOSE_S)
+        self._printer.join(max(0.0, ends_s - time.monotonic()))
 
     def _keep_all(self) -> None:
         while not (self._closing and self._kept == self._wanted):
             self._asked.wait(_RETRY_S)
             self._asked.clear()
             self._keep()
+        self.say("")
 
     def _print_all(self) -> None:
-        while not (self._closing and self._lines.empty()):
+        while not (self._closing and self._lines.empty() and not self._keeper.is_alive()):
             with suppress(queue.Empty):
                 self._print(self._lines.get(timeout=_RETRY_S))
 

@@ -106,6 +106,22 @@ def test_a_mark_that_failed_half_way_is_written_again(latch, scribe, monkeypatch
         assert until(lambda: latch.is_set() is not stopped)
 
 
+def test_a_mark_that_fails_while_it_ends_is_told(latch, scribe, monkeypatch):
+    sys.stdout = written = io.StringIO()
+    slow = threading.Event()
+
+    def keep(_latch, _stopped):
+        slow.wait(0.2)
+        raise OSError(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(StopLatch, "keep", keep)
+        scribe.keep(True)
+        scribe.close()
+    assert "the STOP mark is not kept over a restart: Input/output error" in written.getvalue()
+    slow.set()
+
+
 class Failing:
     """A folder that cannot be written through."""
 
