@@ -85,7 +85,7 @@ class Dialer:
                 self._turned_away(self._hangs_up(), False)
             else:
                 self._turned_away(f"what answers there is no Sightline WebSocket ({type(error).__name__})", True)
-        except ssl.SSLEOFError:
+        except (ssl.SSLEOFError, ssl.SSLZeroReturnError):
             self._turned_away(self._hangs_up(), False)
         except ssl.SSLError as error:
             why = getattr(error, "verify_message", "") or error.reason or type(error).__name__

@@ -46,7 +46,8 @@ def _answer(frame: DetectFrame, result: DetectionResult | None) -> DetectionResu
 
 
 def _why(error: Exception) -> str:
-    return _printable(f"the detector's answer is none: {type(error).__name__}: {error}"[:_LONGEST_WHY])
+    why = " ".join(f"the detector's answer is none: {type(error).__name__}: {error}".split())
+    return _printable(why[:_LONGEST_WHY])
 
 
 def checked(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
