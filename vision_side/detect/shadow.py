@@ -81,9 +81,12 @@ class Shadowed:
                 answers = self._ask(promoted, [frames[index] for index in mine], deadline_us)
                 for index, answer in zip(mine, answers, strict=True):
                     results[index] = answer
-        both_drive = self._both_drive()
+        if self._both_drive():
+            with self._bell:
+                self._tasks.clear()
+            return results
         for frame, result in zip(frames, results, strict=True):
-            self._put(None if both_drive else _Task(frame, result, self._pair(frame).promoted))
+            self._put(_Task(frame, result, self._pair(frame).promoted))
         return results
 
     def attach(self, link: Link) -> None:
@@ -164,12 +167,9 @@ class Shadowed:
         since_us = monotonic_us() - _FRESH_US
         return len({one.promoted for one in self._pairs.values() if one.seen_us >= since_us}) > 1
 
-    def _put(self, task: _Task | None) -> None:
-        """The newest frame of each robot waits; an older one that was not looked at yet is left out. None: all are."""
+    def _put(self, task: _Task) -> None:
+        """The newest frame of each robot waits; an older one that was not looked at yet is left out."""
         with self._bell:
-            if task is None:
-                self._tasks.clear()
-                return
             self._tasks[task.frame.robot] = task
             if len(self._tasks) > MAX_ROBOTS:
                 self._tasks.popitem(last=False)
