@@ -16,7 +16,7 @@ from protocol.errors import ConfigError, HardwareError
 if TYPE_CHECKING:  # it needs the extra
     from operator_side.train_export import Weights
 
-STEPS = [15_000, 14_000, 13_000, 14_000, 20_000]
+STEPS = [15_000, 14_000, 13_000, 14_000, 20_000, 20_000]
 SCENES = 100_000
 BATCH = 32
 VALIDATED = 5000

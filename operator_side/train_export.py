@@ -64,7 +64,8 @@ def onnx_bytes(weights: Weights, properties: dict[str, str]) -> bytes:
     last = _image(graph)
     for layer in network():
         last = _layer(graph, layer, weights)
-    outputs = _suppressed(graph, *_decoded(graph, last))
+    _decoded(graph, last)
+    outputs = _suppressed(graph)
     model = helper.make_model(
         helper.make_graph(
             graph.nodes, "eyes",
@@ -79,7 +80,8 @@ def onnx_bytes(weights: Weights, properties: dict[str, str]) -> bytes:
 
 
 def weights_in(data: bytes) -> Weights:
-    """Those that `onnx_bytes` made a file of. Raises ValueError for a file of another network, or that is broken."""
+    """Those that `onnx_bytes` made a file of; what this network's layers are called in a larger one's. Raises ValueError
+    for a file that lacks a layer, or that is broken."""
     try:
         model = onnx.load_from_string(data)
     except DecodeError:
@@ -109,8 +111,8 @@ def _image(graph: Graph) -> str:
 
     So nothing is moved about: the first convolution steps over three columns for each pixel.
     """
-    names = [graph.constant(f"seen.{name}", value, np.int64) for name, value in
-             (("first", [0, 0]), ("end", [HEIGHT_PX, WIDTH_PX]), ("axes", [1, 2]), ("step", [LOOKED_AT, LOOKED_AT]))]
+    names = [graph.constant(f"seen.{name}", [value], np.int64) for name, value in
+             (("first", 0), ("end", HEIGHT_PX), ("axis", 1), ("step", LOOKED_AT))]
     graph.add("Slice", ["image", *names], "image.few")
     graph.add("Cast", ["image.few"], "image.few.float", to=TensorProto.FLOAT)
     graph.add("ReduceMean", ["image.few.float"], "image.mean", keepdims=0)
@@ -152,74 +154,61 @@ def _doubled(graph: Graph, name: str) -> str:
                      coordinate_transformation_mode="asymmetric", nearest_mode="floor")
 
 
-def _decoded(graph: Graph, head: str) -> tuple[str, str, str]:
-    """The best cells: corners (K, 4), scores (K,), labels (K,)."""
+def _decoded(graph: Graph, head: str) -> None:
+    """The best cells' `corners` (4, K), which are x1, y1, x2, y2, their `top.scores` (K,) and `labels` (K,)."""
     rows, columns = HEIGHT_PX // STRIDE, WIDTH_PX // STRIDE
     maps = [f"heat.{label}" for label in LABELS]
-    parts = graph.constant("parts", [*[1] * len(LABELS), GEOMETRY], np.int64)
-    graph.nodes.append(helper.make_node("Split", [head, parts], [*maps, "rest"], name="split", axis=1))
+    _split(graph, head, [*maps, "rest"], [*[1] * len(LABELS), GEOMETRY], axis=1)
     graph.add("Max", maps, "best")
     graph.add("MaxPool", ["best"], "around", kernel_shape=[3, 3], pads=[1, 1, 1, 1], strides=[1, 1])
     # A peak is no smaller than any cell around it; what is none counts as less than any peak.
     graph.add("GreaterOrEqual", ["best", "around"], "is_peak")
     graph.add("Where", ["is_peak", "best", graph.constant("no_peak", _NO_PEAK)], "peaks")
-    graph.add("Reshape", ["peaks", graph.constant("flat", [rows * columns], np.int64)], "peaks.flat")
+    _shaped(graph, "peaks", "peaks.flat", [rows * columns])
     most = graph.constant("most", [MOST_BOXES], np.int64)
     graph.nodes.append(helper.make_node("TopK", ["peaks.flat", most], ["marks", "cells"], name="topk", axis=0))
     graph.add("Sigmoid", ["marks"], "top.scores")
-    graph.add("Reshape", [head, graph.constant("flat9", [OUTPUTS, rows * columns], np.int64)], "flat.all")
+    _shaped(graph, head, "flat.all", [OUTPUTS, rows * columns])
     graph.add("Gather", ["flat.all", "cells"], "own.all", axis=1)
-    halves = graph.constant("halves", [len(LABELS), GEOMETRY], np.int64)
-    graph.nodes.append(helper.make_node("Split", ["own.all", halves], ["own.heat", "own"], name="split.halves", axis=0))
+    _split(graph, "own.all", ["own.heat", "off", "log"], [len(LABELS), 2, GEOMETRY - 2])
     graph.add("ArgMax", ["own.heat"], "labels", axis=0, keepdims=0)
-    _corners(graph, columns)
-    return "corners", "top.scores", "labels"
+    _corners(graph, rows, columns)
 
 
-def _corners(graph: Graph, columns: int) -> None:
-    """Cells and their geometry -> x1, y1, x2, y2, within the picture, (4, K)."""
-    graph.add("Cast", ["cells"], "cell", to=TensorProto.FLOAT)
-    graph.add("Add", ["cell", graph.constant("half_cell", 0.5)], "cell.middle")
-    graph.add("Div", ["cell.middle", graph.constant("columns", columns)], "cell.rows")
-    graph.add("Floor", ["cell.rows"], "cell.y")
-    graph.add("Mul", ["cell.y", "columns"], "cell.before")
-    graph.add("Sub", ["cell.middle", "cell.before"], "middle.x")
-    graph.add("Add", ["cell.y", "half_cell"], "middle.y")
-    parts = graph.constant("four", [1, 1, 1, 1], np.int64)
-    names = ["off.x", "off.y", "log.x", "log.y"]
-    graph.nodes.append(helper.make_node("Split", ["own", parts], names, name="split.own", axis=0))
-    stride, size = graph.constant("stride", STRIDE), graph.constant("half_size", SIZE_PX / 2)
-    zero, largest = graph.constant("zero", 0.0), graph.constant("largest", _LARGEST)
-    for axis, limit_px in (("x", WIDTH_PX), ("y", HEIGHT_PX)):
-        graph.add("Add", [f"middle.{axis}", f"off.{axis}"], f"at.{axis}")
-        graph.add("Mul", [f"at.{axis}", stride], f"px.{axis}")
-        graph.add("Min", [f"log.{axis}", largest], f"bounded.{axis}")
-        graph.add("Exp", [f"bounded.{axis}"], f"exp.{axis}")
-        graph.add("Mul", [f"exp.{axis}", size], f"half.{axis}")
-        limit = graph.constant(f"limit.{axis}", limit_px)
-        for sign, end in (("Sub", "1"), ("Add", "2")):
-            graph.add(sign, [f"px.{axis}", f"half.{axis}"], f"edge.{axis}{end}")
-            graph.add("Max", [f"edge.{axis}{end}", zero], f"inner.{axis}{end}")
-            graph.add("Min", [f"inner.{axis}{end}", limit], f"{axis}{end}")
-    graph.add("Concat", ["x1", "y1", "x2", "y2"], "corners", axis=0)
+def _corners(graph: Graph, rows: int, columns: int) -> None:
+    """Cells and their geometry, across and down at once -> `corners`, within the picture."""
+    down, across = np.mgrid[:rows, :columns] + 0.5
+    graph.constant("cell.middles", np.stack([across.ravel(), down.ravel()]))
+    graph.add("Gather", ["cell.middles", "cells"], "cell", axis=1)
+    graph.add("Add", ["cell", "off"], "at")
+    graph.add("Mul", ["at", graph.constant("stride", STRIDE)], "at.px")
+    graph.add("Min", ["log", graph.constant("largest", _LARGEST)], "bounded")
+    graph.add("Exp", ["bounded"], "size")
+    graph.add("Mul", ["size", graph.constant("half_size", SIZE_PX / 2)], "half.px")
+    graph.add("Sub", ["at.px", "half.px"], "low.free")
+    graph.add("Add", ["at.px", "half.px"], "high.free")
+    graph.add("Concat", ["low.free", "high.free"], "edges", axis=0)
+    graph.add("Max", ["edges", graph.constant("zero", 0.0)], "inner")
+    limits = [[WIDTH_PX], [HEIGHT_PX]] * 2
+    graph.add("Min", ["inner", graph.constant("limits", limits)], "corners")
 
 
-def _suppressed(graph: Graph, corners: str, scores: str, labels: str) -> list[tuple[str, int, list[int]]]:
+def _suppressed(graph: Graph) -> list[tuple[str, int, list[int]]]:
     """Scores of boxes that a better one covers become 0. The outputs' names, types and shapes."""
-    graph.add("Transpose", [corners], "boxes", perm=[1, 0])
-    column = graph.constant("column", [MOST_BOXES, 1], np.int64)
-    for name in ("x1", "y1", "x2", "y2"):
-        graph.add("Reshape", [name, column], f"{name}.column")
-    for axis in ("x", "y"):
-        graph.add("Min", [f"{axis}2", f"{axis}2.column"], f"right.{axis}")
-        graph.add("Max", [f"{axis}1", f"{axis}1.column"], f"left.{axis}")
-        graph.add("Sub", [f"right.{axis}", f"left.{axis}"], f"shared.{axis}")
-        graph.add("Max", [f"shared.{axis}", "zero"], f"common.{axis}")
-        graph.add("Sub", [f"{axis}2", f"{axis}1"], f"side.{axis}")
-    graph.add("Mul", ["common.x", "common.y"], "common")
-    graph.add("Mul", ["side.x", "side.y"], "area")
-    graph.add("Reshape", ["area", column], "area.column")
-    graph.add("Add", ["area", "area.column"], "areas")
+    graph.add("Transpose", ["corners"], "boxes", perm=[1, 0])
+    _split(graph, "corners", ["low", "high"], [2, 2])
+    for end in ("low", "high"):
+        _shaped(graph, end, f"{end}.across", [2, 1, MOST_BOXES])
+        _shaped(graph, end, f"{end}.down", [2, MOST_BOXES, 1])
+    graph.add("Min", ["high.across", "high.down"], "shared.high")
+    graph.add("Max", ["low.across", "low.down"], "shared.low")
+    graph.add("Sub", ["shared.high", "shared.low"], "shared")
+    graph.add("Max", ["shared", "zero"], "shared.sides")
+    graph.add("ReduceProd", ["shared.sides"], "common", axes=[0], keepdims=0)
+    graph.add("Sub", ["high", "low"], "sides")
+    graph.add("ReduceProd", ["sides"], "area", axes=[0], keepdims=0)
+    _shaped(graph, "area", "area.down", [MOST_BOXES, 1])
+    graph.add("Add", ["area", "area.down"], "areas")
     graph.add("Sub", ["areas", "common"], "union")
     graph.add("Mul", ["union", graph.constant("same", SAME_BOX)], "enough")
     graph.add("Greater", ["common", "enough"], "is_same")
@@ -228,9 +217,18 @@ def _suppressed(graph: Graph, corners: str, scores: str, labels: str) -> list[tu
     graph.add("Mul", ["same.float", better], "covered")
     graph.add("ReduceMax", ["covered"], "is_covered", axes=[1], keepdims=0)
     graph.add("Sub", [graph.constant("one", 1.0), "is_covered"], "kept")
-    graph.add("Mul", [scores, "kept"], "scores")
+    graph.add("Mul", ["top.scores", "kept"], "scores")
     return [("boxes", TensorProto.FLOAT, [MOST_BOXES, 4]), ("scores", TensorProto.FLOAT, [MOST_BOXES]),
-            (labels, TensorProto.INT64, [MOST_BOXES])]
+            ("labels", TensorProto.INT64, [MOST_BOXES])]
+
+
+def _split(graph: Graph, name: str, parts: list[str], sizes: list[int], axis: int = 0) -> None:
+    takes = [name, graph.constant(f"{name}.sizes", sizes, np.int64)]
+    graph.nodes.append(helper.make_node("Split", takes, parts, name=f"{name}.split", axis=axis))
+
+
+def _shaped(graph: Graph, source: str, name: str, shape: list[int]) -> None:
+    graph.add("Reshape", [source, graph.constant(f"{name}.shape", shape, np.int64)], name)
 
 
 def shifted(weights: Weights, thresholds: Sequence[float]) -> Weights:

@@ -44,7 +44,7 @@ class Network(nn.Module):  # type: ignore[misc]
     def forward(self, image: Any) -> Any:
         """Heat maps (before the sigmoid), geometry, heat maps of `TAUGHT`: (N, OUTPUTS + TAUGHT, H/4, W/4)."""
         seen = image.float() / 255
-        mean = seen[:, :, ::LOOKED_AT, ::LOOKED_AT].mean(dim=(1, 2, 3), keepdim=True).clamp(min=DARKEST)
+        mean = seen[:, :, ::LOOKED_AT].mean(dim=(1, 2, 3), keepdim=True).clamp(min=DARKEST)
         known = {"image": seen * (BRIGHTNESS / mean)}
         for layer in self.layers:
             known[layer.name] = self._run(layer, [known[name] for name in layer.takes])
@@ -53,7 +53,7 @@ class Network(nn.Module):  # type: ignore[misc]
     def _run(self, layer: Layer, takes: list[Any]) -> Any:
         if layer.kind in ("add", "add-up"):
             second = takes[1] if layer.kind == "add" else nn.functional.interpolate(takes[1], scale_factor=2)
-            return torch.relu(takes[0] + second)
+            return torch.relu(takes[0] + second) if layer.relu else takes[0] + second
         return getattr(self, _key(layer))(takes[0])
 
 

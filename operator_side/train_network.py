@@ -27,8 +27,8 @@ BRIGHTNESS: Final = 0.5
 """Each picture is scaled to this mean before all else, so that dim and bright look alike ..."""
 DARKEST: Final = 0.03
 """... unless it is darker than this, which would scale up mere noise."""
-LOOKED_AT: Final = 4
-"""Each fourth pixel of each fourth row is enough to know how bright a picture is."""
+LOOKED_AT: Final = 16
+"""Each sixteenth row is enough to know how bright a picture is."""
 COLOURS: Final = 3
 
 Kind = Literal["conv", "depthwise", "add", "add-up", "head"]
@@ -60,7 +60,7 @@ def network() -> tuple[Layer, ...]:
         *_down("sixteenth", "middle2", 128, 5),
     ]
     last = "sixteenth"
-    for number in range(1, 5):
+    for number in range(1, 4):
         layers += _block(f"coarse{number}", last, 128, 5)
         last = f"coarse{number}"
     return (
@@ -93,7 +93,7 @@ def _up(name: str, source: str, beside: str, channels: int, kernel: int) -> list
     """Bring what is known of the surroundings to twice the size and look again."""
     return [
         Layer(f"{name}.narrow", "conv", (source,), channels, relu=False),
-        Layer(f"{name}.joined", "add-up", (beside, f"{name}.narrow"), channels),
+        Layer(f"{name}.joined", "add-up", (beside, f"{name}.narrow"), channels, relu=False),
         Layer(f"{name}.around", "depthwise", (f"{name}.joined",), channels, kernel),
         Layer(name, "conv", (f"{name}.around",), channels),
     ]

@@ -13,11 +13,11 @@ import cv2
 import onnx
 import torch
 
-from operator_side import cli, train_run
+from operator_side import cli, train_export, train_run
 from operator_side.train_export import onnx_bytes, weights_in
 from operator_side.train_loop import train
 from operator_side.train_module import Network, begin_from, folded
-from operator_side.train_network import AGAINST, OUTPUTS
+from operator_side.train_network import AGAINST, OUTPUTS, Layer, network
 from operator_side.train_rounds import Training
 from operator_side.train_samples import CUT_PX
 from operator_side.train_scenes import DrawnScenes
@@ -131,6 +131,17 @@ def test_a_network_that_begins_from_a_file_gives_what_the_file_gives():
         seen_by_batch = network(images)
         seen_by_itself = network.eval()(images)
     assert seen_by_batch == pytest.approx(seen_by_itself, abs=1e-2), "the normalisation knows what it will see"
+
+
+def test_a_larger_networks_file_gives_the_layers_that_are_left(monkeypatch):
+    given, draw = weights(), np.random.default_rng(5)
+    larger = [*network()[:-1], Layer("more", "conv", ("top",), 32), network()[-1]]
+    more = {"more.weight": draw.normal(size=(32, 32, 1, 1)), "more.bias": draw.normal(size=32)}
+    with monkeypatch.context() as patched:
+        patched.setattr(train_export, "network", lambda: tuple(larger))
+        content = onnx_bytes({**given, **more}, {})
+    left = weights_in(content)
+    assert set(left) == set(given) and all(np.array_equal(left[name], value) for name, value in given.items())
 
 
 def test_the_last_round_alone_is_trained_from_a_file(tmp_path, capsys):

@@ -6,7 +6,7 @@ from operator_side.train_rounds import LEAST_SHARE, WHOLE_FROM, Shown, Training
 
 
 @pytest.mark.parametrize("rounds", [(1000,), (1000, 600), (300, 1000, 500), (300, 400, 500, 600, 700)])
-def test_each_round_has_the_rate_up_and_down_again_half_as_high_but_not_below_an_eighth(rounds):
+def test_each_round_has_the_rate_up_and_down_again_half_as_high_but_not_below_a_quarter(rounds):
     training, begin = Training(rounds), 0
     for steps, highest in zip(rounds, [1, 0.5, 0.25, LEAST_SHARE, LEAST_SHARE], strict=False):
         rates = [training.rate_at(step) for step in range(begin, begin + steps)]
