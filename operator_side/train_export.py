@@ -80,8 +80,8 @@ def onnx_bytes(weights: Weights, properties: dict[str, str]) -> bytes:
 
 
 def weights_in(data: bytes) -> Weights:
-    """Those that `onnx_bytes` made a file of; what this network's layers are called in a larger one's. Raises ValueError
-    for a file that lacks a layer, or that is broken."""
+    """Those that `onnx_bytes` made a file of; what this network's layers are called in a larger one's. Raises
+    ValueError for a file that lacks a layer, or that is broken."""
     try:
         model = onnx.load_from_string(data)
     except DecodeError:
