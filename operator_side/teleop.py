@@ -9,7 +9,7 @@ from enum import Enum
 from typing import Final
 
 from operator_side.requests import Report, read_report
-from operator_side.teleop_keys import HAND_OVER, MOVES, SPEEDS, STOPS, Hold, split_keys
+from operator_side.teleop_keys import HAND_OVER, MOST_AT_ONCE, MOVES, SPEEDS, STOPS, Hold, split_keys
 from operator_side.teleop_speed import Speeds, SpeedUp
 from protocol.channels import ACK, REPLY, REQUEST, TWIST, Channel
 from protocol.codec import decode, encode
@@ -62,6 +62,8 @@ class Teleop:
         """What the person should know beside the robot's status."""
         self._hold = Hold()
         self._stick: tuple[float, float] | None = None
+        self._stick_waits = False
+        """Somebody stopped, or handed over, with the dead man's button held: it has to be let go of first."""
         self._speed_up = SpeedUp()
         self._echo: Echo | None = None
         self._unanswered = False
@@ -75,8 +77,13 @@ class Teleop:
     # --- what comes in -------------------------------------------------------------------------------------------
 
     def on_keys(self, text: str, now_us: int) -> None:
-        """What was read from the terminal."""
-        for key in split_keys(text):
+        """What was read from the terminal at once. A pile of keys is what a link that stalled or a paste brings, and
+        tells of no key that is held now: only stopping counts."""
+        keys = split_keys(text)
+        if len(keys) > MOST_AT_ONCE:
+            keys = [key for key in keys if key in STOPS]
+            self._hold.miss(now_us)
+        for key in keys:
             if key in MOVES:
                 self._drive(self._hold.press(key, now_us), now_us)
             elif key in STOPS:
@@ -88,6 +95,9 @@ class Teleop:
 
     def on_stick(self, shares: tuple[float, float] | None, now_us: int) -> None:
         """A gamepad: shares (-1..1) of both speeds while its dead man's button is held, else None."""
+        self._stick_waits &= shares is not None
+        if self._stick_waits:
+            return
         pressed = shares is not None and self._stick is None
         released = shares is None and self._stick is not None
         self._stick = shares
@@ -143,15 +153,19 @@ class Teleop:
 
     def stop(self) -> None:
         """Stand still, whoever drove; the robot stays armed, in this person's hands."""
-        self._hold.release()
-        self._stick = None
+        self._let_go()
         self.mode, self._asking, self._due_us = Mode.DRIVING, None, 0
 
     def hand_over(self, now_us: int) -> None:
         """Let go of the robot and arm whoever else sends commands: the one way back to autonomy, and a person's own."""
-        self._hold.release()
+        self._let_go()
         self.mode, self.note = Mode.HANDING_OVER, ""
         self._ask(Verb.RELEASE, now_us, _HAND_OVER_FOR_US)
+
+    def _let_go(self) -> None:
+        self._hold.release()
+        self._stick_waits |= self._stick is not None
+        self._stick = None
 
     def leave(self) -> Iterator[Message]:
         """The last words: zero, then the lease given back, again until `has_left`. Nothing where another one drives."""

@@ -20,6 +20,8 @@ SPEEDS: Final[dict[str, tuple[int, int]]] = {
 """Key -> whether (linear, angular) speed goes up or down."""
 STOPS: Final = ("k", " ", "\x1b[E")
 HAND_OVER: Final = "a"
+MOST_AT_ONCE: Final = 4
+"""Keys of one read that hands on a keyboard may bring: at 30 repeats a second, what comes in 130 ms."""
 
 _FIRST_DELAY_US: Final = 500_000
 """From a press to its first repeat on most desktops, until it is learnt."""
@@ -88,6 +90,11 @@ class Hold:
     def release(self) -> None:
         """Nothing is held any more."""
         self.key, self._presses = "", 0
+
+    def miss(self, now_us: int) -> None:
+        """Keys came that tell nothing of now; what follows them is no fresh press."""
+        self.release()
+        self._last_us = now_us
 
     def is_held(self, now_us: int) -> bool:
         """Whether the key has to be taken as held."""

@@ -7,8 +7,11 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
+EV_SYN: Final = 0
 EV_KEY: Final = 1
 EV_ABS: Final = 3
+SYN_DROPPED: Final = 3
+"""Events were lost: nobody had read for long. A release may be among them."""
 ABS_X, ABS_Y, ABS_RX = 0, 1, 3
 BTN_SOUTH, BTN_EAST, BTN_TL, BTN_TR = 0x130, 0x131, 0x136, 0x137
 _DEAD_MAN: Final = frozenset((BTN_TL, BTN_TR))
@@ -42,6 +45,10 @@ class Pad:
         """Take one event; a button that acts is returned. STOP also asks for the shoulder button anew."""
         if kind == EV_ABS and code in self.ranges:
             self._axes[code] = self._share(code, value)
+        elif (kind, code) == (EV_SYN, SYN_DROPPED):
+            self._held.clear()
+            self._axes.clear()
+            self._stopped = False
         elif kind == EV_KEY and code in _DEAD_MAN:
             (self._held.add if value else self._held.discard)(code)
             self._stopped &= bool(self._held)

@@ -7,7 +7,19 @@ from types import SimpleNamespace
 import pytest
 
 from operator_side.teleop_evdev import Gamepad
-from operator_side.teleop_pad import ABS_X, ABS_Y, BTN_EAST, BTN_SOUTH, BTN_TL, EV_ABS, EV_KEY, PadKey
+from operator_side.teleop_pad import (
+    ABS_X,
+    ABS_Y,
+    BTN_EAST,
+    BTN_SOUTH,
+    BTN_TL,
+    EV_ABS,
+    EV_KEY,
+    EV_SYN,
+    SYN_DROPPED,
+    Pad,
+    PadKey,
+)
 from protocol.errors import ConfigError, HardwareError
 
 
@@ -79,3 +91,16 @@ def test_without_evdev_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "evdev", None)
     with pytest.raises(ConfigError, match=r"evdev is not installed: pip install 'sightline\[gamepad\]'"):
         Gamepad("auto")
+
+
+def test_after_events_were_lost_nothing_counts_as_held():
+    """The release may have been among them; what is not pressed anew does not drive."""
+    pad = Pad({ABS_Y: (0, 255)})
+    pad.on_event(EV_KEY, BTN_TL, 1)
+    pad.on_event(EV_ABS, ABS_Y, 0)
+    assert pad.shares == (1.0, 0.0)
+    pad.on_event(EV_SYN, SYN_DROPPED, 0)
+    pad.on_event(EV_ABS, ABS_Y, 10)
+    assert pad.shares is None
+    pad.on_event(EV_KEY, BTN_TL, 1)
+    assert pad.shares is not None

@@ -1,8 +1,9 @@
 """What teleop shows a person, and a gamepad's stick at the gate: in virtual time."""
 
+import pytest
 
 from operator_side.teleop_text import live_line
-from protocol.messages import STILL, Twist
+from protocol.messages import STILL, State, Twist, Verb
 from tests.teleop_rig import TeleopRig, vision_drives
 
 
@@ -44,3 +45,53 @@ def test_a_stick_drives_proportionally_and_its_release_is_zero_at_once():
     rig.teleop.on_stick(None, rig.now_us)
     rig.step()
     assert rig.commands[-1] == (rig.now_us, STILL)
+
+
+@pytest.mark.parametrize("act", ["k", " ", "a"])
+def test_a_stick_that_was_held_when_a_key_stopped_it_drives_only_once_pressed_anew(act):
+    rig = TeleopRig(vision=True).armed()
+    rig.teleop.on_stick((1.0, 0.0), rig.now_us)
+    rig.run(0.5)
+    rig.tap(act)
+    asked = len(rig.asked)
+    for _ in range(100):  # a stick that jitters, its button held or jammed
+        rig.teleop.on_stick((0.99, 0.01), rig.now_us)
+        rig.run(0.01)
+    assert all(twist == STILL for us, twist in rig.commands if us > rig.now_us - 900_000)
+    assert act == "a" or Verb.ARM not in rig.asked[asked:], "handing over arms whoever else drives"
+    rig.teleop.on_stick(None, rig.now_us)
+    rig.teleop.on_stick((1.0, 0.0), rig.now_us)
+    assert rig.until(lambda: rig.applied.linear_mps == pytest.approx(0.2), 2.0) is not None
+
+
+@pytest.mark.parametrize("pile", ["i" * 90, "sightline arm", "iiiii", "\x1b[A" * 6])
+def test_a_pile_of_keys_of_one_read_neither_arms_nor_drives(pile):
+    """What a link that stalled hands over at once, or a paste."""
+    rig = TeleopRig()
+    rig.run(0.5)
+    rig.tap(pile)
+    rig.run(2.0)
+    assert Verb.ARM not in rig.asked and {twist for _, twist in rig.commands} <= {STILL} and rig.state is State.DISARMED
+
+
+def test_a_pile_of_keys_lets_go_of_what_was_held_and_a_stop_in_it_stops():
+    for pile in ("i" * 30, "iiii k iii"):
+        rig = TeleopRig().armed()
+        rig.hold("i")
+        rig.run(1.0)
+        rig.let_go()
+        rig.tap(pile)
+        rig.step()
+        assert rig.until(lambda: rig.applied == STILL, 1.0) is not None  # noqa: B023
+        rig.run(0.5)
+        assert rig.commands[-1][1] == STILL
+
+
+def test_a_key_still_held_after_a_pile_drives_without_arming():
+    rig = TeleopRig().armed()
+    rig.hold("i")
+    rig.run(1.0)
+    asked = len(rig.asked)
+    rig.tap("i" * 30)
+    rig.run(1.0)
+    assert rig.applied.linear_mps == pytest.approx(0.2) and rig.asked[asked:] == []
