@@ -187,7 +187,7 @@ class _FailingRuntime(_FakeRuntime):
             if providers != ["CPUExecutionProvider"] and enable_fallback:
                 print("EP Error")
             elif providers != ["CPUExecutionProvider"]:
-                raise RuntimeError("CUDA failure 100: no CUDA-capable device is detected")
+                raise Exception("CUDA failure 100")  # as ONNX Runtime does
 
 
 @pytest.mark.parametrize("runtime", [_FakeRuntime, _FailingRuntime])
@@ -282,8 +282,9 @@ def test_a_golden_output_that_differs_ends_it(tmp_path: Path) -> None:
     again = brightness_model(tmp_path / "g.onnx", BOXES, [0, 1], golden=golden_text(found))
     assert detector(again, min_score=0.1).maker.device == "cpu"
     other = golden_text([Detection(1, 1, 9, 9, 0.99, "ball")])
-    with pytest.raises(HardwareError, match="ball at \\(1, 1\\)"):
-        detector(brightness_model(tmp_path / "w.onnx", BOXES, [0, 1], golden=other), min_score=0.1)
+    for least in (0.1, 0.95):  # what is asked of a picture has nothing to do with what the file should give
+        with pytest.raises(HardwareError, match="ball at \\(1, 1\\)"):
+            detector(brightness_model(tmp_path / "w.onnx", BOXES, [0, 1], golden=other), min_score=least)
     with pytest.raises(ConfigError, match="golden"):
         detector(brightness_model(tmp_path / "b.onnx", BOXES, [0, 1], golden="[1]"))
 

@@ -174,11 +174,16 @@ class FakeRemote(Held):
 
     state = "good"
 
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.besides = []
+
     def detect(self, frames, deadline_us):
         self.good = self.state == "good"
         return super().detect(frames, deadline_us)
 
     def ask(self, frames, deadline_us):
+        self.besides.append(deadline_us)
         results = self.detect(frames, deadline_us) if self.state in ("good", "none") else None
         return Asked(results, self.state in ("late", "overtaken"), self.state != "overtaken")
 
@@ -197,6 +202,17 @@ def test_late_once_and_own_eyes_drive_on_in_that_very_frame():
     assert fallback.detect([frame(2)], deadline_us)[0].detector == "own"
     assert remote.deadlines[-1] == deadline_us - RESERVE_US and own.deadlines == [deadline_us]
     assert "own eyes drive on" in fallback.news()[0] and fallback.switched == 1
+
+
+def test_asked_beside_the_remote_has_no_more_time_than_when_it_drives():
+    """Or one that takes most of the deadline would be good beside, late when it drives, and change each second."""
+    remote = FakeRemote()
+    fallback = Fallback(remote, Held("own"))
+    remote.state = "none"
+    _who(fallback, 1)
+    deadline_us = within(2)
+    fallback.detect([frame(2)], deadline_us)
+    assert remote.besides == [deadline_us - RESERVE_US]
 
 
 def test_of_a_short_deadline_the_remote_has_half():

@@ -1,6 +1,7 @@
 """What is told of a remote that is not answered, and when a model server is asked anew what its model is like."""
 
 import json
+import time
 from dataclasses import asdict
 
 import numpy as np
@@ -65,11 +66,12 @@ class ModelServer(Server):
 
     def __init__(self, closes):
         self.headers = ["Connection: close"] if closes else []
-        self.slots, self.told, self.status = OUTPUTS, 0, "200 OK"
+        self.slots, self.told, self.status, self.takes_s = OUTPUTS, 0, "200 OK", 0.0
         super().__init__(self._answer)
 
     def _answer(self, request):
         head, body = request
+        time.sleep(self.takes_s)
         if head.startswith("GET"):
             self.told += 1
             said = {"name": "ball", "versions": ["1"], "platform": "x", "inputs": [asdict(JPEG_INPUT)],
@@ -106,6 +108,20 @@ def test_a_model_is_asked_for_once_and_again_after_an_error(closes):
         server.start(port)
         server.slots = OUTPUTS
         assert label(9) in ("ball", "box") and (closes or label(10) == "box"), "another server, unnoticed if it closes"
+        detector.close()
+
+
+def test_a_server_that_was_late_once_is_not_made_later_by_asking_for_its_model_again():
+    """60 ms for each request of 100: once the model is known that is enough, with its metadata asked for it is not."""
+    with ModelServer(closes=False) as server:
+        detector = Asking("oip", HttpServer(parse_address(f"oip+http://127.0.0.1:{server.port}/ball"), Looking(("b",))))
+        assert detector.detect([frame(1)], within(2)) != [None]
+        server.takes_s = 0.2
+        assert detector.detect([frame(2)], within(0.1)) == [None]
+        server.takes_s = 0.06
+        time.sleep(0.2)
+        seen = [detector.detect([frame(seq)], within(0.1))[0] for seq in range(3, 9)]
+        assert sum(one is not None for one in seen) >= 4 and server.told == 1
         detector.close()
 
 

@@ -117,7 +117,7 @@ class OnnxDetector:
     def _warm_up(self, model: "Model", config: Config) -> None:
         """Run warm, on the known picture, and compare: with what the model brought, or with itself on the CPU."""
         picture, path, expected = Picture(golden_picture(), 1), model.path, model.expected
-        form, least = model.own_form, max(self._min_score, model.own_min_score)
+        form, least = model.own_form, model.own_min_score
         try:
             for _ in range(_WARM_UP):
                 (found,) = _found(self._engine, [picture], form, least)
@@ -157,7 +157,7 @@ def read_model(config: OnnxDetector.Config) -> Model:
         header = read_onnx_header(data)
         form, least = form_of(header, config.names, config.colour), _least(config.min_score, header)
         if KEY not in header.metadata:
-            return Model(path, header, form, least, None, form, least, digest)
+            return Model(path, header, form, least, None, form, _least(None, header), digest)
         own = replace(form, labels=own_labels(header.metadata))
         return Model(path, header, form, least, read_golden(header.metadata[KEY]), own, _least(None, header), digest)
     except ValueError as error:

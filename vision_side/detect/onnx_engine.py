@@ -93,7 +93,7 @@ def _session(runtime: Any, path: Path, options: Any, providers: list[str]) -> An
     """On the CPU where the others fail; ONNX Runtime would do that by itself, and print it where our output goes."""
     try:
         return runtime.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
-    except (RuntimeError, ValueError):
+    except Exception:  # ONNX Runtime's own errors are no RuntimeErrors
         if len(providers) == 1:
             raise
     return runtime.InferenceSession(str(path), options, providers=[PROVIDERS["cpu"]], enable_fallback=0)

@@ -76,12 +76,13 @@ class Fallback:
         self._judge()
         firsts = [one for one in frames if one.robot not in self._good]
         others = [one for one in frames if one.robot in self._good]
-        answers = iter(self._by_first(firsts, deadline_us))
+        first_us = deadline_us - min(RESERVE_US, max(0, deadline_us - monotonic_us()) // 2)
+        answers = iter(self._first.detect(firsts, first_us) if firsts else [])
         results = [next(answers, None) if one.robot not in self._good else None for one in frames]
         for frame, result in zip(frames, results, strict=True):
             if result is None and frame.robot not in self._good:
                 self._switch(frame.robot)
-        self._ask_beside(others, deadline_us)
+        self._ask_beside(others, first_us)  # who would be late when it drives is late here, too
         return self._filled(results, frames, deadline_us)
 
     def attach(self, link: Link) -> None:
@@ -98,10 +99,6 @@ class Fallback:
     def news(self) -> list[str]:
         """What both have to say, and which of them drives."""
         return [*news_of(self._first), *self._news.take(), *news_of(self._second)]
-
-    def _by_first(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
-        reserve_us = min(RESERVE_US, max(0, deadline_us - monotonic_us()) // 2)
-        return self._first.detect(frames, deadline_us - reserve_us) if frames else []
 
     def _switch(self, robot: str) -> None:
         """From now on the second drives."""

@@ -35,7 +35,8 @@ _REASONS: Final = {"DEADLINE_EXCEEDED": Reason.LATE, "UNAVAILABLE": Reason.UNREA
 
 
 class GrpcServer:
-    """A `Server`. What the model is like is asked again after every call that failed."""
+    """A `Server`. What the model is like is asked again after every call that failed otherwise than by
+    lateness."""
 
     def __init__(self, address: Address, looking: Looking) -> None:
         """Raises ConfigError without grpcio."""
@@ -76,8 +77,10 @@ class GrpcServer:
         try:
             answer: bytes = self._calls[path](request, timeout=left)
         except self._failed as error:
-            self._model = None
-            raise _no_answer(error) from None
+            refused = _no_answer(error)
+            if refused.reason is not Reason.LATE:  # to ask anew would make the next answer later still
+                self._model = None
+            raise refused from None
         return answer
 
 

@@ -8,11 +8,11 @@ from vision_side.detect.remote.http_exchange import HttpExchange
 from vision_side.detect.remote.oip import Looking, Model, detections_of, tensor_of
 from vision_side.detect.remote.oip_json import HEADER_LENGTH, infer_body, read_infer, read_metadata
 from vision_side.detect.remote.oip_settings import OipSettings
-from vision_side.detect.remote.refusing import NoAnswerError
+from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
 
 class HttpServer:
-    """A `Server`. What the model is like is asked once, and again after every error and every lost connection."""
+    """A `Server`. What the model is like is asked once, and again after every error but lateness."""
 
     def __init__(self, address: Address, looking: Looking) -> None:
         self._http = HttpExchange(address.host, address.port)
@@ -28,8 +28,9 @@ class HttpServer:
         """As `Server` says."""
         try:
             return self._answer(frame, until_us)
-        except NoAnswerError:
-            self._model = None
+        except NoAnswerError as error:
+            if error.reason is not Reason.LATE:  # to ask anew would make the next answer later still
+                self._model = None
             raise
 
     def _answer(self, frame: DetectFrame, until_us: int) -> Answer:
