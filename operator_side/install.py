@@ -75,13 +75,14 @@ def _fitted(unit: str, service: str, program: Path, config: Path) -> str:
 
 
 def write(planned: Plan, beside: Plan | None = None) -> None:
-    """Put the unit in place, and what belongs beside it, and begin it, now and at every start of the machine.
+    """Put the unit in place, and what belongs beside it, and begin it, now and at every start of the machine. One that
+    runs already begins anew: with other pins than those that are put low at its end it must not go on.
 
     Raises ConfigError, with nothing begun, where it may not be written or systemd does not run.
     """
     for one in [planned, *([beside] if beside else [])]:
         _put(one)
-    for command in (["daemon-reload"], ["enable", "--now", planned.path.name]):
+    for command in (["daemon-reload"], ["enable", planned.path.name], ["restart", planned.path.name]):
         _systemctl(command)
 
 

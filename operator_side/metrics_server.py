@@ -5,10 +5,12 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol
+from socketserver import ThreadingMixIn
+from typing import TYPE_CHECKING, Any, Final, Protocol
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from protocol.errors import LinkError
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 
     Family = GaugeMetricFamily | CounterMetricFamily
 
+_IDLE_S: Final = 20
+"""After that a connection that says nothing is let go of."""
 Respond = Callable[[str, list[tuple[str, str]]], Any]
 
 
@@ -80,8 +84,22 @@ def serving(told: Told, host: str, port: int) -> Iterator[int]:
         server.server_close()
 
 
+class _Server(ThreadingMixIn, WSGIServer):
+    """Each connection on a thread: one that says nothing holds up neither the others nor the end."""
+
+    daemon_threads = True
+    block_on_close = False
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Who goes away in the middle of it, or says nothing, is no error of ours."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
+
 class _Quiet(WSGIRequestHandler):
     """One line per change of state, never one per request."""
+
+    timeout = _IDLE_S
 
     def log_message(self, format: str, *arguments: Any) -> None:
         """Say nothing."""
@@ -89,7 +107,7 @@ class _Quiet(WSGIRequestHandler):
 
 def _listening(host: str, port: int, answer: Callable[..., Iterable[bytes]]) -> WSGIServer:
     try:
-        return make_server(host, port, answer, handler_class=_Quiet)
+        return make_server(host, port, answer, server_class=_Server, handler_class=_Quiet)
     except OSError as error:
         owner = port_owner(port)
         by = f" by {owner}" if owner else ""

@@ -145,7 +145,8 @@ def test_both_files_are_shown_first_and_written_when_asked(car, capsys):
     written = [(units / name).read_text() for name in
                ("sightline-robot.service", "sightline-robot.service.d/gpio-low.conf")]
     assert "\n".join(written) == shown.out, "what was shown is what is written"
-    assert told == [["daemon-reload"], ["enable", "--now", "sightline-robot.service"]]
+    assert told == [["daemon-reload"], ["enable", "sightline-robot.service"],
+                    ["restart", "sightline-robot.service"]], "one that runs has to go on with the new pins"
 
 
 def test_the_pins_of_a_drive_that_is_gone_are_left_alone_again(car, capsys):
