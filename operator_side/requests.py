@@ -65,7 +65,7 @@ class Operator:
     def wait_report(self, timeout_s: float = 2.0) -> Report:
         """The next status. Raises LinkError when none comes, saying so of a robot of another protocol version."""
         with self._news:
-            seen = self._reports
+            seen, self._version_trouble = self._reports, ""
             if not self._news.wait_for(lambda: self._reports > seen or self._version_trouble, timeout_s):
                 raise LinkError(
                     f"robot {self._link.robot!r} is not heard within {timeout_s:g} s; `sightline robots` lists who is"
@@ -138,7 +138,9 @@ class Operator:
             report = read_report(message)
         except WireError as error:
             if error.reason is Refusal.UNSUPPORTED_VERSION:
-                self._version_trouble = error.detail
+                with self._news:
+                    self._version_trouble = error.detail
+                    self._news.notify_all()
             return
         with self._news:
             self._report = report

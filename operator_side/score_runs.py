@@ -44,7 +44,7 @@ class Case:
     def group(self) -> str:
         """What it shares with the runs of other seeds."""
         others = "".join(f" {one}" for one in (self.mission, self.robot, self.look, self.detector) if one)
-        return f"{self.scenario}{others} +{self.latency_ms:g} ms {self.loss:.0%} loss"
+        return f"{self.scenario}{others} +{self.latency_ms:g} ms {100 * self.loss:g}% loss"
 
 
 @dataclass(frozen=True, slots=True)

@@ -183,6 +183,8 @@ def load_robot(name: str) -> RobotModel:
 def _measure(table: dict[str, Any], path: Path) -> None:
     """Fill in what the URDF says of wheels and sensors. Raises ConfigError."""
     file = path.parent / str(table["urdf"])
+    if not file.exists() and (ROBOTS / str(table["urdf"])).exists():
+        file = ROBOTS / str(table["urdf"])  # it is that of the robot which this one extends
     table["urdf"] = str(file)
     wheels = _table(table, "wheels", path)
     joints = [wheels.get(name) for name in ("left_joint", "right_joint")]

@@ -115,6 +115,15 @@ def test_silence_and_another_version_are_told_apart():
         other.operator.wait_report(timeout_s=1.0)
 
 
+def test_a_status_of_another_version_is_forgotten_once_it_is_not_heard_any_more():
+    """It was anybody's: waiting for the next report waits again, and gets it."""
+    with PumpedRobot() as robot:
+        stray = Message(STATUS, "", b'{"v":2,"session":"0000000f","seq":1,"t_us":1}', b"{}")
+        robot.operator._on_status(stray)
+        for _ in range(3):
+            assert robot.operator.wait_report(2.0).status is not None
+
+
 def test_replies_to_others_are_not_taken():
     with PumpedRobot() as robot:
         other = Operator(robot.network.link("r1", role="operator"))

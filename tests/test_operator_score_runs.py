@@ -25,6 +25,11 @@ def test_every_combination_is_a_case_and_groups_lie_together():
                for name in groups)
 
 
+def test_losses_that_differ_a_little_are_not_judged_as_one():
+    assert len({case.group for case in cases(["static"], [1], [0], [0.001, 0.004, 0.101, 0.104, 0.1], None)}) == 5
+    assert cases(["static"], [1], [50], [0.1], None)[0].group == "static +50 ms 10% loss"
+
+
 @pytest.mark.parametrize(
     "arguments",
     [(["cirle"], [1], [0], [0]), (["circle"], [], [0], [0]), (["circle"], [-1], [0], [0]),

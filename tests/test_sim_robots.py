@@ -134,3 +134,12 @@ def test_small_sensors_beside_see_what_is_beside_and_what_is_between_is_inf():
     beside = min(away_m for away_m in scan.ranges_m)
     assert beside == pytest.approx(0.20, abs=0.01)
     assert len(seen_deg) < 30, "of 120 rays, most are between"
+
+
+@pytest.mark.parametrize("name", [name for name in robot_names() if name != "chaser-small"])  # extends one itself
+def test_a_robot_of_ones_own_extends_any_that_comes_along(name, tmp_path):
+    """Also one with a urdf, which lies beside the one that is extended."""
+    mine = tmp_path / "mine.toml"
+    mine.write_text(f'extends = "{name}"\n[camera]\nfps = 15\n')
+    model, base = load_robot(str(mine)), load_robot(name)
+    assert model.camera.fps == 15 and model.wheels == base.wheels and model.urdf == base.urdf
