@@ -72,6 +72,31 @@ class Bench:
         return self.service.tallies()["r1"]
 
 
+def test_what_is_refused_is_no_load_and_each_reason_is_told_once():
+    says = Says(GOOD)
+    bench = Bench(says)
+    assert bench.look() is not None
+    says.found = (ValueError("out of memory"),)
+    for _ in range(30):
+        assert bench.look() is None
+    says.found, says.changes = (GOOD,), {"device": "d" * 100}
+    for _ in range(30):
+        assert bench.look() is None
+    told = [line for line in bench.words if "looks at" not in line]
+    assert len(told) == 2 and "out of memory" in told[0] and "cannot be sent" in told[1]
+    bench.service._look_at_load(1e9)
+    assert bench.tally().refused == 60 and "overloaded" not in bench.service.about() and len(bench.words) == 3
+
+
+def test_other_reasons_each_time_end_somewhere():
+    says = Says()
+    bench = Bench(says)
+    for number in range(100):
+        says.found = (ValueError(f"failure {number}"),)
+        bench.look()
+    assert 4 < len(bench.words) < 20
+
+
 def test_an_answer_that_is_too_long_for_the_wire_loses_its_last_boxes_and_ends_nothing():
     bench = Bench(Says(*[LONGEST] * 64))
     said = bench.look()

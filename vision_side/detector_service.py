@@ -46,6 +46,8 @@ _AGES: Final = 512
 """Ages kept for the percentile; some seconds of a busy service."""
 _SMOOTHING: Final = 0.2
 _LOOK_AT_LOAD_S: Final = 5.0
+_MOST_WHYS: Final = 8
+"""Reasons that are told: a plug-in's may be another each time."""
 _OVERLOAD: Final = 0.1
 """Share of frames that go unanswered, from which on it is said that there are too many."""
 Say = Callable[[str], None]
@@ -116,7 +118,8 @@ class DetectorService:
         self._maker = (maker.model_hash[:8], maker.device) if maker else ("", "")
         self._looked_at_load_s = time.monotonic()
         self._load_before = (0, 0)
-        self._overloaded = self._failed = False
+        self._overloaded = False
+        self._whys: set[str] = set()
         site.on_news(lambda: self._bell.put(True))
 
     def serve(self, ending: threading.Event) -> None:
@@ -202,11 +205,11 @@ class DetectorService:
         return self._decoders.frame(turn.robot, header, jpeg, sides)
 
     def _refuse(self, turn: Turn[Message], why: str, late: bool = False) -> None:
-        """Count it; the first is told: the others are in the tallies."""
+        """Count it. Each reason is told once, as far as there are few; the rest is in the tallies."""
         tally = self._tally(turn)
         tally.late, tally.refused = tally.late + late, tally.refused + (not late)
-        if not self._failed:
-            self._failed = True
+        if why not in self._whys and len(self._whys) < _MOST_WHYS:
+            self._whys.add(why)
             self._say(f"detector: {why}")
 
     def _answer(self, turn: Turn[Message], frame: DetectFrame, result: DetectionResult, took_us: int) -> None:
@@ -233,7 +236,8 @@ class DetectorService:
         """Say so when more comes than it can look at, and when that is over."""
         if now_s - self._looked_at_load_s < _LOOK_AT_LOAD_S:
             return
-        now, before = self._totals(), self._load_before
+        tallies, before = self.tallies().values(), self._load_before
+        now = sum(one.served for one in tallies), sum(one.too_many for one in tallies)
         self._looked_at_load_s, self._load_before = now_s, now
         served, dropped = now[0] - before[0], now[1] - before[1]
         overloaded = dropped > _OVERLOAD * (served + dropped)

@@ -37,7 +37,12 @@ class Tally:
     @property
     def dropped(self) -> int:
         """All that was not answered."""
-        return self.overtaken + self.stale + self.late + self.refused
+        return self.too_many + self.refused
+
+    @property
+    def too_many(self) -> int:
+        """What was not answered for want of time; what is refused says nothing of the load."""
+        return self.overtaken + self.stale + self.late
 
 
 class Turns(Generic[Item]):
