@@ -19,6 +19,7 @@ from typing import IO, TYPE_CHECKING, Any, Final, Self
 from operator_side.extras import needs
 from protocol.channels import ACK, CAMERA, CHANNELS, DETECTIONS, FRAME, MISSION, REPORT, SCAN, STATUS, TWIST, Channel
 from protocol.errors import ConfigError
+from protocol.log_lines import tell
 from protocol.transports.link import Link, Message
 
 if TYPE_CHECKING:
@@ -49,12 +50,12 @@ class Recorder:
     ) -> None:
         """`about` is kept in the file as metadata. Raises ConfigError for a path that cannot be written."""
         self._queue: queue.Queue[tuple[int, Message] | None] = queue.Queue(MAX_WAITING)
-        self._file = _open_new(path)
+        self._path, self._file = path, _open_new(path)
         self._writer = _writer(self._file, about)
         self._ids: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self.dropped = 0
-        self._closed = False
+        self._closed = self._failed = False
         self._writing = threading.Thread(target=self._write_all, name="recorder", daemon=True)
         self._writing.start()
         for channel in channels:
@@ -75,7 +76,21 @@ class Recorder:
 
     def _write_all(self) -> None:
         while (item := self._queue.get()) is not None:
-            self._write(*item)
+            if self._failed:
+                self.dropped += 1
+                continue
+            with self._telling():
+                self._write(*item)
+
+    @contextmanager
+    def _telling(self) -> Iterator[None]:
+        """A disk that takes no more ends the recording with one line, and nothing else."""
+        try:
+            yield
+        except OSError as error:
+            if not self._failed:
+                tell(f"recording {self._path}: {error.strerror or error}; nothing more is recorded")
+            self._failed = True
 
     def _write(self, log_time_ns: int, message: Message) -> None:
         topic = message.channel.name + (f"/{message.source}" if message.source else "")
@@ -92,8 +107,10 @@ class Recorder:
         self._closed = True
         self._queue.put(None)
         self._writing.join()
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._file.close()
+        with self._telling():
+            self._writer.finish()  # type: ignore[no-untyped-call]
+        with self._telling():
+            self._file.close()
 
     def __enter__(self) -> Self:
         return self

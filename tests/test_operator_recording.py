@@ -1,12 +1,14 @@
 """Recording and replay: what went over a link comes back, and the pipeline says the same again, byte for byte."""
 
 import threading
+import time
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from operator_side import recording
 from operator_side.lockstep import Conditions, Lockstep
 from operator_side.recording import CHUNK_BYTES, MAX_WAITING, Recorder, read_about, read_recording
 from operator_side.replay import VISION_CONFIG, replay, replay_steps
@@ -169,3 +171,16 @@ def test_recording_takes_nothing_from_the_network_it_listens_to(tmp_path):
         network.advance(1)
     assert len(heard) == 1
     assert [one.message for one in read_recording(tmp_path / "run.mcap")] == heard
+
+
+def test_a_disk_that_is_full_ends_the_recording_with_one_line(monkeypatch, capfd):
+    """No thread dies, `close` comes back, and what came afterwards is counted."""
+    lines = []
+    monkeypatch.setattr(recording, "tell", lines.append)
+    wire = Wire()
+    with Recorder(wire, Path("/dev/full"), {}, CHANNELS.values()) as recorder:
+        for at in range(3 * MAX_WAITING):
+            wire.deliver(Message(FRAME, "", b"%d" % at, bytes(CHUNK_BYTES // 4)))
+            time.sleep(0.0005)
+    assert lines == ["recording /dev/full: No space left on device; nothing more is recorded"]
+    assert recorder.dropped > MAX_WAITING and capfd.readouterr().err == ""
