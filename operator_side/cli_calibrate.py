@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from operator_side.cli_judge import Json
+from operator_side.cli_people import Secure
 from operator_side.cli_robot_tools import drive
 from operator_side.cli_services import Connect, RobotName
 from operator_side.extras import needs
@@ -55,6 +56,7 @@ def camera(
     camera_sets: PluginSets = None,
     robot: RobotName = None,
     connect: Connect = None,
+    secure: Secure = "",
     board: Annotated[str, typer.Option(metavar="CxR", help="Inner corners of the chessboard.")] = "9x6",
     square_m: Annotated[float, typer.Option(min=0.001, max=1, help="Side of one square, metres.")] = 0.025,
     ball_radius_m: Annotated[float | None, typer.Option(min=0.005, max=2, help="Use a ball of this radius.")] = None,
@@ -76,7 +78,7 @@ def camera(
     wanted = _subject(board, square_m, ball_radius_m, distance_m)
     given = {"x_m": x_m, "y_m": y_m, "z_m": z_m, "pitch_rad": pitch_rad}
     with needs("vision"), ExitStack() as ending:
-        source, mounted = _source(ending, pictures, (camera, camera_sets or []), (robot, connect), seconds)
+        source, mounted = _source(ending, pictures, (camera, camera_sets or []), (robot, connect, secure), seconds)
         mounting = _mounting(mounted, given)
         say = _quiet if as_json else _say_board
         most = _MOST_IN_FOLDER if pictures is not None else views
@@ -102,13 +104,13 @@ def _source(
     ending: ExitStack,
     folder: Path | None,
     plugin: tuple[str | None, list[str]],
-    robot: tuple[str | None, list[str] | None],
+    robot: tuple[str | None, list[str] | None, str],
     seconds: float,
 ) -> tuple[Iterator[bytes], dict[str, float]]:
     """The pictures, and the mounting that is known already. Exactly one source must be named."""
     from operator_side import calibrate_pictures as sources
 
-    if sum((folder is not None, plugin[0] is not None, robot != (None, None))) != 1:
+    if sum((folder is not None, plugin[0] is not None, robot[:2] != (None, None))) != 1:
         raise ConfigError("say where the pictures come from, once: --pictures DIR, --camera KIND, or --robot ID")
     if folder is not None:
         return sources.folder_pictures(folder), {}
@@ -117,12 +119,16 @@ def _source(
 
         opened = ending.enter_context(local_camera(plugin[0], plugin[1]))
         return sources.camera_pictures(opened, seconds), {}
+    from operator_side.pictures import viewer_role
     from protocol.transports.opening import open_link
 
-    link = ending.enter_context(open_link(robot[0] or "r1", connect=robot[1] or [DEFAULT_ENDPOINT], role=sources.ROLE))
+    name, connect, secure = robot
+    role = viewer_role(secure) if secure else sources.ROLE
+    at = connect or [DEFAULT_ENDPOINT]
+    link = ending.enter_context(open_link(name or "r1", connect=at, role=role, secure=secure))
     model = sources.robot_model(link)
     mounted = {"x_m": model.x_m, "y_m": model.y_m, "z_m": model.z_m, "pitch_rad": model.pitch_rad}
-    return sources.robot_pictures(link, seconds), mounted
+    return sources.robot_pictures(link, seconds, role), mounted
 
 
 def _mounting(known: dict[str, float], given: dict[str, float | None]) -> "Mounting":

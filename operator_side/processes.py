@@ -3,6 +3,7 @@
 Waits are for facts (a printed line), never for time alone; whatever happens, nothing is left behind.
 """
 
+import os
 import subprocess
 import sys
 import time
@@ -12,6 +13,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from protocol.errors import SightlineError
+from protocol.log_lines import ENV_NAME, FORMS
 
 END_S: Final = 4.0
 """A process that has not ended this long after SIGTERM is killed; the robot takes up to 2 s to bring wheels to zero."""
@@ -34,11 +36,12 @@ class Processes:
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, name: str, arguments: Sequence[str]) -> None:
-        """Run `sightline ARGUMENTS`, its output going to `<name>.log`."""
+        """Run `sightline ARGUMENTS`, its output going to `<name>.log`, as text: who starts them reads it."""
         command = [sys.executable, "-u", "-m", "operator_side.cli", *arguments]
         with self.log(name).open("wb") as log:
             self._running[name] = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
+                env={**os.environ, ENV_NAME: FORMS[0]},
             )
 
     def log(self, name: str) -> Path:

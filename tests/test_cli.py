@@ -100,6 +100,7 @@ def test_alone_it_shows_its_help(capsys):
         (["config", "check", "vision", "--set", "detector.kind=boxes", "--set", "detector.tracked=true"], 2, "tracked"),
         (["robot", "--robot", "a/b"], 2, "'a/b'"),
         (["robot", "--robot", "*"], 2, "'*'"),
+        (["calibrate", "camera", "--robot", "r1", "--secure", "no-such-folder"], 2, "no-such-folder"),
         (["robot", "--listen", "7447"], 2, "tcp/127.0.0.1:7447"),
         (["robot", "--listn", "x"], 2, "--listen"),
         (["robot", "--set", "safety.max_linear_mps=nan"], 2, "nan"),

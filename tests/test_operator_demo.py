@@ -149,3 +149,13 @@ def test_the_last_word_of_a_process_and_its_exit_code_are_passed_on(tmp_path):
         with pytest.raises(ProcessError, match="nothing simulates a robot in /nowhere") as error:
             processes.wait_line("robot", "on tcp", 20.0)
     assert error.value.exit_code == 3
+
+
+def test_what_they_print_is_text_whatever_the_shell_says(tmp_path, monkeypatch):
+    """Who starts them reads it: a line as JSON would be an error inside an error."""
+    monkeypatch.setenv("SIGHTLINE_LOG", "json")
+    with Processes(tmp_path) as processes:
+        processes.start("robot", ["robot", "--config", str(tmp_path / "absent.toml")])
+        with pytest.raises(ProcessError, match="absent.toml") as told:
+            processes.wait_line("robot", "never", 20)
+    assert "{" not in str(told.value)
