@@ -55,13 +55,20 @@ def judge(scenario: str, result: Score, latency_ms: float = 0.0, factor: float =
     """Hold `result` against the bounds of `scenario`, each times `factor` but for those that leave no room."""
     if latency_ms >= STANDS_STILL_FROM_MS:
         return [_check("travelled_m", result, 0.05), _check("wall_contacts", result, 0.0)]
-    bounds = dict(BOUNDS.get(scenario, {}))
+    bounds = dict(BOUNDS[scenario] if scenario in BOUNDS else _usual(result))
     if "wall_contact_s" not in bounds:
         bounds["wall_contacts"] = 0.0
     checks = [_check(name, result, _granted(name, bound, factor)) for name, bound in bounds.items()]
     if "acquired_s" not in bounds and _must_acquire(bounds):
         checks.insert(0, Check("acquired_s", result.acquired_s, "s", result.seconds, result.acquired_s is not None))
     return checks
+
+
+def _usual(result: Score) -> dict[str, float]:
+    """Of a scenario of somebody's own: what its kind demands, by what there was to be judged."""
+    if "least_crossings" in result.figures:
+        return _LIGHT
+    return {**_COURSE, "reached_s": result.seconds} if "reached_s" in result.figures else {}
 
 
 def _must_acquire(bounds: dict[str, float]) -> bool:

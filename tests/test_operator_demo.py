@@ -156,6 +156,6 @@ def test_what_they_print_is_text_whatever_the_shell_says(tmp_path, monkeypatch):
     monkeypatch.setenv("SIGHTLINE_LOG", "json")
     with Processes(tmp_path) as processes:
         processes.start("robot", ["robot", "--config", str(tmp_path / "absent.toml")])
-        with pytest.raises(ProcessError, match="absent.toml") as told:
+        with pytest.raises(ProcessError, match=r"absent\.toml") as told:
             processes.wait_line("robot", "never", 20)
     assert "{" not in str(told.value)

@@ -20,9 +20,9 @@ def drive(light_of, way_of, speed_of=lambda _s: 0.3, count=600):
     ]
 
 
-def failed(name, run, said=()):
+def failed(name, run, said=(), called=None):
     scenario = load_scenario(name)
-    checks = judge(name, score(run, scenario.stand_off_m, figures_of(scenario, run, said)))
+    checks = judge(called or name, score(run, scenario.stand_off_m, figures_of(scenario, run, said)))
     return {check.name for check in checks if not check.ok}
 
 
@@ -140,3 +140,17 @@ def test_driving_into_the_target_is_a_failure():
 def test_the_worst_of_a_least_is_the_smallest():
     results = [score(samples(), 0.8, {"least_clearance_m": value}) for value in (0.2, 0.1, 0.3)]
     assert median_and_worst(results, "least_clearance_m") == (0.2, 0.1)
+
+
+@pytest.mark.parametrize("mine", ["my-course", "./mine.toml"])
+def test_a_scenario_of_ones_own_is_judged_by_what_its_kind_demands(mine):
+    """Not by a ball that is not in it."""
+    there = [replace(truth(index / 50, x_m=min(2.0, index / 50)), clearance_m=0.5) for index in range(300)]
+    scenario = load_scenario("thymio").model_copy(update={"goals_m": ((1.0, 0.0), (2.0, 0.0))})
+    for run, missed in ((there, set()), (there[:70], {"reached_s"})):
+        checks = judge(mine, score(run, scenario.stand_off_m, figures_of(scenario, run)))
+        assert {one.name for one in checks if not one.ok} == missed
+    run = drive(lambda _s: "red", lambda s: -1.5 + 0.3 * s)
+    assert "crossed_on_red" in failed("traffic-light", run, called=mine)
+    run = drive(lambda _s: "green", lambda s: -1.5 + 0.3 * s)
+    assert failed("traffic-light", run, called=mine) == failed("traffic-light", run)
