@@ -20,7 +20,7 @@ Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of keys.")]
 
 def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
-    group = typer.Typer(help="Make and look at the certificates that --secure uses.", no_args_is_help=True,
+    group = typer.Typer(help="Make and look at the certificates that --secure uses.", no_args_is_help=False,
                         rich_markup_mode=None)
     group.command(epilog="Example: sightline keys init keys --host robot.local --host 192.168.1.20")(init)
     group.command(epilog="Example: sightline keys add keys robot --host 10.0.0.7")(add)

@@ -9,14 +9,16 @@ from pydantic import BaseModel, ValidationError
 from operator_side.settings_keys import Key, allowed, known_keys
 
 _LONGEST_VALUE = 60
+_MOST_NAMES = 12
 
 
 def no_such_name(kind: str, name: str, names: Iterable[str]) -> str:
-    """`name` is none of `names`: say so, with the nearest, or all if they are few."""
+    """`name` is none of `names`: say so, with the nearest, or those there are, the first if they are many."""
     names = list(names)
     nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
-    few = f"; there are: {', '.join(names)}" if len(names) <= 12 else ""
-    return f"no {kind} called {name!r}" + (f"; did you mean {nearest[0]!r}?" if nearest else few or "")
+    shown = [*names[:_MOST_NAMES], *([f"and {len(names) - _MOST_NAMES} more"] if len(names) > _MOST_NAMES else [])]
+    there_are = f"; there are: {', '.join(shown)}"
+    return f"no {kind} called {name!r}" + (f"; did you mean {nearest[0]!r}?" if nearest else there_are)
 
 
 def explain(

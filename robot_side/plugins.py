@@ -54,7 +54,7 @@ def _load(group: str, kind: str) -> Any:
                 sys.path.append(str(Path.cwd()))  # last: a file there is not to stand in for what is installed
             module, _, name = kind.partition(":")
             return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:  # the last two: `:Name`, `.module:Name`
         raise ConfigError(f"{_WORDS[group]} {kind!r} cannot be loaded: {error}") from None
     nearest = difflib.get_close_matches(kind, known, n=1)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
