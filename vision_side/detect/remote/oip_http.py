@@ -12,7 +12,8 @@ from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
 
 class HttpServer:
-    """A `Server`. What the model is like is asked once, and again after every error but lateness."""
+    """A `Server`. What the model is like is asked once, and again after every error but lateness and every
+    connection that the server ended."""
 
     def __init__(self, address: Address, looking: Looking) -> None:
         self._http = HttpExchange(address.host, address.port)
