@@ -144,6 +144,8 @@ def test_however_it_ends_zero_is_commanded_soon_and_the_robot_is_let_go(seat, ho
     else:
         seat.terminal.types({"Ctrl-C": "\x03", "Ctrl-D": "\x04"}[how])
     assert seat.terminal.process.wait(5) == 0, seat.terminal.text()
+    heard = until(lambda: seat.overheard.first_zero_s(ended_s), 2)  # who listens may run later than who has ended
+    assert heard, (ended_s, seat.overheard.commands[-9:], seat.terminal.text(), seat.robot.output())
     zero_s = seat.overheard.first_zero_s(ended_s)
     print(f"\n{how}: zero command after {(zero_s - ended_s) * 1e3:.0f} ms")
     assert zero_s - ended_s <= ZERO_S
