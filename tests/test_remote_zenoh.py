@@ -51,10 +51,10 @@ class Robot:
         self.link.publish(FRAME, encode(stamp) if header is None else header, jpeg)
         return DetectFrame(self.name, stamp, jpeg, Decoder(320, 240, 1920 * 1080))
 
-    def say(self, asked, *boxes, source=ROLE, width_px=320, **changes):
+    def say(self, asked, *boxes, source=ROLE, by="00000009", width_px=320, **changes):
         """Boxes as a service says them, or as a hostile one does."""
         echo = Echo(channel="frame", session=asked.header.session, seq=asked.header.seq, t_us=asked.header.t_us)
-        header = DetectionsHeader(source=ROLE, session="00000009", seq=1, echo=echo.model_copy(update=changes))
+        header = DetectionsHeader(source=ROLE, session=by, seq=1, echo=echo.model_copy(update=changes))
         said = Detections(width_px=width_px, height_px=240, boxes=boxes)
         self.link.publish(DETECTIONS, encode(header), encode(said), source)
 
@@ -239,7 +239,7 @@ def pair():
 
 
 @pytest.mark.parametrize(("changes", "reason"), [
-    ({"session": "0000ffff"}, "OTHER_FRAME"), ({"t_us": 1}, "OTHER_FRAME"), ({"seq": 0, "t_us": 0}, "LATE"),
+    ({"session": "0000ffff"}, "OTHER_FRAME"), ({"t_us": 1}, "OTHER_FRAME"), ({"seq": 0, "t_us": 10**9}, "OTHER_FRAME"),
     ({"seq": 9, "t_us": 1}, "OTHER_FRAME"), ({"channel": "status"}, "OTHER_FRAME"), ({"width_px": 640}, "OTHER_SIZE"),
 ])  # fmt: skip
 def test_boxes_of_another_frame_or_size_are_refused_and_counted(pair, changes, reason):
@@ -269,6 +269,31 @@ def test_what_is_no_detections_message_is_refused_and_counted(pair, payload):
     echo = Echo(channel="frame", session=asked.header.session, seq=3, t_us=asked.header.t_us)
     robot.link.publish(DETECTIONS, encode(DetectionsHeader(source=ROLE, session="00000009", seq=1, echo=echo)), payload)
     assert until(lambda: waiting.detect([asked], within(0.05)) == [None] and waiting.refused["MALFORMED"])
+
+
+def test_boxes_of_an_older_frame_are_nobodys_and_no_news(pair):
+    """Vision asks about the newest frame and leaves others out; the service looks at all of them."""
+    robot, waiting = pair
+    for seq in range(4):
+        robot.say(frame(seq), BOX)
+        time.sleep(0.02)
+    assert waiting.detect([frame(9)], within(0.1)) == [None] and waiting.refused == {"LATE": 1}
+
+
+def test_of_two_services_one_is_kept_to_until_it_is_silent(pair):
+    """Two trackers' identities, or two models' boxes in turns, would steer by neither."""
+    robot, waiting = pair
+    other = DetectedBox(label="box", score=0.9, x1_px=50.0, y1_px=10.0, x2_px=90.0, y2_px=30.0)
+    labels = set()
+    for seq in range(3, 9):
+        robot.say(frame(seq), BOX, by="00000001")
+        robot.say(frame(seq), other, by="00000002")
+        labels |= {one.label for one in waiting.detect([frame(seq)], within(1.0))[0].detections}
+    assert labels == {"ball"} and not waiting.refused
+    assert sum("several services look at robot r1" in line for line in waiting.news()) == 1
+    time.sleep(0.6)
+    robot.say(frame(9), other, by="00000002")
+    assert waiting.detect([frame(9)], within(1.0))[0].detections[0].label == "box", "the first one is gone"
 
 
 def test_anothers_boxes_are_not_even_looked_at(pair):

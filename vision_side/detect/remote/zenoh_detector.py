@@ -9,6 +9,7 @@ Nothing is sent: robot and service meet by themselves. Here it is waited, by the
 from typing import ClassVar, Final
 
 from protocol.channels import DETECTIONS, FRAME
+from protocol.clock import monotonic_us
 from protocol.codec import decode
 from protocol.config import Config as Settings
 from protocol.errors import WireError
@@ -26,19 +27,37 @@ ROLE: Final = "detector"
 _NEWER_US: Final = 1_000_000
 """Boxes of a frame so much newer than the one asked about are kept for it; of what claims to be from later it may never
 come, and one such message would stand in the way of all others."""
+_SILENT_US: Final = 500_000
+"""A service that says nothing for so long is gone; another one of its name takes its place."""
 
 
 class _OfSource(LatestSlot[Message]):
-    """The newest boxes of one source."""
+    """The newest boxes of one source, and of one service while several speak as that: what one of them tracks or calls
+    a thing is nothing to the other."""
 
     def __init__(self, source: str) -> None:
         super().__init__()
         self._source = source
+        self._session, self._heard_us = "", 0
+        self.others = 0
+        """Boxes of other services than the one that is kept to."""
 
     def put(self, item: Message) -> None:
-        """Others' boxes are for others."""
-        if item.source == self._source:
+        """Others' boxes are for others. What cannot be read goes on, to be counted by who reads it."""
+        if item.source == self._source and self._is_kept_to(item):
             super().put(item)
+
+    def _is_kept_to(self, item: Message) -> bool:
+        try:
+            session = decode(DetectionsHeader, item.header).session
+        except WireError:
+            return True
+        now_us = monotonic_us()
+        if session != self._session and self._session and now_us - self._heard_us <= _SILENT_US:
+            self.others += 1
+            return False
+        self._session, self._heard_us = session, now_us
+        return True
 
 
 class _Heard:
@@ -48,6 +67,8 @@ class _Heard:
         self.slot = _OfSource(source)
         self.kept: Message | None = None
         """Boxes of a frame that was not asked about yet."""
+        self.told = False
+        """That there are several services."""
         link.subscribe(DETECTIONS, self.slot.put)
 
     def take(self, wait_s: float) -> Message | None:
@@ -88,21 +109,29 @@ class ZenohDetector(FrameByFrame):
         """The boxes that cite `frame`. Raises NoAnswerError if none come by the deadline, or those of a newer one."""
         while True:
             message = heard.take(left_s(deadline_us))
+            if heard.slot.others and not heard.told:
+                heard.told = True
+                self._tally.news.add(f"detector zenoh ({self._config.source}): several services look at robot "
+                                     f"{frame.robot}; the first is kept to. End the others, or share the robots out "
+                                     "among them with --robot")
             if message is None:
                 raise NoAnswerError(Reason.LATE, f"no boxes from {self._config.source} by the deadline; does it run?")
             try:
-                header, newer = _cites(message, frame)
+                header, ahead = _cites(message, frame)
             except NoAnswerError as error:
                 self._tally.refuse(error)
                 continue
-            if newer:
+            if ahead < 0:  # who asked about that one has counted it as late
+                continue
+            if ahead > 0:
                 heard.kept = message
                 raise NoAnswerError(Reason.OTHER_FRAME, "it looked at a newer frame instead")
             return _result(message, header, frame, self._config.min_score)
 
 
-def _cites(message: Message, frame: DetectFrame) -> tuple[DetectionsHeader, bool]:
-    """The header of boxes of `frame`, or of a newer one. Raises NoAnswerError for those of any other."""
+def _cites(message: Message, frame: DetectFrame) -> tuple[DetectionsHeader, int]:
+    """The header of boxes of `frame`, or of one so many frames after it, or before it if negative. Raises NoAnswerError
+    for those of any other."""
     try:
         header = decode(DetectionsHeader, message.header)
     except WireError as error:
@@ -110,12 +139,12 @@ def _cites(message: Message, frame: DetectFrame) -> tuple[DetectionsHeader, bool
     echo, asked = header.echo, frame.header
     if header.source != message.source or echo is None or echo.channel != FRAME.name or echo.session != asked.session:
         raise NoAnswerError(Reason.OTHER_FRAME, "boxes of no frame of this robot's session, or not of who says so")
-    if echo.seq > asked.seq and asked.t_us < echo.t_us <= asked.t_us + _NEWER_US:
-        return header, True
-    if (echo.seq, echo.t_us) != (asked.seq, asked.t_us):
-        reason = Reason.LATE if echo.seq < asked.seq else Reason.OTHER_FRAME
-        raise NoAnswerError(reason, f"boxes of frame {echo.seq}, asked about is {asked.seq}")
-    return header, False
+    ahead = echo.seq - asked.seq
+    is_newer = ahead > 0 and asked.t_us < echo.t_us <= asked.t_us + _NEWER_US
+    is_older = ahead < 0 and echo.t_us < asked.t_us
+    if not (is_newer or is_older or (echo.seq, echo.t_us) == (asked.seq, asked.t_us)):
+        raise NoAnswerError(Reason.OTHER_FRAME, f"boxes of frame {echo.seq}, asked about is {asked.seq}")
+    return header, ahead
 
 
 def _result(message: Message, header: DetectionsHeader, frame: DetectFrame, min_score: float) -> DetectionResult:
