@@ -2,6 +2,7 @@
 
 import gzip
 import resource
+import socket
 import threading
 import time
 
@@ -71,6 +72,24 @@ def test_one_connection_is_kept_and_made_again_when_the_server_let_go_of_it():
         assert _ask(detector, seq=10) and not detector.refused, "the kept connection is over, another one is made"
 
 
+def test_a_name_whose_first_address_is_dead_is_reached_at_its_second(monkeypatch):
+    with Server(lambda request: GOOD) as server, socket.create_server(("127.0.0.2", server.port), backlog=0) as dead:
+        filling = [socket.socket() for _ in range(3)]  # a full queue answers no more than a firewall
+        for one in filling:
+            one.setblocking(False)
+            one.connect_ex(dead.getsockname())
+        two = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (host, server.port)) for host in ("127.0.0.2", "127.0.0.1")]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: list(two))
+        detector = _asking(server)
+        began_s = time.monotonic()
+        assert _ask(detector, seconds=0.6)
+        assert time.monotonic() - began_s > 0.2, "the first was tried"
+        server.answer = lambda request: http_reply(said(box()), headers=["Connection: close"])
+        assert all(_ask(detector, seconds=0.2, seq=seq) for seq in (2, 3)), "the one that was there is tried first"
+        for one in filling:
+            one.close()
+
+
 def test_what_a_server_says_unasked_answers_no_later_frame():
     def twice(request):
         yield http_reply(said(box(x1=1.0)))
@@ -107,6 +126,8 @@ HOSTILE = {
     "sixty-five boxes": (http_reply(said(*[box()] * 65)), "TOO_MANY"),
     "a million boxes": (http_reply(MILLION), "TOO_LARGE"),
     "longer than it says": (http_reply(bytes(MAX_ANSWER_BYTES), length=10**12), "TOO_LARGE"),
+    "a chunk of -1": ((b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n-1\r\n",
+                       *[bytes(1 << 16)] * 64), "TOO_LARGE"),
     "endless": ((b"HTTP/1.1 200 OK\r\n\r\n", *[bytes(1 << 16)] * 64), "TOO_LARGE"),
     "endless chunks": ((b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n",
                         *[b"10000\r\n" + bytes(1 << 16) + b"\r\n"] * 64), "TOO_LARGE"),
@@ -122,7 +143,7 @@ HOSTILE = {
     "cut": (http_reply(said(box()))[:-9], "LATE"),
     "nothing": (None, "LATE"),
     "dripping": (lambda: (GOOD[at:at + 1] for at in range(len(GOOD)) if not time.sleep(0.02)), "LATE"),
-    "a hundred continues": (b"HTTP/1.1 100 Continue\r\n\r\n" * 100_000, "LATE"),
+    "a hundred continues": (b"HTTP/1.1 100 Continue\r\n\r\n" * 100_000, "TOO_LARGE"),
 }
 
 

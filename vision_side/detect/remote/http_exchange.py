@@ -18,6 +18,8 @@ from vision_side.detect.remote.refusing import NoAnswerError, Reason
 
 MAX_ANSWER_BYTES: Final = 1 << 20
 """Security limit: 1024 rows of boxes as JSON are a tenth of it."""
+_MAX_TAKEN_BYTES: Final = 2 * MAX_ANSWER_BYTES
+"""Security limit: with headers and what parts an answer into chunks; the client believes in chunks of any size."""
 RETRY_US: Final = 200_000
 """A server that could not be reached is tried again this much later: often enough to be back well within a second."""
 
@@ -37,6 +39,8 @@ class HttpExchange:
         self._host, self._port = host, port
         self._socket: socket.socket | None = None
         self._not_before_us = 0
+        self._reached: Any = None
+        """Of the addresses that the host's name has, the one that was there last."""
         self.lost = 0
         """How often a kept connection turned out to be over: the server behind the next may be another."""
 
@@ -110,10 +114,28 @@ class HttpExchange:
     def _connect(self, until_us: int) -> socket.socket:
         if monotonic_us() < self._not_before_us:
             raise NoAnswerError(Reason.UNREACHABLE, f"{self._host}:{self._port} is tried again in a moment")
-        connection = socket.create_connection((self._host, self._port), _left_s(until_us))
+        connection = self._reach(until_us)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket = connection
         return connection
+
+    def _reach(self, until_us: int) -> socket.socket:
+        """A connection to one of the host's addresses; each that is still to be tried has its share of the time."""
+        found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
+        found.sort(key=lambda one: one[4] != self._reached)
+        for number, (family, kind, protocol, _, address) in enumerate(found):
+            connection = socket.socket(family, kind, protocol)
+            try:
+                connection.settimeout(_left_s(until_us) / (len(found) - number))
+                connection.connect(address)
+            except OSError:
+                connection.close()
+                if number == len(found) - 1:
+                    raise
+            else:
+                self._reached = address
+                return connection
+        raise OSError("its name has no address")
 
     def _unreachable(self, error: OSError) -> NoAnswerError:
         if self._socket is None:
@@ -143,10 +165,11 @@ class HttpExchange:
 
 
 class _Timed(io.RawIOBase):
-    """What a response reads from: each read waits no longer than is left for the whole."""
+    """What a response reads from: each read waits no longer than is left for the whole, and all have one limit."""
 
     def __init__(self, connection: socket.socket, until_us: int) -> None:
         self._connection, self._until_us = connection, until_us
+        self._taken_bytes = 0
 
     def makefile(self, _mode: str) -> io.BufferedReader:
         """As a socket does."""
@@ -157,7 +180,11 @@ class _Timed(io.RawIOBase):
 
     def readinto(self, buffer: Any, /) -> int:
         self._connection.settimeout(_left_s(self._until_us))
-        return int(self._connection.recv_into(buffer))
+        count = self._connection.recv_into(buffer)
+        self._taken_bytes += count
+        if self._taken_bytes > _MAX_TAKEN_BYTES:
+            raise NoAnswerError(Reason.TOO_LARGE, f"an answer of more than {MAX_ANSWER_BYTES} bytes")
+        return count
 
 
 def _left_s(until_us: int) -> float:
