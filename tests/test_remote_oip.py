@@ -10,7 +10,7 @@ import pytest
 
 from tests.remote_rig import ASKED, BALL_JPEG, COLUMNS, JPEG_INPUT, OUTPUTS, frame, grpc_answer
 from vision_side.detect.protobuf import fields, put, put_integers, varint
-from vision_side.detect.remote.oip import Looking, Model, Slot, Tensor, detections_of, model_of, tensor_of
+from vision_side.detect.remote.oip import Inferred, Looking, Model, Slot, Tensor, detections_of, model_of, tensor_of
 from vision_side.detect.remote.oip_json import read_infer, read_metadata
 from vision_side.detect.remote.oip_messages import infer_request, metadata_request
 from vision_side.detect.remote.oip_messages import read_infer as read_grpc
@@ -36,8 +36,8 @@ def _binary(boxes, scores, labels, **more):
     return head + b"".join(column.tobytes() for column in columns.values()), str(len(head))
 
 
-def _found(outputs, **looking):
-    return detections_of(outputs, Looking(**looking), (1.0, 1.0), SIZE)
+def _found(answer, **looking):
+    return detections_of(answer, Looking(**looking), (1.0, 1.0), SIZE)
 
 
 # --- models ----------------------------------------------------------------------------------------------------------
@@ -101,6 +101,7 @@ def test_binary_and_json_answers_are_the_same():
     names = ("ball", "box")
     found = _found(read_infer(body, length, ASKED), labels=names)
     assert found == _found(read_infer(plain, None, ASKED), labels=names)
+    assert read_infer(body, length, ASKED).version == "1" and not read_infer(plain, None, ASKED).version
     assert [(one.label, one.score, one.x1_px) for one in found] == [("2", 0.75, 50), ("ball", 0.5, 10)]
 
 
@@ -115,7 +116,7 @@ def test_padded_rows_are_no_boxes_whatever_the_batch_dimension(boxes, scores, la
 
 def test_boxes_in_the_models_pixels_become_those_of_the_picture():
     outputs = {"boxes": np.array([[10.0, 10, 20, 20]]), "scores": np.array([0.9])}
-    one = detections_of(outputs, Looking(("ball",)), (2.0, 3.0), SIZE)[0]
+    one = detections_of(Inferred(outputs), Looking(("ball",)), (2.0, 3.0), SIZE)[0]
     assert (one.x1_px, one.y1_px, one.x2_px, one.y2_px, one.label) == (20, 30, 40, 60, "ball")
 
 
@@ -169,6 +170,7 @@ def test_grpc_messages_say_what_json_says():
     slots = [put(1, one.name) + put(2, one.datatype) + put_integers(3, one.shape) for one in (JPEG_INPUT, *OUTPUTS)]
     said = put(1, "ball") + put(2, "1") + put(2, "3") + put(4, slots[0]) + b"".join(put(5, one) for one in slots[1:])
     assert read_grpc_metadata(said) == read_metadata(_metadata([JPEG_INPUT], OUTPUTS))
+    assert read_grpc(grpc_answer(COLUMNS, version="7"), ASKED).version == "7"
     assert _found(read_grpc(grpc_answer(COLUMNS), ASKED)) == _found(read_infer(*_binary(*COLUMNS.values()), ASKED))
     assert dict(fields(metadata_request("ball", "3"))) == {1: b"ball", 2: b"3"}
 

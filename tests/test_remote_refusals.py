@@ -10,7 +10,7 @@ import pytest
 from tests.remote_rig import COLUMNS, JPEG_INPUT, OUTPUTS, Server, frame, http_reply, within
 from vision_side.detect.remote.address import parse_address
 from vision_side.detect.remote.asking import Asking
-from vision_side.detect.remote.oip import Looking, detections_of
+from vision_side.detect.remote.oip import Inferred, Looking, detections_of
 from vision_side.detect.remote.oip_http import HttpServer
 from vision_side.detect.remote.refusing import NoAnswerError, Reason, Tally
 
@@ -129,7 +129,7 @@ def test_a_server_that_was_late_once_is_not_made_later_by_asking_for_its_model_a
 def test_numbers_of_labels_may_be_written_as_floats(kind):
     outputs = {"boxes": np.float32([[10, 20, 30, 40], [50, 60, 70, 80]]), "scores": np.float32([0.9, 0.8]),
                "labels": np.array([1, 7], kind)}
-    found = detections_of(outputs, Looking(("ball", "box")), (1.0, 1.0), (320, 240))
+    found = detections_of(Inferred(outputs), Looking(("ball", "box")), (1.0, 1.0), (320, 240))
     assert [one.label for one in found] == ["box", "7"]
 
 
@@ -137,5 +137,5 @@ def test_numbers_of_labels_may_be_written_as_floats(kind):
 def test_what_is_no_whole_number_is_no_label(bad):
     outputs = {"boxes": np.float32([[10, 20, 30, 40]]), "scores": np.float32([0.9]), "labels": np.float64([bad])}
     with pytest.raises(NoAnswerError) as error:
-        detections_of(outputs, Looking(("ball",)), (1.0, 1.0), (320, 240))
+        detections_of(Inferred(outputs), Looking(("ball",)), (1.0, 1.0), (320, 240))
     assert error.value.reason is Reason.MALFORMED

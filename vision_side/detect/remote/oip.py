@@ -48,9 +48,11 @@ class Model:
     input: Slot
     outputs: tuple[str, ...]
 
-    def title(self, scheme: str) -> str:
-        """What its results say that they are of: servers tell a version, and no hash."""
-        return f"{scheme}:{self.name[:40]}" + (f" {self.version[:8]}" if self.version else "")
+    def title(self, scheme: str, answered: str) -> str:
+        """What results say that they are of: servers tell a version, and no hash. That of the answer counts, for a
+        server takes new versions while it runs; the metadata's where it has none."""
+        version = answered or self.version
+        return f"{scheme}:{self.name[:40]}" + (f" {version[:8]}" if version else "")
 
     @property
     def takes_jpeg(self) -> bool:
@@ -66,6 +68,15 @@ class Tensor:
     datatype: str
     shape: tuple[int, ...]
     data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Inferred:
+    """What an answer holds."""
+
+    tensors: Mapping[str, NDArray[Any] | list[str]]
+    version: str = ""
+    """Of the model that answered; empty where the server does not say."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,10 +186,10 @@ def elements_of(shape: Sequence[int]) -> int:
 
 
 def detections_of(
-    outputs: Mapping[str, NDArray[Any] | list[str]], looking: Looking, stretch: tuple[float, float],
-    size_px: tuple[int, int],
+    answer: Inferred, looking: Looking, stretch: tuple[float, float], size_px: tuple[int, int]
 ) -> tuple[Detection, ...]:
     """What an answer's tensors say. Raises NoAnswerError for a missing or misshapen one."""
+    outputs = answer.tensors
     boxes, scores = (_numbers(outputs, name) for name in (BOXES, SCORES))
     boxes = boxes.reshape(boxes.shape[-2:]) if boxes.ndim > 2 and math.prod(boxes.shape[:-2]) == 1 else boxes
     scores = _flat(scores)

@@ -57,8 +57,9 @@ class GrpcServer:
         tensor, stretch = tensor_of(model, frame, self._looking.rgb)
         number = f"{frame.header.session}-{frame.header.seq}"
         data = self._call(INFER, infer_request(model, self._address.version, tensor, number), until_us)
-        found = detections_of(read_infer(data, number), self._looking, stretch, (frame.width_px, frame.height_px))
-        return Answer(found, Maker(model.title(self._address.scheme), device=REMOTE))
+        answer = read_infer(data, number)
+        found = detections_of(answer, self._looking, stretch, (frame.width_px, frame.height_px))
+        return Answer(found, Maker(model.title(self._address.scheme, answer.version), device=REMOTE))
 
     def close(self) -> None:
         """End the channel."""

@@ -40,9 +40,9 @@ class HttpServer:
         number = f"{frame.header.session}-{frame.header.seq}"
         length, body = infer_body(model, tensor, number)
         reply = self._http.post(f"{self._path}/infer", {HEADER_LENGTH: str(length)}, body, until_us)
-        outputs = read_infer(reply.body, reply.headers.get(HEADER_LENGTH.lower()), number)
-        found = detections_of(outputs, self._looking, stretch, (frame.width_px, frame.height_px))
-        return Answer(found, Maker(model.title(self._scheme), device=REMOTE))
+        answer = read_infer(reply.body, reply.headers.get(HEADER_LENGTH.lower()), number)
+        found = detections_of(answer, self._looking, stretch, (frame.width_px, frame.height_px))
+        return Answer(found, Maker(model.title(self._scheme, answer.version), device=REMOTE))
 
     def close(self) -> None:
         """Let go of the connection."""

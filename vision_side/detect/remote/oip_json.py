@@ -11,6 +11,7 @@ from vision_side.detect.remote.oip import (
     MAX_DIMENSIONS,
     MAX_TENSORS,
     NUMBERS,
+    Inferred,
     Model,
     Slot,
     Tensor,
@@ -82,8 +83,8 @@ def infer_body(model: Model, tensor: Tensor, number: str) -> tuple[int, bytes]:
     return len(head), head + tensor.data
 
 
-def read_infer(body: bytes, json_length: str | None, number: str) -> dict[str, NDArray[Any] | list[str]]:
-    """The tensors of an answer, by name. Raises NoAnswerError, also if it is the answer to something else."""
+def read_infer(body: bytes, json_length: str | None, number: str) -> Inferred:
+    """An answer. Raises NoAnswerError, also if it is the answer to something else."""
     length = _json_length(json_length, len(body))
     said = _validated(_Answer, body[:length])
     if said.id not in (None, "", number):
@@ -98,7 +99,7 @@ def read_infer(body: bytes, json_length: str | None, number: str) -> dict[str, N
             raise NoAnswerError(Reason.MALFORMED, f"output {one.name[:40]!r} ends behind the end of the answer")
         tensors[one.name] = _from_bytes(one, body[at : at + size])
         at += size
-    return tensors
+    return Inferred(tensors, said.model_version)
 
 
 def _json_length(text: str | None, whole: int) -> int:

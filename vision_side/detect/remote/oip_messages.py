@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vision_side.detect.protobuf import Bytes, as_bytes, fields, integers, put, put_integers, text
 from vision_side.detect.remote.oip import (
     MAX_TENSORS,
+    Inferred,
     Model,
     Slot,
     Tensor,
@@ -66,20 +67,21 @@ def infer_request(model: Model, asked_version: str, tensor: Tensor, number: str)
 
 
 @_malformed()
-def read_infer(data: bytes, number: str) -> dict[str, NDArray[Any] | list[str]]:
-    """The tensors of a ModelInferResponse, by name. Raises NoAnswerError, also if it answers something else."""
-    slots: list[Slot] = []
-    contents: list[bytes] = []
+def read_infer(data: bytes, number: str) -> Inferred:
+    """A ModelInferResponse. Raises NoAnswerError, also if it answers something else."""
+    version, slots, contents = "", list[Slot](), list[bytes]()
     for which, value in fields(data):
         if which == 3 and text(value) not in ("", number):
             raise NoAnswerError(Reason.OTHER_FRAME, f"the answer's id is {text(value)[:40]!r}, asked was {number!r}")
-        if which == 5:
+        if which == 2:
+            version = text(value)
+        elif which == 5:
             slots.append(_slot(as_bytes(value)))
         elif which == 6:
             contents.append(bytes(as_bytes(value)))
     if len(slots) != len(contents) or len(slots) > MAX_TENSORS:
         raise NoAnswerError(Reason.MALFORMED, f"{len(slots)} outputs, {len(contents)} raw contents; they go together")
-    return {slot.name: _tensor(slot, raw) for slot, raw in zip(slots, contents, strict=True)}
+    return Inferred({slot.name: _tensor(slot, raw) for slot, raw in zip(slots, contents, strict=True)}, version)
 
 
 def _tensor(slot: Slot, raw: bytes) -> NDArray[Any] | list[str]:
