@@ -58,6 +58,8 @@ class Teleop:
         self.speeds = speeds
         self.mode = Mode.LOOKING_ON
         self.report: Report | None = None
+        self.heard_us = 0
+        """When the report came."""
         self.note = ""
         """What the person should know beside the robot's status."""
         self._hold = Hold()
@@ -120,13 +122,14 @@ class Teleop:
         self._echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
         self._unanswered = True
 
-    def on_status(self, message: Message) -> None:
+    def on_status(self, message: Message, now_us: int) -> None:
         """The newest status."""
         try:
             self.report = read_report(message)
         except WireError as error:
             self.note = f"the robot's status is not understood: {error.detail}"
             return
+        self.heard_us = now_us
         self.speeds.limit(self.report.status)
         if self.mode is Mode.HANDING_OVER and self._asking is not Verb.RELEASE and self._other_drives():
             self.mode, self._asking, self.note = Mode.LOOKING_ON, None, ""

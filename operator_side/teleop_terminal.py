@@ -48,8 +48,8 @@ class Cockpit:
         os.set_blocking(self._woken, False)
         os.set_blocking(self._wake, False)
         self._slots = [
-            (self._slot(FRAME), teleop.on_frame), (self._slot(STATUS), teleop.on_status),
-            (self._slot(REPLY), teleop.on_reply),
+            (self._slot(FRAME), teleop.on_frame), (self._slot(REPLY), teleop.on_reply),
+            (self._slot(STATUS), lambda message: teleop.on_status(message, monotonic_us())),
         ]  # fmt: skip
         self._shown_us = 0
         self._ended = False
@@ -128,7 +128,7 @@ class Cockpit:
         if now_us - self._shown_us >= _SHOW_US:
             self._shown_us = now_us
             width = shutil.get_terminal_size().columns
-            _print("\r\x1b[K" + live_line(self._link.robot, self._teleop, width - 1))
+            _print("\r\x1b[K" + live_line(self._link.robot, self._teleop, width - 1, now_us))
 
     def _say_farewell(self) -> None:
         """Zero and release, again until the robot has said that nobody drives, or for a moment."""

@@ -17,10 +17,17 @@ Ctrl-C ends it. The first press arms the robot: make sure that it may move.
 """
 
 
-def live_line(robot: str, teleop: Teleop, width: int) -> str:
-    """State, reason, who drives, speeds; cut to the terminal's width, so that it stays one line."""
+_SILENT_US: Final = 1_000_000
+"""Ten times as long as a robot is silent between two words."""
+
+
+def live_line(robot: str, teleop: Teleop, width: int, now_us: int) -> str:
+    """State, reason, who drives, speeds; cut to the terminal's width, so that it stays one line. Of a robot that has
+    fallen silent nothing is known any more."""
     if teleop.report is None:
         text = f"{robot}: nothing heard yet"
+    elif (silent_us := now_us - teleop.heard_us) > _SILENT_US:
+        text = f"{robot}: nothing heard for {silent_us / 1e6:.0f} s; without commands it stops by itself"
     else:
         text = " | ".join(part for part in _parts(robot, teleop, teleop.report.status) if part)
     return text if len(text) <= width else text[: max(0, width - 1)] + "…"

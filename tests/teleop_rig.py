@@ -101,7 +101,8 @@ class TeleopRig:
     def _deliver(self):
         while self._to_robot and self._to_robot[0][0] <= self.now_us:
             self._at_robot(self._to_robot.pop(0)[1])
-        handlers = {FRAME: self.teleop.on_frame, STATUS: self.teleop.on_status, REPLY: self.teleop.on_reply}
+        handlers = {FRAME: self.teleop.on_frame, REPLY: self.teleop.on_reply,
+                    STATUS: lambda message: self.teleop.on_status(message, self.now_us)}
         while self._to_person and self._to_person[0][0] <= self.now_us:
             message = self._to_person.pop(0)[1]
             if message.channel is STATUS:

@@ -157,7 +157,7 @@ def test_handing_over_again_at_once_is_not_misled_by_an_old_status():
     rig.tap("i")
     rig.run(0.01)
     rig.tap("a")
-    rig.teleop.on_status(rig.last_status)
+    rig.teleop.on_status(rig.last_status, rig.now_us)
     rig.run(2.0)
     assert rig.state is State.ACTIVE and rig.holder.session == VISION and rig.teleop.mode is Mode.LOOKING_ON
 

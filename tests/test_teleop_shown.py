@@ -7,17 +7,34 @@ from protocol.messages import STILL, State, Twist, Verb
 from tests.teleop_rig import TeleopRig, vision_drives
 
 
+def shown(rig, width):
+    return live_line("r1", rig.teleop, width, rig.now_us)
+
+
 def test_the_line_says_state_reason_driver_and_fits():
     rig = TeleopRig()
-    assert live_line("r1", rig.teleop, 80) == "r1: nothing heard yet"
+    assert shown(rig, 80) == "r1: nothing heard yet"
     rig.run(0.3)
-    assert live_line("r1", rig.teleop, 200).startswith("r1 DISARMED: not armed | nobody drives | ")
+    assert shown(rig, 200).startswith("r1 DISARMED: not armed | nobody drives | ")
     rig.hold("i")
     rig.run(1.5)
-    line = live_line("r1", rig.teleop, 200)
+    line = shown(rig, 200)
     assert line.startswith("r1 ACTIVE: driving | you drive | +0.20 m/s +0.00 rad/s | up to 0.20 m/s 1.00 rad/s | frame")
-    assert len(live_line("r1", rig.teleop, 30)) == 30
-    assert "vision drives" in live_line("r1", vision_drives().teleop, 200)
+    assert len(shown(rig, 30)) == 30
+    assert "vision drives" in shown(vision_drives(), 200)
+
+
+def test_a_robot_that_fell_silent_is_not_shown_as_it_was():
+    rig = TeleopRig()
+    rig.hold("i")
+    rig.run(1.0)
+    assert "ACTIVE" in shown(rig, 200)
+    rig.connected = False
+    rig.run(2.0)
+    assert shown(rig, 200).startswith("r1: nothing heard for 2 s")
+    rig.connected = True
+    rig.run(0.5)
+    assert shown(rig, 200).startswith("r1 ")
 
 
 def test_a_press_before_the_first_status_arms_once_it_has_come():
@@ -34,7 +51,7 @@ def test_without_a_picture_it_is_said_why_nothing_moves():
     rig._frame = lambda: None
     rig.hold("i")
     rig.run(1.0)
-    assert rig.commands == [] and "no picture yet" in live_line("r1", rig.teleop, 200)
+    assert rig.commands == [] and "no picture yet" in shown(rig, 200)
 
 
 def test_a_stick_drives_proportionally_and_its_release_is_zero_at_once():
