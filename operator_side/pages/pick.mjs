@@ -6,6 +6,7 @@ const part = (id) => document.getElementById(id);
 const canvas = part("picture");
 const live = document.body.dataset.live === "true";
 let number = 0; // of the picture that is shown
+let last = 0; // number of the picture that came last, drawn or not
 let held = false; // live pictures stand still
 let from = null; // where a box was begun
 let picks = 0;
@@ -30,8 +31,10 @@ async function showLive() {
       continue;
     }
     try {
-      const answer = await fetch(`picture?after=${number}`);
-      if (answer.status === 200) await draw(answer);
+      const answer = await fetch(`picture?after=${last}`);
+      if (answer.status !== 200) continue;
+      last = Number(answer.headers.get("X-Number"));
+      await draw(answer);
     } catch {
       await pause(RETRY_MS);
     }

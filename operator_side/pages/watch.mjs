@@ -11,7 +11,8 @@ const RETRY_MS = 500;
 const part = (id) => document.getElementById(id);
 const canvas = part("picture");
 const drawnAt_ms = []; // of the last second
-let newest = { number: 0, channel: "", size: "", age_ms: null };
+let last = 0; // number of the picture that came last, drawn or not: none is asked for before it is known to have come
+let newest = { channel: "", size: "", age_ms: null };
 
 const pause = (time_ms) => new Promise((resolve) => setTimeout(resolve, time_ms));
 
@@ -26,8 +27,8 @@ async function draw(answer) {
   canvas.getContext("2d").drawImage(bitmap, 0, 0);
   const age_us = answer.headers.get("X-Age-Us");
   newest = {
-    number: Number(answer.headers.get("X-Number")), channel: answer.headers.get("X-Channel"),
-    size: `${bitmap.width}x${bitmap.height}`, age_ms: age_us === "" ? null : Number(age_us) / 1000,
+    channel: answer.headers.get("X-Channel"), size: `${bitmap.width}x${bitmap.height}`,
+    age_ms: age_us === "" ? null : Number(age_us) / 1000,
   };
   bitmap.close();
   drawnAt_ms.push(performance.now());
@@ -36,8 +37,10 @@ async function draw(answer) {
 async function showPictures() {
   for (;;) {
     try {
-      const answer = await fetch(`picture?after=${newest.number}`);
-      if (answer.status === 200) await draw(answer);
+      const answer = await fetch(`picture?after=${last}`);
+      if (answer.status !== 200) continue;
+      last = Number(answer.headers.get("X-Number"));
+      await draw(answer);
     } catch {
       await pause(RETRY_MS);
     }
@@ -67,16 +70,16 @@ async function showStates() {
   }
 }
 
-/** What stands still must be seen to stand still: the age grows while nothing comes. */
+/** What stands still, or comes late, must be seen to: the age grows while nothing comes. */
 function showAge() {
   const now_ms = performance.now();
   while (drawnAt_ms.length > 1 && drawnAt_ms[0] < now_ms - 1000) drawnAt_ms.shift();
   if (drawnAt_ms.length === 0) return;
   const since_ms = now_ms - drawnAt_ms.at(-1);
-  const old = since_ms > OLD_MS;
-  part("figure").className = old ? "old" : "";
-  const age = newest.age_ms === null ? "" : `, at least ${Math.round(newest.age_ms + since_ms)} ms old`;
-  part("age").textContent = old
+  const age_ms = since_ms + (newest.age_ms ?? 0);
+  part("figure").className = age_ms > OLD_MS ? "old" : "";
+  const age = newest.age_ms === null ? "" : `, at least ${Math.round(age_ms)} ms old`;
+  part("age").textContent = since_ms > OLD_MS
     ? `no picture for ${(since_ms / 1000).toFixed(1)} s`
     : `${newest.channel} ${newest.size}, ${drawnAt_ms.length} pictures/s${age}`;
 }
