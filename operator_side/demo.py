@@ -31,6 +31,7 @@ from sim.scenario import Scenario, load_scenario
 from sim.toml_file import laid_over
 from sim.truth import Truth
 from vision_side.detect.choice import BOXES, check_choice
+from vision_side.missions.choice import configured
 
 ROBOT: Final = "r1"
 READY_S: Final = 30.0
@@ -86,7 +87,7 @@ class DemoRun:
 def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
     """Run it. Raises ConfigError, LinkError or the failure of a process; nothing is left running in any case."""
     scenario = load_scenario(options.scenario)
-    _check_eyes(options, scenario)
+    _check_vision(options, scenario)
     run = DemoRun(options, scenario, _run_folder(options, scenario))
     with ExitStack() as ending:
         ending.enter_context(terminated_like_interrupted())
@@ -103,15 +104,17 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
     return run
 
 
-def _check_eyes(options: DemoOptions, scenario: Scenario) -> None:
-    """Raise ConfigError for a detector that vision would refuse, before anything is started."""
+def _check_vision(options: DemoOptions, scenario: Scenario) -> None:
+    """Raise ConfigError for a mission or detector that vision would refuse, before anything is started."""
+    config = vision_config(scenario, robot_of(scenario), options.seed, options.mission)
+    configured(config)
     kind = options.detector
     if kind is None or (kind == BOXES and scenario.labels):
         return
     if kind == BOXES:
         raise ConfigError(f"--detector {BOXES}: nobody finds boxes in {scenario.name}; take one that looks itself, "
                           "e.g. hsv")
-    check_choice(kind, {}, vision_config(scenario, robot_of(scenario), options.seed, options.mission))
+    check_choice(kind, {}, config)
 
 
 def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str], None]) -> None:
@@ -120,9 +123,12 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str]
     listen = [part for end in dict.fromkeys((endpoint, for_vision)) for part in ("--listen", end)]
     _write_configuration(run, sockets)
     say(f"simulation, robot and vision start as three processes; their logs are in {run.folder}")
-    processes.start("sim", ["sim", "--config", str(run.folder / "sim.toml")])
+    # What the run is about is said on the command lines: the environment, which lies over files, may say the rest.
+    processes.start("sim", ["sim", "--config", str(run.folder / "sim.toml"), "--scenario", options.scenario,
+                            "--seed", str(options.seed), "--motor-log", str(run.folder / MOTOR_LOG),
+                            "--socket-dir", sockets])
     processes.wait_line("sim", "simulation ready", READY_S)
-    processes.start("robot", ["robot", "--config", str(run.folder / "robot.toml"), *listen])
+    processes.start("robot", ["robot", "--robot", ROBOT, "--config", str(run.folder / "robot.toml"), *listen])
     processes.wait_line("robot", f"robot {ROBOT}: on", READY_S)
     with (
         open_link(ROBOT, connect=[endpoint], role=SOURCE) as link,
@@ -206,7 +212,7 @@ def _write_configuration(run: DemoRun, sockets: str) -> None:
 
 def _vision_arguments(run: DemoRun, endpoint: str) -> list[str]:
     options = run.options
-    arguments = ["vision", "--config", str(run.folder / "vision.toml"), "--connect", endpoint]
+    arguments = ["vision", "--robot", ROBOT, "--config", str(run.folder / "vision.toml"), "--connect", endpoint]
     if options.latency_ms or options.loss:
         arguments += ["--shape", Shape(options.latency_ms, options.loss, options.seed).text()]
     return arguments
@@ -221,6 +227,8 @@ def _run_folder(options: DemoOptions, scenario: Scenario) -> Path:
     name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{scenario.name}-{options.seed}"
     folder = (options.out or Path("runs") / name).expanduser().absolute()
     try:
+        while options.out is None and folder.exists():  # of a run that began in the same second
+            folder = folder.with_name(folder.name + "-again")
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"run folder {folder}: {error.strerror}; choose another with --out") from None

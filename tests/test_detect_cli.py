@@ -90,6 +90,8 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("detector", "check", "hsv", "--set", "label=a", "--set", "label.b=1"), 2, "'label' has a value"),
         (("demo", "--detector", "hsw", "--out", "/nowhere/made"), 2, "did you mean 'hsv'"),
         (("demo", "--detector", "onnx:/nowhere.onnx", "--out", "/nowhere/made"), 2, "/nowhere.onnx: No such file"),
+        (("demo", "--mission", "folow", "--out", "/nowhere/made"), 2, "did you mean 'follow'"),
+        (("demo", "--mission", "goto", "--out", "/nowhere/made"), 2, "waypoints"),
         (("demo", "--detector", "boxes", "--out", "/nowhere/made"), 2, "nobody finds boxes in circle"),
     ],
 )

@@ -42,7 +42,8 @@ def demo(folder: Path, *options: str, **environment: str) -> subprocess.Complete
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo") / "run"
-    return folder, demo(folder, "--scenario", "circle", "--seconds", "5", "--json")
+    about = {"SIGHTLINE_SIM__SCENARIO": "eight", "SIGHTLINE_SIM__SEED": "9", "SIGHTLINE_ROBOT__ROBOT": "r9"}
+    return folder, demo(folder, "--scenario", "circle", "--seconds", "5", "--json", **about)
 
 
 def test_it_drives_and_says_so_to_a_script(driven):
@@ -54,6 +55,7 @@ def test_it_drives_and_says_so_to_a_script(driven):
     assert said["score"]["travelled_m"] > 0.5
     assert said == json.loads((folder / "score.json").read_text())
     assert running_in(folder) == []
+    assert "ready: circle, raspberry, seed 1," in (folder / "sim.log").read_text(), "the environment chooses none"
 
 
 def test_the_twists_on_the_wire_come_again_from_the_recording(driven):
