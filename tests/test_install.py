@@ -35,6 +35,7 @@ def test_a_unit_has_this_machines_paths_and_nothing_of_the_template(service, tmp
     unit = _parsed(planned.text)
     assert unit["Service"]["ExecStart"] == f"{PROGRAM} {service} --config {CONFIG}"
     assert unit["Service"]["User"] == "pi"
+    assert unit["Service"]["WorkingDirectory"] == "/home/pi", "where its relative paths begin"
     assert unit["Install"]["WantedBy"] == "multi-user.target"
     assert "/opt/" not in planned.text
     assert planned.path == tmp_path / f"sightline-{service}.service"
