@@ -157,8 +157,10 @@ def test_certificates_that_cannot_be_read_here_are_told_with_the_extra(capsys, t
     assert not check["ok"] and "pip install 'sightline[secure]'" in str(check)
 
 
-def test_nobody_listening_is_told_apart_from_no_such_name(capsys):
+def test_nobody_listening_is_told_apart_from_no_such_name(capsys, monkeypatch):
+    monkeypatch.setattr(between, "neighbour", lambda host: "; it is a firewall")
     refused = _checks(capsys, "--peer", free_endpoint())["reach"]
+    assert "firewall" not in refused["fix"], "who refuses is there"
     unknown = _checks(capsys, "--peer", "tcp/no-such-name.invalid:7447")["reach"]
     assert "nobody listens" in refused["fix"] and "no machine is called" in unknown["fix"]
     assert not refused["ok"] and not unknown["ok"]

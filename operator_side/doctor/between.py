@@ -48,7 +48,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
     if transport not in _OVER_UDP:
         knocks_ms, why = _knock(host, port)
         if why:
-            yield Finding("reach", False, f"{host}:{port} does not answer", why + neighbour(host))
+            yield Finding("reach", False, f"{host}:{port} does not answer", why)
             return
         yield from _round_trip(knocks_ms, "handshakes")
     if not host.startswith(LOOPBACK):
@@ -132,11 +132,13 @@ def _knock(host: str, port: int) -> tuple[list[float], str]:
         try:
             socket.create_connection((host, port), _PATIENCE_S).close()
         except TimeoutError:
-            return times_ms, "nothing comes back: firewall, wrong address, or client isolation on the access point"
+            why = "nothing comes back: firewall, wrong address, or client isolation on the access point"
+            return times_ms, why + neighbour(host)
         except socket.gaierror:
             return times_ms, f"no machine is called {host!r}: check the name, or use its address"
         except OSError as error:
-            return times_ms, _UNREACHED.get(error.errno or 0, error.strerror or "unknown")
+            why = _UNREACHED.get(error.errno or 0, error.strerror or "unknown")
+            return times_ms, why + (neighbour(host) if error.errno == errno.EHOSTUNREACH else "")
         times_ms.append((time.monotonic_ns() - begun_ns) / 1e6)
         time.sleep(0.01)
     return times_ms, ""
