@@ -32,7 +32,7 @@ def scenarios(
         return
     files = _files(name, seed)
     if out is not None:
-        _write(out, files)
+        _write(out, name, files)
     elif as_json:
         typer.echo(json.dumps(files))
     else:
@@ -67,7 +67,9 @@ def _files(name: str, seed: int) -> dict[str, dict[str, Any]]:
     }
 
 
-def _write(out: Path, files: dict[str, dict[str, Any]]) -> None:
+def _write(out: Path, name: str, files: dict[str, dict[str, Any]]) -> None:
+    from sim.scenario import load_scenario
+
     try:
         out.mkdir(parents=True, exist_ok=True)
         for service, table in files.items():
@@ -76,6 +78,8 @@ def _write(out: Path, files: dict[str, dict[str, Any]]) -> None:
         raise ConfigError(f"--out {out}: {error.strerror}") from None
     typer.echo(f"sightline sim --config {out}/sim.toml\nsightline robot --profile sim --config {out}/robot.toml\n"
                f"sightline vision --config {out}/vision.toml")
+    if load_scenario(name).labels:
+        typer.echo("sightline labels r1")
 
 
 def labels(

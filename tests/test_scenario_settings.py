@@ -2,6 +2,7 @@
 
 import pytest
 
+from operator_side import cli
 from operator_side.scenario_settings import robot_config, robot_of, vision_config, vision_table
 from protocol.errors import ConfigError
 from robot_side.config import RobotConfig
@@ -19,6 +20,13 @@ def test_every_scenario_configures_a_vision_with_its_mission(name):
     config = vision_config(scenario, robot_of(scenario), 3)
     assert configured(config).name == scenario.mission
     assert config.target.stand_off_m == scenario.stand_off_m
+
+
+def test_all_that_has_to_run_is_told(tmp_path, capsys):
+    assert cli.run(["scenarios", "circle", "--out", str(tmp_path)]) == 0
+    assert "labels" not in capsys.readouterr().out
+    assert cli.run(["scenarios", "legs", "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.endswith("sightline labels r1\n")
 
 
 def test_the_plain_scenarios_are_seen_with_plain_eyes():
