@@ -10,6 +10,7 @@ import cv2
 
 from operator_side.film import Film
 from operator_side.jpeg_pixels import jpeg_pixels
+from operator_side.out_file import check_out_file
 from operator_side.pictures import Pictures, Shot
 from protocol.channels import OVERLAY, Channel
 from protocol.errors import ConfigError, LinkError, WireError
@@ -39,10 +40,7 @@ def check_target(path: Path, seconds: float | None) -> None:
         raise ConfigError(f"{path}: a snapshot ends in .png or .jpg, a video in .mp4")
     if kind in PICTURES and seconds is not None:
         raise ConfigError(f"--seconds is for a video, and {path} is a picture: write --out NAME.mp4")
-    if not path.parent.is_dir():
-        raise ConfigError(f"{path}: there is no folder {path.parent}")
-    if path.is_dir():
-        raise ConfigError(f"{path}: is a folder; name a file in it")
+    check_out_file(path)
 
 
 def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:

@@ -16,6 +16,7 @@ from operator_side.cli_people import Secure
 from operator_side.cli_robot_tools import drive
 from operator_side.cli_services import Connect, RobotName
 from operator_side.extras import needs
+from operator_side.out_file import check_out_file
 from protocol.errors import ConfigError
 from robot_side.config import DEFAULT_ENDPOINT
 
@@ -75,6 +76,7 @@ def camera(
 
     Pictures come from --pictures, from --camera, or from a running robot (--robot, --connect).
     """
+    check_out_file(out)
     wanted = _subject(board, square_m, ball_radius_m, distance_m)
     given = {"x_m": x_m, "y_m": y_m, "z_m": z_m, "pitch_rad": pitch_rad}
     with needs("vision"), ExitStack() as ending:

@@ -10,6 +10,7 @@ import typer
 
 from operator_side.conform_access import access_for
 from operator_side.conform_table import listing, print_results, progress
+from operator_side.out_file import check_out_file
 from protocol.conformance.html_report import to_html
 from protocol.conformance.live import LiveBench
 from protocol.conformance.report import to_dict, to_junit, to_page
@@ -210,10 +211,10 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _check_files(*files: Path | None) -> None:
-    """So that a folder that is not there is missed before the run. Raises ConfigError."""
+    """So that what cannot be written is known before the run. Raises ConfigError."""
     for path in files:
-        if path is not None and not path.absolute().parent.is_dir():
-            raise ConfigError(f"{path}: there is no folder {path.parent}; name a file in one that exists")
+        if path is not None:
+            check_out_file(path)
 
 
 def _report(

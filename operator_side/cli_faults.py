@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from operator_side.extras import needs
-from protocol.errors import ConfigError
+from operator_side.out_file import check_out_file
 
 if TYPE_CHECKING:
     from operator_side.faults.report import Results
@@ -55,8 +55,8 @@ def faults(
     if listing:
         typer.echo("\n".join(f"{row.id:<22} {row.what}: {row.demanded}" for row in rows))
         return 0
-    if out is not None and not out.absolute().parent.is_dir():
-        raise ConfigError(f"--out {out}: there is no folder {out.parent}; name a file in one that exists")
+    if out is not None:
+        check_out_file(out)
     machine, folder = describe_machine(), Path(tempfile.mkdtemp(prefix="sightline-faults-"))
     results = run_rows(
         rows, repeat, folder, jobs, lambda one, progress: typer.echo(progress_line(one, *progress), err=as_json)

@@ -9,6 +9,7 @@ import typer
 
 from operator_side.cli_judge import numbers
 from operator_side.cli_services import ConfigFile, Sets
+from operator_side.out_file import check_out_file
 from operator_side.service_settings import load_service
 from operator_side.settings_errors import no_such_name
 from operator_side.wheel_test import check_confirmed, opened_drive, try_wheels, turn_for
@@ -50,11 +51,15 @@ def drive(
     robot: Any = load_service("robot", file=config, sets=sets or (), environ=os.environ).config
     duties = _rising_duties(duty)
     check_confirmed(yes, sys.stdin.isatty(), "calibrate drive")
-    _check_writable(out)
+    check_out_file(out)
     rows = _measured_rows(robot, duties, seconds, confirmed=yes)
     text = table_text(rows, f"measured by `sightline calibrate drive`, {seconds:g} s at each duty")
-    table_of(text, "these measurements")  # what could not be read back is not written
-    out.write_text(text, "utf-8")
+    try:
+        table_of(text, "these measurements")  # what could not be read back is not written
+        out.write_text(text, "utf-8")
+    except (ConfigError, OSError) as error:
+        typer.echo(f"not written, so that nothing measured is lost:\n{text}", err=True)
+        raise error if isinstance(error, ConfigError) else ConfigError(f"{out}: {error.strerror}; see --out") from None
     typer.echo(f"{out} is written; use it: sightline robot --set drive.options.table_file={out}")
 
 
@@ -63,13 +68,6 @@ def _rising_duties(text: str) -> list[float]:
     if any(not 0 < one <= 1 for one in duties) or sorted(set(duties)) != duties:
         raise ConfigError(f"--duty {text!r}: rising numbers above 0 and up to 1, e.g. --duty 0.4,0.6,1")
     return duties
-
-
-def _check_writable(path: Path) -> None:
-    """Before the car has driven about for nothing."""
-    folder = path.expanduser().absolute().parent
-    if not os.access(path if path.exists() else folder, os.W_OK):
-        raise ConfigError(f"{path}: cannot be written; see --out")
 
 
 def _measured_rows(

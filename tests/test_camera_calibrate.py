@@ -189,6 +189,13 @@ def test_no_board_found_is_one_line(tmp_path):
     assert not out.exists()
 
 
+def test_a_file_that_cannot_be_is_told_before_anything_is_looked_at(tmp_path):
+    pictures = folder(tmp_path, [EMPTY])
+    for out, words in ((tmp_path, "is a folder"), (tmp_path / "none" / "camera.toml", "there is no folder")):
+        with pytest.raises(ConfigError, match=words):
+            run("--pictures", pictures, "--out", out)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
