@@ -179,6 +179,8 @@ def serve_zenoh(robot: Robot, port: int) -> None:
 
 
 def main() -> None:
+    if len(sys.argv) != 4 or sys.argv[1] not in ("ws", "zenoh") or not sys.argv[2].isdecimal():
+        sys.exit(__doc__)
     kind, port, folder = sys.argv[1:]
     robot = Robot([path.read_bytes() for path in sorted(Path(folder).glob("*.jpg"))])
     carry = {"ws": serve_websocket, "zenoh": serve_zenoh}[kind]

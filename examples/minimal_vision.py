@@ -127,6 +127,8 @@ def run_zenoh(endpoint: str) -> None:
 
 
 def main() -> None:
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
     if not sys.argv[1].startswith("ws"):
         run_zenoh(sys.argv[1])
     from websockets.exceptions import WebSocketException

@@ -188,3 +188,11 @@ def test_a_vision_may_name_several_robots_and_a_robot_is_one():
 
 def test_what_a_simulated_robot_is_made_of_may_be_a_file():
     assert load("sim", sets=("robot=my/car.toml",), environ={}).config.robot == "my/car.toml"
+
+
+def test_what_is_missing_is_told_with_the_file_of_what_stands_beside_it(tmp_path):
+    file = tmp_path / "vision.toml"
+    file.write_text("[camera]\nwidth_px = 320\n")
+    with pytest.raises(ConfigError) as error:
+        load("vision", file=str(file), environ={})
+    assert one_line(error).startswith(f"{file}: camera.height_px: is missing")
