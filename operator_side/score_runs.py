@@ -19,7 +19,7 @@ from protocol.errors import ConfigError
 from sim.look import look_named
 from sim.scenario import Scenario, load_scenario
 from vision_side.detect.choice import check_choice
-from vision_side.missions.choice import configured
+from vision_side.missions.choice import FAMILY, configured
 
 _MOST_NEWS: Final = 3
 """Of each group: later ones repeat the first with higher counts."""
@@ -94,10 +94,17 @@ def cases(
     detector: str | None = None,
 ) -> list[Case]:
     """Every combination, those of one group together. Raises ConfigError for a name or number that is none."""
+    if mission is not None:
+        FAMILY.load(mission)
     for name in scenarios:
         scenario = load_scenario(name)
         config = vision_config(scenario, robot_of(scenario, robot), 0, mission)
-        configured(config)
+        try:
+            configured(config)
+        except ConfigError as error:
+            if mission is None:
+                raise
+            raise ConfigError(f"scenario {name}: {error}; choose with --scenario what {mission} can drive") from None
         if detector is not None:
             check_choice(detector, {}, config)
     if look is not None:

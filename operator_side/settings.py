@@ -256,9 +256,9 @@ def _typed(given: Mapping[Key, Given], key: Key) -> Key:
 
 
 def _label(given: Mapping[Key, Given], key: Key) -> str:
-    """How to name `key` to a person: as they wrote it, where they wrote it."""
+    """How to name `key` to a person: as and where they wrote it; of what is missing, where its neighbours are."""
     beside = (given[other] for other in given if len(key) > 1 and other[: len(key) - 1] == key[:-1])
-    one, dotted = given_at(given, key) or next(beside, None), ".".join(key)  # what is missing has its neighbours' origin
+    one, dotted = given_at(given, key) or next(beside, None), ".".join(key)
     if one is None:
         return dotted
     if one.origin == "--set":

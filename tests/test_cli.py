@@ -120,6 +120,8 @@ def test_alone_it_shows_its_help(capsys):
         (["score", "--scenario", "cirle"], 2, "'circle'"),
         (["score", "--seeds", "a,b"], 2, "--seeds 1,2,3"),
         (["score", "--latency-ms", "-5"], 2, "0 to 10000"),
+        (["score", "--mission", "folow"], 2, "did you mean 'follow'"),
+        (["score", "--mission", "band"], 2, "scenario thymio: mission 'band': unknown option 'waypoints'"),
         (["score", "--detector", "hvs"], 2, "'hsv'"),
         (["status", "--connect", "here"], 2, "tcp/127.0.0.1:7447"),
         (["arm", "a b"], 2, "'a b'"),

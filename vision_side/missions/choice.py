@@ -31,7 +31,7 @@ BUILT_IN: Final = {
 }
 """Here and not as entry points, so that a checkout that nobody installed has them too."""
 GROUP: Final = "sightline.missions"
-_FAMILY: Final = Family("mission", BUILT_IN, GROUP)
+FAMILY: Final = Family("mission", BUILT_IN, GROUP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ def check_choices(config: VisionConfig) -> None:
     for when somebody asks for them: their waypoints come with the request."""
     configured(config)
     for kind, options in config.missions.items():
-        settings = settings_model(_FAMILY.load(kind))
+        settings = settings_model(FAMILY.load(kind))
         missing = {"waypoints": [(0.0, 0.0)]} if settings and "waypoints" in settings.model_fields else {}
         choose(kind, {**missing, **options}, config)
 
@@ -114,5 +114,5 @@ def choose(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Chose
 
     Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option.
     """
-    plugin = _FAMILY.load(kind)
-    return Chosen(kind, plugin, _FAMILY.settings(kind, plugin, options, config))
+    plugin = FAMILY.load(kind)
+    return Chosen(kind, plugin, FAMILY.settings(kind, plugin, options, config))
