@@ -196,7 +196,9 @@ def test_a_colour_is_picked_on_the_page_and_written(tmp_path: Path, site: Site) 
         drag(page, x_px, y_px, x_px, y_px)
         assert until(lambda: page.text("ranges").startswith("hue "), 5.0), page.text("error")
         assert until(lambda: page.run("document.getElementById('mask').naturalWidth") > 0, 5.0)
-        assert page.text("error") == "" and "in 1 blob" in page.text("trial")
+        # A busy machine's stream is of coarser JPEGs, in some of which an edge of the ball comes apart.
+        assert page.text("error") == "" and re.search(r"in 1 (to 2 )?blobs?; something in (\d+) of \2 ",
+                                                      page.text("trial")), page.text("trial")
         page.screenshot(tmp_path / "picked.png")
         page.click("use")
         assert until(lambda: page.text("said").startswith("written into "), 5.0), page.text("error")
