@@ -9,7 +9,7 @@ from enum import Enum
 from typing import Final
 
 from operator_side.requests import Report, read_report
-from operator_side.teleop_keys import HAND_OVER, MOST_AT_ONCE, MOVES, SPEEDS, STOPS, Hold, split_keys
+from operator_side.teleop_keys import FRESH_US, HAND_OVER, MOST_AT_ONCE, MOVES, SPEEDS, STOPS, Hold, split_keys
 from operator_side.teleop_speed import Speeds, SpeedUp
 from protocol.channels import ACK, REPLY, REQUEST, TWIST, Channel
 from protocol.codec import decode, encode
@@ -59,10 +59,11 @@ class Teleop:
         self.mode = Mode.LOOKING_ON
         self.report: Report | None = None
         self.heard_us = 0
-        """When the report came."""
+        """When a status came, understood or not."""
         self.note = ""
         """What the person should know beside the robot's status."""
         self._hold = Hold()
+        self._deaf_until_us = 0
         self._stick: tuple[float, float] | None = None
         self._stick_waits = False
         """Somebody stopped, or handed over, with the dead man's button held: it has to be let go of first."""
@@ -80,9 +81,11 @@ class Teleop:
 
     def on_keys(self, text: str, now_us: int) -> None:
         """What was read from the terminal at once. A pile of keys is what a link that stalled or a paste brings, and
-        tells of no key that is held now: only stopping counts."""
+        tells of no key that is held now: only stopping counts, and so it is of what comes just behind it."""
         keys = split_keys(text)
         if len(keys) > MOST_AT_ONCE:
+            self._deaf_until_us = now_us + FRESH_US
+        if now_us < self._deaf_until_us:
             keys = [key for key in keys if key in STOPS]
             self._hold.miss(now_us)
         for key in keys:
@@ -124,12 +127,12 @@ class Teleop:
 
     def on_status(self, message: Message, now_us: int) -> None:
         """The newest status."""
+        self.heard_us = now_us
         try:
             self.report = read_report(message)
         except WireError as error:
             self.note = f"the robot's status is not understood: {error.detail}"
             return
-        self.heard_us = now_us
         self.speeds.limit(self.report.status)
         if self.mode is Mode.HANDING_OVER and self._asking is not Verb.RELEASE and self._other_drives():
             self.mode, self._asking, self.note = Mode.LOOKING_ON, None, ""

@@ -27,6 +27,7 @@ from protocol.transports.link import LatestSlot, Link, Message
 
 _TICK_S: Final = 0.01
 _SHOW_US: Final = 100_000
+_ALL: Final = 4096  # what a terminal holds: a pile of keys must be seen as one
 _FAREWELL_S: Final = 0.25
 """Last words are repeated this long, unless the robot answers."""
 _SAY_AGAIN_S: Final = 0.03
@@ -94,7 +95,7 @@ class Cockpit:
 
     def _read_keys(self) -> None:
         try:
-            data = os.read(sys.stdin.fileno(), 256)
+            data = os.read(sys.stdin.fileno(), _ALL)
         except OSError:  # the terminal was closed
             data = b""
         if not data or b"\x04" in data:

@@ -25,7 +25,7 @@ def live_line(robot: str, teleop: Teleop, width: int, now_us: int) -> str:
     """State, reason, who drives, speeds; cut to the terminal's width, so that it stays one line. Of a robot that has
     fallen silent nothing is known any more."""
     if teleop.report is None:
-        text = f"{robot}: nothing heard yet"
+        text = f"{robot}: {teleop.note or 'nothing heard yet'}"
     elif (silent_us := now_us - teleop.heard_us) > _SILENT_US:
         text = f"{robot}: nothing heard for {silent_us / 1e6:.0f} s; without commands it stops by itself"
     else:

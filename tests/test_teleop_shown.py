@@ -2,9 +2,13 @@
 
 import pytest
 
+from operator_side.teleop import Teleop
+from operator_side.teleop_speed import Speeds
 from operator_side.teleop_text import live_line
+from protocol.channels import STATUS
 from protocol.messages import STILL, State, Twist, Verb
-from tests.teleop_rig import TeleopRig, vision_drives
+from protocol.transports.link import Message
+from tests.teleop_rig import PERSON, TeleopRig, vision_drives
 
 
 def shown(rig, width):
@@ -35,6 +39,16 @@ def test_a_robot_that_fell_silent_is_not_shown_as_it_was():
     rig.connected = True
     rig.run(0.5)
     assert shown(rig, 200).startswith("r1 ")
+
+
+def test_a_robot_of_another_version_is_not_told_to_be_silent():
+    rig = TeleopRig()
+    rig.run(0.3)
+    rig.teleop.on_status(Message(STATUS, "", b"{}", b"{}"), rig.now_us)
+    assert "the robot's status is not understood" in shown(rig, 200)
+    fresh = Teleop(PERSON, Speeds(0.2, 1.0))
+    fresh.on_status(Message(STATUS, "", b"{}", b"{}"), 0)
+    assert live_line("r1", fresh, 200, 0).startswith("r1: the robot's status is not understood")
 
 
 def test_a_press_before_the_first_status_arms_once_it_has_come():
@@ -89,6 +103,20 @@ def test_a_pile_of_keys_of_one_read_neither_arms_nor_drives(pile):
     rig.tap(pile)
     rig.run(2.0)
     assert Verb.ARM not in rig.asked and {twist for _, twist in rig.commands} <= {STILL} and rig.state is State.DISARMED
+
+
+@pytest.mark.parametrize("pile", ["x" * 256, "iiii k iii"])
+def test_what_comes_just_behind_a_pile_is_of_it(pile):
+    """A second read, or a second segment of the link that stalled."""
+    rig = TeleopRig()
+    rig.run(0.5)
+    for text in (pile, "hi", "i"):
+        rig.tap(text)
+        rig.run(0.1)
+    rig.run(1.0)
+    assert Verb.ARM not in rig.asked and {twist for _, twist in rig.commands} <= {STILL} and rig.state is State.DISARMED
+    rig.hold("i")
+    assert rig.until(lambda: rig.applied.linear_mps > 0, 1.0) is not None, "hands on the keyboard drive"
 
 
 def test_a_pile_of_keys_lets_go_of_what_was_held_and_a_stop_in_it_stops():
