@@ -70,7 +70,7 @@ def _fitted(unit: str, service: str, program: Path, config: Path) -> str:
     fitted = (
         unit.replace(_PROGRAM, str(program)).replace(_PYTHON, str(program.with_name("python")))
         .replace(f"/etc/sightline/{service}.toml", str(config))
-        .replace("WorkingDirectory=/etc/sightline", f"WorkingDirectory={config.parent}")
+        .replace("WorkingDirectory=-/etc/sightline", f"WorkingDirectory=-{config.parent}")
     )
     return "\n".join(line for line in fitted.splitlines() if line[:1] != "#") + "\n"
 

@@ -35,7 +35,7 @@ def test_a_unit_has_this_machines_paths_and_nothing_of_the_template(service, tmp
     unit = _parsed(planned.text)
     assert unit["Service"]["ExecStart"] == f"{PROGRAM} {service} --config {CONFIG}"
     assert unit["Service"]["User"] == "pi"
-    assert unit["Service"]["WorkingDirectory"] == "/home/pi", "where its relative paths begin"
+    assert unit["Service"]["WorkingDirectory"] == "-/home/pi", "where its relative paths begin; gone or not"
     assert unit["Install"]["WantedBy"] == "multi-user.target"
     assert "/opt/" not in planned.text
     assert planned.path == tmp_path / f"sightline-{service}.service"
@@ -115,7 +115,7 @@ def test_a_robot_on_pins_has_its_own_pins_put_low_first_and_then_its_own_command
     options = {"left_forward_pin": 20, "right_backward_pin": 21, "enable_pins": enable}
     robot = RobotConfig(drive=PluginChoice(kind="gpio", options=options))
     planned = install.drop_in(robot, PROGRAM, CONFIG, tmp_path)
-    first = f"-/home/pi/.venv/bin/python -m robot_side.hardware.gpio_low {' '.join(map(str, (20, 9, 8, 21, *enable)))}"
+    first = f"-/home/pi/.venv/bin/python -P -m robot_side.hardware.gpio_low {' '.join(map(str, (20, 9, 8, 21, *enable)))}"
     own = stops_with(install.plan("robot", PROGRAM, CONFIG, "pi", tmp_path).text)
     assert stops_with(planned.text) == ["", first, *own], "emptied, then in this order"
     assert planned.path == tmp_path / "sightline-robot.service.d" / "gpio-low.conf"
