@@ -90,6 +90,14 @@ def test_a_name_whose_first_address_is_dead_is_reached_at_its_second(monkeypatch
             one.close()
 
 
+def test_a_name_whose_first_address_is_of_a_family_that_this_machine_lacks_is_reached(monkeypatch):
+    with Server(lambda request: GOOD) as server:
+        lacking = (9999, socket.SOCK_STREAM, 6, "", ("::1", server.port, 0, 0))
+        there = (socket.AF_INET, socket.SOCK_STREAM, 6, "", ("127.0.0.1", server.port))
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: [lacking, there])
+        assert _ask(_asking(server))
+
+
 def test_what_a_server_says_unasked_answers_no_later_frame():
     def twice(request):
         yield http_reply(said(box(x1=1.0)))

@@ -123,17 +123,14 @@ class HttpExchange:
         """A connection to one of the host's addresses; each that is still to be tried has its share of the time."""
         found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
         found.sort(key=lambda one: one[4] != self._reached)
-        for number, (family, kind, protocol, _, address) in enumerate(found):
-            connection = socket.socket(family, kind, protocol)
+        for number, one in enumerate(found):
             try:
-                connection.settimeout(_left_s(until_us) / (len(found) - number))
-                connection.connect(address)
+                connection = _connected(one, _left_s(until_us) / (len(found) - number))
             except OSError:
-                connection.close()
                 if number == len(found) - 1:
                     raise
             else:
-                self._reached = address
+                self._reached = one[4]
                 return connection
         raise OSError("its name has no address")
 
@@ -162,6 +159,19 @@ class HttpExchange:
             if response.will_close or not response.isclosed():
                 self.close()
             return Reply({name.lower(): value for name, value in response.headers.items()}, body)
+
+
+def _connected(found: Any, timeout_s: float) -> socket.socket:
+    """To one of what `getaddrinfo` gives."""
+    family, kind, protocol, _, address = found
+    connection = socket.socket(family, kind, protocol)
+    try:
+        connection.settimeout(timeout_s)
+        connection.connect(address)
+    except OSError:
+        connection.close()
+        raise
+    return connection
 
 
 class _Timed(io.RawIOBase):
