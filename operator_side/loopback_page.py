@@ -10,20 +10,19 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from html import escape
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import parse_qsl, urlsplit
 
+from operator_side.bounded_threads import BoundedThreads
 from protocol.errors import LinkError, SightlineError
 from protocol.transports.port_owner import port_owner
 
 HOST: Final = "127.0.0.1"
 MAX_BODY_BYTES: Final = 4096
 """Security limit: what a page posts."""
-MAX_CONNECTIONS: Final = 32
-"""Security limit: more are closed at once; a browser holds six."""
 SILENCE_S: Final = 20.0
 """Security limit: a connection that says nothing for this long is closed."""
 _MAX_FIELDS: Final = 16
@@ -89,28 +88,7 @@ def _answered(route: Route, query: str, body: bytes) -> Answer:
         return as_json({"error": f"this is not asked rightly: {error}"}, 400)
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
-        self._places = threading.BoundedSemaphore(MAX_CONNECTIONS)
-        super().__init__(address, handler)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """On a thread of its own, while there is a place."""
-        if self._places.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Give the place back afterwards."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._places.release()
-
+class _Server(BoundedThreads, HTTPServer):
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that goes away in the middle is no news."""
 

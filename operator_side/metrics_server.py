@@ -9,10 +9,10 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from socketserver import ThreadingMixIn
 from typing import TYPE_CHECKING, Any, Final, Protocol
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
+from operator_side.bounded_threads import BoundedThreads
 from protocol.errors import LinkError
 from protocol.transports.port_owner import port_owner
 
@@ -84,12 +84,7 @@ def serving(told: Told, host: str, port: int) -> Iterator[int]:
         server.server_close()
 
 
-class _Server(ThreadingMixIn, WSGIServer):
-    """Each connection on a thread: one that says nothing holds up neither the others nor the end."""
-
-    daemon_threads = True
-    block_on_close = False
-
+class _Server(BoundedThreads, WSGIServer):
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Who goes away in the middle of it, or says nothing, is no error of ours."""
         if not isinstance(sys.exception(), OSError):

@@ -1,12 +1,14 @@
 """The little server of `/metrics` and `/health`: connections that say nothing, or go, hold up nobody."""
 
 import socket
+import threading
 import time
 import urllib.request
 
 import pytest
 
 from operator_side import metrics_server
+from operator_side.bounded_threads import MAX_CONNECTIONS
 from operator_side.metrics_server import serving
 from tests.link_rigs import until
 
@@ -37,6 +39,18 @@ def test_a_connection_that_says_nothing_holds_up_neither_others_nor_the_end(said
     assert time.monotonic() - began_s < 3
     for one in idle:
         one.close()
+
+
+def test_there_are_no_more_threads_than_places():
+    """They are threads of the process that steers."""
+    with serving(Nothing(), "127.0.0.1", 0) as port:
+        before = threading.active_count()
+        held = [socket.create_connection(("127.0.0.1", port), 5) for _ in range(3 * MAX_CONNECTIONS)]
+        assert until(lambda: threading.active_count() - before == MAX_CONNECTIONS)
+        for one in held:
+            one.close()
+        assert until(lambda: threading.active_count() == before)
+        assert _health(port) == b"heard\n"
 
 
 def test_a_connection_that_says_nothing_is_let_go_of_in_silence(monkeypatch, capfd):
