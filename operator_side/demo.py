@@ -80,6 +80,7 @@ class DemoRun:
     folder: Path
     samples: list[Truth] = field(default_factory=list)
     dropped_by_recorder: int = 0
+    recorder_failed: str = ""
     killed: list[str] = field(default_factory=list)
     interrupted: bool = False
 
@@ -145,7 +146,7 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str]
             _watch(run, processes, operator, truth, block)
         finally:
             recorder.close()
-            run.dropped_by_recorder = recorder.dropped
+            run.dropped_by_recorder, run.recorder_failed = recorder.dropped, recorder.failed
 
 
 def _arm(operator: Operator, processes: Processes) -> None:
@@ -226,13 +227,14 @@ def _about(run: DemoRun) -> dict[str, str]:
 def _run_folder(options: DemoOptions, scenario: Scenario) -> Path:
     name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{scenario.name}-{options.seed}"
     folder = (options.out or Path("runs") / name).expanduser().absolute()
-    try:
-        while options.out is None and folder.exists():  # of a run that began in the same second
-            folder = folder.with_name(folder.name + "-again")
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"run folder {folder}: {error.strerror}; choose another with --out") from None
-    return folder
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=options.out is not None)
+            return folder
+        except OSError as error:
+            if options.out is not None or not isinstance(error, FileExistsError):
+                raise ConfigError(f"run folder {folder}: {error.strerror}; choose another with --out") from None
+            folder = folder.with_name(folder.name + "-again")  # another run began in the same second
 
 
 def _free_port() -> int:

@@ -45,8 +45,8 @@ class DemoReport:
             "score": asdict(self.score),
             "scenario": options.scenario, "seed": options.seed, "latency_ms": options.latency_ms, "loss": options.loss,
             "replayed": asdict(self.replayed), "injected": self.injected,
-            "recorder_dropped": self.run.dropped_by_recorder, "interrupted": self.run.interrupted,
-            "folder": str(self.run.folder),
+            "recorder_dropped": self.run.dropped_by_recorder, "recorder_failed": self.run.recorder_failed,
+            "interrupted": self.run.interrupted, "folder": str(self.run.folder),
         }
 
 
@@ -107,7 +107,7 @@ def _injection_checks(run: DemoRun, injected: dict[str, Any] | None) -> list[Che
 def _checks(run: DemoRun, result: Score) -> list[Check]:
     """The scenario's bounds; of the older dialect, slow and without odometry, only that it follows is demanded."""
     if run.options.transport != "legacy":
-        return judge(run.scenario.name, result, run.options.latency_ms, REAL_TIME_FACTOR)
+        return judge(run.options.scenario, result, run.options.latency_ms, REAL_TIME_FACTOR)
     unseen = 100 * sum(not sample.visible for sample in run.samples) / len(run.samples)
     return [
         Check("out of view", unseen, "%", 0.0, unseen == 0),
@@ -122,6 +122,8 @@ def summary(judged: DemoReport) -> list[str]:
     lines.append(_replay_line(replayed))
     if run.dropped_by_recorder:
         lines.append(f"the recorder dropped {run.dropped_by_recorder} messages: the disk was too slow")
+    if run.recorder_failed:
+        lines.append(f"the recording ends early: {run.recorder_failed}")
     if run.killed:
         lines.append(f"had to be killed: {', '.join(run.killed)}; see their logs")
     lines.append(f"left in {run.folder}: score.json trajectory.png run.mp4 run.mcap motors.csv *.log")

@@ -55,7 +55,10 @@ class Recorder:
         self._ids: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self.dropped = 0
-        self._closed = self._failed = False
+        """For want of time to write them."""
+        self.failed = ""
+        """Why nothing more could be written, if so."""
+        self._closed = False
         self._writing = threading.Thread(target=self._write_all, name="recorder", daemon=True)
         self._writing.start()
         for channel in channels:
@@ -76,11 +79,9 @@ class Recorder:
 
     def _write_all(self) -> None:
         while (item := self._queue.get()) is not None:
-            if self._failed:
-                self.dropped += 1
-                continue
-            with self._telling():
-                self._write(*item)
+            if not self.failed:
+                with self._telling():
+                    self._write(*item)
 
     @contextmanager
     def _telling(self) -> Iterator[None]:
@@ -88,9 +89,9 @@ class Recorder:
         try:
             yield
         except OSError as error:
-            if not self._failed:
-                tell(f"recording {self._path}: {error.strerror or error}; nothing more is recorded")
-            self._failed = True
+            if not self.failed:
+                self.failed = error.strerror or str(error)
+                tell(f"recording {self._path}: {self.failed}; nothing more is recorded")
 
     def _write(self, log_time_ns: int, message: Message) -> None:
         topic = message.channel.name + (f"/{message.source}" if message.source else "")
