@@ -257,10 +257,11 @@ def _typed(given: Mapping[Key, Given], key: Key) -> Key:
 
 def _label(given: Mapping[Key, Given], key: Key) -> str:
     """How to name `key` to a person: as and where they wrote it; of what is missing, where its neighbours are."""
-    beside = (given[other] for other in given if len(key) > 1 and other[: len(key) - 1] == key[:-1])
-    one, dotted = given_at(given, key) or next(beside, None), ".".join(key)
+    one, dotted = given_at(given, key), ".".join(key)
     if one is None:
-        return dotted
+        beside = (one.origin for at, one in given.items() if len(key) > 1 and at[: len(key) - 1] == key[:-1])
+        file = next((origin for origin in beside if not origin.startswith((ENV_PREFIX, "--"))), "")
+        return f"{file}: {dotted}" if file else dotted
     if one.origin == "--set":
         return f"--set {dotted}"
     return one.origin if one.origin.startswith((ENV_PREFIX, "--")) else f"{one.origin}: {dotted}"

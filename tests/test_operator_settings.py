@@ -196,3 +196,5 @@ def test_what_is_missing_is_told_with_the_file_of_what_stands_beside_it(tmp_path
     with pytest.raises(ConfigError) as error:
         load("vision", file=str(file), environ={})
     assert one_line(error).startswith(f"{file}: camera.height_px: is missing")
+    with pytest.raises(ConfigError, match=r"^camera\.height_px: is missing"):
+        load("vision", environ={"SIGHTLINE_VISION__CAMERA__WIDTH_PX": "320"})

@@ -1,0 +1,33 @@
+"""Where a result is to go is looked at before the work: every way it cannot be is one line."""
+
+import pytest
+
+from operator_side.out_file import check_out_file
+from protocol.errors import ConfigError
+
+
+def test_a_file_that_can_be_written_passes(tmp_path):
+    (tmp_path / "old.toml").touch()
+    check_out_file(tmp_path / "old.toml")
+    check_out_file(tmp_path / "new.toml")
+
+
+@pytest.mark.parametrize(("name", "words"), [
+    ("none/x.toml", "there is no folder"), ("", "is a folder"), ("locked/x.toml", "cannot be written"),
+    ("locked/inner/x.toml", "cannot be written"),
+])  # fmt: skip
+def test_what_cannot_be_is_said(tmp_path, monkeypatch, name, words):
+    locked = tmp_path / "locked"
+    locked.mkdir()
+    kind = type(tmp_path)
+    is_dir = kind.is_dir
+
+    def refused(path):  # root may look everywhere; others are told so
+        if locked in path.parents:
+            raise PermissionError
+        return is_dir(path)
+
+    monkeypatch.setattr(kind, "is_dir", refused)
+    monkeypatch.setattr("os.access", lambda path, mode: path != locked)
+    with pytest.raises(ConfigError, match=words):
+        check_out_file(tmp_path / name)
