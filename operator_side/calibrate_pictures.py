@@ -48,12 +48,12 @@ def camera_pictures(camera: Camera, seconds: float) -> Iterator[bytes]:
             yield picture.jpeg
 
 
-def robot_pictures(link: Link, seconds: float, role: str = ROLE) -> Iterator[bytes]:
-    """What a robot's camera sees for `seconds`; frames are acknowledged, so that it goes on sending.
+def robot_pictures(link: Link, seconds: float, role: str = ROLE, secure: str = "") -> Iterator[bytes]:
+    """What a robot's camera sees for `seconds`; frames are acknowledged by who may, so that it goes on sending.
 
     Raises LinkError when no frame comes for five seconds.
     """
-    frames, viewer = link.latest(FRAME), Viewer(link, role)
+    frames, viewer = link.latest(FRAME), Viewer(link, role, secure)
     heard_s = time.monotonic()
     ends_s = heard_s + seconds
     while time.monotonic() < ends_s:

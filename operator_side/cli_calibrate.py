@@ -130,7 +130,7 @@ def _source(
     link = ending.enter_context(open_link(name or "r1", connect=at, role=role, secure=secure))
     model = sources.robot_model(link)
     mounted = {"x_m": model.x_m, "y_m": model.y_m, "z_m": model.z_m, "pitch_rad": model.pitch_rad}
-    return sources.robot_pictures(link, seconds, role), mounted
+    return sources.robot_pictures(link, seconds, role, secure), mounted
 
 
 def _mounting(known: dict[str, float], given: dict[str, float | None]) -> "Mounting":
