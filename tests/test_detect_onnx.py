@@ -231,13 +231,25 @@ FORM = Form(False, False, (240, 320), "triple", ("ball",))
 STRAIGHT = Fitting(1.0, 0, 0)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
-def test_numbers_that_are_none_are_no_detections(bad: float) -> None:
-    boxes = np.array([[bad, 0, 10, 10], [5, 5, bad, 9], [1, 1, 9, 9]])
-    outputs = {"boxes": boxes, "scores": np.array([0.9, 0.9, bad]), "labels": np.zeros(3)}
-    found = read_outputs(outputs, FORM, STRAIGHT, PICTURE, 0.1)
-    assert all(0 <= one.x1_px < one.x2_px <= 320 and 0 <= one.score <= 1 for one in found)
-    assert len(found) <= 1
+def _found_beside_a_good_one(box: float, score: float, label: float) -> tuple[Detection, ...]:
+    outputs = {"boxes": np.array([[1, 1, 9, 9], [5, 5, box, 9]]), "scores": np.array([0.9, score]),
+               "labels": np.array([0.0, label])}
+    return read_outputs(outputs, FORM, STRAIGHT, PICTURE, 0.1)
+
+
+@pytest.mark.parametrize(("box", "score", "label"), [
+    (np.nan, 0.9, 0), (-np.inf, 0.9, 0), (9, np.nan, 0), (9, np.inf, 0), (9, 1.01, 0), (9, 7, 0), (9, 0.9, np.nan),
+])  # fmt: skip
+def test_numbers_that_are_none_are_no_answer(box: float, score: float, label: float) -> None:
+    """Who took them for "saw nothing" would begin to search."""
+    with pytest.raises(ValueError, match=r"nan or infinite|between 0 and 1"):
+        _found_beside_a_good_one(box, score, label)
+
+
+@pytest.mark.parametrize(("box", "score", "count"), [(np.nan, 0.05, 1), (9, -np.inf, 1), (1e300, 0.9, 2)])
+def test_what_does_not_count_may_hold_anything(box: float, score: float, count: int) -> None:
+    found = _found_beside_a_good_one(box, score, 0)
+    assert len(found) == count and all(0 <= one.x1_px < one.x2_px <= 320 for one in found)
 
 
 def test_a_million_boxes_and_other_shapes_are_refused() -> None:

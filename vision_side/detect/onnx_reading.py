@@ -65,6 +65,8 @@ def form_of(header: OnnxHeader, names: Sequence[str], colour: str) -> Form:
     if len(one.shape) != 4 or not ((one.type == "uint8" and rows_first) or (floats and channels_first)):
         raise ValueError(f"its input is {one.type} {_shape_text(one)}; it should be uint8 (1, H, W, 3) or float "
                          "(1, 3, H, W)")
+    if one.shape[0] not in (1, None):
+        raise ValueError(f"it takes {one.shape[0]} pictures at once; export it for 1, or for any number")
     rows, columns = one.shape[1:3] if rows_first and not floats else one.shape[2:4]
     size = (rows, columns) if rows and columns else None
     labels = tuple(map(clean_label, names)) or own_labels(header.metadata)
@@ -90,10 +92,14 @@ def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> str:
         shape = outputs[0].shape
         if shape and shape[-1] == 6:
             return "rows"
-        if len(shape) == 3 and shape[1] is not None and shape[1] > 4 and (not labels or shape[1] == 4 + len(labels)):
+        if len(shape) == 3 and shape[1] is not None and shape[1] > 4:
+            if labels and shape[1] != 4 + len(labels):
+                raise ValueError(f"it tells {shape[1] - 4} classes apart and has {len(labels)} names; "
+                                 "detector.options.names has one for each, in order")
             return "yolo"
     given = ", ".join(f"{one.name} {_shape_text(one)}" for one in outputs)
-    raise ValueError(f"it gives {given}; it should be boxes, scores and labels, or one (N, 6), or one (4 + classes, N)")
+    raise ValueError(f"it gives {given}; it should be boxes, scores and labels, or one (N, 6), or one "
+                     "(1, 4 + classes, N)")
 
 
 def own_labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
@@ -137,14 +143,19 @@ def read_outputs(
 ) -> tuple[Detection, ...]:
     """What the model saw, surest first, in pixels of the encoded picture.
 
-    Raises ValueError for outputs of another shape than the model said. Numbers that are none are no detections.
+    Raises ValueError for outputs of another shape than the model said, and for numbers that are none in what counts: to
+    have seen nothing is another thing.
     """
     boxes, scores, labels = _READERS[form.kind](outputs)
     count = len(boxes)
     if boxes.shape != (count, 4) or scores.shape != (count,) or labels.shape != (count,):
         raise ValueError(f"boxes {boxes.shape}, scores {scores.shape}, labels {labels.shape}")
-    good = np.isfinite(boxes).all(axis=1) & np.isfinite(labels) & (scores >= min_score) & (scores <= 1)
-    boxes, scores, labels = boxes[good], scores[good], labels[good]
+    counts = ~(scores < min_score)  # nan counts, too
+    boxes, scores, labels = boxes[counts], scores[counts], labels[counts]
+    if not (np.isfinite(boxes).all() and np.isfinite(scores).all() and np.isfinite(labels).all()):
+        raise ValueError("a box, score or label is nan or infinite")
+    if (scores > 1).any():
+        raise ValueError(f"a score of {scores.max():g}; it is between 0 and 1")
     first = np.argsort(-scores, kind="stable")
     if form.kind == "yolo":
         first = first[_uncovered(boxes[first], scores[first], labels[first])]
