@@ -84,7 +84,7 @@ class VideoCamera:
             raise HardwareError(f"video {self._config.path} is not there; set camera.options.path to a video file")
         self._capture: Any = self._cv2.VideoCapture(str(path), self._cv2.CAP_FFMPEG)
         self._at = 0
-        if not self._capture.isOpened():
+        if not self._capture.isOpened() or min(self._size().width_px, self._size().height_px) < 1:
             raise HardwareError(f"video {self._config.path} cannot be played: it is broken or no video; play it with "
                                 "another program, or record it anew")
 
