@@ -19,6 +19,7 @@ from pydantic import BaseModel, ValidationError
 
 from protocol.errors import ConfigError
 from vision_side.config import VisionConfig
+from vision_side.detect.around import PLUGIN_RAISES
 
 LONGEST_DETAIL: Final = 160
 _CLASS: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
@@ -46,9 +47,10 @@ class Family:
                 return others[kind].load()
             if where is not None or _CLASS.fullmatch(kind):
                 return _imported(where or kind)
-        except Exception as error:  # whatever a plug-in's own import raises
+        except PLUGIN_RAISES as error:  # in a plug-in's own import
             hint = "" if where or kind in others else self._hint(kind)
-            raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {error}"[:LONGEST_DETAIL] + hint) from None
+            why = str(error) or type(error).__name__
+            raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {why}"[:LONGEST_DETAIL] + hint) from None
         hint, there = self._hint(kind), ", ".join(self.names())
         raise ConfigError(f"no {self.noun} called {kind!r}{hint}; there are {there}, or package.module:Name")
 

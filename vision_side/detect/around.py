@@ -8,6 +8,8 @@ from protocol.errors import ConfigError, SightlineError
 from protocol.transports.link import Link
 from vision_side.detect.port import Detector, Maker
 
+PLUGIN_RAISES: Final = (Exception, SystemExit)
+"""What a plug-in's own code may raise: `sys.exit` in it is to end itself, not the service around it."""
 _LONGEST: Final = 160
 
 
@@ -50,7 +52,7 @@ def news_of(detector: Any) -> list[str]:
         return []
     try:
         return [" ".join(str(line).split()) for line in news()]
-    except Exception as error:  # a plug-in's own; who only talks badly may still see well
+    except PLUGIN_RAISES as error:  # who only talks badly may still see well
         return [_raises("the detector's news()", error)]
 
 
@@ -75,9 +77,9 @@ def plugin_does(what: str) -> Iterator[None]:
         yield
     except SightlineError:
         raise
-    except Exception as error:
+    except PLUGIN_RAISES as error:
         raise ConfigError(f"{_raises(what, error)}; it has to be mended") from error
 
 
-def _raises(what: str, error: Exception) -> str:
+def _raises(what: str, error: BaseException) -> str:
     return f"{what} raises {type(error).__name__}: {' '.join(str(error).split())}"[:_LONGEST]

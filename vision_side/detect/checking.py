@@ -10,6 +10,7 @@ from numbers import Real
 from typing import Any, Final
 
 from protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER
+from vision_side.detect.around import PLUGIN_RAISES
 from vision_side.detect.labels import LONGEST_LABEL, is_label
 from vision_side.detect.port import Circle, DetectFrame, Detection, DetectionResult, Detector, clipped
 
@@ -30,7 +31,7 @@ def asked(
         results = detector.detect(frames, deadline_us)
         if len(results) != len(frames):
             raise ValueError(f"{len(results)} results for {len(frames)} frames")
-    except Exception as error:  # a plug-in's own
+    except PLUGIN_RAISES as error:
         if len(frames) > 1:  # whose frame it failed for is not known, and should cost no other robot its answer
             why = _why(error)
             return [why if clock() > deadline_us else asked(detector, [one], deadline_us)[0] for one in frames]
@@ -45,7 +46,7 @@ def _answer(frame: DetectFrame, result: DetectionResult | None) -> DetectionResu
         return _why(error)
 
 
-def _why(error: Exception) -> str:
+def _why(error: BaseException) -> str:
     why = " ".join(f"the detector's answer is none: {type(error).__name__}: {error}".split())
     return _printable(why[:_LONGEST_WHY])
 

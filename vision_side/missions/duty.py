@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from protocol.messages import STILL, CameraModel
+from vision_side.detect.around import PLUGIN_RAISES
 from vision_side.missions.choice import Chosen
 from vision_side.missions.port import Plan, View
 
@@ -57,7 +58,7 @@ class Duty:
         self._over: Plan | None = None
         try:
             self._mission = self.chosen.build(camera)
-        except Exception as error:  # a plug-in's own
+        except PLUGIN_RAISES as error:
             self._over = _failed(error)
 
     def _checked(self, view: View) -> Plan:
@@ -65,12 +66,12 @@ class Duty:
             plan = self._mission.step(view)
             if max(abs(plan.twist.linear_mps), abs(plan.twist.angular_rad_s)) > MAX_ASKED:
                 raise ValueError(f"asks for {plan.twist.linear_mps:g} m/s, {plan.twist.angular_rad_s:g} rad/s")
-        except Exception as error:  # a plug-in's own; vision goes on, the robot stands still
+        except PLUGIN_RAISES as error:  # vision goes on, the robot stands still
             plan = _failed(error)
         if plan.done:
             self._over = plan = replace(plan, twist=STILL, target=None)
         return plan
 
 
-def _failed(error: Exception) -> Plan:
+def _failed(error: BaseException) -> Plan:
     return Plan(STILL, "failed", " ".join(f"{type(error).__name__}: {error}".split())[:200], done=True)
