@@ -53,22 +53,9 @@ def _check_names(config: BaseModel) -> None:
     if isinstance(config, SimConfig):
         load_robot(config.robot or load_scenario(config.scenario).robot)
     if isinstance(config, VisionConfig):
-        _check_eyes_and_missions(config)
-
-
-def _check_eyes_and_missions(config: VisionConfig) -> None:
-    with needs("vision"):
-        from vision_side.detect.choice import BOXES, check_choice, check_device, configured_detector
-        from vision_side.missions.choice import check_choices
-    check_choices(config)
-    one = config.detector
-    if one.kind == BOXES:
-        configured_detector(config)
-        return
-    check_device(config)
-    for kind, options in ((one.kind, one.options), (one.fallback, {}), (one.shadow, one.shadow_options)):
-        if kind:
-            check_choice(kind, options, config)
+        with needs("vision"):
+            from vision_side.detect.choice import check_vision
+        check_vision(config)
 
 
 def show(

@@ -113,10 +113,11 @@ def check(
     given: Any = load_service("vision", file=config, sets=(), options=options, environ=os.environ).config
     with needs("vision"):
         from vision_side.detect.around import news_of
-        from vision_side.detect.choice import check_device, choose_detector
+        from vision_side.detect.choice import check_device, check_looks, choose_detector
         from vision_side.detect.contract import check_detector, time_detector
     settings = given.model_copy(update={"detector": given.detector.model_copy(update={"kind": name})})
     check_device(settings)
+    check_looks(name)
     own, made = own_options(sets or ()), list["Detector"]()
 
     def make() -> "Detector":

@@ -12,6 +12,7 @@ import typer
 from operator_side.cli_detector_serve import Device
 from operator_side.cli_services import ConfigFile, Sets
 from operator_side.extras import needs
+from operator_side.out_file import check_out_file
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
 
@@ -58,6 +59,8 @@ def detectors(
         from operator_side.score_table import progress
     if demand and seeds < FROM:
         raise ConfigError(f"--demand judges, which only seeds from {FROM} up are for, not {seeds}")
+    if sheet is not None:
+        check_out_file(sheet)
     columns, shown = _columns(column), frames or (DEMANDED_FRAMES if demand else FRAMES)
     asked = _subjects(names or COMPARED, config, sets or (), device)
     try:

@@ -196,12 +196,15 @@ def router(listen: Listen = None, connect: Connect = None, secure: Secure = "", 
 
 def _only_look(config: Any, camera: str | None, camera_sets: list[str]) -> int:
     from operator_side.local_camera import local_camera
+    from vision_side.detect.choice import check_looks, check_vision
     from vision_side.dry_run import watch_camera, watch_robot
 
     if config.detector.kind == "boxes":
         raise ConfigError("--dry-run looks with vision's own eyes; name a detector, e.g. --detector hsv")
     if camera is None:
         return watch_robot(config, typer.echo, None)
+    check_looks(config.detector.kind)
+    check_vision(config)
     with local_camera(camera, camera_sets) as opened:
         return watch_camera(config, opened, typer.echo, None)
 

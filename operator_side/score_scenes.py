@@ -18,7 +18,7 @@ from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
 from vision_side.detect.around import close_detector, news_of
 from vision_side.detect.checking import asked as checked_answers
-from vision_side.detect.choice import choose_detector
+from vision_side.detect.choice import check_looks, choose_detector
 from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Detector
 
 _FRAME_US: Final = 33_333
@@ -91,6 +91,7 @@ def subjects(
     with ExitStack() as ending:
         ending.callback(close_subjects, asked)
         for name in dict.fromkeys(names):
+            check_looks(name)
             asked.append(Subject(name, choose_detector(name, given.get(name, {}), settings), balls))
         ending.pop_all()
     return asked

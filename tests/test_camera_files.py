@@ -70,11 +70,13 @@ def test_a_video_that_breaks_off_is_said(tmp_path):
             next_picture(camera)
 
 
-@pytest.mark.parametrize("content", [b"", b"no film at all" * 100])
-def test_what_is_no_video_is_said(tmp_path, content):
-    (tmp_path / "film.mp4").write_bytes(content)
+@pytest.mark.parametrize(("name", "content"), [
+    ("film.mp4", b""), ("film.mp4", b"no film at all" * 100), ("film.jpg", b"hello"),
+])  # fmt: skip
+def test_what_is_no_video_is_said(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
     with pytest.raises(HardwareError, match="cannot be played"):
-        VideoCamera(VideoCamera.Config(path=tmp_path / "film.mp4"))
+        VideoCamera(VideoCamera.Config(path=tmp_path / name))
 
 
 def test_a_video_that_is_not_there_is_said(tmp_path):

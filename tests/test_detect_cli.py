@@ -11,6 +11,7 @@ from operator_side import cli, cli_detector
 from tests.onnx_rig import brightness_model, without_gpu
 from vision_side import detector_service
 from vision_side.detect import onnx_detector
+from vision_side.detect.local import Hsv
 from vision_side.detect.remote import oip_grpc
 
 BROKEN = '''
@@ -21,6 +22,19 @@ class Late(Hsv):
     def detect(self, frames, deadline_us):
         return super().detect(frames, deadline_us)[:-1]
 '''
+
+
+class Blind:
+    """A class that is no detector."""
+
+    Config = Hsv.Config
+
+
+class Leaves(Hsv):
+    """What was a program of its own."""
+
+    def __init__(self, config: object) -> None:
+        sys.exit(7)
 
 
 @pytest.fixture(autouse=True)
@@ -86,6 +100,20 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("vision", "--dry-run", "--detector", "boxes"), 2, "own eyes"),
         (("vision", "--detector", "boxes", "--device", "cuda", "--connect", "tcp/127.0.0.1:1"), 2, "somebody else's"),
         (("detector", "check", "boxes"), 2, "that looks itself"),
+        (("detector", "check", "zenoh"), 2, "name what that service serves"),
+        (("score", "detectors", "zenoh", "--frames", "1"), 2, "name what that service serves"),
+        (("detector", "--serve", "zenoh"), 2, "serve one that looks itself"),
+        (("vision", "--dry-run", "--camera", "v4l2", "--detector", "zenoh"), 2, "name what that service serves"),
+        (("vision", "--dry-run", "--camera", "v4l2", "--detector", "hvs"), 2, "did you mean 'hsv'"),
+        (("vision", "--dry-run", "--camera", "v4l2", "--mission", "folow"), 2, "did you mean 'follow'"),
+        (("vision", "--set", "detector.fallback=zenoh", "--connect", "tcp/127.0.0.1:1"), 2, "it has to look here"),
+        (("detector", "check", "http+jpeg"), 2, "say where and what, e.g. http+jpeg://"),
+        (("detector", "check", "oip+http://127.0.0.1:99999/ball"), 2, "there is no port 99999"),
+        (("detector", "check", "tests.test_detect_cli:Blind"), 2, "no method detect"),
+        (("detector", "check", "tests.test_detect_cli:Leaves"), 2, "raises SystemExit: 7"),
+        (("vision", "--dry-run", "--detector", "onnx", "--set", "detector.labels=[\"bal\"]", "--camera", "folder",
+          "--camera-set", "path=examples/pictures"), 2, "onnx knows no 'bal'; did you mean 'ball'?"),
+        (("score", "detectors", "hsv", "--sheet", "/nowhere/x.png"), 2, "there is no folder /nowhere"),
         (("detector", "check", "hsv", "--set", "hsv.min_radius_px=900"), 2, "'hsv.min_radius_px'"),
         (("detector", "check", "hsv", "--set", "label=a", "--set", "label.b=1"), 2, "'label' has a value"),
         (("demo", "--detector", "hsw", "--out", "/nowhere/made"), 2, "did you mean 'hsv'"),

@@ -115,7 +115,8 @@ def test_a_robot_on_pins_has_its_own_pins_put_low_first_and_then_its_own_command
     options = {"left_forward_pin": 20, "right_backward_pin": 21, "enable_pins": enable}
     robot = RobotConfig(drive=PluginChoice(kind="gpio", options=options))
     planned = install.drop_in(robot, PROGRAM, CONFIG, tmp_path)
-    first = f"-/home/pi/.venv/bin/python -P -m robot_side.hardware.gpio_low {' '.join(map(str, (20, 9, 8, 21, *enable)))}"
+    pins = " ".join(map(str, (20, 9, 8, 21, *enable)))
+    first = f"-/home/pi/.venv/bin/python -P -m robot_side.hardware.gpio_low {pins}"
     own = stops_with(install.plan("robot", PROGRAM, CONFIG, "pi", tmp_path).text)
     assert stops_with(planned.text) == ["", first, *own], "emptied, then in this order"
     assert planned.path == tmp_path / "sightline-robot.service.d" / "gpio-low.conf"

@@ -161,7 +161,7 @@ def test_the_command_gives_json_and_a_sheet(tmp_path, capsys):
     (["hsv", "--column", "blurr"], "did you mean 'blur'"),
     (["hsv", "--frames", "0"], "--frames"),
     (["onnx:nowhere.onnx"], "nowhere.onnx"),
-    (["hsv", "--frames", "1", "--column", "blur", "--sheet", "/nowhere/sheet.png"], "--sheet"),
+    (["hsv", "--frames", "1", "--column", "blur", "--sheet", "/nowhere/sheet.png"], "there is no folder /nowhere"),
 ])
 def test_a_bad_argument_is_one_line(arguments, says, capsys):
     assert cli.run(["score", "detectors", *arguments]) == 2

@@ -65,8 +65,9 @@ def watch_camera(config: VisionConfig, camera: LocalCamera, say: Say, seconds: f
     """Tell what is seen by a camera of this machine, until Ctrl-C or for `seconds`; returns the exit code 0."""
     model = camera.model
     lens = "calibrated" if model.calibrated else "not calibrated, so distances are a guess"
+    watching = Watching(config, camera, say)
     say(f"vision: dry run, camera {model.width_px}x{model.height_px}, {lens}; nothing is driven")
-    return _repeat(Watching(config, camera, say).turn, seconds)
+    return _repeat(watching.turn, seconds)
 
 
 def _repeat(turn: Callable[[], None], seconds: float | None) -> int:

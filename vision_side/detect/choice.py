@@ -5,7 +5,8 @@ Names are those below, those of the entry points `sightline.detectors`, or, from
 `oip+http://box/ball` all of it. A `Config` is filled in from vision's where it has sections or fields of the same name.
 """
 
-from collections.abc import Mapping
+import difflib
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from protocol.errors import ConfigError
@@ -14,8 +15,9 @@ from vision_side.detect.around import plugin_does
 from vision_side.detect.colour_filter import ColourFilter
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.port import Detector
+from vision_side.detect.remote.address import EXAMPLES
 from vision_side.detect.tracked import Tracked
-from vision_side.missions.choice import configured
+from vision_side.missions.choice import check_choices, configured
 from vision_side.plugin_choice import Family, settings_model
 
 BUILT_IN: Final = {
@@ -33,6 +35,7 @@ BOXES: Final = "boxes"
 """No detector here: boxes that somebody else publishes, see vision_side/boxes_service.py."""
 FAMILY: Final = Family("detector", BUILT_IN, GROUP)
 _FILLED: Final = ("robot", "connect", "listen", "secure", "max_frame_bytes", "max_pixels")
+_MOST_NAMED: Final = 12
 _OF_DETECTOR: Final = ("device", "deadline_s")
 
 
@@ -53,6 +56,7 @@ def configured_detector(config: VisionConfig) -> Detector | None:
         _check_no_eyes(config)
         return None
     check_device(config)
+    _check_fallback(config)
     if is_plain(config):
         return None
     detector = choose_detector(one.kind, one.options, config)
@@ -82,10 +86,20 @@ def _check_no_eyes(config: VisionConfig) -> None:
 def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
     one = config.detector
     if one.labels:
+        _check_labels(one.kind, one.labels, getattr(detector, "labels", ()))
         detector = LabelFilter(detector, one.labels)
     if one.only_colour:
         detector = ColourFilter(detector, config.hsv.ranges)
     return Tracked(detector) if one.tracked else detector
+
+
+def _check_labels(kind: str, wanted: Sequence[str], known: Sequence[str]) -> None:
+    """Raise ConfigError for a label that a detector, which says what it knows, never gives."""
+    for label in wanted if known else ():
+        if label not in known:
+            nearest = difflib.get_close_matches(label, known, n=1)
+            hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; it gives {', '.join(known[:_MOST_NAMED])}"
+            raise ConfigError(f"detector.labels: {kind} knows no {label!r}{hint}")
 
 
 def waits(config: VisionConfig) -> bool:
@@ -93,6 +107,20 @@ def waits(config: VisionConfig) -> bool:
     one = config.detector
     kinds = [kind for kind in (one.kind, one.fallback, one.shadow) if kind and kind != BOXES]
     return any(getattr(FAMILY.load(split(kind)[0]), "waits", False) for kind in kinds)
+
+
+def _check_fallback(config: VisionConfig) -> None:
+    """Raise ConfigError for a fallback that may itself be late or gone."""
+    kind = config.detector.fallback
+    if kind and getattr(FAMILY.load(split(kind)[0]), "waits", False):
+        raise ConfigError(f"detector.fallback {kind!r} waits for somebody else, too; it has to look here, e.g. hsv")
+
+
+def check_looks(kind: str) -> None:
+    """Raise ConfigError for a detector that does not look at what it is given, where there is no robot to hear of."""
+    if kind != BOXES and getattr(FAMILY.load(split(kind)[0]), "only_hears", False):
+        raise ConfigError(f"detector {kind!r} hears what a service says of a robot's own frames, of which there are "
+                          "none here; name what that service serves")
 
 
 def check_device(config: VisionConfig) -> None:
@@ -131,6 +159,20 @@ def choose_detector(kind: str, options: Mapping[str, Any], config: VisionConfig)
     return detector
 
 
+def check_vision(config: VisionConfig) -> None:
+    """Raise ConfigError for what can be known to be wrong with all that `config` names, before any of it is built."""
+    check_choices(config)
+    one = config.detector
+    if one.kind == BOXES:
+        _check_no_eyes(config)
+        return
+    check_device(config)
+    _check_fallback(config)
+    for kind, options in ((one.kind, one.options), (one.fallback, {}), (one.shadow, one.shadow_options)):
+        if kind:
+            check_choice(kind, options, config)
+
+
 def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) -> None:
     """Raise ConfigError for what can be known to be wrong before the detector is built: its name, options, model."""
     _, settings = _checked(kind, options, config)
@@ -154,4 +196,9 @@ def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tup
     given: dict[str, Any] = {one: getattr(config, one) for one in _FILLED if one in fields}
     given |= {one: getattr(config.detector, one) for one in _OF_DETECTOR if one in fields}
     given |= {"address": address} if address else {}
-    return plugin, FAMILY.settings(name, plugin, given | dict(options), config)
+    if name in EXAMPLES and "address" not in {**given, **options}:
+        raise ConfigError(f"detector {name!r}: say where and what, e.g. {EXAMPLES[name]}")
+    own = FAMILY.settings(name, plugin, given | dict(options), config)
+    if not callable(getattr(plugin, "detect", None)):
+        raise ConfigError(f"detector {kind!r}: the class has no method detect; see docs/detectors.md")
+    return plugin, own

@@ -61,6 +61,8 @@ class OnnxDetector:
         """Raises ConfigError for a file that is no such model, HardwareError for a device that is not there."""
         model = read_model(config)
         path, self._form, self._min_score = model.path, model.form, model.min_score
+        self.labels = model.form.labels
+        """All that it can call a thing; empty where the model has only numbers."""
         self._refine = frozenset(config.refine)
         self._engine = open_engine(path, model.header, config.device, config.threads)
         self._news = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []

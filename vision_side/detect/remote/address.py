@@ -11,7 +11,7 @@ DEFAULT_PORTS: Final = {"oip+http": 8000, "oip+grpc": 8001, "http+jpeg": 80}
 _HOST = r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)"
 _FORM = re.compile(rf"(oip\+http|oip\+grpc|http\+jpeg)://{_HOST}(?::([0-9]{{1,5}}))?(/[!-~]*)?")
 _MODEL = re.compile(r"/([A-Za-z0-9_.-]{1,128})(?:/([0-9]{1,9}))?")
-_EXAMPLES: Final = {
+EXAMPLES: Final = {
     "oip+http": "oip+http://127.0.0.1:8000/ball", "oip+grpc": "oip+grpc://127.0.0.1:8001/ball",
     "http+jpeg": "http+jpeg://127.0.0.1:8080/detect",
 }
@@ -37,10 +37,12 @@ def is_address(kind: str) -> bool:
 def parse_address(kind: str) -> Address:
     """Split it. Raises ConfigError, with the right form, for what is none."""
     scheme = kind.partition("://")[0]
-    example = _EXAMPLES.get(scheme, _EXAMPLES["oip+http"])
+    example = EXAMPLES.get(scheme, EXAMPLES["oip+http"])
     match = _FORM.fullmatch(kind)
     port = int(match[3]) if match and match[3] else DEFAULT_PORTS.get(scheme, 0)
-    if match is None or not 1 <= port <= 65_535:
+    if match is not None and not 1 <= port <= 65_535:
+        raise ConfigError(f"detector {kind!r}: there is no port {port}; 1 to 65535, e.g. {example}")
+    if match is None:
         raise ConfigError(f"detector {kind!r}: write scheme://HOST[:PORT]/..., e.g. {example}")
     host, path = match[2].strip("[]"), match[4] or "/"
     if scheme == "http+jpeg":

@@ -81,6 +81,7 @@ class ZenohDetector(FrameByFrame):
     """The detector `zenoh`: waits for one source's boxes on the links that vision has to its robots."""
 
     waits: ClassVar[bool] = True
+    only_hears: ClassVar[bool] = True
 
     class Config(Settings):
         """Whose boxes."""
