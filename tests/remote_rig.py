@@ -53,12 +53,13 @@ ASKED = f"{SESSION}-1"
 """The id of a request about `frame()`."""
 
 
-def grpc_answer(columns, answer_id=ASKED, version="1"):
+def grpc_answer(columns, answer_id=ASKED, version=""):
     """A ModelInferResponse."""
     kinds = {one.name: one.datatype for one in OUTPUTS}
     slots = [put(1, name) + put(2, kinds[name]) + put_integers(3, column.shape) for name, column in columns.items()]
     contents = [put(6, column.tobytes()) for column in columns.values()]
-    return b"".join((put(1, "ball"), put(2, version), put(3, answer_id), *(put(5, slot) for slot in slots), *contents))
+    head = put(1, "ball") + (put(2, version) if version else b"") + put(3, answer_id)
+    return b"".join((head, *(put(5, slot) for slot in slots), *contents))
 
 
 def grpc_started(infer, port=0, metadata=None):

@@ -180,7 +180,7 @@ def test_the_sheet_says_the_same_as_the_table(capsys, eyes, monkeypatch, tmp_pat
 
 
 def test_who_cannot_be_asked_here_says_why(capsys):
-    assert "it works within a vision only" in told(capsys, "zenoh")[2]
+    assert "127.0.0.1:1: Connection refused" in told(capsys, "http+jpeg://127.0.0.1:1/eyes")[2]
 
 
 def test_boxes_are_cut_to_the_picture_as_vision_would_have_them(eyes):
