@@ -284,16 +284,26 @@ def test_of_two_services_one_is_kept_to_until_it_is_silent(pair):
     """Two trackers' identities, or two models' boxes in turns, would steer by neither."""
     robot, waiting = pair
     other = DetectedBox(label="box", score=0.9, x1_px=50.0, y1_px=10.0, x2_px=90.0, y2_px=30.0)
-    labels = set()
+    robot.say(frame(2), BOX, by="00000001")
+    labels = {one.label for one in waiting.detect([frame(2)], within(1.0))[0].detections}
     for seq in range(3, 9):
-        robot.say(frame(seq), BOX, by="00000001")
-        robot.say(frame(seq), other, by="00000002")
+        for box, by in sorted(((BOX, "00000001"), (other, "00000002")), key=lambda pair: pair[1], reverse=seq % 2):
+            robot.say(frame(seq), box, by=by)
         labels |= {one.label for one in waiting.detect([frame(seq)], within(1.0))[0].detections}
     assert labels == {"ball"} and not waiting.refused
     assert sum("several services look at robot r1" in line for line in waiting.news()) == 1
     time.sleep(0.6)
     robot.say(frame(9), other, by="00000002")
     assert waiting.detect([frame(9)], within(1.0))[0].detections[0].label == "box", "the first one is gone"
+
+
+def test_who_talks_nonsense_keeps_no_service_out(pair):
+    robot, waiting = pair
+    for seq in range(3, 6):
+        robot.say(frame(seq), BOX, by="00000002", session="0000ffff")
+        assert waiting.detect([frame(seq)], within(0.1)) == [None]
+        robot.say(frame(seq + 10), BOX, by="00000001")
+        assert waiting.detect([frame(seq + 10)], within(1.0))[0]
 
 
 def test_anothers_boxes_are_not_even_looked_at(pair):

@@ -47,16 +47,21 @@ class _OfSource(LatestSlot[Message]):
         if item.source == self._source and self._is_kept_to(item):
             super().put(item)
 
+    def keep_to(self, session: str) -> None:
+        """Boxes of this one were good: only such a one keeps others out, for who talks nonsense must not."""
+        self._session, self._heard_us = session, monotonic_us()
+
     def _is_kept_to(self, item: Message) -> bool:
         try:
             session = decode(DetectionsHeader, item.header).session
         except WireError:
             return True
         now_us = monotonic_us()
-        if session != self._session and self._session and now_us - self._heard_us <= _SILENT_US:
+        if session == self._session:
+            self._heard_us = now_us
+        elif self._session and now_us - self._heard_us <= _SILENT_US:
             self.others += 1
             return False
-        self._session, self._heard_us = session, now_us
         return True
 
 
@@ -127,7 +132,9 @@ class ZenohDetector(FrameByFrame):
             if ahead > 0:
                 heard.kept = message
                 raise NoAnswerError(Reason.OTHER_FRAME, "it looked at a newer frame instead")
-            return _result(message, header, frame, self._config.min_score)
+            result = _result(message, header, frame, self._config.min_score)
+            heard.slot.keep_to(header.session)
+            return result
 
 
 def _cites(message: Message, frame: DetectFrame) -> tuple[DetectionsHeader, int]:
