@@ -169,7 +169,7 @@ def vision(
             from operator_side.shaped_vision import run_shaped
 
             return run_shaped(loaded.config, shape)  # type: ignore[arg-type]
-        from vision_side.service import run
+        from vision_side.service_process import run
 
         if metrics is not None:
             return _measured(run, loaded.config, metrics)

@@ -11,7 +11,7 @@ from protocol.errors import ConfigError
 from protocol.transports.opening import open_link
 from vision_side.config import VisionConfig
 from vision_side.pipeline import SOURCE
-from vision_side.service import serve
+from vision_side.service_process import serve
 
 INJECTED = "injected: "
 """How the line begins that says, at the end, what the legs did."""

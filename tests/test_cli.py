@@ -140,7 +140,7 @@ def test_a_mistake_is_one_line_and_its_exit_code(capsys, arguments, code, expect
 def test_a_robot_may_be_given_by_its_address(capsys, monkeypatch):
     """As in `vision --robot ws-legacy://HOST:9091`: an older robot has an address and no id."""
     seen = []
-    monkeypatch.setattr("vision_side.service.run", lambda config: seen.append(config) or 0)
+    monkeypatch.setattr("vision_side.service_process.run", lambda config: seen.append(config) or 0)
     assert run(capsys, "vision", "--robot", "ws-legacy://127.0.0.1:9091")[0] == 0
     assert run(capsys, "vision", "--robot", "r7", "--connect", "ws://127.0.0.1:9090")[0] == 0
     assert [(config.robot, config.connect) for config in seen] == [

@@ -17,7 +17,7 @@ from protocol.conformance.vision_socket_server import _take
 from protocol.transports.opening import open_link
 from tests.conformance.vision_sockets import SOCKETS, SocketVision
 from vision_side.config import VisionConfig
-from vision_side.service import serve
+from vision_side.service_process import serve
 
 REAL = [case for case in CASES if case.real]
 TOKEN = "0123456789abcdefABCDEF_-"

@@ -10,7 +10,8 @@ import pytest
 from protocol.transports import tcp_table
 from protocol.transports.denied import Certificates
 from protocol.transports.tcp_table import Visitors
-from protocol.transports.tls_refusals import RefusalLines, refusal_cause
+from protocol.log_lines import RefusalLines
+from protocol.transports.tls_refusals import refusal_cause
 from tests.link_rigs import free_endpoint, until
 
 SECOND_US = 1_000_000

@@ -29,7 +29,7 @@ from vision_side.boxes_service import BoxesService
 from vision_side.config import VisionConfig
 from vision_side.detect.boxes import REMEMBERED, locate_box
 from vision_side.detect.port import Detection
-from vision_side.service import serve
+from vision_side.service_process import serve
 
 MODEL = camera()
 FRAME_US = 33_333

@@ -18,7 +18,7 @@ from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess
 from tests.vision_rig import jpeg_of
 from vision_side.config import VisionConfig
-from vision_side.service import serve
+from vision_side.service_process import serve
 
 pytestmark = pytest.mark.slow
 QUIET = VisionConfig.model_validate({"search": {"enabled": False}})

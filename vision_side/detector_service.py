@@ -38,7 +38,7 @@ from vision_side.detect.checking import asked
 from vision_side.detect.own_decoders import OwnDecoders
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
 from vision_side.detector_turns import Tally, Turn, Turns
-from vision_side.service import ends_on_signal
+from vision_side.service_process import ends_on_signal
 
 ROLE: Final = "detector"
 _WAIT_S: Final = 0.2

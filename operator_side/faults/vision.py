@@ -17,7 +17,7 @@ from protocol.transports.zenoh import open_zenoh
 from vision_side.config import VisionConfig
 from vision_side.detect.hsv import HsvDetector
 from vision_side.pipeline import SOURCE
-from vision_side.service import serve
+from vision_side.service_process import serve
 
 if TYPE_CHECKING:
     from operator_side.faults.peer import PeerOptions

@@ -47,11 +47,6 @@ _CAUSES: Final = (
 )
 _HINT: Final = ". Hint: increase the system open file limit."
 _LONGEST_WORDS: Final = 120
-_FIRST_PERIOD_US: Final = 1_000_000
-_LONGEST_PERIOD_US: Final = 60_000_000
-_MOST_CAUSES: Final = 16
-
-
 def refusal_cause(line: str) -> str | None:
     """Why somebody was turned away; "" for what is not worth a word; None for a line that says nothing of it."""
     said = _LINE.match(_COLOURS.sub("", line))
@@ -64,28 +59,3 @@ def refusal_cause(line: str) -> str | None:
     return f"TLS: {text[:_LONGEST_WORDS]}"
 
 
-class RefusalLines:
-    """Per cause a line at once, then after 1, 2, 4 ... 60 s for as long as it goes on, each with how often."""
-
-    def __init__(self) -> None:
-        self._untold: dict[str, int] = {}
-        self._told: dict[str, tuple[int, int]] = {}
-
-    def is_due(self, cause: str, now_us: int, times: int = 1) -> int:
-        """`cause` was given `times` more: how often since the last line about it, if one is due; else 0."""
-        self._untold[cause] = self._untold.get(cause, 0) + times
-        told_us, period_us = self._told.get(cause, (now_us - _FIRST_PERIOD_US, 0))
-        silent_us = now_us - told_us
-        if silent_us < period_us:
-            return 0
-        if silent_us > 2 * _LONGEST_PERIOD_US or not period_us:
-            period_us = _FIRST_PERIOD_US // 2
-        self._told[cause] = (now_us, min(2 * period_us, _LONGEST_PERIOD_US))
-        if len(self._told) > _MOST_CAUSES:
-            self._forget_oldest()
-        return self._untold.pop(cause)
-
-    def _forget_oldest(self) -> None:
-        oldest = min(self._told, key=lambda cause: self._told[cause][0])
-        del self._told[oldest]
-        self._untold.pop(oldest, None)

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Final
 
 from protocol.errors import ConfigError
-from protocol.transports.websocket_legacy import LegacyOptions
 
 _ENDPOINT: Final = re.compile(
     r"(ws|wss|ws-legacy)://(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]@]+):([0-9]{1,5})/?(?:\?([^\s?#]*))?", re.ASCII
@@ -23,6 +22,20 @@ _WORDS: Final = ("dashed", "swapped", "oneline", "boxes")
 _FROM: Final = "from="
 
 
+
+
+@dataclass(frozen=True, slots=True)
+class LegacyOptions:
+    """How the older dialect is spoken."""
+
+    newlines: bool = True
+    """Line ends in the base64 text."""
+    dashed: bool = False
+    """`linear-angular` instead of the bar."""
+    swapped: bool = False
+    """`angular-linear`: as the older robot took it."""
+    boxes: bool = False
+    """Towards the robot: boxes are taken too, as detections of a guest."""
 @dataclass(frozen=True, slots=True)
 class Endpoint:
     """A checked endpoint; `text` is as it was written."""

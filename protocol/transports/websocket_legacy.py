@@ -24,26 +24,13 @@ from protocol.transports.websocket_dialects import BAD_FRAMING, PeerError
 from protocol.transports.websocket_framing import Packet
 from protocol.transports.websocket_seat import Seat
 from protocol.twist_text import format_twist, parse_twist
+from protocol.transports.websocket_endpoints import LegacyOptions
 
 GUEST: Final = "guest"
 GUEST_SESSION: Final = "00000000"
 """The session of everybody who speaks without headers."""
 MAX_COMMAND_TEXT_BYTES: Final = 256
 """Security limit: a text towards a robot; a twist over its own 64 bytes is still counted, not a reason to hang up."""
-
-
-@dataclass(frozen=True, slots=True)
-class LegacyOptions:
-    """How the older dialect is spoken."""
-
-    newlines: bool = True
-    """Line ends in the base64 text."""
-    dashed: bool = False
-    """`linear-angular` instead of the bar."""
-    swapped: bool = False
-    """`angular-linear`: as the older robot took it."""
-    boxes: bool = False
-    """Towards the robot: boxes are taken too, as detections of a guest."""
 
 
 class Client(NamedTuple):

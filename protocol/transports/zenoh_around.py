@@ -17,6 +17,11 @@ from protocol.transports.presence import ASKS, MAX_PEERS, Peer, quickest
 from protocol.transports.secured import Secured, secured_for
 from protocol.transports.zenoh_presence import ANSWER_S, ask
 from protocol.transports.zenoh_session import open_session
+from protocol.errors import ConfigError
+from protocol.transports.endpoints import check_endpoint
+import json
+import logging
+from protocol.transports.zenoh_discovery import _address
 
 if TYPE_CHECKING:
     import zenoh
@@ -24,6 +29,9 @@ if TYPE_CHECKING:
 ROLE: Final = "operator"
 VIEWER: Final = "viewer"
 _BETWEEN_ASKS_S: Final = 0.05
+
+MAX_LISTENERS: Final = 64
+"""Security limit: no more answers than this are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,3 +108,35 @@ def _statuses(session: zenoh.Session, ending: ExitStack) -> dict[str, Message]:
     handler = zenoh.handlers.Callback(note, indirect=False)
     ending.callback(session.declare_subscriber(f"{KEY_PREFIX}/*/{STATUS.name}", handler).undeclare)
     return found
+
+
+def _usable(locator: str) -> str:
+    text = str(locator).partition("?")[0].partition("#")[0]
+    try:
+        check_endpoint(text)
+    except ConfigError:
+        return ""
+    return text
+
+
+def find_listeners(seconds: float) -> list[str]:
+    """An endpoint of each listener that answers within `seconds`; none where multicast does not work.
+
+    Raises ConfigError if Zenoh is not installed.
+    """
+    try:
+        import zenoh
+    except ImportError:
+        raise ConfigError("Zenoh is not installed: pip install 'sightline[zenoh]'") from None
+    logging.getLogger("zenoh").addHandler(logging.NullHandler())
+    answers: zenoh.handlers.RingChannel[zenoh.Hello] = zenoh.handlers.RingChannel(MAX_LISTENERS)
+    config = {"scouting": {"multicast": {"enabled": True, "address": _address()}}}
+    try:
+        with zenoh.scout(answers, zenoh.WhatAmIMatcher("router"), zenoh.Config.from_json5(json.dumps(config))) as scout:
+            time.sleep(seconds)
+            hellos = iter(scout.try_recv, None)
+            found = {str(hello.zid): [locator for text in hello.locators if (locator := _usable(text))]
+                     for hello in hellos}
+    except zenoh.ZError:  # no network at all
+        return []
+    return sorted(min(usable, key=lambda locator: "[" in locator) for usable in found.values() if usable)

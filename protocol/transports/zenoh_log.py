@@ -19,7 +19,8 @@ from protocol.log_lines import JsonLines
 from protocol.transports import denied
 from protocol.transports.endpoints import check_endpoint
 from protocol.transports.tcp_table import Visitors
-from protocol.transports.tls_refusals import LOG_FILTER, RefusalLines, refusal_cause
+from protocol.transports.tls_refusals import LOG_FILTER, refusal_cause
+from protocol.log_lines import RefusalLines
 
 _STDOUT = 1
 _GULP_BYTES = 1_048_576  # what an unprivileged pipe can hold; one that is full costs lines

@@ -19,7 +19,7 @@ from protocol.errors import ConfigError, HardwareError
 from vision_side.config import Device
 from vision_side.decode import Picture
 from vision_side.detect.golden import KEY, difference, golden_picture, read_golden
-from vision_side.detect.local import timed_together
+from vision_side.detect.timing import timed_together
 from vision_side.detect.onnx_engine import Engine, open_engine
 from vision_side.detect.onnx_header import OnnxHeader, read_onnx_header
 from vision_side.detect.onnx_reading import Form, apart, fit_picture, form_of, own_labels, read_outputs

@@ -1,0 +1,61 @@
+"""How long a detector of decoded pictures takes: results with the time that they took. Shell (a clock)."""
+
+from vision_side.detect.port import DetectFrame
+from vision_side.decode import Picture
+from protocol.errors import WireError
+from vision_side.detect.port import Detection
+from collections.abc import Sequence
+from vision_side.detect.port import clipped
+from collections.abc import Callable
+from vision_side.detect.port import DetectionResult
+from vision_side.detect.port import Maker
+from vision_side.detect.port import result_of
+import time
+from vision_side.detect.port import PictureDetector
+
+
+def _picture_of(frame: DetectFrame) -> Picture | None:
+    try:
+        return frame.picture()
+    except WireError:
+        return None
+
+
+def _inside(frame: DetectFrame, found: Sequence[Detection]) -> list[Detection]:
+    """A picture of odd size that was decoded at half scale is a pixel larger than the encoded one."""
+    return [part for one in found if (part := clipped(one, frame.width_px, frame.height_px))]
+
+
+def timed_together(
+    frames: Sequence[DetectFrame], maker: Maker, look: Callable[[Sequence[Picture]], list[Sequence[Detection]]]
+) -> list[DetectionResult | None]:
+    """The same of several pictures at once, each with its share of the time."""
+    pictures = [_picture_of(frame) for frame in frames]
+    there = [one for one in pictures if one is not None]
+    started_ns = time.perf_counter_ns()
+    found = iter(look(there) if there else [])
+    each_us = (time.perf_counter_ns() - started_ns) // 1000 // max(1, len(there))
+    return [None if picture is None else result_of(frame, _inside(frame, next(found)), maker, each_us)
+            for frame, picture in zip(frames, pictures, strict=True)]
+
+
+def timed(
+    frame: DetectFrame, maker: Maker, look: Callable[[Picture], Sequence[Detection]]
+) -> DetectionResult | None:
+    """What `look` finds in the picture of `frame`, and how long it looked; None for what is no picture."""
+    return timed_together([frame], maker, lambda pictures: [look(one) for one in pictures])[0]
+
+
+class Clocked:
+    """A detector of one picture, and how long it looked the last time; None before the first."""
+
+    def __init__(self, inner: PictureDetector) -> None:
+        self._inner = inner
+        self.took_us: int | None = None
+
+    def detect(self, picture: Picture) -> tuple[Detection, ...]:
+        """What the one inside finds."""
+        started_ns = time.perf_counter_ns()
+        found = self._inner.detect(picture)
+        self.took_us = (time.perf_counter_ns() - started_ns) // 1000
+        return found
