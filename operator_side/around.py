@@ -11,8 +11,7 @@ from typing import Any, Final
 from operator_side import around_text
 from protocol.errors import ConfigError, LinkError, SightlineError
 from protocol.transports.endpoints import check_endpoint
-from protocol.transports.zenoh_around import Around, look_around
-from protocol.transports.zenoh_around import find_listeners
+from protocol.transports.zenoh_around import Around, find_listeners, look_around
 from robot_side.config import DEFAULT_ENDPOINT
 
 SCOUT_S: Final = 0.4

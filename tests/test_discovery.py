@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from protocol.transports.zenoh_discovery import NO_MULTICAST, multicast_section
 from protocol.transports.zenoh_around import find_listeners
+from protocol.transports.zenoh_discovery import NO_MULTICAST, multicast_section
 from protocol.transports.zenoh_session import session_config
 
 INSIDE = """

@@ -7,10 +7,10 @@ import sys
 
 import pytest
 
+from protocol.log_lines import RefusalLines
 from protocol.transports import tcp_table
 from protocol.transports.denied import Certificates
 from protocol.transports.tcp_table import Visitors
-from protocol.log_lines import RefusalLines
 from protocol.transports.tls_refusals import refusal_cause
 from tests.link_rigs import free_endpoint, until
 

@@ -13,8 +13,8 @@ from protocol.transports.link import Message
 from protocol.transports.secured import ROLE_SOURCES
 from protocol.transports.websocket import open_websocket
 from protocol.transports.websocket_dialects import V1
-from protocol.transports.websocket_legacy import Client, LegacyToVision
 from protocol.transports.websocket_endpoints import LegacyOptions
+from protocol.transports.websocket_legacy import Client, LegacyToVision
 from protocol.transports.websocket_outbox import MAX_MADE_UP_SOURCES, Outbox, Post
 from protocol.transports.websocket_seat import Seat
 from tests.link_rigs import until

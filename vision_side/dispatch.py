@@ -11,9 +11,9 @@ from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.asking import Desk, Swap
 from vision_side.config import VisionConfig
 from vision_side.detect.around import news_of
-from vision_side.detect.timing import Clocked
 from vision_side.detect.port import Detector
 from vision_side.detect.shadow import Shadowed
+from vision_side.detect.timing import Clocked
 from vision_side.missions.choice import configured
 from vision_side.pipeline import SOURCE, Pipeline, Seen
 from vision_side.reporting import Reporter

@@ -4,13 +4,9 @@ One printed line per change of state, never one per frame. Ends within a second 
 """
 
 import secrets
-import signal
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Callable
 from typing import TypeVar
 
 from protocol.channels import ACK, CAMERA, FRAME, MAX_HEADER_BYTES, TWIST
@@ -22,15 +18,14 @@ from protocol.refusals import Refusal
 from protocol.transports.link import LatestSlot, Link, Message
 from protocol.twist_text import format_twist
 from vision_side.config import VisionConfig
-from vision_side.counts import Counts, Observe
-from vision_side.detect.around import attach_detector, close_detector
+from vision_side.counts import Counts
+from vision_side.detect.around import attach_detector
 from vision_side.detect.choice import configured_detector
 from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.timing import Clocked
 from vision_side.detect.port import Detector
+from vision_side.detect.timing import Clocked
 from vision_side.dispatch import NO_FRAMES, Dispatch
-from vision_side.missions.choice import configured
-from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, Seen, encode_answer
+from vision_side.pipeline import Answer, Frame, Pipeline, Seen, encode_answer
 from vision_side.sessions import Sessions
 from vision_side.viewing import Viewing
 

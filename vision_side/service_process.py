@@ -1,21 +1,20 @@
 """Runs the vision service as a process: opens the link, serves one robot or a fleet, ends on a signal. Shell."""
 
-from types import FrameType
-from collections.abc import Iterator
-from contextlib import contextmanager
 import signal
 import threading
-from vision_side.counts import Observe
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from protocol.transports.link import Link
 from vision_side.config import VisionConfig
+from vision_side.counts import Observe
 from vision_side.detect.around import close_detector
-from vision_side.missions.choice import configured
 from vision_side.detect.choice import configured_detector
 from vision_side.detect.port import Detector
+from vision_side.missions.choice import configured
 from vision_side.pipeline import SOURCE
-from vision_side.service import _endpoints
-from protocol.transports.link import Link
-from vision_side.service import Say
-from vision_side.service import open_service
+from vision_side.service import Say, _endpoints, open_service
 
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 

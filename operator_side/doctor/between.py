@@ -22,8 +22,8 @@ from protocol.transports.link import Link
 from protocol.transports.opening import open_link
 from protocol.transports.presence import ASKS, Peer, quickest
 from protocol.transports.secured import ROBOT
-from protocol.transports.zenoh_discovery import LOOPBACK
 from protocol.transports.zenoh_around import find_listeners
+from protocol.transports.zenoh_discovery import LOOPBACK
 from protocol.transports.zenoh_presence import software
 
 ROLE = "doctor"

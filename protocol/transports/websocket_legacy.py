@@ -1,7 +1,6 @@
 """The older text dialect from either end of a WebSocket; who speaks it has no header, token or session. Pure."""
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from protocol.channels import ACK, DETECTIONS, FRAME, KEY_PREFIX, TWIST, Channel, key_for
@@ -21,10 +20,10 @@ from protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader
 from protocol.refusals import Refusal
 from protocol.transports.link import Message
 from protocol.transports.websocket_dialects import BAD_FRAMING, PeerError
+from protocol.transports.websocket_endpoints import LegacyOptions
 from protocol.transports.websocket_framing import Packet
 from protocol.transports.websocket_seat import Seat
 from protocol.twist_text import format_twist, parse_twist
-from protocol.transports.websocket_endpoints import LegacyOptions
 
 GUEST: Final = "guest"
 GUEST_SESSION: Final = "00000000"

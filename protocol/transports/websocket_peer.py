@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 from protocol.channels import ACK, Channel
 from protocol.clock import monotonic_us
 from protocol.errors import WireError
-from protocol.transports.link_rules import OVERSIZE
 from protocol.log_lines import RefusalLines
+from protocol.transports.link_rules import OVERSIZE
 from protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, V1, Dialect, PeerError
 from protocol.transports.websocket_framing import Packet
 from protocol.transports.websocket_life import Life

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -10,18 +12,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from protocol.channels import KEY_PREFIX, STATUS, parse_key
-from protocol.transports.endpoints import check_endpoints
+from protocol.errors import ConfigError
+from protocol.transports.endpoints import check_endpoint, check_endpoints
 from protocol.transports.link import Message
 from protocol.transports.link_rules import LinkRules
 from protocol.transports.presence import ASKS, MAX_PEERS, Peer, quickest
 from protocol.transports.secured import Secured, secured_for
+from protocol.transports.zenoh_discovery import _address
 from protocol.transports.zenoh_presence import ANSWER_S, ask
 from protocol.transports.zenoh_session import open_session
-from protocol.errors import ConfigError
-from protocol.transports.endpoints import check_endpoint
-import json
-import logging
-from protocol.transports.zenoh_discovery import _address
 
 if TYPE_CHECKING:
     import zenoh

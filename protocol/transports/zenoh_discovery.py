@@ -6,13 +6,9 @@ neither find it nor are found; it connects to nobody by itself. Explicit endpoin
 
 from __future__ import annotations
 
-import json
-import logging
-import time
 from collections.abc import Sequence
 from typing import Any, Final
 
-from protocol.errors import ConfigError
 from protocol.transports.endpoints import check_endpoint
 
 GROUP: Final = ("224.0.0.224", 7449)

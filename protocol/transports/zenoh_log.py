@@ -15,12 +15,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from protocol.clock import monotonic_us
-from protocol.log_lines import JsonLines
+from protocol.log_lines import JsonLines, RefusalLines
 from protocol.transports import denied
 from protocol.transports.endpoints import check_endpoint
 from protocol.transports.tcp_table import Visitors
 from protocol.transports.tls_refusals import LOG_FILTER, refusal_cause
-from protocol.log_lines import RefusalLines
 
 _STDOUT = 1
 _GULP_BYTES = 1_048_576  # what an unprivileged pipe can hold; one that is full costs lines

@@ -1,11 +1,9 @@
 """Detectors of one decoded picture, behind the port: who made the result, and how long it took. Shell (a clock)."""
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from protocol.config import Config as Settings
-from protocol.errors import WireError
 from protocol.messages import MAX_DETECTED_BOXES
 from vision_side.config import HsvConfig
 from vision_side.decode import Picture
@@ -13,7 +11,7 @@ from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveEye
 from vision_side.detect.by_session import BySession
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.labels import Label
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, PictureDetector, clipped, result_of
+from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
 from vision_side.detect.timing import timed
 
 _CPU: Final = "cpu"

@@ -19,12 +19,12 @@ from protocol.errors import ConfigError, HardwareError
 from vision_side.config import Device
 from vision_side.decode import Picture
 from vision_side.detect.golden import KEY, difference, golden_picture, read_golden
-from vision_side.detect.timing import timed_together
 from vision_side.detect.onnx_engine import Engine, open_engine
 from vision_side.detect.onnx_header import OnnxHeader, read_onnx_header
 from vision_side.detect.onnx_reading import Form, apart, fit_picture, form_of, own_labels, read_outputs
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
 from vision_side.detect.refine import refined
+from vision_side.detect.timing import timed_together
 
 SHIPPED: Final = Path(__file__).parent.parent / "models" / "sightline.onnx"
 HASH_DIGITS: Final = 16

@@ -1,17 +1,11 @@
 """How long a detector of decoded pictures takes: results with the time that they took. Shell (a clock)."""
 
-from vision_side.detect.port import DetectFrame
-from vision_side.decode import Picture
-from protocol.errors import WireError
-from vision_side.detect.port import Detection
-from collections.abc import Sequence
-from vision_side.detect.port import clipped
-from collections.abc import Callable
-from vision_side.detect.port import DetectionResult
-from vision_side.detect.port import Maker
-from vision_side.detect.port import result_of
 import time
-from vision_side.detect.port import PictureDetector
+from collections.abc import Callable, Sequence
+
+from protocol.errors import WireError
+from vision_side.decode import Picture
+from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, PictureDetector, clipped, result_of
 
 
 def _picture_of(frame: DetectFrame) -> Picture | None:
