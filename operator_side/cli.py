@@ -12,28 +12,26 @@ from typing import Final
 
 import typer
 
-from operator_side import (
-    cli_bench,
-    cli_calibrate,
-    cli_capture,
-    cli_config,
-    cli_conform,
-    cli_detector,
-    cli_doctor,
-    cli_faults,
-    cli_install,
-    cli_judge,
-    cli_keys,
-    cli_metrics,
-    cli_mission,
-    cli_people,
-    cli_pick_color,
-    cli_scenarios,
-    cli_services,
-    cli_teleop,
-    cli_train,
-    cli_watch,
-)
+from operator_side.cli_bench import register as register_bench
+from operator_side.cli_calibrate import register as register_calibrate
+from operator_side.cli_capture import register as register_capture
+from operator_side.cli_config import register as register_config
+from operator_side.cli_conform import register as register_conform
+from operator_side.cli_detector import register as register_detector
+from operator_side.cli_doctor import register as register_doctor
+from operator_side.cli_faults import register as register_faults
+from operator_side.cli_install import register as register_install
+from operator_side.cli_judge import register as register_judge
+from operator_side.cli_keys import register as register_keys
+from operator_side.cli_metrics import register as register_metrics
+from operator_side.cli_mission import register as register_mission
+from operator_side.cli_people import register as register_people
+from operator_side.cli_pick_color import register as register_pick_color
+from operator_side.cli_scenarios import register as register_scenarios
+from operator_side.cli_services import register as register_services
+from operator_side.cli_teleop import register as register_teleop
+from operator_side.cli_train import register as register_train
+from operator_side.cli_watch import register as register_watch
 from operator_side.settings_errors import no_such_name
 from protocol.errors import SightlineError
 
@@ -50,13 +48,26 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for module in (
-    cli_services, cli_judge, cli_people, cli_bench, cli_faults,
-    cli_calibrate, cli_keys, cli_install, cli_doctor, cli_metrics, cli_config, cli_conform,
-    cli_detector, cli_teleop, cli_mission, cli_scenarios, cli_watch, cli_capture,
-    cli_pick_color, cli_train,
-):
-    module.register(app)
+register_services(app)
+register_judge(app)
+register_people(app)
+register_bench(app)
+register_faults(app)
+register_calibrate(app)
+register_keys(app)
+register_install(app)
+register_doctor(app)
+register_metrics(app)
+register_config(app)
+register_conform(app)
+register_detector(app)
+register_teleop(app)
+register_mission(app)
+register_scenarios(app)
+register_watch(app)
+register_capture(app)
+register_pick_color(app)
+register_train(app)
 
 
 @app.callback(invoke_without_command=True)
