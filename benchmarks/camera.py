@@ -22,8 +22,8 @@ from protocol.errors import HardwareError
 from protocol.messages import Holder
 from robot_side.hardware.v4l2_camera import V4l2Camera
 from robot_side.hardware.v4l2_device import V4l2CameraConfig
-from robot_side.ipc import Judged
-from robot_side.sending import Sending
+from robot_side.ipc import CommandAck
+from robot_side.sending import NetworkCore
 from robot_side.stream import StreamConfig
 
 BOUND_MS: Final = 0.1
@@ -105,7 +105,7 @@ def _pass_through(seconds: float, jpegs: list[bytes]) -> PassThrough:
     device_ms, _ = _cpu_ms(partial(_take_one, StandIn(jpegs)), seconds / 3)
     camera = V4l2Camera(V4l2CameraConfig(), lambda _: StandIn(jpegs))
     try:
-        sending = Sending(StreamConfig(max_fps=_FPS), "00000001", 0, 400_000)
+        sending = NetworkCore(StreamConfig(max_fps=_FPS), "00000001", 0, 400_000)
         read_ms, missed = _cpu_ms(lambda: camera.read(1.0) is not None, seconds / 3)
         ready_ms, missed_ready = _cpu_ms(partial(_send_one, camera, sending), seconds / 3)
     finally:
@@ -130,7 +130,7 @@ def _take_one(device: StandIn) -> bool:
     return device.grab() and device.retrieve()[0]
 
 
-def _send_one(camera: V4l2Camera, sending: Sending) -> bool:
+def _send_one(camera: V4l2Camera, sending: NetworkCore) -> bool:
     """As the network process does it; a peer answers after some milliseconds. Whether a frame was made ready."""
     picture = camera.read(1.0)
     now_us = monotonic_us()
@@ -140,7 +140,7 @@ def _send_one(camera: V4l2Camera, sending: Sending) -> bool:
     if sent is None:
         return False
     peer = Holder(source="vision", session="00000002")
-    sending.on_judged(Judged(peer, sent[0].seq, _ANSWER_US, peer), now_us + _ANSWER_US)
+    sending.on_judged(CommandAck(peer, sent[0].seq, _ANSWER_US, peer), now_us + _ANSWER_US)
     return True
 
 

@@ -10,7 +10,7 @@ from protocol.codec import decode, encode
 from protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
 from protocol.twist_text import format_twist, parse_twist
 
-BOUND_US: Final = 10.0
+CODEC_BOUND_US: Final = 10.0
 _ROUNDS: Final = 200
 _PER_ROUND: Final = 50
 
@@ -39,7 +39,7 @@ class CodecCost:
 
     name: str
     median_us: float
-    bound_us: float = BOUND_US
+    bound_us: float = CODEC_BOUND_US
 
     @property
     def ok(self) -> bool:

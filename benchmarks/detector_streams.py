@@ -125,7 +125,7 @@ def measure_streams(endpoint: str, folder: Path, streams: int = 40, seconds: flo
 
 
 def _service(endpoint: str, each_us: int, log: Path) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-u", "-m", "operator_side.cli", "detector", "--serve", "benchmarks.slow_eyes:SlowEyes",
+    command = [sys.executable, "-u", "-m", "operator_side.cli", "detector", "--serve", "benchmarks.slow_eyes:SlowDetector",
                "--connect", endpoint, "--set", f"detector.options.each_us={each_us}"]
     with log.open("wb") as out:
         return subprocess.Popen(command, stdout=out, stderr=out)

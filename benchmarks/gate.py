@@ -8,7 +8,7 @@ from protocol.messages import AnswerHeader, Echo, Twist
 from robot_side.limits import SafetyConfig
 from robot_side.safety import SafetyGate
 
-BOUND_US: Final = 20.0
+GATE_BOUND_US: Final = 20.0
 _SESSION: Final = "0000aaaa"
 _TICK_US: Final = 20_000
 

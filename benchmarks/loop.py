@@ -8,7 +8,7 @@ from typing import Final
 
 from benchmarks.interrupted import terminated_like_interrupted
 from benchmarks.loop_course import Sample, joined
-from benchmarks.loop_figures import Figures, LoopCheck, figures_of, judge
+from benchmarks.loop_figures import Figures, LoopCheck, figures_of, loop_checks
 from benchmarks.loop_ours import endpoint_of
 from benchmarks.loop_overload import overloaded
 from benchmarks.loop_pictures import write_pictures
@@ -45,7 +45,7 @@ def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
             ready = overloaded(ready, say)
         samples = _samples(ready, Path(name), say)
     figures = {one: figures_of(sample) for one, sample in samples.items()}
-    return Race(ready, jpeg_bytes, samples, figures, judge(figures, ready))
+    return Race(ready, jpeg_bytes, samples, figures, loop_checks(figures, ready))
 
 
 def _samples(setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> dict[str, Sample]:

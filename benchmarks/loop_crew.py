@@ -17,7 +17,7 @@ _END_S: Final = 4.0
 _POLL_S: Final = 0.02
 
 
-class Crew:
+class BenchProcesses:
     """Use it in a `with`; whatever happens, nothing is left running."""
 
     def __init__(self, folder: Path) -> None:

@@ -38,7 +38,7 @@ def build_pipeline(config: VisionConfig, camera: CameraModel, delay_ms: float, b
     return Pipeline(config, camera, slow)
 
 
-class Eyes:
+class PipelineVision:
     """Pictures in, `linear|angular` out."""
 
     def __init__(self, width_px: int, height_px: int, delay_ms: float = 0.0, busy_ms: float = 0.0) -> None:

@@ -104,7 +104,7 @@ def _parts(ages_us: Sequence[tuple[int, int]]) -> tuple[float | None, float | No
     return median(first) / 1000, median(last) / 1000
 
 
-def judge(figures: Mapping[str, Figures], setting: LoopSetting) -> list[LoopCheck]:
+def loop_checks(figures: Mapping[str, Figures], setting: LoopSetting) -> list[LoopCheck]:
     """Hold Sightline against the floor of the same run, or, with a detector slower than the camera, against its delay.
 
     And against every rival there is; transports with our eyes are shown and not judged. `figures` has at least the

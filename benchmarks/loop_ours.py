@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.loop_course import Accepted, Course, course_of_headers
-from benchmarks.loop_crew import Crew, free_port
+from benchmarks.loop_crew import BenchProcesses, free_port
 from benchmarks.loop_machine import children_of
 from benchmarks.loop_setting import LoopSetting
 from protocol.channels import STATUS
@@ -51,7 +51,7 @@ def endpoint_of(transport: str, port: int) -> str:
 
 
 @contextmanager
-def running_services(setting: LoopSetting, folder: Path, crew: Crew) -> Iterator[Ours]:
+def running_services(setting: LoopSetting, folder: Path, crew: BenchProcesses) -> Iterator[Ours]:
     """Robot and vision, seen working. Raises HardwareError with a service's own words if one does not start."""
     port = free_port()
     endpoint = endpoint_of(setting.transport, port)

@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import median
 from typing import Final
 
-from benchmarks.loop_eyes import Eyes
+from benchmarks.loop_eyes import PipelineVision
 from benchmarks.loop_setting import MAX_FPS, LoopSetting
 
 _STEPS: Final = 60
@@ -20,7 +20,7 @@ _FRAME_US: Final = 33_333
 
 def overloaded(setting: LoopSetting, say: Callable[[str], None]) -> LoopSetting:
     """`setting` with the rate, or the detector's time, that its `overload` asks for. Its pictures are written."""
-    step_ms = _step_ms(Eyes(setting.width_px, setting.height_px), setting.pictures)
+    step_ms = _step_ms(PipelineVision(setting.width_px, setting.height_px), setting.pictures)
     found = with_overload(setting, step_ms)
     say(f"overload {setting.overload:g}: one step takes {step_ms:.2f} ms; {found.fps:g} pictures a second, "
         + (f"each detector works {found.busy_ms:.1f} ms" if found.busy_ms else "detectors as they are"))
@@ -35,7 +35,7 @@ def with_overload(setting: LoopSetting, step_ms: float) -> LoopSetting:
     return replace(setting, busy_ms=1000 * setting.overload / setting.fps)
 
 
-def _step_ms(eyes: Eyes, pictures: Path) -> float:
+def _step_ms(eyes: PipelineVision, pictures: Path) -> float:
     """Median, without pauses: who is overloaded never pauses."""
     jpegs = [path.read_bytes() for path in sorted(pictures.glob("*.jpg"))]
     took_ms = []

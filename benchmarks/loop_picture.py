@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from benchmarks.loop import Race
-from benchmarks.loop_setting import FLOOR, OUR_EYES, OURS, TCP, LoopSetting
+from benchmarks.loop_setting import FLOOR, OUR_DETECTOR, OURS, TCP, LoopSetting
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 LABELS: Final = {
     FLOOR: "floor (one process)", OURS: "sightline", TCP: "bare TCP", "older": "older write-up",
     "lekiwi": "ZeroMQ as LeKiwi", "openpi": "WebSocket as openpi", "callback": "zenoh, plain callback",
-    "openpi" + OUR_EYES: "openpi's transport alone", "callback" + OUR_EYES: "callback's transport alone",
+    "openpi" + OUR_DETECTOR: "openpi's transport alone", "callback" + OUR_DETECTOR: "callback's transport alone",
 }
 _PAUSE_US: Final = 2_000_000
 
@@ -56,7 +56,7 @@ def _slowness(setting: LoopSetting) -> str:
 def _draw_one(shares: "Axes", times: "Axes", name: str, ages_us: tuple[tuple[int, int], ...]) -> None:
     ages_ms = sorted(age_us / 1000 for _, age_us in ages_us)
     width = 2.5 if name == OURS else 1.2
-    style = ":" if name.endswith(OUR_EYES) else "--" if name in (FLOOR, TCP) else "-"
+    style = ":" if name.endswith(OUR_DETECTOR) else "--" if name in (FLOOR, TCP) else "-"
     percents = [100 * (at + 1) / len(ages_ms) for at in range(len(ages_ms))]
     shares.plot(ages_ms, percents, label=LABELS[name], linewidth=width, linestyle=style)
     times.plot(*_over_time(ages_us), linewidth=width, linestyle=style)

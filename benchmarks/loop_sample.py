@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from benchmarks.loop_course import Course, Sample, course_of_tally
-from benchmarks.loop_crew import Crew, free_port
+from benchmarks.loop_crew import BenchProcesses, free_port
 from benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
 from benchmarks.loop_ours import running_services
-from benchmarks.loop_setting import FLOOR, OUR_EYES, OURS, OWN_EYES, TAKEN_BOUND_PERCENT, LoopSetting
+from benchmarks.loop_setting import FLOOR, OUR_DETECTOR, OURS, OWN_DETECTOR, TAKEN_BOUND_PERCENT, LoopSetting
 from benchmarks.loop_sockets import carried_between, carried_bytes
 from protocol.clock import monotonic_us
 
@@ -73,7 +73,7 @@ def take_sample(name: str, setting: LoopSetting, folder: Path, say: Callable[[st
 def _take_one(name: str, setting: LoopSetting, folder: Path, number: int) -> Sample:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    with Crew(folder) as crew, _running(name, setting, folder, crew) as contestant:
+    with BenchProcesses(folder) as crew, _running(name, setting, folder, crew) as contestant:
         time.sleep(_SETTLE_S)
         carried_before = carried_bytes(contestant.ports)
         before, begin_us = read_machine(contestant.pids), monotonic_us()
@@ -94,7 +94,7 @@ def _take_one(name: str, setting: LoopSetting, folder: Path, number: int) -> Sam
 
 
 @contextmanager
-def _running(name: str, setting: LoopSetting, folder: Path, crew: Crew) -> Iterator[Contestant]:
+def _running(name: str, setting: LoopSetting, folder: Path, crew: BenchProcesses) -> Iterator[Contestant]:
     if name == OURS:
         with running_services(setting, folder, crew) as ours:
             yield ours
@@ -102,10 +102,10 @@ def _running(name: str, setting: LoopSetting, folder: Path, crew: Crew) -> Itera
     tally, port = folder / "tally.json", free_port()
     settings = json.dumps({
         "width_px": setting.width_px, "height_px": setting.height_px, "delay_ms": setting.detector_delay_ms,
-        "busy_ms": setting.busy_ms, "eyes": "classic" if name in OWN_EYES else "ours",
+        "busy_ms": setting.busy_ms, "eyes": "classic" if name in OWN_DETECTOR else "ours",
         "fps": setting.fps, "pictures": str(setting.pictures), "tally": str(tally), "port": port,
     })
-    peer = name.removesuffix(OUR_EYES)
+    peer = name.removesuffix(OUR_DETECTOR)
     if name == FLOOR:
         pids = {"vision": crew.start(FLOOR, _MODULE, peer, "alone", settings)}
         crew.wait_line(FLOOR, "first answer")

@@ -12,11 +12,11 @@ TCP: Final = "tcp"
 """The least that two processes can do; a reference, and a rival only when the detector is slow."""
 PEERS: Final = ("older", "lekiwi", "openpi", "callback")
 """What a user would build, one by one."""
-OUR_EYES: Final = "+our eyes"
+OUR_DETECTOR: Final = "+our eyes"
 """After a peer's name: the peer with Sightline's own pipeline instead of its own, so that its transport alone shows."""
-WITH_OUR_EYES: Final = ("openpi", "callback")
+WITH_OUR_DETECTOR: Final = ("openpi", "callback")
 """Peers whose transport is quick enough for that to tell something."""
-OWN_EYES: Final = ("lekiwi", "openpi", "callback")
+OWN_DETECTOR: Final = ("lekiwi", "openpi", "callback")
 """Peers that see as the older write-ups do; all others, floor and bare TCP included, have Sightline's pipeline."""
 MAX_FPS: Final = 240.0
 """As much as the robot service takes."""
@@ -61,7 +61,7 @@ class LoopSetting:
     @property
     def contestants(self) -> tuple[str, ...]:
         """Whoever runs, in this order; transports alone last."""
-        alone = tuple(name + OUR_EYES for name in WITH_OUR_EYES if name in self.peers)
+        alone = tuple(name + OUR_DETECTOR for name in WITH_OUR_DETECTOR if name in self.peers)
         return (FLOOR, OURS, *((TCP, *self.peers, *alone) if self.peers else ()))
 
 

@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 
 from benchmarks.interrupted import terminated_like_interrupted
-from benchmarks.loop_crew import Crew
+from benchmarks.loop_crew import BenchProcesses
 from benchmarks.loop_figures import LoopCheck, at_most
 from benchmarks.loop_pictures import write_pictures
-from benchmarks.network_figures import Stretch, figures_of, judge
+from benchmarks.network_figures import Stretch, figures_of, network_checks
 from benchmarks.network_fleet import fleet
-from benchmarks.network_rows import Row, spans_s
+from benchmarks.network_rows import Case, spans_s
 from benchmarks.network_stage import (
     BenchWire,
     NetworkRun,
@@ -33,10 +33,10 @@ from benchmarks.network_stage import (
 )
 from benchmarks.network_takeover import moved, router, standby
 from benchmarks.network_uplink import uplink
-from benchmarks.network_wheels import on_old_sight, read_told
+from benchmarks.network_wheels import on_old_sight, read_wheel_commands
 from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, HardwareError
-from sim.wire import Shapes
+from sim.wire import LinkShapes
 from sim.wire_tun import ADDRESS_A, why_impossible
 
 WIDTH_PX, HEIGHT_PX, FPS = 640, 480, 30.0
@@ -47,7 +47,7 @@ _SETTLE_S: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Telling:
+class Progress:
     """Who hears how it goes: that a run begins, and what came of it."""
 
     begins: Callable[[str], None]
@@ -55,7 +55,7 @@ class Telling:
 
 
 def run_network(
-    rows: Sequence[Row], setting: NetworkSetting, wiring: Wiring, telling: Telling, scenes: Mapping[str, Scene]
+    rows: Sequence[Case], setting: NetworkSetting, wiring: Wiring, telling: Progress, scenes: Mapping[str, Scene]
 ) -> list[NetworkRun]:
     """Every row, with every seed where chance has a part in it; `scenes` are added to `SCENES`.
 
@@ -90,7 +90,7 @@ def write_film(folder: Path) -> Path:
     return path
 
 
-def _run(row: Row, stage: Stage, scenes: Mapping[str, Scene]) -> NetworkRun:
+def _run(row: Case, stage: Stage, scenes: Mapping[str, Scene]) -> NetworkRun:
     try:
         return scenes[row.scene](row, stage) if row.scene else _course(row, stage)
     except HardwareError as error:
@@ -98,7 +98,7 @@ def _run(row: Row, stage: Stage, scenes: Mapping[str, Scene]) -> NetworkRun:
         return NetworkRun(row, stage.seed, 0, (), (LoopCheck(why, None, "", 1.0, ok=False),))
 
 
-def _course(row: Row, stage: Stage) -> NetworkRun:
+def _course(row: Case, stage: Stage) -> NetworkRun:
     """One robot and one vision, the wire shaped phase by phase."""
     with stage.wire() as wire, stage.crew("crew") as crew:
         # From the first packet on: what TCP learned of a better wire would be what is measured.
@@ -112,22 +112,22 @@ def _course(row: Row, stage: Stage) -> NetworkRun:
             time.sleep(seconds if phase.seconds else seconds + settle_s)
             stretches.append(Stretch(begin_us, begin_us + round(settle_s * 1e6), monotonic_us()))
             crew.check()
-        injected = wire.shape(Shapes()) - before
+        injected = wire.shape(LinkShapes()) - before
         crew.end()
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
     figures = tuple(figures_of(notes, stretch) for stretch in stretches)
     harmed = LoopCheck("injected", float(injected), "", 1.0, injected >= 1)
-    return NetworkRun(row, stage.seed, injected, figures, (harmed, *judge(row, figures), *_judge_wheels(stage, notes)))
+    return NetworkRun(row, stage.seed, injected, figures, (harmed, *network_checks(row, figures), *_wheel_checks(stage, notes)))
 
 
-def _judge_wheels(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[LoopCheck]:
+def _wheel_checks(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[LoopCheck]:
     """From what the wheels were told, whatever the robot says of itself; over Zenoh, where twists can be heard."""
     if notes["twists"]:
-        lines = on_old_sight(read_told(stage.wheels.read_text("ascii")), notes["twists"])
+        lines = on_old_sight(read_wheel_commands(stage.wheels.read_text("ascii")), notes["twists"])
         yield at_most("moved on frames over 400 ms", float(lines), "lines", 0)
 
 
-def _start(row: Row, wire: BenchWire, crew: Crew, stage: Stage) -> None:
+def _start(row: Case, wire: BenchWire, crew: BenchProcesses, stage: Stage) -> None:
     """Robot and watcher on one side, vision on the other, seen driving over the wire as it is."""
     start_robot(stage, crew, wire.robot_side, passes_through=row.passes_through)
     crew.start("watch", "benchmarks.network_watch", stage.form.format("127.0.0.1"), str(stage.folder / "notes.json"),

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Any, Final
 
 from benchmarks.loop_figures import LoopCheck, at_most, percentile
-from benchmarks.network_rows import HOLD_AGE_MS, Row
+from benchmarks.network_rows import HOLD_AGE_MS, Case
 from benchmarks.network_watch import NOTED
 
 DRIVING: Final = ("ACTIVE", "DEGRADED")
@@ -113,7 +113,7 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else 0.0
 
 
-def judge(row: Row, figures: Sequence[NetworkFigures]) -> Iterator[LoopCheck]:
+def network_checks(row: Case, figures: Sequence[NetworkFigures]) -> Iterator[LoopCheck]:
     """Hold the last phase of a row against its bounds; `figures` are those of all its phases."""
     last, first = figures[-1], figures[0]
     if row.p50_ms is not None:

@@ -8,20 +8,20 @@ from typing import Final
 from benchmarks.loop_figures import LoopCheck, at_most, percentile
 from benchmarks.loop_pictures import write_pictures
 from benchmarks.network_robots import Settings
-from benchmarks.network_rows import Row
+from benchmarks.network_rows import Case
 from benchmarks.network_stage import EVERYWHERE, NetworkRun, Stage
 from protocol.clock import monotonic_us
-from sim.wire import Shapes
+from sim.wire import LinkShapes
 from sim.wire_tun import ADDRESS_B
 
 ROBOTS: Final = 20
 WIDTH_PX, HEIGHT_PX, FPS = 320, 240, 15.0
-LEAST_FPS: Final = 14.0
+FLEET_LEAST_FPS: Final = 14.0
 MOST_P95_MS: Final = 80.0
-_SETTLE_S: Final = 3.0
+_FLEET_SETTLE_S: Final = 3.0
 
 
-def fleet(row: Row, stage: Stage) -> NetworkRun:
+def fleet(row: Case, stage: Stage) -> NetworkRun:
     """All of them for as long as there is time; judged by the robot that fared worst."""
     pictures = stage.folder / "small"
     pictures.mkdir()
@@ -35,19 +35,19 @@ def fleet(row: Row, stage: Stage) -> NetworkRun:
         crew.wait_line("vision", "looking for robots")
         crew.start("robots", "benchmarks.network_robots", settings.model_dump_json(), namespace=wire.robot_side)
         crew.wait_line("robots", f"playing {ROBOTS} robots")
-        time.sleep(_SETTLE_S)
+        time.sleep(_FLEET_SETTLE_S)
         begin_us = monotonic_us()
         time.sleep(stage.setting.seconds)
         end_us = monotonic_us()
         crew.check()
-        injected = wire.shape(Shapes()) - before
+        injected = wire.shape(LinkShapes()) - before
         crew.end()
     answers = json.loads(settings.notes.read_text("utf-8"))
     harmed = LoopCheck("injected", float(injected), "", 1.0, injected >= 1)
-    return NetworkRun(row, stage.seed, injected, (), (harmed, *judge_fleet(answers, begin_us, end_us)))
+    return NetworkRun(row, stage.seed, injected, (), (harmed, *fleet_checks(answers, begin_us, end_us)))
 
 
-def judge_fleet(
+def fleet_checks(
     answers: Mapping[str, Sequence[Sequence[int]]], begin_us: int, end_us: int
 ) -> tuple[LoopCheck, LoopCheck, LoopCheck]:
     """The robot with the fewest answers, and the one with the oldest. `answers`: (captured_us, age_us) of each."""
@@ -59,6 +59,6 @@ def judge_fleet(
     oldest_ms = max(known) if known and len(known) == len(p95_ms) else None
     return (
         LoopCheck("robots", float(len(answers)), "", float(ROBOTS), len(answers) >= ROBOTS),
-        LoopCheck("answered, least", least_fps, "fps", LEAST_FPS, least_fps >= LEAST_FPS),
+        LoopCheck("answered, least", least_fps, "fps", FLEET_LEAST_FPS, least_fps >= FLEET_LEAST_FPS),
         at_most("age p95, worst robot", oldest_ms, "ms", MOST_P95_MS),
     )

@@ -26,9 +26,9 @@ from protocol.jpeg import read_jpeg_size
 from protocol.messages import AnswerHeader, Holder, Stamp, State, Status
 from protocol.transports.link import Link, Message
 from protocol.transports.opening import open_link
-from robot_side.ipc import Judged
+from robot_side.ipc import CommandAck
 from robot_side.ports import Picture
-from robot_side.sending import Sending
+from robot_side.sending import NetworkCore
 from robot_side.stream import StreamConfig
 
 _STATUS_US = 100_000
@@ -57,7 +57,7 @@ class PlayedRobot:
         size = read_jpeg_size(self._jpegs[0])
         self._model = camera_of(size.width_px, size.height_px)
         self._session = secrets.token_hex(4)
-        self._sending = Sending(StreamConfig(max_fps=settings.fps), self._session, 0, FRAME.max_payload_bytes)
+        self._sending = NetworkCore(StreamConfig(max_fps=settings.fps), self._session, 0, FRAME.max_payload_bytes)
         self._lock = threading.Lock()
         self._period_us = round(1e6 / settings.fps)
         self._due_us, self._status_due_us = due_us, 0
@@ -99,7 +99,7 @@ class PlayedRobot:
             return
         who = Holder(source=header.source, session=header.session)
         with self._lock:
-            self._sending.on_judged(Judged(who, header.echo.seq, header.compute_us, who), at_us)
+            self._sending.on_judged(CommandAck(who, header.echo.seq, header.compute_us, who), at_us)
         self.answers.append((header.echo.t_us, at_us - header.echo.t_us))
 
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from benchmarks.loop_crew import Crew
+from benchmarks.loop_crew import BenchProcesses
 from benchmarks.loop_figures import LoopCheck
 from benchmarks.loop_ours import ROBOT
 from benchmarks.network_figures import NetworkFigures
-from benchmarks.network_rows import WEBSOCKET, ZENOH, Row
+from benchmarks.network_rows import WEBSOCKET, ZENOH, Case
 from protocol.errors import ConfigError
-from sim.wire import Shapes
+from sim.wire import LinkShapes
 
 PORTS: Final = {ZENOH: "tcp/{}:7447", WEBSOCKET: "ws://{}:9090"}
 EVERYWHERE: Final = "0.0.0.0"
@@ -29,7 +29,7 @@ class BenchWire(Protocol):
     far_side: str
     carried_bytes: dict[str, int]
 
-    def shape(self, shapes: Shapes) -> int:
+    def shape(self, shapes: LinkShapes) -> int:
         """Put `shapes` in force; returns how many packets were harmed so far."""
         ...
 
@@ -59,7 +59,7 @@ class NetworkSetting:
 class NetworkRun:
     """One row with one seed; `injected` packets or processes were harmed. `facts` are what was seen besides."""
 
-    row: Row
+    row: Case
     seed: int
     injected: int
     figures: tuple[NetworkFigures, ...]
@@ -82,15 +82,15 @@ class Stage:
         """The two namespaces and what lies between."""
         return self.wiring(self.folder / "wire.log")
 
-    def seeded(self, shapes: Shapes) -> Shapes:
+    def seeded(self, shapes: LinkShapes) -> LinkShapes:
         """`shapes`, their chance drawn from this run's seed."""
         return shapes.model_copy(update={"seed": self.seed})
 
-    def crew(self, name: str) -> Crew:
+    def crew(self, name: str) -> BenchProcesses:
         """Processes with a folder of their own: some may be killed while the others are looked after."""
         folder = self.folder / name
         folder.mkdir()
-        return Crew(folder)
+        return BenchProcesses(folder)
 
     @property
     def form(self) -> str:
@@ -103,10 +103,10 @@ class Stage:
         return self.folder / "wheels.csv"
 
 
-Scene = Callable[[Row, Stage], NetworkRun]
+Scene = Callable[[Case, Stage], NetworkRun]
 
 
-def start_robot(stage: Stage, crew: Crew, namespace: str, *, connect: str = "", passes_through: bool = False) -> int:
+def start_robot(stage: Stage, crew: BenchProcesses, namespace: str, *, connect: str = "", passes_through: bool = False) -> int:
     """A robot that listens, or connects where a router is; returns its process id once it is on."""
     config = _robot_toml(stage, connect, passes_through)
     pid = crew.start("robot", "operator_side.cli", "robot", "--config", str(config), namespace=namespace)
@@ -114,7 +114,7 @@ def start_robot(stage: Stage, crew: Crew, namespace: str, *, connect: str = "", 
     return pid
 
 
-def start_vision(stage: Stage, crew: Crew, namespace: str, endpoint: str) -> int:
+def start_vision(stage: Stage, crew: BenchProcesses, namespace: str, endpoint: str) -> int:
     """A vision, seen working; returns its process id."""
     secure = ("--secure", str(stage.folder)) if stage.setting.transport in _TOKENED else ()
     pid = crew.start("vision", "operator_side.cli", "vision", "--robot", ROBOT, "--connect", endpoint, *secure,

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Final
 
-from benchmarks.loop_crew import Crew
+from benchmarks.loop_crew import BenchProcesses
 from benchmarks.loop_figures import LoopCheck, at_most
-from benchmarks.network_rows import Row
+from benchmarks.network_rows import Case
 from benchmarks.network_stage import EVERYWHERE, BenchWire, NetworkRun, Stage, start_robot, start_vision
-from benchmarks.network_wheels import Told, moves_again_s, read_told
+from benchmarks.network_wheels import WheelCommand, moves_again_s, read_wheel_commands
 from protocol.clock import monotonic_us
 from protocol.errors import HardwareError
 from sim.wire_tun import ADDRESS_A, ADDRESS_B, move_address
@@ -29,12 +29,12 @@ _PATIENCE_S: Final = 10.0
 _OTHER_ADDRESS: Final = "10.213.77.3"
 
 
-def standby(row: Row, stage: Stage) -> NetworkRun:
+def standby(row: Case, stage: Stage) -> NetworkRun:
     """Two visions; whoever drives is killed and a new one stands by, for as long as there is time."""
     endpoint = stage.form.format(ADDRESS_A)
     with _on_site(row, stage) as (wire, ending):
         start_robot(stage, ending.enter_context(stage.crew("robot")), wire.robot_side)
-        visions: list[tuple[Crew, int]] = []
+        visions: list[tuple[BenchProcesses, int]] = []
 
         def start() -> None:
             crew = ending.enter_context(stage.crew(f"vision{len(visions)}"))
@@ -48,13 +48,13 @@ def standby(row: Row, stage: Stage) -> NetworkRun:
             return killed_us
 
         start()
-        return _judged(row, stage, harm, "drives again after", TAKES_OVER_S)
+        return _checks(row, stage, harm, "drives again after", TAKES_OVER_S)
 
 
-def router(row: Row, stage: Stage) -> NetworkRun:
+def router(row: Case, stage: Stage) -> NetworkRun:
     """Everybody is a client of a router that is killed; counted from when there is one again."""
     with _on_site(row, stage) as (wire, ending):
-        crews: list[tuple[Crew, int]] = []
+        crews: list[tuple[BenchProcesses, int]] = []
 
         def start() -> None:
             crew = ending.enter_context(stage.crew(f"router{len(crews)}"))
@@ -69,10 +69,10 @@ def router(row: Row, stage: Stage) -> NetworkRun:
 
         start()
         _start_clients(stage, wire, ending)
-        return _judged(row, stage, harm, "drives again after", BACK_S)
+        return _checks(row, stage, harm, "drives again after", BACK_S)
 
 
-def moved(row: Row, stage: Stage) -> NetworkRun:
+def moved(row: Case, stage: Stage) -> NetworkRun:
     """The robot's end of the wire gets another address, and the one before back the next time."""
     addresses = [ADDRESS_A, _OTHER_ADDRESS]
     with _on_site(row, stage) as (wire, ending):
@@ -86,10 +86,10 @@ def moved(row: Row, stage: Stage) -> NetworkRun:
 
         start_router(ending.enter_context(stage.crew("router")), wire)
         _start_clients(stage, wire, ending)
-        return _judged(row, stage, harm, "drives again after", BACK_S)
+        return _checks(row, stage, harm, "drives again after", BACK_S)
 
 
-def start_router(crew: Crew, wire: BenchWire) -> int:
+def start_router(crew: BenchProcesses, wire: BenchWire) -> int:
     """`sightline router` beyond the radio; returns its process id."""
     pid = crew.start("router", "operator_side.cli", "router", "--listen", f"tcp/{EVERYWHERE}:7447",
                      namespace=wire.far_side)
@@ -98,7 +98,7 @@ def start_router(crew: Crew, wire: BenchWire) -> int:
 
 
 @contextmanager
-def _on_site(row: Row, stage: Stage) -> Iterator[tuple[BenchWire, ExitStack]]:
+def _on_site(row: Case, stage: Stage) -> Iterator[tuple[BenchWire, ExitStack]]:
     with stage.wire() as wire, ExitStack() as ending:
         wire.shape(stage.seeded(row.phases[0].shapes))
         yield wire, ending
@@ -109,7 +109,7 @@ def _start_clients(stage: Stage, wire: BenchWire, ending: ExitStack) -> None:
     start_vision(stage, ending.enter_context(stage.crew("vision")), wire.far_side, "tcp/127.0.0.1:7447")
 
 
-def _judged(row: Row, stage: Stage, harm: Callable[[], int], what: str, bound_s: float) -> NetworkRun:
+def _checks(row: Case, stage: Stage, harm: Callable[[], int], what: str, bound_s: float) -> NetworkRun:
     """Do `harm` until the time is over; the worst of the times until the wheels turned again."""
     _wait_moving(stage)
     end_s = time.monotonic() + stage.setting.seconds
@@ -131,7 +131,7 @@ def _worst(took_s: Sequence[float | None]) -> float | None:
 
 def _wait_moving(stage: Stage) -> None:
     deadline_s = time.monotonic() + _PATIENCE_S
-    while not any(row.moves for row in _told(stage)):
+    while not any(row.moves for row in _wheel_commands(stage)):
         if time.monotonic() > deadline_s:
             raise HardwareError(f"the wheels do not turn within {_PATIENCE_S:g} s of all being on")
         time.sleep(0.1)
@@ -143,9 +143,9 @@ def _wait_again(stage: Stage, harmed_us: int) -> float | None:
     again_s = None
     while time.monotonic() < deadline_s and not again_s:
         time.sleep(0.1)
-        again_s = moves_again_s(_told(stage), harmed_us, monotonic_us())
+        again_s = moves_again_s(_wheel_commands(stage), harmed_us, monotonic_us())
     return again_s
 
 
-def _told(stage: Stage) -> list[Told]:
-    return read_told(stage.wheels.read_text("ascii")) if stage.wheels.exists() else []
+def _wheel_commands(stage: Stage) -> list[WheelCommand]:
+    return read_wheel_commands(stage.wheels.read_text("ascii")) if stage.wheels.exists() else []

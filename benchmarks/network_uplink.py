@@ -10,25 +10,25 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, Final
 
-from benchmarks.loop_crew import Crew
+from benchmarks.loop_crew import BenchProcesses
 from benchmarks.loop_figures import LoopCheck, at_most
 from benchmarks.network_figures import sent_between
-from benchmarks.network_rows import Row
+from benchmarks.network_rows import Case
 from benchmarks.network_stage import BenchWire, NetworkRun, Stage, start_robot, start_vision
 from benchmarks.network_takeover import start_router
 from protocol.clock import monotonic_us
-from sim.wire import Shapes
+from sim.wire import LinkShapes
 from sim.wire_tun import ADDRESS_B
 
 MOST_SHARE: Final = 1.05
-LEAST_FPS: Final = 25.0
+UPLINK_LEAST_FPS: Final = 25.0
 """With fewer, what is sent besides frames would weigh more on each."""
 READERS: Final = 2
 _AT_ROUTER: Final = "tcp/127.0.0.1:7447"
-_SETTLE_S: Final = 2.0
+_UPLINK_SETTLE_S: Final = 2.0
 
 
-def uplink(row: Row, stage: Stage) -> NetworkRun:
+def uplink(row: Case, stage: Stage) -> NetworkRun:
     """Bytes from the robot for each frame it sent, crowded over alone."""
     shapes = stage.seeded(row.phases[0].shapes)
     with stage.wire() as wire, ExitStack() as ending:
@@ -46,21 +46,21 @@ def uplink(row: Row, stage: Stage) -> NetworkRun:
         crowded = _stretch(wire, shapes, stage.setting.seconds / 2)
         for crew in crews.values():
             crew.check()
-        injected = wire.shape(Shapes()) - before
+        injected = wire.shape(LinkShapes()) - before
         crews["site"].end()
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
-    return _run(row, stage, injected, [_stream_of(notes, one) for one in (alone, crowded)])
+    return _uplink_run(row, stage, injected, [_stream_of(notes, one) for one in (alone, crowded)])
 
 
-def _start_notes(crew: Crew, wire: BenchWire, stage: Stage) -> None:
+def _start_notes(crew: BenchProcesses, wire: BenchWire, stage: Stage) -> None:
     crew.start("notes", "benchmarks.network_watch", _AT_ROUTER, str(stage.folder / "notes.json"), "statuses",
                namespace=wire.far_side)
     crew.wait_line("notes", "watching")
 
 
-def _stretch(wire: BenchWire, shapes: Shapes, seconds: float) -> tuple[int, int, int]:
+def _stretch(wire: BenchWire, shapes: LinkShapes, seconds: float) -> tuple[int, int, int]:
     """(from, until, bytes that came from the robot in between)."""
-    time.sleep(_SETTLE_S)
+    time.sleep(_UPLINK_SETTLE_S)
     wire.shape(shapes)
     begin_us, begin_bytes = monotonic_us(), wire.carried_bytes["ab"]
     time.sleep(seconds)
@@ -75,12 +75,12 @@ def _stream_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: tuple[int,
     return carried / max(1.0, sent), sent * 1e6 / (end_us - begin_us)
 
 
-def _run(row: Row, stage: Stage, injected: int, streams: Sequence[tuple[float, float]]) -> NetworkRun:
+def _uplink_run(row: Case, stage: Stage, injected: int, streams: Sequence[tuple[float, float]]) -> NetworkRun:
     (alone_bytes, alone_fps), (crowded_bytes, crowded_fps) = streams
     checks = (
         LoopCheck("injected", float(injected), "", 1.0, injected >= 1),
         at_most("bytes from the robot, over one stream", crowded_bytes / max(1.0, alone_bytes), "times", MOST_SHARE),
-        LoopCheck("frames while crowded", crowded_fps, "fps", LEAST_FPS, crowded_fps >= LEAST_FPS),
+        LoopCheck("frames while crowded", crowded_fps, "fps", UPLINK_LEAST_FPS, crowded_fps >= UPLINK_LEAST_FPS),
     )
     facts = {"alone_bytes_per_frame": alone_bytes, "crowded_bytes_per_frame": crowded_bytes, "alone_fps": alone_fps}
     return NetworkRun(row, stage.seed, injected, (), checks, facts)

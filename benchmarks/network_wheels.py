@@ -16,7 +16,7 @@ _FASTER_RAD_S: Final = 0.15
 """Less is no gain of speed: turning a twist into wheel speeds rounds."""
 
 
-class Told(NamedTuple):
+class WheelCommand(NamedTuple):
     """One line of the log drive's file."""
 
     t_us: int
@@ -29,13 +29,13 @@ class Told(NamedTuple):
         return bool(self.left_rad_s or self.right_rad_s)
 
 
-def read_told(text: str) -> list[Told]:
+def read_wheel_commands(text: str) -> list[WheelCommand]:
     """Whole lines; one that is still being written is left out."""
     parts = [line.split(",") for line in text.split("\n")[:-1]]
-    return [Told(int(t), float(left), float(right)) for t, left, right in parts]
+    return [WheelCommand(int(t), float(left), float(right)) for t, left, right in parts]
 
 
-def on_old_sight(rows: Sequence[Told], answers: Sequence[Sequence[int]]) -> int:
+def on_old_sight(rows: Sequence[WheelCommand], answers: Sequence[Sequence[int]]) -> int:
     """Lines that no young frame allows; `answers` are (heard_us, t_us of the frame answered) of every command sent.
 
     With the youngest frame that was answered by then older than is driven on, no wheel may turn faster than before;
@@ -51,11 +51,11 @@ def on_old_sight(rows: Sequence[Told], answers: Sequence[Sequence[int]]) -> int:
     return lines
 
 
-def _is_faster(before: Told, row: Told) -> bool:
+def _is_faster(before: WheelCommand, row: WheelCommand) -> bool:
     return max(abs(row[1]) - abs(before[1]), abs(row[2]) - abs(before[2])) > _FASTER_RAD_S
 
 
-def moves_again_s(rows: Sequence[Told], since_us: int, until_us: int) -> float | None:
+def moves_again_s(rows: Sequence[WheelCommand], since_us: int, until_us: int) -> float | None:
     """From `since_us` to the end of the longest standstill that ends after it, up to `until_us`.
 
     0 if the wheels never stood; None if they did not turn again, or nothing is known.
@@ -67,7 +67,7 @@ def moves_again_s(rows: Sequence[Told], since_us: int, until_us: int) -> float |
     return (max(stood_us)[1] - since_us) / 1e6 if stood_us else 0.0
 
 
-def _stands(rows: Sequence[Told]) -> Iterator[tuple[int, int]]:
+def _stands(rows: Sequence[WheelCommand]) -> Iterator[tuple[int, int]]:
     """When each standstill began, and when it was over."""
     begin_us: int | None = None
     for row in rows:

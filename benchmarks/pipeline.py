@@ -15,7 +15,7 @@ from protocol.messages import CameraModel, FrameHeader
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
 from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.onnx_detector import OnnxDetector, read_model
+from vision_side.detect.onnx_detector import OnnxDetector, read_onnx_model
 from vision_side.detect.onnx_engine import open_engine
 from vision_side.detect.onnx_reading import fit_picture
 from vision_side.detect.port import NO_DEADLINE, DetectFrame
@@ -80,7 +80,7 @@ def time_learned(frames: int = 600) -> LearnedTime:
     size = (320, 240)
     pictures, decoder = _pictures(*size), Decoder(*size, size[0] * size[1])
     config = OnnxDetector.Config(device="cpu")
-    detector, model = OnnxDetector(config), read_model(config)
+    detector, model = OnnxDetector(config), read_onnx_model(config)
     engine = open_engine(model.path, model.header, "cpu", config.threads)
     asked = [DetectFrame("r1", one.header, one.jpeg, decoder) for one in islice(_frames(pictures), frames)]
     pixels = [fit_picture(decoder.decode(jpeg), model.form)[0].copy() for jpeg in pictures]

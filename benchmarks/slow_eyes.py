@@ -10,8 +10,8 @@ from protocol.config import Config as Settings
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
 
 
-class SlowEyes:
-    """`--serve benchmarks.slow_eyes:SlowEyes`."""
+class SlowDetector:
+    """`--serve benchmarks.slow_eyes:SlowDetector`."""
 
     class Config(Settings):
         """How slow."""

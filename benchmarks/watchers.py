@@ -14,7 +14,7 @@ from typing import Final
 
 from benchmarks.interrupted import terminated_like_interrupted
 from benchmarks.loop_course import Course
-from benchmarks.loop_crew import Crew
+from benchmarks.loop_crew import BenchProcesses
 from benchmarks.loop_figures import ANSWERED_PERCENT, LoopCheck, at_most, percentile
 from benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
 from benchmarks.loop_ours import Ours, running_services
@@ -67,7 +67,7 @@ def measure_watchers(setting: LoopSetting, viewers: int, say: Callable[[str], No
 
 
 def _measure(setting: LoopSetting, viewers: int, folder: Path, say: Callable[[str], None]) -> tuple[Watch, Watch]:
-    with Crew(folder) as crew, running_services(setting, folder, crew) as ours:
+    with BenchProcesses(folder) as crew, running_services(setting, folder, crew) as ours:
         alone = _stretch(ours, {}, setting.seconds)
         say(f"without viewers: others had {alone.taken_percent:.1f} % of the machine's time")
         crowded = _stretch(ours, start_viewers(crew, ours.endpoint, viewers), setting.seconds)
@@ -77,7 +77,7 @@ def _measure(setting: LoopSetting, viewers: int, folder: Path, say: Callable[[st
         return _watch(ours, alone), _watch(ours, crowded)
 
 
-def start_viewers(crew: Crew, endpoint: str, viewers: int) -> dict[str, int]:
+def start_viewers(crew: BenchProcesses, endpoint: str, viewers: int) -> dict[str, int]:
     """Start them, each seen watching: one stopped by the kernel, one slow, the rest quick. Returns process ids."""
     parts = {"stalled": (1, 0.0), "slow": (1, _SLOW_NAP_S), "quick": (viewers - 2, 0.0)}
     pids = {}

@@ -10,7 +10,7 @@ import sys
 from typing import Any
 
 from protocol.golden import outcome
-from protocol.golden_wires import READERS, wire_outcome
+from protocol.golden_wires import READERS, framing_outcome
 from protocol.messages import Twist
 from protocol.twist_text import format_twist
 
@@ -25,7 +25,7 @@ def answer(question: dict[str, Any]) -> dict[str, Any]:
         twist = Twist(linear_mps=question["linear_mps"], angular_rad_s=question["angular_rad_s"])
         return {"ok": format_twist(twist).decode("ascii")}
     if question["kind"] in READERS:
-        came_to = wire_outcome(question["kind"], question)
+        came_to = framing_outcome(question["kind"], question)
         return {"ok": came_to["accept"]} if "accept" in came_to else {"refusal": came_to["refuse"]}
     return {"unsupported": True}
 

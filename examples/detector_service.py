@@ -22,7 +22,7 @@ from protocol.codec import decode, encode
 from protocol.errors import SightlineError, WireError
 from protocol.jpeg import read_jpeg_size
 from protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link import Message
 from protocol.transports.opening import open_link
 
@@ -49,7 +49,7 @@ def boxes_of(jpeg: bytes) -> Detections:
     size = read_jpeg_size(jpeg)
     bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     if bgr is None:
-        raise WireError(Refusal.MALFORMED, "the picture does not decode")
+        raise WireError(RejectReason.MALFORMED, "the picture does not decode")
     return Detections(width_px=size.width_px, height_px=size.height_px, boxes=look(bgr))
 
 

@@ -7,7 +7,7 @@ from protocol.codec import decode, encode
 from protocol.errors import WireError
 from protocol.messages import AnswerHeader, Echo, FrameHeader
 from protocol.transports.link import Link, Message
-from protocol.transports.secured import SOURCES, certificate_role
+from protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
 
 
 class Viewer:
@@ -15,7 +15,7 @@ class Viewer:
 
     def __init__(self, link: Link, role: str, secure: str = "") -> None:
         self._link, self._role = link, role
-        self._is_silent = bool(secure) and not SOURCES.get(certificate_role(role))
+        self._is_silent = bool(secure) and not SOURCES_OF_ROLE.get(certificate_role(role))
         self._session = secrets.token_hex(4)
         self._seq = 0
 

@@ -10,22 +10,22 @@ from typing import Any, Final
 
 from operator_side import around_text
 from protocol.errors import ConfigError, LinkError, SightlineError
-from protocol.transports.endpoints import check_endpoint
-from protocol.transports.zenoh_around import Around, find_listeners, look_around
+from protocol.transports.endpoints import parse_zenoh_endpoint
+from protocol.transports.zenoh_around import Discovered, find_listeners, discover
 from robot_side.config import DEFAULT_ENDPOINT
 
 SCOUT_S: Final = 0.4
 """Who hears a multicast answers within some milliseconds; one is repeated within this, since Wi-Fi loses many."""
-_KNOCK_S: Final = 0.2
+_PROBE_S: Final = 0.2
 _PLACES: Final = 16
 """Security limit: no more places are looked at, however many answer."""
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class DiscoveryReport:
     """What each place gave: those around it, or why not."""
 
-    places: dict[str, Around | SightlineError]
+    places: dict[str, Discovered | SightlineError]
 
     def lines(self) -> Iterator[str]:
         """For a person; the place is said where there is a choice."""
@@ -48,27 +48,27 @@ class Found:
         return whole
 
 
-def find_around(connect: Sequence[str] | None, seconds: float, secure: str) -> Found:
+def discover_all(connect: Sequence[str] | None, seconds: float, secure: str) -> DiscoveryReport:
     """Explicit endpoints first; without them this machine, and then whoever answers a multicast.
 
     Raises ConfigError for an endpoint that is none, LinkError if nobody is there, with what was tried.
     """
     if connect:
-        return _someone(Found({", ".join(connect): look_around(_of_zenoh(connect), seconds, secure)}), seconds)
+        return _someone(DiscoveryReport({", ".join(connect): discover(_of_zenoh(connect), seconds, secure)}), seconds)
     if _listens(DEFAULT_ENDPOINT):
         endpoint = DEFAULT_ENDPOINT.replace("tcp/", "tls/") if secure else DEFAULT_ENDPOINT
-        return _someone(Found({endpoint: look_around([endpoint], seconds, secure)}), seconds)
+        return _someone(DiscoveryReport({endpoint: discover([endpoint], seconds, secure)}), seconds)
     places = find_listeners(SCOUT_S)[:_PLACES]
     if not places:
         raise LinkError(f"nobody listens at {DEFAULT_ENDPOINT}, and nobody answers a multicast within {SCOUT_S:g} s; "
                         "name where one listens: sightline robots --connect tcp/ROBOT:7447")
     with ThreadPoolExecutor(len(places)) as pool:
-        return Found(dict(zip(places, pool.map(lambda place: _looked(place, seconds, secure), places), strict=True)))
+        return DiscoveryReport(dict(zip(places, pool.map(lambda place: _looked(place, seconds, secure), places), strict=True)))
 
 
-def _someone(found: Found, seconds: float) -> Found:
+def _someone(found: DiscoveryReport, seconds: float) -> DiscoveryReport:
     for place, around in found.places.items():
-        if isinstance(around, Around) and not around.statuses and not around.peers:
+        if isinstance(around, Discovered) and not around.statuses and not around.peers:
             raise LinkError(f"no robot is heard at {place} within {seconds:g} s; start one: sightline robot")
     return found
 
@@ -80,17 +80,17 @@ def _of_zenoh(connect: Sequence[str]) -> Sequence[str]:
     return connect
 
 
-def _looked(place: str, seconds: float, secure: str) -> Around | SightlineError:
+def _looked(place: str, seconds: float, secure: str) -> Discovered | SightlineError:
     try:
-        return look_around([place], seconds, secure)
+        return discover([place], seconds, secure)
     except SightlineError as error:
         return error
 
 
 def _listens(endpoint: str) -> bool:
-    _, host, port = check_endpoint(endpoint)
+    _, host, port = parse_zenoh_endpoint(endpoint)
     try:
-        socket.create_connection((host, port), _KNOCK_S).close()
+        socket.create_connection((host, port), _PROBE_S).close()
     except OSError:
         return False
     return True

@@ -9,24 +9,24 @@ from operator_side.requests import read_report
 from operator_side.status_text import status_line
 from protocol.errors import WireError
 from protocol.transports.link import Message
-from protocol.transports.presence import Peer
-from protocol.transports.secured import ROBOT
+from protocol.transports.presence import PeerInfo
+from protocol.transports.secured import ROBOT_ROLE
 
 _ROLE_WIDTH = 9
 
 
-def lines(statuses: dict[str, Message], peers: list[Peer]) -> Iterator[str]:
+def lines(statuses: dict[str, Message], peers: list[PeerInfo]) -> Iterator[str]:
     """A line for each: robots first, then who sees, steers or looks on."""
-    robots = {peer.presence.robot: peer for peer in peers if peer.presence.role == ROBOT}
+    robots = {peer.presence.robot: peer for peer in peers if peer.presence.role == ROBOT_ROLE}
     for robot in sorted({*statuses, *robots}):
         said = _status_words(robot, statuses[robot]) if robot in statuses else f"{robot}: says nothing of its state"
-        yield f"{ROBOT:{_ROLE_WIDTH}} {said}{_about(robots.get(robot))}"
+        yield f"{ROBOT_ROLE:{_ROLE_WIDTH}} {said}{_about(robots.get(robot))}"
     for peer in peers:
-        if peer.presence.role != ROBOT:
+        if peer.presence.role != ROBOT_ROLE:
             yield f"{peer.presence.role:{_ROLE_WIDTH}} of {peer.presence.robot}{_about(peer)}"
 
 
-def as_object(statuses: dict[str, Message], peers: list[Peer]) -> dict[str, Any]:
+def as_object(statuses: dict[str, Message], peers: list[PeerInfo]) -> dict[str, Any]:
     """The same for scripts."""
     return {
         "robots": [_status_object(name, statuses[name]) for name in sorted(statuses)],
@@ -34,7 +34,7 @@ def as_object(statuses: dict[str, Message], peers: list[Peer]) -> dict[str, Any]
     }
 
 
-def _about(peer: Peer | None) -> str:
+def _about(peer: PeerInfo | None) -> str:
     if peer is None:
         return "  (does not say what it is)"
     said = peer.presence
@@ -42,7 +42,7 @@ def _about(peer: Peer | None) -> str:
     return f"{where}; {said.about}" if said.about else where
 
 
-def _peer_object(peer: Peer) -> dict[str, Any]:
+def _peer_object(peer: PeerInfo) -> dict[str, Any]:
     said = peer.presence
     return {
         "role": said.role, "robot": said.robot, "session": said.session, "software": said.software, "host": said.host,

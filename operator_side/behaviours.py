@@ -15,7 +15,7 @@ from operator_side.extras import needs
 from operator_side.score import Score, score
 from operator_side.score_course import figures_of
 from operator_side.score_runs import Case, run_of
-from operator_side.speed_runs import SpeedRun, speed_run, speed_wishes
+from operator_side.speed_runs import SpeedRun, speed_run, speed_cases
 from operator_side.worker_pool import worker_pool
 
 Progress = Callable[[int], AbstractContextManager[Callable[[], None]]]
@@ -24,7 +24,7 @@ Progress = Callable[[int], AbstractContextManager[Callable[[], None]]]
 def write_page(page: Path, seeds: Sequence[int], jobs: int, progress: Progress, rows: Sequence[Row] = ROWS) -> bool:
     """Run all rows and write `page`, and its pictures into a folder beside it. True if every bound was kept."""
     wanted = list(dict.fromkeys(case for row in rows for case in row.all_cases(seeds)))
-    wishes = speed_wishes(seeds[0]) if any(row.scenario == "thymio" for row in rows) else []
+    wishes = speed_cases(seeds[0]) if any(row.scenario == "thymio" for row in rows) else []
     pictures = page.parent / page.stem
     pictures.mkdir(parents=True, exist_ok=True)
     with progress(len(wanted) + len(wishes)) as advance, worker_pool(jobs) as pool:

@@ -6,7 +6,7 @@ from typing import Final
 from operator_side.behaviours_rows import CHARACTER, LATENCY_MS, LOSS, Row
 from operator_side.check_text import number
 from operator_side.score import Check, Score, median_and_worst
-from operator_side.score_bounds import BOUNDS, EXACT, UNITS, judge
+from operator_side.score_bounds import BOUNDS, EXACT, UNITS, checks_of
 from operator_side.score_course import HARDEST_MPS2, READ_WITHIN_M, SETTLED_S
 from operator_side.score_runs import Case
 from operator_side.speed_runs import SpeedRun
@@ -27,7 +27,7 @@ def picture_name(case: Case) -> str:
 def kept(row: Row, results: Results, seeds: Sequence[int]) -> bool:
     """Whether every run kept every bound; nothing is demanded of a baseline."""
     return bool(row.baseline) or all(
-        check.ok for case in row.all_cases(seeds) for check in _judged(row, results[case])
+        check.ok for case in row.all_cases(seeds) for check in _checks(row, results[case])
     )
 
 
@@ -60,7 +60,7 @@ def _overview(rows: Sequence[Row], results: Results, seeds: Sequence[int]) -> It
     yield "| scenario | law | starts that kept every bound | most of a bound that was used |\n|---|---|---:|---|"
     for row in (row for row in rows if not row.baseline):
         cases = row.all_cases(seeds)
-        judged = [_judged(row, results[case]) for case in cases]
+        judged = [_checks(row, results[case]) for case in cases]
         good = sum(all(check.ok for check in checks) for checks in judged)
         yield (f"| [{row.title.replace('`', '')}](#{row.anchor}) | `{row.law}` | {good} of {len(cases)} | "
                f"{_tightest(row, [check for checks in judged for check in checks])} |")
@@ -82,8 +82,8 @@ def _share(check: Check) -> float:
     return check.bound / value if value else 9.99
 
 
-def _judged(row: Row, result: Score) -> list[Check]:
-    return judge(row.scenario, result, LATENCY_MS)
+def _checks(row: Row, result: Score) -> list[Check]:
+    return checks_of(row.scenario, result, LATENCY_MS)
 
 
 def _head(row: Row) -> Iterator[str]:
@@ -97,7 +97,7 @@ def _behaviour(row: Row, results: Results, seeds: Sequence[int], folder: str) ->
     yield from _head(row)
     yield "| figure | median | worst | bound | |\n|---|---:|---:|---:|---|"
     runs = [results[case] for case in row.cases(seeds)]
-    for same in zip(*(_judged(row, run) for run in runs), strict=True):
+    for same in zip(*(_checks(row, run) for run in runs), strict=True):
         verdict = "ok" if all(check.ok for check in same) else "**not kept**"
         name = same[0].name
         yield f"| {name} | {_both(runs, name)} | {_figure(same[0].bound, same[0].unit)} | {verdict} |"
@@ -116,7 +116,7 @@ def _in_other_light(row: Row, results: Results, seeds: Sequence[int]) -> Iterato
     yield f"| look | {' | '.join(_IN_LIGHT)} | |\n|---|{'---:|' * len(_IN_LIGHT)}---|"
     for look in row.looks:
         runs = [results[case] for case in row.cases(seeds, look)]
-        verdict = "ok" if all(check.ok for run in runs for check in _judged(row, run)) else "**not kept**"
+        verdict = "ok" if all(check.ok for run in runs for check in _checks(row, run)) else "**not kept**"
         worst = [_figure(median_and_worst(runs, name)[1], _UNITS[name]) for name in _IN_LIGHT]
         yield f"| {look} | {' | '.join(worst)} | {verdict} |"
 
@@ -127,7 +127,7 @@ def _baseline(row: Row, results: Results, seeds: Sequence[int], folder: str) -> 
     default = row.default
     yield f"| figure | `{row.law}` median | worst | `{default.law}` median | worst |\n|---|---:|---:|---:|---:|"
     runs, others = ([results[case] for case in one.cases(seeds)] for one in (row, default))
-    names = [check.name for check in _judged(row, runs[0])]
+    names = [check.name for check in _checks(row, runs[0])]
     for name in [*names, *(name for name in _ALSO_OF_BASELINES if name not in names)]:
         yield f"| {name} | {_both(runs, name)} | {_both(others, name)} |"
     yield _shown(row, seeds, folder)
@@ -140,7 +140,7 @@ def _shown(row: Row, seeds: Sequence[int], folder: str) -> str:
 
 def _failures(row: Row, results: Results, seeds: Sequence[int]) -> str:
     """Which of the bounds it would break, and how often."""
-    judged = [_judged(row, results[case]) for case in row.cases(seeds)]
+    judged = [_checks(row, results[case]) for case in row.cases(seeds)]
     broken = [(same[0].name, sum(not check.ok for check in same)) for same in zip(*judged, strict=True)]
     said = ", ".join(f"{name} ({count})" for name, count in broken if count)
     if not said:

@@ -20,7 +20,7 @@ from vision_side.config import HsvConfig
 from vision_side.decode import Decoder
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.port import Detection
-from vision_side.sphere import locate
+from vision_side.sphere import locate_sphere
 
 MIN_BOARDS = 5
 MAX_RMS_PX = 1.0
@@ -215,5 +215,5 @@ def _focal_px(detection: Detection, ball: Ball, size: JpegSize, mounting: Mounti
 def _away_m(detection: Detection, ball: Ball, size: JpegSize, mounting: Mounting, focal_px: float) -> float:
     """How far over the floor the ball would be with this lens; nan if it would be none."""
     matrix = [[focal_px, 0, size.width_px / 2 - 0.5], [0, focal_px, size.height_px / 2 - 0.5]]
-    sighting = locate(detection, _model(size, matrix, (), mounting), ball.radius_m)
+    sighting = locate_sphere(detection, _model(size, matrix, (), mounting), ball.radius_m)
     return math.hypot(sighting.x_m - mounting.x_m, sighting.y_m - mounting.y_m) if sighting else math.nan

@@ -8,7 +8,7 @@ from protocol.channels import JPEG, SCAN, TWIST, Channel
 from protocol.codec import decode, decode_ranges
 from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
-from protocol.messages import Wire
+from protocol.messages import WireModel
 from protocol.transports.link import Message
 from protocol.twist_text import parse_twist
 
@@ -59,7 +59,7 @@ def _payload(message: Message) -> Any:
     return None
 
 
-def _plain(model: Wire) -> dict[str, Any]:
+def _plain(model: WireModel) -> dict[str, Any]:
     return model.model_dump(mode="json")
 
 

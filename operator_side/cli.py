@@ -12,26 +12,26 @@ from typing import Final
 
 import typer
 
-from operator_side.cli_bench import register as register_bench
-from operator_side.cli_calibrate import register as register_calibrate
-from operator_side.cli_capture import register as register_capture
-from operator_side.cli_config import register as register_config
-from operator_side.cli_conform import register as register_conform
-from operator_side.cli_detector import register as register_detector
-from operator_side.cli_doctor import register as register_doctor
-from operator_side.cli_faults import register as register_faults
-from operator_side.cli_install import register as register_install
-from operator_side.cli_judge import register as register_judge
-from operator_side.cli_keys import register as register_keys
-from operator_side.cli_metrics import register as register_metrics
-from operator_side.cli_mission import register as register_mission
-from operator_side.cli_people import register as register_people
-from operator_side.cli_pick_color import register as register_pick_color
-from operator_side.cli_scenarios import register as register_scenarios
-from operator_side.cli_services import register as register_services
-from operator_side.cli_teleop import register as register_teleop
-from operator_side.cli_train import register as register_train
-from operator_side.cli_watch import register as register_watch
+from operator_side.cli_bench import register_benches as register_bench
+from operator_side.cli_calibrate import register_calibrate
+from operator_side.cli_capture import register_capture
+from operator_side.cli_config import register_config
+from operator_side.cli_conform import register_conform
+from operator_side.cli_detector import register_detector
+from operator_side.cli_doctor import register_doctor
+from operator_side.cli_faults import register_faults
+from operator_side.cli_install import register_install
+from operator_side.cli_judge import register_demo_and_score as register_judge
+from operator_side.cli_keys import register_keys
+from operator_side.cli_metrics import register_metrics
+from operator_side.cli_mission import register_missions as register_mission
+from operator_side.cli_people import register_operator as register_people
+from operator_side.cli_pick_color import register_pick_color
+from operator_side.cli_scenarios import register_scenarios
+from operator_side.cli_services import register_services
+from operator_side.cli_teleop import register_teleop
+from operator_side.cli_train import register_train
+from operator_side.cli_watch import register_watch
 from operator_side.settings_errors import no_such_name
 from protocol.errors import SightlineError
 
@@ -82,7 +82,7 @@ def run(arguments: Sequence[str]) -> int:
         code = app(list(arguments), standalone_mode=False, prog_name="sightline")
         return code if isinstance(code, int) else 0
     except SightlineError as error:
-        return _say(str(error), error.exit_code)
+        return _print_error(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return INTERRUPTED
     except BrokenPipeError:  # `sightline status --watch | head`: whoever read has gone, and knows
@@ -97,11 +97,11 @@ def _unexpected(error: Exception) -> int:
     usage = getattr(error, "format_message", None)
     if usage is not None:
         line = _usage_line(" ".join(usage().split()), getattr(error, "ctx", None))
-        return _say(line, getattr(error, "exit_code", 2))
+        return _print_error(line, getattr(error, "exit_code", 2))
     if os.environ.get("SIGHTLINE_DEBUG") == "1":
         raise error
     where = f"{type(error).__name__}: {' '.join(str(error).split())}"
-    return _say(f"unexpected {where}; SIGHTLINE_DEBUG=1 shows where, please report it", UNEXPECTED)
+    return _print_error(f"unexpected {where}; SIGHTLINE_DEBUG=1 shows where, please report it", UNEXPECTED)
 
 
 def _usage_line(text: str, context: typer.Context | None) -> str:
@@ -121,7 +121,7 @@ def _names_in(group: object) -> list[str]:
     return list(getattr(group or typer.main.get_command(app), "commands", ()))
 
 
-def _say(line: str, code: int) -> int:
+def _print_error(line: str, code: int) -> int:
     typer.echo(f"error: {line}", err=True)
     return code
 

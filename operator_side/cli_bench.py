@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from operator_side.cli_bench_detector import register_detector
-from operator_side.cli_bench_loop import register_bench
-from operator_side.cli_bench_network import register_network
+from operator_side.cli_bench_detector import register_detector_benches
+from operator_side.cli_bench_loop import register_loop_benches
+from operator_side.cli_bench_network import register_network_bench
 from operator_side.cli_judge import CHECK_FAILED, Json, numbers
 from operator_side.extras import needs
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from operator_side.score import Check
 
 
-def register(app: typer.Typer) -> None:
+def register_benches(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(help="Measure what things cost on this machine.", rich_markup_mode=None)
     group.command(epilog="Example: sightline bench codec --json")(codec)
@@ -27,9 +27,9 @@ def register(app: typer.Typer) -> None:
     group.command(epilog="Example: sightline bench robot --seconds 60")(robot)
     group.command(epilog="Example: sightline bench demo --scenario circle --seeds 201,202,203")(demo)
     group.command(epilog="Example: sightline bench report --section loop --section watchers")(report)
-    register_bench(group)
-    register_network(group)
-    register_detector(group)
+    register_loop_benches(group)
+    register_network_bench(group)
+    register_detector_benches(group)
     app.add_typer(group, name="bench")
 
 
@@ -44,11 +44,11 @@ def codec(*, as_json: Json = False) -> int:
 
 def gate(*, as_json: Json = False) -> int:
     """Judge one command and decide one step, as the driver does."""
-    from benchmarks.gate import BOUND_US, measure_gate
+    from benchmarks.gate import GATE_BOUND_US, measure_gate
     from operator_side.score import Check
 
     took_us = measure_gate()
-    return print_checks([Check("offer and step", took_us, "us", BOUND_US, took_us <= BOUND_US)], as_json)
+    return print_checks([Check("offer and step", took_us, "us", GATE_BOUND_US, took_us <= GATE_BOUND_US)], as_json)
 
 
 def pipeline(*, as_json: Json = False) -> int:

@@ -19,7 +19,7 @@ _BOUND_US = {"zenoh": 1_000.0, "oip+http": 2_000.0}
 """The median that asking elsewhere on the same machine may add, hot; the rest is only told."""
 
 
-def register_detector(group: typer.Typer) -> None:
+def register_detector_benches(group: typer.Typer) -> None:
     """Add the commands to the `bench` group."""
     group.command(epilog="Example: sightline bench detector oip+http://127.0.0.1:8000/ball_jpeg")(detector)
     group.command(epilog="Example: sightline bench streams --streams 40 --seconds 60")(streams)
@@ -42,10 +42,10 @@ def detector(
         from operator_side.score import Check
         from vision_side.config import VisionConfig
         from vision_side.detect.around import attach_detector, close_detector
-        from vision_side.detect.choice import choose_detector
+        from vision_side.detect.choice import build_detector
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder, _service(name, Path(folder)) as robot:
-        here = choose_detector("hsv", {}, VisionConfig())
-        there = choose_detector(name, own_options(sets or ()), VisionConfig())
+        here = build_detector("hsv", {}, VisionConfig())
+        there = build_detector(name, own_options(sets or ()), VisionConfig())
         if robot is not None:
             attach_detector(there, robot)
         try:
@@ -103,11 +103,11 @@ def _service(name: str, folder: Path) -> "Iterator[Any]":
         processes = ending.enter_context(Processes(folder))
         processes.start("detector", ["detector", "--serve", "hsv", "--connect", endpoint])
         processes.wait_line("detector", "for robots", _READY_S)
-        _say_status(robot, processes)
+        _publish_status(robot, processes)
         yield robot
 
 
-def _say_status(robot: Any, processes: Any) -> None:
+def _publish_status(robot: Any, processes: Any) -> None:
     """Until the service has taken note."""
     from protocol.channels import STATUS
     from protocol.codec import encode

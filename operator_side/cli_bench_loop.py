@@ -24,7 +24,7 @@ _ALONE = (
 Transport = Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")]
 
 
-class Judged(Protocol):
+class AnyCheck(Protocol):
     """A check, whichever bench made it."""
 
     @property
@@ -53,7 +53,7 @@ class Judged(Protocol):
         ...
 
 
-def register_bench(group: typer.Typer) -> None:
+def register_loop_benches(group: typer.Typer) -> None:
     """Add the commands to the `bench` group."""
     group.command(epilog="Example: sightline bench loop --detector-delay-ms 80 --seconds 20 --out runs/loop")(loop)
     group.command(epilog="Example: sightline bench watchers --viewers 10 --seconds 20")(watchers)
@@ -86,7 +86,7 @@ def loop(
         Path(), width_px, height_px, fps, transport, detector_delay_ms, overload, seconds=seconds, peers=peers_of(peers)
     )
     race = run_race(setting, lambda line: typer.echo(line, err=True))
-    result = _result_of(race)
+    result = _race_result(race)
     if out is not None:
         _leave(out, race, result)
     if as_json:
@@ -109,7 +109,7 @@ def watchers(
         from benchmarks.watchers import measure_watchers
 
     setting = LoopSetting(Path(), transport=transport, seconds=seconds)
-    return _print_judged(measure_watchers(setting, viewers, lambda line: typer.echo(line, err=True)), as_json)
+    return _print_loop_checks(measure_watchers(setting, viewers, lambda line: typer.echo(line, err=True)), as_json)
 
 
 def camera(
@@ -128,10 +128,10 @@ def camera(
         at_most(name, seen.cpu_ms, "ms", BOUND_MS),
         at_most(f"missed frames of {seen.jpeg_bytes:.0f} bytes", seen.missed, "", MISSED_BOUND),
     ]
-    return _print_judged(checks, as_json)
+    return _print_loop_checks(checks, as_json)
 
 
-def _print_judged(checks: "Sequence[LoopCheck]", as_json: bool) -> int:
+def _print_loop_checks(checks: "Sequence[LoopCheck]", as_json: bool) -> int:
     ok = all(check.ok for check in checks)
     if as_json:
         typer.echo(json.dumps({"ok": ok, "checks": [asdict(check) for check in checks]}))
@@ -140,7 +140,7 @@ def _print_judged(checks: "Sequence[LoopCheck]", as_json: bool) -> int:
     return 0 if ok else CHECK_FAILED
 
 
-def _result_of(race: "Race") -> dict[str, Any]:
+def _race_result(race: "Race") -> dict[str, Any]:
     return {
         "ok": all(check.ok for check in race.checks),
         "checks": [asdict(check) for check in race.checks],
@@ -161,11 +161,11 @@ def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
 
 
 def _table(race: "Race") -> list[str]:
-    from benchmarks.loop_setting import OUR_EYES
+    from benchmarks.loop_setting import OUR_DETECTOR
 
     names = f"{'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'bytes':>8} {'others':>7}"
     head = f"{'':18} {names}  CPU ms a picture; MB"
-    alone = [_ALONE] if any(name.endswith(OUR_EYES) for name in race.figures) else []
+    alone = [_ALONE] if any(name.endswith(OUR_DETECTOR) for name in race.figures) else []
     return [head, *(_row(name, race) for name in race.figures), *alone]
 
 
@@ -178,7 +178,7 @@ def _row(name: str, race: "Race") -> str:
     return f"{name:18} {one.answered_percent:7.1f} % {ages}    {carried}  {cpu}; {memory}"
 
 
-def _check_lines(checks: "Sequence[Judged]") -> list[str]:
+def _check_lines(checks: "Sequence[AnyCheck]") -> list[str]:
     from operator_side.check_text import check_line
     from operator_side.score import Check
 

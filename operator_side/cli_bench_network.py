@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from benchmarks.network_stage import NetworkRun
 
 
-def register_network(group: typer.Typer) -> None:
+def register_network_bench(group: typer.Typer) -> None:
     """Add the command to the `bench` group."""
     group.command(epilog="Example: sightline bench network --only radio --seeds 1,2,3,4,5 --seconds 60")(network)
 
@@ -31,23 +31,23 @@ def network(
 ) -> int:
     """Robots, visions and people in two network namespaces: what slow, lossy, far, broken and shared wires cost."""
     with needs("all"):
-        from benchmarks.network import Telling, run_network
+        from benchmarks.network import Progress, run_network
         from benchmarks.network_rows import chosen
         from benchmarks.network_stage import NetworkSetting
         from operator_side.faults.wires import BenchWire
         from operator_side.network_medium import medium
     setting = NetworkSetting(transport, seconds, tuple(numbers("--seeds", seeds, int)))
-    telling = Telling(lambda line: typer.echo(line, err=True), lambda run: _say(run, as_json=as_json))
+    telling = Progress(lambda line: typer.echo(line, err=True), lambda run: _print_run(run, as_json=as_json))
     runs = run_network(chosen(only or (), transport), setting, BenchWire, telling, {"medium": medium})
-    result = _result_of(runs, transport)
+    result = _network_result(runs, transport)
     if as_json:
         typer.echo(json.dumps(result))
     elif len(setting.seeds) > 1:
-        _say_worst(runs)
+        _print_worst(runs)
     return 0 if result["ok"] else CHECK_FAILED
 
 
-def _result_of(runs: "Sequence[NetworkRun]", transport: str) -> dict[str, Any]:
+def _network_result(runs: "Sequence[NetworkRun]", transport: str) -> dict[str, Any]:
     checks = [asdict(check) for check in _worst(runs)]
     rows = [
         {"row": run.row.name, "seed": run.seed, "injected": run.injected, "facts": run.facts,
@@ -66,7 +66,7 @@ def _worst(runs: "Sequence[NetworkRun]") -> "Iterator[LoopCheck]":
         yield from worst_of_seeds(name, [run.checks for run in runs if run.row.name == name])
 
 
-def _say(run: "NetworkRun", *, as_json: bool) -> None:
+def _print_run(run: "NetworkRun", *, as_json: bool) -> None:
     from operator_side.check_text import number
 
     typer.echo(f"{run.row.name} ({run.row.what}), seed {run.seed}", err=as_json)
@@ -79,15 +79,15 @@ def _say(run: "NetworkRun", *, as_json: bool) -> None:
         )
     if run.facts:
         typer.echo("  " + ", ".join(f"{name} {number(fact)}" for name, fact in run.facts.items()), err=as_json)
-    _say_checks(run.checks, as_json=as_json)
+    _print_network_checks(run.checks, as_json=as_json)
 
 
-def _say_worst(runs: "Sequence[NetworkRun]") -> None:
+def _print_worst(runs: "Sequence[NetworkRun]") -> None:
     typer.echo("worst of all seeds")
-    _say_checks(list(_worst(runs)), as_json=False)
+    _print_network_checks(list(_worst(runs)), as_json=False)
 
 
-def _say_checks(checks: "Sequence[LoopCheck]", *, as_json: bool) -> None:
+def _print_network_checks(checks: "Sequence[LoopCheck]", *, as_json: bool) -> None:
     from operator_side.check_text import check_line
     from operator_side.score import Check
 

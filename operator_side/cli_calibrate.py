@@ -14,7 +14,7 @@ import typer
 from operator_side.cli_judge import Json
 from operator_side.cli_people import Secure
 from operator_side.cli_robot_tools import drive
-from operator_side.cli_services import Connect, RobotName
+from operator_side.cli_services import ServiceConnect, RobotName
 from operator_side.extras import needs
 from operator_side.out_file import check_out_file
 from protocol.errors import ConfigError
@@ -37,7 +37,7 @@ PluginSets = Annotated[
 Metres = Annotated[float | None, typer.Option(help="Where the lens is, from the axle's middle on the floor.")]
 
 
-def register(app: typer.Typer) -> None:
+def register_calibrate(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(help="Measure what a robot is made of.", rich_markup_mode=None)
     group.callback()(_calibrate)
@@ -56,7 +56,7 @@ def camera(
     camera: PluginName = None,
     camera_sets: PluginSets = None,
     robot: RobotName = None,
-    connect: Connect = None,
+    connect: ServiceConnect = None,
     secure: Secure = "",
     board: Annotated[str, typer.Option(metavar="CxR", help="Inner corners of the chessboard.")] = "9x6",
     square_m: Annotated[float, typer.Option(min=0.001, max=1, help="Side of one square, metres.")] = 0.025,
@@ -82,7 +82,7 @@ def camera(
     with needs("vision"), ExitStack() as ending:
         source, mounted = _source(ending, pictures, (camera, camera_sets or []), (robot, connect, secure), seconds)
         mounting = _mounting(mounted, given)
-        say = _quiet if as_json else _say_board
+        say = _quiet if as_json else _print_board
         most = _MOST_IN_FOLDER if pictures is not None else views
         made = _measure(source, wanted, mounting, views=most, config=config, say=say)
     _write(out, made)
@@ -196,7 +196,7 @@ def _as_object(path: Path, made: "Calibration") -> dict[str, Any]:
     }
 
 
-def _say_board(line: str) -> None:
+def _print_board(line: str) -> None:
     typer.echo(f"board {line}; move it, and tilt it")
 
 

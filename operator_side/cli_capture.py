@@ -16,7 +16,7 @@ from protocol.transports.opening import open_link
 _SECONDS = 5.0
 
 
-def register(app: typer.Typer) -> None:
+def register_capture(app: typer.Typer) -> None:
     """Add the command to `app`."""
     app.command(epilog="Example: sightline capture r1 --overlay --seconds 10 --out run.mp4")(capture)
 

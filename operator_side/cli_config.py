@@ -13,7 +13,7 @@ from operator_side.service_settings import load_service
 from operator_side.settings import model_of
 from operator_side.toml_text import toml_text
 from robot_side.config import RobotConfig
-from robot_side.plugins import configured
+from robot_side.plugins import load_device
 from sim.robot_model import load_robot
 from sim.scenario import load_scenario
 from sim.service import SimConfig
@@ -24,7 +24,7 @@ File = Annotated[str | None, typer.Argument(metavar="[FILE]", help="The service'
 Profile = Annotated[str | None, typer.Option(help="Lay this profile under it, e.g. sim.")]
 
 
-def register(app: typer.Typer) -> None:
+def register_config(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(
         help="Check, show and describe a service's configuration: defaults < profile < file < environment < --set.",
@@ -49,7 +49,7 @@ def _check_names(config: BaseModel) -> None:
         named = {"cameras": config.camera, "drives": config.motors, "range_sensors": config.ranging}
         for group, choice in named.items():
             if choice is not None:
-                configured(group, choice)
+                load_device(group, choice)
     if isinstance(config, SimConfig):
         load_robot(config.robot or load_scenario(config.scenario).robot)
     if isinstance(config, VisionConfig):

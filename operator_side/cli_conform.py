@@ -49,7 +49,7 @@ Name = Annotated[str, typer.Option("--name", metavar="TEXT", help="The peer's na
 Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
 
 
-def register(app: typer.Typer) -> None:
+def register_conform(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(
         help="Test any robot, vision or codec against the wire protocol, case by case.",
@@ -83,7 +83,7 @@ def robot(
     """Test a robot as its driver, its watcher and its enemy. It is armed and its wheels turn: lift it off the floor."""
     from protocol.conformance import robot as side
     from protocol.conformance.robot_sockets import put_over_websocket
-    from protocol.conformance.strangers import ZenohStranger
+    from protocol.conformance.strangers import RawZenoh
     from protocol.conformance.virtual import FROM_ROBOT
     from protocol.transports.opening import open_link
 
@@ -101,7 +101,7 @@ def robot(
         def put_it(key: str, header: bytes, payload: bytes) -> None:
             put_over_websocket(bench, key, header, payload)
 
-        put = put_it if "://" in endpoint else ending.enter_context(ZenohStranger(endpoint, access.folder)).put
+        put = put_it if "://" in endpoint else ending.enter_context(RawZenoh(endpoint, access.folder)).put
         roles = _ROLES if access.is_guarded else _ROLES[:1]
         bench = LiveBench(
             robot, open_it, FROM_ROBOT, put, roles=roles, endpoint=endpoint, older=older, access=access
@@ -132,7 +132,7 @@ def vision(
 ) -> int:
     """Test a vision: the kit plays its robot at ENDPOINT; start the vision against it, before or after."""
     from protocol.conformance import vision as side
-    from protocol.conformance.strangers import ZenohStranger
+    from protocol.conformance.strangers import RawZenoh
     from protocol.conformance.virtual import TO_ROBOT
     from protocol.transports.opening import open_link
 
@@ -148,7 +148,7 @@ def vision(
             ends: dict[str, Any] = {"connect": [endpoint]} if dial else {"listen": [endpoint]}
             return open_link(robot, role=role, secure=access.folder, **ends)
 
-        stranger = ending.enter_context(ZenohStranger(endpoint, access.folder, "robot"))
+        stranger = ending.enter_context(RawZenoh(endpoint, access.folder, "robot"))
         put = None if "://" in endpoint else stranger.put
         bench = ending.enter_context(
             LiveBench(robot, open_it, TO_ROBOT, put, roles=("robot",), endpoint=endpoint, access=access)

@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from operator_side import cli_detector_serve as serving
-from operator_side.cli_people import DEFAULT_CONNECT, REFUSED_EXIT, Connect, Json, Robot, Secure
+from operator_side.cli_people import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure
 from operator_side.cli_services import ConfigFile, LogForm, MaybeSecure, Sets
-from operator_side.cli_services import Connect as MaybeConnect
+from operator_side.cli_services import ServiceConnect as MaybeConnect
 from operator_side.cli_services import Listen as MaybeListen
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
 
 if TYPE_CHECKING:
-    from vision_side.detect.contract import Times, Verdict
+    from vision_side.detect.contract import Times, PromiseResult
     from vision_side.detect.port import Detector
 
 CHECK_FAILED = 5
 Device = Annotated[str | None, typer.Option("--device", help="auto, cpu, cuda or tensorrt [default: auto].")]
 
 
-def register(app: typer.Typer) -> None:
+def register_detector(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(
         help="Detectors: what there is, whether one keeps its promises, and one that serves many robots.",
@@ -67,8 +67,8 @@ def _serve(
 def list_detectors(as_json: Json = False) -> int:
     """Name every detector, and say whether it can be used here."""
     with needs("vision"):
-        from vision_side.detect.choice import FAMILY
-    rows = [(name, _problem(lambda name=name: FAMILY.load(name))) for name in FAMILY.names()]  # type: ignore[misc]
+        from vision_side.detect.choice import REGISTRY
+    rows = [(name, _problem(lambda name=name: REGISTRY.load(name))) for name in REGISTRY.names()]  # type: ignore[misc]
     model = _shipped_model()
     if as_json:
         listed = [{"name": name, "usable": not why, "why": why} for name, why in rows]
@@ -112,22 +112,22 @@ def check(
     options: dict[str, Any] = {"detector.device": device}
     given: Any = load_service("vision", file=config, sets=(), options=options, environ=os.environ).config
     with needs("vision"):
-        from vision_side.detect.around import news_of
-        from vision_side.detect.choice import check_device, check_looks, choose_detector
+        from vision_side.detect.around import notices_of
+        from vision_side.detect.choice import check_device, check_takes_pictures, build_detector
         from vision_side.detect.contract import check_detector, time_detector
     settings = given.model_copy(update={"detector": given.detector.model_copy(update={"kind": name})})
     check_device(settings)
-    check_looks(name)
+    check_takes_pictures(name)
     own, made = own_options(sets or ()), list["Detector"]()
 
     def make() -> "Detector":
-        made.append(choose_detector(name, own, settings))
+        made.append(build_detector(name, own, settings))
         return made[-1]
 
     verdicts = check_detector(make, seed)
     ok = not any(one.wrong for one in verdicts)
     times = time_detector(make, seed=seed) if ok else []
-    said = list(dict.fromkeys(line for one in made for line in news_of(one)))
+    said = list(dict.fromkeys(line for one in made for line in notices_of(one)))
     report = _as_json(name, ok, verdicts, times) | {"said": said}
     typer.echo(json.dumps(report) if as_json else _as_text(name, verdicts, times, said))
     return 0 if ok else CHECK_FAILED
@@ -165,23 +165,23 @@ def promote(
     as_json: Json = False,
 ) -> int:
     """Let the detector of `vision --shadow NAME` drive from the next frame on, and the other one look on."""
-    from operator_side.mission_asking import MissionDesk
+    from operator_side.mission_asking import MissionClient
     from operator_side.mission_text import detector_line
     from operator_side.requests import SOURCE
     from protocol.transports.opening import open_link
 
     with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
-        report = MissionDesk(link).ask("detector", options={"shadow": not back})
+        report = MissionClient(link).ask("detector", options={"shadow": not back})
     if as_json:
         typer.echo(json.dumps({"robot": robot, "ok": not report.refused, **report.model_dump(mode="json")}))
     elif report.refused:
         typer.echo(f"error: vision of {robot} refused: {report.refused}", err=True)
     else:
         typer.echo(f"{robot}: {detector_line(report)}")
-    return REFUSED_EXIT if report.refused else 0
+    return REJECTED_EXIT if report.refused else 0
 
 
-def _as_json(name: str, ok: bool, verdicts: Sequence["Verdict"], times: Sequence["Times"]) -> dict[str, Any]:
+def _as_json(name: str, ok: bool, verdicts: Sequence["PromiseResult"], times: Sequence["Times"]) -> dict[str, Any]:
     checks = [{"name": one.name, "value": one.wrong or "kept", "unit": "", "bound": one.promise, "ok": not one.wrong}
               for one in verdicts]
     took = [{"size": f"{one.width_px}x{one.height_px}", "p50_ms": _or_none(one.p50_ms), "p95_ms": _or_none(one.p95_ms)}
@@ -193,7 +193,7 @@ def _or_none(value: float) -> float | None:
     return None if math.isnan(value) else round(value, 3)
 
 
-def _as_text(name: str, verdicts: Sequence["Verdict"], times: Sequence["Times"], said: Sequence[str]) -> str:
+def _as_text(name: str, verdicts: Sequence["PromiseResult"], times: Sequence["Times"], said: Sequence[str]) -> str:
     lines = [f"{name}:"]
     for one in verdicts:
         lines.append(f"  {'FAIL' if one.wrong else 'ok':<5} {one.promise}" + (f": {one.wrong}" if one.wrong else ""))

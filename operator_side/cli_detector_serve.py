@@ -5,11 +5,11 @@ from typing import Annotated, Any
 
 import typer
 
-from operator_side.cli_services import ConfigFile, Connect, Listen, LogForm, MaybeSecure, Sets
+from operator_side.cli_services import ConfigFile, ServiceConnect, Listen, LogForm, MaybeSecure, Sets
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
-from protocol.log_lines import use_form
+from protocol.log_lines import set_log_format
 
 Robots = Annotated[
     str | None, typer.Option(metavar="ID", help="A robot's id, or several by * and ? [default: the configured or *].")
@@ -27,7 +27,7 @@ def serve(
     *,
     robot: Robots = None,
     listen: Listen = None,
-    connect: Connect = None,
+    connect: ServiceConnect = None,
     secure: MaybeSecure = None,
     device: Device = None,
     deadline_ms: DeadlineMs = 100.0,
@@ -40,7 +40,7 @@ def serve(
 
     Raises ConfigError for a detector that looks nowhere itself, and as `sightline vision` does.
     """
-    use_form(log, "detector")
+    set_log_format(log, "detector")
     if name in _ELSEWHERE:
         raise ConfigError(f"detector {name!r} is boxes that somebody else finds: serve one that looks itself, e.g. hsv")
     options = {"robot": robot, "listen": tuple(listen) if listen else None,
@@ -51,11 +51,11 @@ def serve(
     loaded: Any = given.config.model_copy(update=everybody)
     with needs("vision"):
         from vision_side.detect.around import close_detector
-        from vision_side.detect.choice import choose_detector, configured_detector
-        from vision_side.detector_service import Serving, run
+        from vision_side.detect.choice import build_detector, configured_detector
+        from vision_side.detector_service import ServingOptions, run
 
-        detector = configured_detector(loaded) or choose_detector("hsv", {}, loaded)
+        detector = configured_detector(loaded) or build_detector("hsv", {}, loaded)
         try:
-            return run(loaded, detector, Serving(name, round(deadline_ms * 1000), max_batch, loaded.max_pixels))
+            return run(loaded, detector, ServingOptions(name, round(deadline_ms * 1000), max_batch, loaded.max_pixels))
         finally:
             close_detector(detector)

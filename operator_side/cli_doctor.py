@@ -10,7 +10,7 @@ from operator_side.doctor.finding import Finding, as_object
 from protocol.transports.opening import check_endpoint
 
 
-def register(app: typer.Typer) -> None:
+def register_doctor(app: typer.Typer) -> None:
     """Add the command to `app`."""
     app.command(epilog="Example: sightline doctor --peer tcp/192.168.1.20:7447")(doctor)
 

@@ -21,7 +21,7 @@ JOBS = min(4, (os.cpu_count() or 1) + 1)
 SAFETY_PAGE = "safety.md"
 
 
-def register(app: typer.Typer) -> None:
+def register_faults(app: typer.Typer) -> None:
     """Add the command to `app`."""
     app.command(epilog="Example: sightline faults --only vision.kill --only wire")(faults)
 
@@ -48,7 +48,7 @@ def faults(
     """Start real processes, break one thing at a time, and judge from the simulated motors' own log."""
     with needs("all"):
         from operator_side.faults.machine import describe_machine
-        from operator_side.faults.parallel import run_rows
+        from operator_side.faults.parallel import run_cases
         from operator_side.faults.report import markdown, passed, progress_line, to_dict, with_rows_of
         from operator_side.faults.rows import chosen
     rows = chosen(only or (), short=short)
@@ -58,25 +58,25 @@ def faults(
     if out is not None:
         check_out_file(out)
     machine, folder = describe_machine(), Path(tempfile.mkdtemp(prefix="sightline-faults-"))
-    results = run_rows(
+    results = run_cases(
         rows, repeat, folder, jobs, lambda one, progress: typer.echo(progress_line(one, *progress), err=as_json)
     )
     _remove_if_empty(folder)
     if out is not None:
         report = markdown(results, machine, _command(only, short, repeat, jobs), repeat)
-        _write(out, with_rows_of(out.read_text("utf-8"), report) if only and out.exists() else report)
+        _write_report(out, with_rows_of(out.read_text("utf-8"), report) if only and out.exists() else report)
     typer.echo(json.dumps(to_dict(results)) if as_json else _summary(results, folder))
     return 0 if passed(results) else CHECK_FAILED
 
 
-def _write(out: Path, report: str) -> None:
+def _write_report(out: Path, report: str) -> None:
     """The report, and its worst values into the page of promises beside it."""
-    from operator_side.faults.worst import page_with_worst
+    from operator_side.faults.worst import page_with_summary
 
     out.write_text(report, "utf-8")
     page = out.with_name(SAFETY_PAGE)
     if page.exists():
-        page.write_text(page_with_worst(page.read_text("utf-8"), report), "utf-8")
+        page.write_text(page_with_summary(page.read_text("utf-8"), report), "utf-8")
 
 
 def _command(only: list[str] | None, short: bool, repeat: int, jobs: int) -> str:

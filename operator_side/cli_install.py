@@ -13,7 +13,7 @@ from operator_side.service_settings import load_service
 from robot_side.config import RobotConfig
 
 
-def register(app: typer.Typer) -> None:
+def register_install(app: typer.Typer) -> None:
     """Add the command to `app`."""
     app.command(epilog="Example: sightline install robot --config robot.toml --user pi")(install)
 

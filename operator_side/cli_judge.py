@@ -20,7 +20,7 @@ Number = TypeVar("Number", int, float)
 Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
 
 
-def register(app: typer.Typer) -> None:
+def register_demo_and_score(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline demo --scenario eight --latency-ms 100 --loss 0.1")(demo)
     group = typer.Typer(

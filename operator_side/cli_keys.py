@@ -18,7 +18,7 @@ Days = Annotated[int, typer.Option(min=1, max=825, help="How long they are valid
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of keys.")]
 
 
-def register(app: typer.Typer) -> None:
+def register_keys(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(help="Make and look at the certificates that --secure uses.", no_args_is_help=False,
                         rich_markup_mode=None)

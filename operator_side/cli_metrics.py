@@ -14,7 +14,7 @@ from protocol.transports.opening import open_link
 ROLE = "metrics"
 
 
-def register(app: typer.Typer) -> None:
+def register_metrics(app: typer.Typer) -> None:
     """Add the command to `app`."""
     app.command(epilog="Example: sightline metrics r1 --connect tcp/192.168.1.20:7447 --port 9464")(metrics)
 

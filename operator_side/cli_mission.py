@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from operator_side.cli_people import DEFAULT_CONNECT, REFUSED_EXIT, Connect, Json, Robot, Secure
-from operator_side.mission_asking import MissionDesk, request_of
+from operator_side.cli_people import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure
+from operator_side.mission_asking import MissionClient, request_of
 from operator_side.mission_text import cannot, detector_line, mission_line
 from operator_side.requests import SOURCE
 from operator_side.waypoints import Waypoints, waypoints_of, waypoints_of_file
@@ -23,7 +23,7 @@ Sets = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
+def register_missions(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline mission r1 follow")(mission)
     app.command(
@@ -47,9 +47,9 @@ def mission(
         raise ConfigError("--set is for a mission to begin: name it, e.g. sightline mission r1 follow --set ...")
     if name is not None:
         request_of(0, name, (), options)  # what is wrong with it is said without a robot
-    with _desk(robot, connect, secure) as desk:
+    with _missions(robot, connect, secure) as desk:
         report = desk.report() if name is None else desk.ask(name, options=options)
-        return _tell(robot, report, as_json, asked=name is not None)
+        return _print_report(robot, report, as_json, asked=name is not None)
 
 
 def goto(
@@ -70,15 +70,15 @@ def goto(
     """Send a robot to one place or several, round what its range sensors see. Ctrl-C does not stop it: `stop` does."""
     waypoints, options = _given(numbers or [], file), options_of(sets or ())
     request_of(0, "goto", waypoints, options)
-    with _desk(robot, connect, secure) as desk:
+    with _missions(robot, connect, secure) as desk:
         report = desk.ask("goto", waypoints, options)
         if report.refused or not wait:
-            return _tell(robot, report, as_json, asked=True)
+            return _print_report(robot, report, as_json, asked=True)
         for report in desk.follow():
             if not as_json and not report.done:
                 typer.echo(f"{robot}: {mission_line(report)}")
-        code = _tell(robot, report, as_json, asked=True)
-        return REFUSED_EXIT if cannot(report) else code
+        code = _print_report(robot, report, as_json, asked=True)
+        return REJECTED_EXIT if cannot(report) else code
 
 
 def options_of(texts: Sequence[str]) -> dict[str, Any]:
@@ -107,12 +107,12 @@ def _given(numbers: list[str], file: Path | None) -> Waypoints:
 
 
 @contextmanager
-def _desk(robot: str, connect: list[str], secure: str) -> Iterator[MissionDesk]:
+def _missions(robot: str, connect: list[str], secure: str) -> Iterator[MissionClient]:
     with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
-        yield MissionDesk(link)
+        yield MissionClient(link)
 
 
-def _tell(robot: str, report: MissionReport, as_json: bool, *, asked: bool) -> int:
+def _print_report(robot: str, report: MissionReport, as_json: bool, *, asked: bool) -> int:
     """Print a report; exit code 5 if vision refused what was asked."""
     refused = report.refused if asked else ""
     if as_json:
@@ -124,4 +124,4 @@ def _tell(robot: str, report: MissionReport, as_json: bool, *, asked: bool) -> i
         typer.echo(f"{robot}: {mission_line(report)}")
         if not asked and report.detector:
             typer.echo(f"detector: {detector_line(report)}")
-    return REFUSED_EXIT if refused else 0
+    return REJECTED_EXIT if refused else 0

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from operator_side.around import find_around
-from operator_side.mission_asking import MissionDesk
+from operator_side.around import discover_all
+from operator_side.mission_asking import MissionClient
 from operator_side.mission_text import mission_lines
 from operator_side.pictures import viewer_role
 from operator_side.requests import SOURCE, Operator
@@ -18,7 +18,7 @@ from protocol.messages import Reply, Status, Verb
 from protocol.transports.opening import open_link
 from robot_side.config import DEFAULT_ENDPOINT
 
-REFUSED_EXIT = 5
+REJECTED_EXIT = 5
 _REPORT_S = 0.8  # vision reports twice a second; where one drives, that is worth waiting for
 
 Robot = Annotated[str, typer.Argument(metavar="[ROBOT]", help="The robot's id.")]
@@ -33,7 +33,7 @@ Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts
 DEFAULT_CONNECT = [DEFAULT_ENDPOINT]
 
 
-def register(app: typer.Typer) -> None:
+def register_operator(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline robots --connect tcp/192.168.1.20:7447")(robots)
     app.command(epilog="Example: sightline status r1 --watch")(status)
@@ -53,7 +53,7 @@ def robots(
 
     Without --connect it looks on this machine, then asks the network (multicast).
     """
-    found = find_around(connect, seconds, secure)
+    found = discover_all(connect, seconds, secure)
     if as_json:
         typer.echo(json.dumps(found.as_object()))
     else:
@@ -71,7 +71,7 @@ def status(
     """Say what a robot does and why: state, driver, twist, frame age, latency, every refusal; its vision's mission."""
     role = viewer_role(secure) if secure else SOURCE  # a viewer's keys are enough to look
     with open_link(robot, connect=connect, role=role, secure=secure) as link:
-        desk = MissionDesk(link)
+        desk = MissionClient(link)
         while True:
             state = desk.operator.wait_report().status
             seen_to = state.holder is not None and state.holder.source == "vision"
@@ -96,19 +96,19 @@ def arm(
 ) -> int:
     """Let whoever drives a robot move its wheels. The robot must be seeing live commands."""
     with _operator(robot, connect, secure) as operator:
-        return _tell(robot, operator.arm(wait), as_json)
+        return _print_reply(robot, operator.arm(wait), as_json)
 
 
 def disarm(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> int:
     """Wheels to zero; commands are judged but not obeyed until armed again."""
     with _operator(robot, connect, secure) as operator:
-        return _tell(robot, operator.ask(Verb.DISARM), as_json)
+        return _print_reply(robot, operator.ask(Verb.DISARM), as_json)
 
 
 def reset(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> int:
     """Leave STOPPED or FAULT. Permits arming, starts nothing."""
     with _operator(robot, connect, secure) as operator:
-        return _tell(robot, operator.ask(Verb.RESET), as_json)
+        return _print_reply(robot, operator.ask(Verb.RESET), as_json)
 
 
 def stop(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> None:
@@ -118,17 +118,17 @@ def stop(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure
         typer.echo(f"STOP of {robot} is not confirmed yet; repeating. Be ready to cut its power by hand", err=True)
 
     with _operator(robot, connect, secure) as operator:
-        _tell_stopped(robot, operator.stop(on_slow), as_json)
+        _print_stopped(robot, operator.stop(on_slow), as_json)
 
 
-def _tell_stopped(robot: str, state: Status, as_json: bool) -> None:
+def _print_stopped(robot: str, state: Status, as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps({"robot": robot, "ok": True, "state": state.state, "detail": state.reason}))
     else:
         typer.echo(status_line(robot, state))
 
 
-def _tell(robot: str, reply: Reply, as_json: bool) -> int:
+def _print_reply(robot: str, reply: Reply, as_json: bool) -> int:
     """Print a reply; exit code 5 if the robot refused."""
     if as_json:
         typer.echo(json.dumps({"robot": robot, "ok": reply.ok, "state": reply.state, "detail": reply.detail}))
@@ -136,7 +136,7 @@ def _tell(robot: str, reply: Reply, as_json: bool) -> int:
         typer.echo(f"{robot}: {reply.detail} ({reply.state})")
     else:
         typer.echo(f"error: {robot} refused: {reply.detail}", err=True)
-    return 0 if reply.ok else REFUSED_EXIT
+    return 0 if reply.ok else REJECTED_EXIT
 
 
 @contextmanager

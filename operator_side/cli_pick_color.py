@@ -28,7 +28,7 @@ _WAIT_S = 0.2
 _LAST_WORD_S = 0.3  # for the page to hear what became of it
 
 
-def register(app: typer.Typer) -> None:
+def register_pick_color(app: typer.Typer) -> None:
     """Add the command to `app`."""
     app.command("pick-color", epilog="Example: sightline pick-color r1 --config vision.toml")(pick_color)
 
@@ -113,7 +113,7 @@ class _Source:
     def gallery(self, frames: int) -> "Iterator[Gallery]":
         """For a page."""
         from operator_side.pick_color_pictures import LiveGallery, StillGallery
-        from operator_side.reel import Reel, fill
+        from operator_side.reel import FrameBuffer, fill
 
         still = self._of_file(frames)
         if still is not None:
@@ -121,7 +121,7 @@ class _Source:
             return
         role, ending = viewer_role(self._secure), threading.Event()
         with open_link(self._robot, connect=self._connect, role=role, secure=self._secure) as link:
-            pictures, reel = Pictures(link, role, FRAME, self._secure), Reel(frames)
+            pictures, reel = Pictures(link, role, FRAME, self._secure), FrameBuffer(frames)
             filling = threading.Thread(target=fill, args=(reel, pictures, ending), name="pictures", daemon=True)
             filling.start()
             try:

@@ -28,7 +28,7 @@ def run_task(task: str, config: RobotConfig, confirmed: bool) -> int:
         hint = f" (a robot's id is given with --robot {task})" if not task.startswith("test") else ""
         raise ConfigError(no_such_name("task", task, TASKS) + hint)
     check_confirmed(confirmed, sys.stdin.isatty(), task)
-    return 0 if try_wheels(config, None if confirmed else _ask, typer.echo) else _CHECK_FAILED
+    return 0 if try_wheels(config, None if confirmed else _prompt, typer.echo) else _CHECK_FAILED
 
 
 def drive(
@@ -80,7 +80,7 @@ def _measured_rows(
             raise ConfigError(f"drive {config.drive.kind!r} does not work by duty, there is nothing to calibrate")
         for one in duties:
             if not confirmed:
-                _ask(f"duty {one:g} for {seconds:g} s: put the car on the floor, the way ahead free; Enter drives")
+                _prompt(f"duty {one:g} for {seconds:g} s: put the car on the floor, the way ahead free; Enter drives")
             turn_for(give, (one, one), seconds)
             way_m = _distance_m(f"duty {one:g}: how far did it go, metres (0: it did not move)")
             if way_m > 0:
@@ -93,7 +93,7 @@ def _measured_rows(
 def _distance_m(question: str) -> float:
     """Asked until it is a distance; a slip of the pen must not throw away what was measured before."""
     while True:
-        answer = _ask(question)
+        answer = _prompt(question)
         try:
             way_m = float(answer.replace(",", "."))
         except ValueError:
@@ -103,6 +103,6 @@ def _distance_m(question: str) -> float:
         question = f"{answer!r} is no distance; metres from 0 to {_LONGEST_WAY_M:g}, e.g. 0.35"
 
 
-def _ask(question: str) -> str:
+def _prompt(question: str) -> str:
     answer: str = typer.prompt(question, default="", show_default=False, prompt_suffix=": ")
     return answer

@@ -12,7 +12,7 @@ from protocol.errors import ConfigError
 from robot_side.config import DEFAULT_ENDPOINT
 
 
-def register(app: typer.Typer) -> None:
+def register_scenarios(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline scenarios thymio --out runs/thymio")(scenarios)
     app.command(epilog="Example: sightline labels r1")(labels)
@@ -56,11 +56,11 @@ def _files(name: str, seed: int) -> dict[str, dict[str, Any]]:
     with needs("vision"):
         from operator_side.scenario_settings import robot_config, robot_of, robot_table, vision_config, vision_table
         from sim.scenario import load_scenario
-        from vision_side.missions.choice import configured
+        from vision_side.missions.choice import configured_mission
     scenario = load_scenario(name)
     model = robot_of(scenario)
     robot_config(model)
-    configured(vision_config(scenario, model, seed))
+    configured_mission(vision_config(scenario, model, seed))
     return {
         "sim": {"scenario": name, "robot": scenario.robot, "seed": seed}, "robot": robot_table(model),
         "vision": vision_table(scenario, model, seed),
@@ -97,8 +97,8 @@ def labels(
         from operator_side.labels_service import run
         from sim.bus import default_socket_dir
 
-        return run(robot, connect or [DEFAULT_ENDPOINT], secure, socket_dir or default_socket_dir(), _say)
+        return run(robot, connect or [DEFAULT_ENDPOINT], secure, socket_dir or default_socket_dir(), _print_line)
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     print(line, flush=True)

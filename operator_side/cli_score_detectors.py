@@ -18,7 +18,7 @@ from protocol.errors import ConfigError
 
 if TYPE_CHECKING:
     from operator_side.score import Check
-    from operator_side.score_scenes import Report, Seen, Subject
+    from operator_side.score_scenes import Report, ScoredScene, Subject
     from operator_side.score_sheet import Sheet
     from operator_side.settings import Loaded
 
@@ -53,7 +53,7 @@ def detectors(
     """
     with needs("all"):
         from operator_side.score_detectors_bounds import FRAMES as DEMANDED_FRAMES
-        from operator_side.score_detectors_bounds import judge_all
+        from operator_side.score_detectors_bounds import all_detector_checks
         from operator_side.score_scenes import LIGHT_SHARE, close_subjects, score_scenes
         from operator_side.score_sheet import Sheet
         from operator_side.score_table import progress
@@ -69,9 +69,9 @@ def detectors(
             report = score_scenes(asked, shown, seeds, looks=looks, columns=columns, each=_each(advance, drawn))
     finally:
         close_subjects(asked)
-    code = _tell(report, judge_all(report) if demand else None, as_json)
+    code = _print_report(report, all_detector_checks(report) if demand else None, as_json)
     if sheet and drawn:
-        _write(sheet, drawn)
+        _write_sheet(sheet, drawn)
     return code
 
 
@@ -113,7 +113,7 @@ def _check_device(names: Sequence[str], settings: Any) -> None:
         raise errors[0]
 
 
-def _tell(report: "Report", checks: "list[Check] | None", as_json: bool) -> int:
+def _print_report(report: "Report", checks: "list[Check] | None", as_json: bool) -> int:
     from operator_side.cli_judge import CHECK_FAILED
     from operator_side.score_detectors_text import check_lines, silence_lines, text
 
@@ -139,8 +139,8 @@ def _columns(asked: str) -> list[str]:
     return names
 
 
-def _each(advance: Callable[[], None], drawn: "Sheet | None") -> Callable[["Seen"], None]:
-    def each(seen: "Seen") -> None:
+def _each(advance: Callable[[], None], drawn: "Sheet | None") -> Callable[["ScoredScene"], None]:
+    def each(seen: "ScoredScene") -> None:
         advance()
         if drawn is not None:
             drawn.add(seen)
@@ -148,7 +148,7 @@ def _each(advance: Callable[[], None], drawn: "Sheet | None") -> Callable[["Seen
     return each
 
 
-def _write(path: Path, drawn: "Sheet") -> None:
+def _write_sheet(path: Path, drawn: "Sheet") -> None:
     import cv2
 
     try:

@@ -9,7 +9,7 @@ import typer
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
-from protocol.log_lines import use_form
+from protocol.log_lines import set_log_format
 from robot_side.config import DEFAULT_ENDPOINT
 
 ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help="TOML file; see `sightline config`.")]
@@ -20,7 +20,7 @@ Sets = Annotated[
 Listen = Annotated[
     list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Listen here, e.g. tcp/0.0.0.0:7447 or ws://0.0.0.0:9090.")
 ]
-Connect = Annotated[
+ServiceConnect = Annotated[
     list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Connect here, e.g. tcp/192.168.1.20:7447.")
 ]
 _SECURE = typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; endpoints are then tls/...")
@@ -35,7 +35,7 @@ SocketDir = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
+def register_services(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline sim --scenario eight --seed 3")(sim)
     app.command(epilog="Example: sightline robot --listen tcp/0.0.0.0:7447 --set safety.max_linear_mps=0.3")(robot)
@@ -62,7 +62,7 @@ def sim(
     """Simulate a robot's hardware, in place of a real one, until Ctrl-C."""
     from sim.service import run
 
-    use_form(log, "sim")
+    set_log_format(log, "sim")
     options = {
         "scenario": scenario, "robot": robot_model, "seed": seed, "motor_log": motor_log, "seconds": seconds,
         "socket_dir": socket_dir,
@@ -80,7 +80,7 @@ def robot(
     *,
     robot: RobotName = None,
     listen: Listen = None,
-    connect: Connect = None,
+    connect: ServiceConnect = None,
     secure: MaybeSecure = None,
     profile: Annotated[str | None, typer.Option(help="`sim`: simulated, armed without a person.")] = None,
     zero_motors: Annotated[
@@ -101,7 +101,7 @@ def robot(
     from robot_side.driver import run
     from robot_side.driver import zero_motors as set_to_zero
 
-    use_form(log, "robot")
+    set_log_format(log, "robot")
     options: dict[str, Any] = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure}
     options |= {f"{device}.options.socket_dir": socket_dir for device in ("camera", "drive")}
     loaded = load_service(
@@ -119,7 +119,7 @@ def vision(
     *,
     robot: RobotName = None,
     listen: Listen = None,
-    connect: Connect = None,
+    connect: ServiceConnect = None,
     secure: MaybeSecure = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -151,7 +151,7 @@ def vision(
     shape: Annotated[str | None, typer.Option("--shape", hidden=True)] = None,
 ) -> int:
     """Look at a robot's pictures and steer it, until Ctrl-C."""
-    use_form(log, "vision")
+    set_log_format(log, "vision")
     if camera is not None and not dry_run:
         raise ConfigError("--camera looks without a robot, so there is nothing to steer: add --dry-run")
     if camera_sets and camera is None:
@@ -164,7 +164,7 @@ def vision(
     loaded = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
     with needs("vision"):
         if dry_run:
-            return _only_look(loaded.config, camera, camera_sets or [])
+            return _dry_run(loaded.config, camera, camera_sets or [])
         if shape is not None:
             from operator_side.shaped_vision import run_shaped
 
@@ -185,25 +185,25 @@ def _measured(run: Any, config: Any, where: str) -> int:
         return int(run(config, observe))
 
 
-def router(listen: Listen = None, connect: Connect = None, secure: Secure = "", log: LogForm = None) -> int:
+def router(listen: Listen = None, connect: ServiceConnect = None, secure: Secure = "", log: LogForm = None) -> int:
     """Run the place where robots, visions and people of one site meet, until Ctrl-C. All of them connect to it."""
-    use_form(log, "router")
+    set_log_format(log, "router")
     with needs("zenoh"):
         from operator_side.router import run
 
         return run(listen or [DEFAULT_ENDPOINT], connect or [], secure)
 
 
-def _only_look(config: Any, camera: str | None, camera_sets: list[str]) -> int:
+def _dry_run(config: Any, camera: str | None, camera_sets: list[str]) -> int:
     from operator_side.local_camera import local_camera
-    from vision_side.detect.choice import check_looks, check_vision
+    from vision_side.detect.choice import check_takes_pictures, check_vision
     from vision_side.dry_run import watch_camera, watch_robot
 
     if config.detector.kind == "boxes":
         raise ConfigError("--dry-run looks with vision's own eyes; name a detector, e.g. --detector hsv")
     if camera is None:
         return watch_robot(config, typer.echo, None)
-    check_looks(config.detector.kind)
+    check_takes_pictures(config.detector.kind)
     check_vision(config)
     with local_camera(camera, camera_sets) as opened:
         return watch_camera(config, opened, typer.echo, None)

@@ -16,7 +16,7 @@ _Gamepad = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
+def register_teleop(app: typer.Typer) -> None:
     """Add the command to `app`."""
     app.command(epilog="Example: sightline teleop r1 --connect tcp/192.168.1.20:7447 --linear 0.15")(teleop)
 

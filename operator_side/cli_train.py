@@ -29,7 +29,7 @@ _LEAST_SHARE = 8
 """Of a batch for each process that trains: the normalisation needs a few pictures."""
 
 
-def register(app: typer.Typer) -> None:
+def register_train(app: typer.Typer) -> None:
     """Add the command to `app`."""
     app.command(epilog="Example: sightline train --out runs/eyes")(train)
 
@@ -62,10 +62,10 @@ def train(
     options = TrainOptions(out, scenes, training, device, processes, validated, judged, weights)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        model = run_training(options, _say, _progress)
+        model = run_training(options, _print_line, _progress)
     except OSError as error:
         raise ConfigError(f"--out {out}: {error.strerror or error}") from None
-    _say(f"{model}, {model.with_suffix('.md').name}: try it with `sightline score detectors onnx:{model}`")
+    _print_line(f"{model}, {model.with_suffix('.md').name}: try it with `sightline score detectors onnx:{model}`")
 
 
 def _begun(model: Path) -> "tuple[Weights, str]":
@@ -86,7 +86,7 @@ def _sharing(batch: int, processes: int) -> int:
     return max(n for n in range(1, processes + 1) if n == 1 or (batch % n == 0 and batch // n >= _LEAST_SHARE))
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     typer.echo(line)
 
 

@@ -12,7 +12,7 @@ import typer
 from operator_side.channel_inbox import ChannelInbox
 from operator_side.channel_text import message_line, message_object
 from operator_side.cli_people import DEFAULT_CONNECT, Connect, Json, Robot, Secure
-from operator_side.mission_asking import MissionDesk
+from operator_side.mission_asking import MissionClient
 from operator_side.mission_text import mission_lines
 from operator_side.pictures import viewer_role
 from operator_side.settings_errors import no_such_name
@@ -32,7 +32,7 @@ Seconds = Annotated[float | None, typer.Option("--seconds", min=0.1, help="End b
 Port = Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page, on this machine; 0 is any free one.")]
 
 
-def register(app: typer.Typer) -> None:
+def register_watch(app: typer.Typer) -> None:
     """Add the command to `app`."""
     app.command(epilog="Example: sightline watch r1   or   sightline watch r1 scan --json")(watch)
 
@@ -114,7 +114,7 @@ def _why_silent(channel: Channel) -> str:
 def _show_text(link: Link, ends_s: float) -> int:
     from operator_side.live_text import LiveText
 
-    desk = MissionDesk(link)
+    desk = MissionClient(link)
     with LiveText() as live:
         while time.monotonic() < ends_s:
             try:

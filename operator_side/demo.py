@@ -31,7 +31,7 @@ from sim.scenario import Scenario, load_scenario
 from sim.toml_file import laid_over
 from sim.truth import Truth
 from vision_side.detect.choice import BOXES, check_choice
-from vision_side.missions.choice import configured
+from vision_side.missions.choice import configured_mission
 
 ROBOT: Final = "r1"
 READY_S: Final = 30.0
@@ -108,7 +108,7 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
 def _check_vision(options: DemoOptions, scenario: Scenario) -> None:
     """Raise ConfigError for a mission or detector that vision would refuse, before anything is started."""
     config = vision_config(scenario, robot_of(scenario), options.seed, options.mission)
-    configured(config)
+    configured_mission(config)
     kind = options.detector
     if kind is None or (kind == BOXES and scenario.labels):
         return

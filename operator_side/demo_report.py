@@ -12,7 +12,7 @@ from operator_side.extras import needs
 from operator_side.processes import last_line
 from operator_side.replay import Replayed, Step, replay
 from operator_side.score import Check, Score, score
-from operator_side.score_bounds import judge
+from operator_side.score_bounds import checks_of
 from operator_side.score_course import figures_of
 from operator_side.shaped_vision import INJECTED
 from protocol.errors import SightlineError
@@ -56,7 +56,7 @@ def report(run: DemoRun) -> DemoReport:
         raise SightlineError(f"ended before the robot drove; the logs are in {run.folder}")
     recording = run.folder / RECORDING
     said: list[tuple[int, str, str]] = []
-    replayed = replay(recording, lambda step: said.append(_said(step)))
+    replayed = replay(recording, lambda step: said.append(_printed(step)))
     during = [one for one in said if run.samples[0].t_us <= one[0] <= run.samples[-1].t_us]
     result = score(run.samples, run.scenario.stand_off_m, figures_of(run.scenario, run.samples, during))
     injected = _injected(run)
@@ -67,7 +67,7 @@ def report(run: DemoRun) -> DemoReport:
     return judged
 
 
-def _said(step: Step) -> tuple[int, str, str]:
+def _printed(step: Step) -> tuple[int, str, str]:
     """What the mission said of a frame: the same pipeline says the same of the same frames."""
     return step.frame.header.t_us, step.answer.seen.phase, step.answer.seen.note
 
@@ -107,7 +107,7 @@ def _injection_checks(run: DemoRun, injected: dict[str, Any] | None) -> list[Che
 def _checks(run: DemoRun, result: Score) -> list[Check]:
     """The scenario's bounds; of the older dialect, slow and without odometry, only that it follows is demanded."""
     if run.options.transport != "legacy":
-        return judge(run.options.scenario, result, run.options.latency_ms, REAL_TIME_FACTOR)
+        return checks_of(run.options.scenario, result, run.options.latency_ms, REAL_TIME_FACTOR)
     unseen = 100 * sum(not sample.visible for sample in run.samples) / len(run.samples)
     return [
         Check("out of view", unseen, "%", 0.0, unseen == 0),

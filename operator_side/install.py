@@ -11,7 +11,7 @@ from pathlib import Path
 
 from protocol.errors import ConfigError
 from robot_side.config import RobotConfig
-from robot_side.plugins import configured
+from robot_side.plugins import load_device
 
 SERVICES = ("robot", "vision")
 UNIT_DIR = Path("/etc/systemd/system")
@@ -54,7 +54,7 @@ def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UN
     """
     if robot.motors.kind != "gpio":
         return None
-    _, options = configured("drives", robot.motors)
+    _, options = load_device("drives", robot.motors)
     pins = " ".join(str(number) for number in (*options.pins, *options.enable_pins))
     text = files("robot_side").joinpath("systemd", _DROP_IN).read_text().replace(_DROP_INS_PINS, f"gpio_low {pins}")
     return Plan("robot", drop_in_path(unit_dir), _fitted(text, "robot", program, config))

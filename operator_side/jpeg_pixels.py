@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
 
@@ -20,7 +20,7 @@ def jpeg_pixels(jpeg: bytes) -> NDArray[np.uint8]:
     try:
         pixels: NDArray[np.uint8] = simplejpeg.decode_jpeg(jpeg, "BGR")
     except ValueError as error:
-        raise WireError(Refusal.MALFORMED, f"picture does not decode: {error}"[:160]) from None
+        raise WireError(RejectReason.MALFORMED, f"picture does not decode: {error}"[:160]) from None
     return pixels
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from protocol.errors import ConfigError
 from robot_side.config import PluginChoice
-from robot_side.plugins import build
+from robot_side.plugins import build_device
 from robot_side.ports import Camera
 
 
@@ -20,7 +20,7 @@ def local_camera(kind: str, sets: Sequence[str]) -> Iterator[Camera]:
 
     Raises ConfigError for a bad kind or option, HardwareError when there is no such camera.
     """
-    camera: Camera = build("cameras", PluginChoice(kind=kind, options=dict(_option(text) for text in sets)))
+    camera: Camera = build_device("cameras", PluginChoice(kind=kind, options=dict(_option(text) for text in sets)))
     try:
         yield camera
     finally:

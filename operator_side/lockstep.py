@@ -18,20 +18,20 @@ from protocol.transports.link import LatestSlot, Message
 from protocol.transports.memory import MemoryNetwork
 from protocol.twist_text import format_twist
 from robot_side.config import RobotConfig
-from robot_side.driving import Driving
+from robot_side.driving import DriverCore
 from robot_side.limits import TICK_US
 from robot_side.ports import Picture
-from robot_side.sending import Sending
-from sim.cadence import Cadence
+from robot_side.sending import NetworkCore
+from sim.cadence import PeriodicTimer
 from sim.robot_model import RobotModel
 from sim.scenario import Scenario
 from sim.truth import Truth
 from sim.world import World
 from vision_side.config import VisionConfig
-from vision_side.detect.around import close_detector, news_of
+from vision_side.detect.around import close_detector, notices_of
 from vision_side.detect.choice import configured_detector
 from vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
-from vision_side.scan import read_scan
+from vision_side.scan import decode_scan
 
 COMPUTE_US = 4_000
 """What one frame costs the vision side in virtual time: one step of the world, above what it takes in truth."""
@@ -78,8 +78,8 @@ class Lockstep:
         self.network = MemoryNetwork(
             seed, round(conditions.latency_ms * 1000), round(conditions.jitter_ms * 1000), conditions.loss
         )
-        self.driving = Driving(robot, _ROBOT_SESSION)
-        self._sending = Sending(robot.stream, _ROBOT_SESSION, 0, robot.max_frame_bytes)
+        self.driving = DriverCore(robot, _ROBOT_SESSION)
+        self._sending = NetworkCore(robot.stream, _ROBOT_SESSION, 0, robot.max_frame_bytes)
         self._robot_link = self.network.link(robot.robot)
         self._robot_link.subscribe(TWIST, self._on_twist)
         self._robot_link.subscribe(ACK, lambda message: self._sending.on_ack(message, self._now_us))
@@ -92,7 +92,7 @@ class Lockstep:
         self._answers = 0
         self._camera_tick = 0
         self._frame_interval_us = 1e6 / world.robot.camera.fps
-        self._scans = Cadence(1e6 / world.robot.lidar.rate_hz)
+        self._scans = PeriodicTimer(1e6 / world.robot.lidar.rate_hz)
         self._now_us = 0
 
     def step(self) -> None:
@@ -109,7 +109,7 @@ class Lockstep:
 
     def close(self) -> None:
         """Hear what the detector has to say, and let go of it."""
-        self.run.news += news_of(self._pipeline.eyes)
+        self.run.news += notices_of(self._pipeline.eyes)
         close_detector(self._pipeline.eyes)
 
     # --- robot ---------------------------------------------------------------------------------------------------
@@ -167,7 +167,7 @@ class Lockstep:
         frame = Frame(decode(FrameHeader, message.header), message.payload)
         scan = self._scanned.take() if self._scanned else None
         if scan is not None:
-            self._pipeline.see_scan(*read_scan(scan.header, scan.payload))
+            self._pipeline.see_scan(*decode_scan(scan.header, scan.payload))
         answer = self._pipeline.step(frame) if self._labels is None else self._pipeline.follow(
             *self._labels.of(frame.header)
         )

@@ -41,8 +41,8 @@ class Answer:
     headers: Mapping[str, str] = field(default_factory=dict)
 
 
-Ask = Mapping[str, str]
-Route = Callable[[Ask, bytes], Answer]
+PageRequest = Mapping[str, str]
+Route = Callable[[PageRequest, bytes], Answer]
 
 
 def as_json(value: Any, status: int = 200) -> Answer:

@@ -13,8 +13,8 @@ from protocol.channels import STATUS
 from protocol.errors import WireError
 from protocol.messages import State, Status, StreamStatus
 from protocol.transports.link import Link, Message
-from protocol.transports.presence import Peer
-from protocol.transports.secured import ROBOT
+from protocol.transports.presence import PeerInfo
+from protocol.transports.secured import ROBOT_ROLE
 
 if TYPE_CHECKING:
     from operator_side.metrics_server import Family
@@ -30,7 +30,7 @@ class Watched:
         self._robot = link.robot
         self._newest: tuple[Status, float] | None = None
         self._entered: Counter[str] = Counter()
-        self._peers: Callable[[], list[Peer]] = getattr(link, "peers", list)
+        self._peers: Callable[[], list[PeerInfo]] = getattr(link, "peers", list)
         link.subscribe(STATUS, self._on_status)
 
     def _on_status(self, message: Message) -> None:
@@ -98,7 +98,7 @@ class Watched:
     def _round_trip(self) -> Iterator[Family]:
         """Asked of the robot's network process at every look; nothing where that cannot be asked."""
         for peer in self._peers():
-            if peer.presence.role == ROBOT and peer.presence.robot == self._robot:
+            if peer.presence.role == ROBOT_ROLE and peer.presence.robot == self._robot:
                 yield self._gauge("round_trip_seconds", "there and back on the link", peer.round_trip_us / 1e6)
                 return
 

@@ -26,7 +26,7 @@ _IDLE_S: Final = 20
 Respond = Callable[[str, list[tuple[str, str]]], Any]
 
 
-class Told(Protocol):
+class Exposed(Protocol):
     """What is served."""
 
     def collect(self) -> Iterator[Family]:
@@ -59,7 +59,7 @@ def counter(name: str, about: str, values: dict[tuple[str, ...], float], *labels
 
 
 @contextmanager
-def serving(told: Told, host: str, port: int) -> Iterator[int]:
+def serving(told: Exposed, host: str, port: int) -> Iterator[int]:
     """Serve `/metrics` and `/health` while inside; gives the port. Raises LinkError for a port in use."""
     from prometheus_client import CollectorRegistry, make_wsgi_app
 

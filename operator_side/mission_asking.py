@@ -17,7 +17,7 @@ from operator_side.waypoints import Waypoints
 from protocol.channels import MISSION, REPORT
 from protocol.codec import decode, encode
 from protocol.errors import ConfigError, LinkError, WireError
-from protocol.messages import Asked, Echo, RequestHeader
+from protocol.messages import RequestId, Echo, RequestHeader
 from protocol.mission_messages import MAX_OPTIONS, MissionReport, MissionRequest
 from protocol.transports.link import Link, Message
 
@@ -27,7 +27,7 @@ PATIENCE_S: Final = 3.0
 _REPORTER: Final = "vision"
 
 
-class MissionDesk:
+class MissionClient:
     """One person at one robot's vision. Every method that waits is bounded."""
 
     def __init__(self, link: Link) -> None:
@@ -62,7 +62,7 @@ class MissionDesk:
         request = request_of(self._id, name, waypoints, options or {})
         stamp = self.operator.wait_report().stamp  # of now: what is said again later is as old as when it was asked
         echo = Echo(channel="status", session=stamp.session, seq=stamp.seq, t_us=stamp.t_us)
-        mine = Asked(session=self._session, id=self._id)
+        mine = RequestId(session=self._session, id=self._id)
         deadline_s = time.monotonic() + PATIENCE_S
         while (left_s := deadline_s - time.monotonic()) > 0:
             self._seq += 1
@@ -79,7 +79,7 @@ class MissionDesk:
 
         Raises LinkError when no report comes within `timeout_s`, or when vision does something else meanwhile.
         """
-        mine, said = Asked(session=self._session, id=self._id), None
+        mine, said = RequestId(session=self._session, id=self._id), None
         while True:
             report = self.report(timeout_s)
             if report.asked != mine:

@@ -7,17 +7,17 @@ from collections.abc import Sequence
 from typing import Final
 
 from benchmarks.loop_figures import LoopCheck, at_most, percentile
-from benchmarks.network_rows import Row
+from benchmarks.network_rows import Case
 from benchmarks.network_stage import NetworkRun, Stage
-from operator_side.faults.judge import Motors, measure_stop, moved_on_old_sight, wheel_mps
-from operator_side.faults.ledger import TOLD
-from operator_side.faults.rig import ROBOT, Rig, Setup
+from operator_side.faults.judge import MotorRow, measure_stop, moved_on_old_sight, wheel_mps
+from operator_side.faults.ledger import REQUESTED
+from operator_side.faults.rig import ROBOT, RobotFixture, Setup
 from operator_side.network_person import RESET, STOPPED
 from protocol.errors import HardwareError, SightlineError
-from sim.wire import Shapes
+from sim.wire import LinkShapes
 
 REACHES_MS: Final = 300.0
-SAID_MS: Final = REACHES_MS + 100.0
+REPORTED_MS: Final = REACHES_MS + 100.0
 """By the robot's own status, ten times a second: as frames age, wheels slow down by themselves, before any STOP."""
 ZERO_MS: Final = 700.0
 """Reached, and then the ramp from 0.5 m/s: as the fault bench demands of every STOP."""
@@ -25,16 +25,16 @@ _READY_S: Final = 30.0
 _BESIDE_S: Final = 60.0
 
 
-def medium(row: Row, stage: Stage) -> NetworkRun:
+def medium(row: Case, stage: Stage) -> NetworkRun:
     """STOP, reset and so on for as long as there is time. Raises HardwareError if anything does not run."""
     try:
-        with Rig(stage.folder / "rig", Setup(wired=True, camera="heavy")) as rig:
-            return _run(row, stage, rig)
+        with RobotFixture(stage.folder / "rig", Setup(wired=True, camera="heavy")) as rig:
+            return _medium_run(row, stage, rig)
     except SightlineError as error:
         raise HardwareError(str(error)) from None
 
 
-def _run(row: Row, stage: Stage, rig: Rig) -> NetworkRun:
+def _medium_run(row: Case, stage: Stage, rig: RobotFixture) -> NetworkRun:
     assert rig.wire is not None
     before = rig.wire.shape(stage.seeded(row.phases[0].shapes))
     ledger = rig.folder / "person.ledger"
@@ -43,19 +43,19 @@ def _run(row: Row, stage: Stage, rig: Rig) -> NetworkRun:
     rig.fleet.wait_line("person", "person ready", _READY_S)
     if rig.fleet.exit_code("person", stage.setting.seconds + _BESIDE_S) != 0:
         raise HardwareError(f"the person gave up: {rig.fleet.log('person').read_text('utf-8').strip()[-200:]}")
-    injected = rig.wire.shape(Shapes()) - before
-    told_us = [one.t_us for one in rig.noted("person", TOLD)]
+    injected = rig.wire.shape(LinkShapes()) - before
+    told_us = [one.t_us for one in rig.noted("person", REQUESTED)]
     rows = rig.motors()
     checks = (
         LoopCheck("injected", float(injected), "", 1.0, injected >= 1),
-        *judge_stops(rows, told_us, [one.t_us for one in rig.noted("person", RESET)]),
-        judge_said(told_us, [one.frame_us for one in rig.noted("person", STOPPED)]),
+        *stop_checks_of(rows, told_us, [one.t_us for one in rig.noted("person", RESET)]),
+        reported_check(told_us, [one.frame_us for one in rig.noted("person", STOPPED)]),
         at_most("moved on frames over 400 ms", moved_on_old_sight(rows, rig.sent(), None), "lines", 0),
     )
     return NetworkRun(row, stage.seed, injected, (), checks, {"stops": len(told_us)})
 
 
-def judge_stops(rows: Sequence[Motors], told_us: Sequence[int], reset_us: Sequence[int]) -> Sequence[LoopCheck]:
+def stop_checks_of(rows: Sequence[MotorRow], told_us: Sequence[int], reset_us: Sequence[int]) -> Sequence[LoopCheck]:
     """When each STOP, said at `told_us`, shows in what the motors were told, and when the wheels stood; each holds
     until the wheels turn after its reset.
     """
@@ -69,25 +69,25 @@ def judge_stops(rows: Sequence[Motors], told_us: Sequence[int], reset_us: Sequen
     )
 
 
-def judge_said(told_us: Sequence[int], stopped_us: Sequence[int]) -> LoopCheck:
+def reported_check(told_us: Sequence[int], stopped_us: Sequence[int]) -> LoopCheck:
     """When the robot itself said, in the status with that stamp, that it was stopped."""
     said = [(stop_us - at_us) / 1000 for at_us, stop_us in zip(told_us, stopped_us, strict=False)]
     value = percentile(said, 99) if len(stopped_us) == len(told_us) else None
-    return at_most(f"robot says STOPPED, p99 of {len(said)}", value, "ms", SAID_MS)
+    return at_most(f"robot says STOPPED, p99 of {len(said)}", value, "ms", REPORTED_MS)
 
 
-def _again_us(rows: Sequence[Motors], reset_us: int) -> int:
+def _again_us(rows: Sequence[MotorRow], reset_us: int) -> int:
     """Just before the wheels turn after the reset; the end of the log if they do not."""
     return next((row.t_us - 1 for row in rows if row.t_us > reset_us and wheel_mps(row) > 0), rows[-1].t_us)
 
 
-def _window(rows: Sequence[Motors], begin_us: int, end_us: int) -> list[Motors]:
+def _window(rows: Sequence[MotorRow], begin_us: int, end_us: int) -> list[MotorRow]:
     """What they were told when it began, and all up to its end."""
     before = [row for row in rows if row.t_us <= begin_us]
     return [*before[-1:], *(row for row in rows if begin_us < row.t_us <= end_us)]
 
 
-def reached_ms(window: Sequence[Motors], told_us: int) -> float | None:
+def reached_ms(window: Sequence[MotorRow], told_us: int) -> float | None:
     """From STOP to the first line of the fall after which the wheels stayed at zero; None if they turn to the end."""
     zero = 1 + max((index for index, row in enumerate(window) if wheel_mps(row) > 0), default=-1)
     if zero == len(window):

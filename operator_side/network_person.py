@@ -10,10 +10,10 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
-from operator_side.faults.ledger import TOLD, Ledger
+from operator_side.faults.ledger import REQUESTED, EventLog
 from operator_side.requests import SOURCE, Operator
 from protocol.messages import Reply, State, Status, Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.zenoh import open_zenoh
 
 STOPPED: Final = "stopped"
@@ -26,7 +26,7 @@ _PAUSE_S: Final = 0.2, 0.8
 """Between driving and STOP, drawn: a STOP meets the video in every phase."""
 
 
-def run(endpoint: str, robot: str, ledger: Ledger, seconds: float, seed: int) -> None:
+def run(endpoint: str, robot: str, ledger: EventLog, seconds: float, seed: int) -> None:
     """Until the time is over. Raises LinkError when the robot does not answer."""
     chance = Random(seed)
     with open_zenoh(robot, connect=[endpoint], role=SOURCE, timeout_s=15) as link:
@@ -37,7 +37,7 @@ def run(endpoint: str, robot: str, ledger: Ledger, seconds: float, seed: int) ->
         while time.monotonic() < end_s:
             _until(operator, _drives)
             time.sleep(chance.uniform(*_PAUSE_S))
-            ledger.note(TOLD)
+            ledger.note(REQUESTED)
             operator.stop(lambda: print("a STOP took over 300 ms to be confirmed", flush=True))
             assert operator.report is not None
             ledger.note(STOPPED, operator.report.stamp.t_us)
@@ -52,7 +52,7 @@ def _agreed(ask: Callable[[], Reply]) -> None:
     """As a person does, ask anew when the robot says that what was asked came too late: the medium is full."""
     deadline_s = time.monotonic() + _PATIENCE_S
     while not (reply := ask()).ok:
-        if not reply.detail.startswith(Refusal.STALE) or time.monotonic() > deadline_s:
+        if not reply.detail.startswith(RejectReason.STALE) or time.monotonic() > deadline_s:
             raise SystemExit(f"the robot refused: {reply.detail}")
 
 
@@ -68,4 +68,4 @@ def _until(operator: Operator, happened: Callable[[Status], bool]) -> None:
 
 
 if __name__ == "__main__":
-    run(sys.argv[1], sys.argv[2], Ledger(Path(sys.argv[3])), float(sys.argv[4]), int(sys.argv[5]))
+    run(sys.argv[1], sys.argv[2], EventLog(Path(sys.argv[3])), float(sys.argv[4]), int(sys.argv[5]))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from protocol.errors import ConfigError
 from vision_side.config import HsvRange
-from vision_side.detect.colour import ColourMask
+from vision_side.detect.colour import ColorMask
 
 Image = NDArray[np.uint8]
 Numbers = NDArray[np.float32]
@@ -91,7 +91,7 @@ def check_trial(trial: Trial) -> None:
 def mask_of(ranges: Ranges, picture: Image) -> Image:
     """255 where the detector would see the colour, 0 elsewhere."""
     mask = np.zeros(picture.shape[:2], np.uint8)
-    region = ColourMask(ranges).region(picture)
+    region = ColorMask(ranges).region(picture)
     if region is not None:
         x, y = region.origin_px
         rows, columns = region.mask.shape[:2]

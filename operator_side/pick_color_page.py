@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
-from operator_side.loopback_page import Answer, Ask, Route, as_json, page
+from operator_side.loopback_page import Answer, PageRequest, Route, as_json, page
 from operator_side.pick_color import Box, Image, Ranges, check_trial, pick, ranges_text, trial_text, try_out
 from operator_side.pick_color_file import mask_png
 from operator_side.pick_color_pictures import Gallery
@@ -38,7 +38,7 @@ class PickPage:
             "POST /use": self._take,
         }
 
-    def _pick(self, _ask: Ask, body: bytes) -> Answer:
+    def _pick(self, _ask: PageRequest, body: bytes) -> Answer:
         asked = json.loads(body)
         picture = self._gallery.pixels(int(asked["number"]))
         with self._lock:
@@ -55,11 +55,11 @@ class PickPage:
             self._good = ranges
             return as_json(said)
 
-    def _mask(self, _ask: Ask, _body: bytes) -> Answer:
+    def _mask(self, _ask: PageRequest, _body: bytes) -> Answer:
         with self._lock:
             return Answer(mask_png(*self._picked), "image/png") if self._picked else Answer(status=204)
 
-    def _take(self, _ask: Ask, _body: bytes) -> Answer:
+    def _take(self, _ask: PageRequest, _body: bytes) -> Answer:
         with self._lock:
             if self._good is None:
                 raise ConfigError("pick a colour first")

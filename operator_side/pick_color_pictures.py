@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operator_side.jpeg_pixels import jpeg_pixels
-from operator_side.loopback_page import Answer, Ask
+from operator_side.loopback_page import Answer, PageRequest
 from operator_side.pictures import Pictures
-from operator_side.reel import Reel
+from operator_side.reel import FrameBuffer
 from protocol.errors import ConfigError, LinkError, WireError
 
 Image = NDArray[np.uint8]
@@ -38,7 +38,7 @@ class Gallery(Protocol):
         """The last pictures, to try a range on."""
         ...
 
-    def route(self, ask: Ask, body: bytes) -> Answer:
+    def route(self, ask: PageRequest, body: bytes) -> Answer:
         """`GET /picture`."""
         ...
 
@@ -61,7 +61,7 @@ class StillGallery:
         """All of them."""
         return self._pictures
 
-    def route(self, ask: Ask, _body: bytes) -> Answer:
+    def route(self, ask: PageRequest, _body: bytes) -> Answer:
         """`?number=N`, else the last."""
         number = int(ask.get("number", len(self._pictures)))
         done, data = cv2.imencode(".jpg", self.pixels(number), [cv2.IMWRITE_JPEG_QUALITY, _PAGE_QUALITY])
@@ -76,7 +76,7 @@ class LiveGallery:
 
     live = True
 
-    def __init__(self, reel: Reel) -> None:
+    def __init__(self, reel: FrameBuffer) -> None:
         self._reel = reel
         self.route = reel.route
 

@@ -16,7 +16,7 @@ from protocol.errors import ConfigError
 _TABLE: Final = ("hsv",)
 _KEY: Final = ("hsv", "ranges")
 _STRING: Final = re.compile(r'"""(?:\\.|[^\\])*?"""|\'\'\'.*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'', re.DOTALL)
-Path = tuple[str, ...]
+KeyPath = tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class _Statement:
 
     start: int
     end: int
-    path: Path
+    path: KeyPath
     is_head: bool
 
 
@@ -115,7 +115,7 @@ def _comments(text: str) -> str:
 
 def _statements(text: str) -> Iterator[_Statement]:
     """Of text that is TOML."""
-    at, table = 0, Path()
+    at, table = 0, KeyPath()
     while at < len(text):
         if text[at] in " \t\r\n":
             at += 1
@@ -149,7 +149,7 @@ def _line_end(text: str, at: int) -> int:
     return len(text) if found < 0 else found
 
 
-def _path_of(statement: str) -> Path:
+def _path_of(statement: str) -> KeyPath:
     """The names of a head or a key, as TOML reads them; nothing for a key that the scanner took apart wrongly."""
     try:
         node: Any = tomllib.loads(statement)

@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from protocol.errors import SightlineError
-from protocol.log_lines import ENV_NAME, FORMS
+from protocol.log_lines import LOG_FORMAT_VARIABLE, LOG_FORMATS
 
 END_S: Final = 4.0
 """A process that has not ended this long after SIGTERM is killed; the robot takes up to 2 s to bring wheels to zero."""
@@ -41,7 +41,7 @@ class Processes:
         with self.log(name).open("wb") as log:
             self._running[name] = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
-                env={**os.environ, ENV_NAME: FORMS[0]},
+                env={**os.environ, LOG_FORMAT_VARIABLE: LOG_FORMATS[0]},
             )
 
     def log(self, name: str) -> Path:

@@ -19,7 +19,7 @@ from typing import IO, TYPE_CHECKING, Any, Final, Self
 from operator_side.extras import needs
 from protocol.channels import ACK, CAMERA, CHANNELS, DETECTIONS, FRAME, MISSION, REPORT, SCAN, STATUS, TWIST, Channel
 from protocol.errors import ConfigError
-from protocol.log_lines import tell
+from protocol.log_lines import log_line
 from protocol.transports.link import Link, Message
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class Recorder:
         except OSError as error:
             if not self.failed:
                 self.failed = error.strerror or str(error)
-                tell(f"recording {self._path}: {self.failed}; nothing more is recorded")
+                log_line(f"recording {self._path}: {self.failed}; nothing more is recorded")
 
     def _write(self, log_time_ns: int, message: Message) -> None:
         topic = message.channel.name + (f"/{message.source}" if message.source else "")

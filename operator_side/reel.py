@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from operator_side.loopback_page import Answer, Ask
+from operator_side.loopback_page import Answer, PageRequest
 from operator_side.pictures import Pictures, Shot
 
 IDLE_S: Final = 3.0
@@ -28,7 +28,7 @@ class Numbered:
     shot: Shot
 
 
-class Reel:
+class FrameBuffer:
     """The newest `kept` pictures."""
 
     def __init__(self, kept: int, age_us: Callable[[Shot], int | None] = lambda _shot: None) -> None:
@@ -73,7 +73,7 @@ class Reel:
             self._news.wait_for(lambda: self._number > after, timeout_s)
             return self._shots[-1] if self._number > after else None
 
-    def route(self, ask: Ask, _body: bytes) -> Answer:
+    def route(self, ask: PageRequest, _body: bytes) -> Answer:
         """`GET /picture?after=N`, the next one, or `?number=N`, that one; 204 if there is none."""
         if "number" in ask:
             shot = self.of(int(ask["number"]))
@@ -92,7 +92,7 @@ class Reel:
         return self._shots[-1].number if self._shots else 0
 
 
-def fill(reel: Reel, pictures: Pictures, ending: threading.Event) -> None:
+def fill(reel: FrameBuffer, pictures: Pictures, ending: threading.Event) -> None:
     """Take pictures as they are wanted, until `ending`; while nobody looks, nothing is subscribed to."""
     while not ending.is_set():
         if not reel.is_wanted(_TAKE_S):

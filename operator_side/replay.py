@@ -12,16 +12,16 @@ from operator_side.recording import read_about, read_recording
 from protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MISSION, SCAN, TWIST
 from protocol.codec import decode
 from protocol.errors import ConfigError, WireError
-from protocol.messages import AnswerHeader, Asked, CameraModel, DetectionsHeader, FrameHeader, RequestHeader, Stamp
+from protocol.messages import AnswerHeader, RequestId, CameraModel, DetectionsHeader, FrameHeader, RequestHeader, Stamp
 from protocol.mission_messages import MissionRequest
 from protocol.transports.link import Message
 from protocol.twist_text import format_twist
 from vision_side.config import VisionConfig
 from vision_side.detect.boxes import BoxReader
 from vision_side.detect.choice import configured_detector
-from vision_side.missions.choice import requested
-from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline
-from vision_side.scan import read_scan
+from vision_side.missions.choice import requested_mission
+from vision_side.pipeline import SOURCE, PipelineAnswer, Frame, Pipeline
+from vision_side.scan import decode_scan
 
 VISION_CONFIG = "vision_config"
 """Key of the recording's metadata that holds the configuration of vision, as JSON."""
@@ -35,7 +35,7 @@ class Step:
 
     frame: Frame
     sent: bytes | None
-    answer: Answer
+    answer: PipelineAnswer
 
     @property
     def now(self) -> bytes | None:
@@ -67,7 +67,7 @@ class _Answers:
     by_frame: dict[_FrameId, list[tuple[AnswerHeader, bytes | None]]] = field(default_factory=dict)
     gaps: int = 0
     scans: dict[_FrameId, Message] = field(default_factory=dict)
-    missions: dict[Asked, MissionRequest] = field(default_factory=dict)
+    missions: dict[RequestId, MissionRequest] = field(default_factory=dict)
     boxes: dict[_FrameId, Message] = field(default_factory=dict)
     """What somebody else found in each frame, for a vision without eyes of its own."""
 
@@ -126,7 +126,7 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
 
 def _by_boxes(
     pipeline: Pipeline, frame: Frame, found: Message, camera: CameraModel, config: VisionConfig
-) -> Answer:
+) -> PipelineAnswer:
     """What the pipeline answers to what somebody else found in `frame`."""
     reader = BoxReader(config.boxes)
     reader.remember(frame.header)
@@ -137,11 +137,11 @@ def _give(pipeline: Pipeline, header: AnswerHeader, answers: _Answers, config: V
     """What the answer of `header` went by besides its frame, if that is in the recording."""
     scan = answers.scans.get((header.echo.session, header.scan)) if header.scan is not None else None
     if scan is not None:
-        pipeline.see_scan(*read_scan(scan.header, scan.payload))
+        pipeline.see_scan(*decode_scan(scan.header, scan.payload))
     pipeline.meet(header.echo.session)  # so that its first frame does not end what was asked for it
     request = answers.missions.get(header.mission) if header.mission else None
     if header.mission and request and header.mission != pipeline.asked:
-        pipeline.switch(requested(request, config), header.mission)
+        pipeline.switch(requested_mission(request, config), header.mission)
 
 
 def _gather_cited(path: Path, answers: _Answers) -> int:
@@ -161,7 +161,7 @@ def _gather_cited(path: Path, answers: _Answers) -> int:
                 answers.scans[stamp.session, stamp.seq] = message
         elif message.channel is MISSION:
             request = decode(MissionRequest, message.payload, MISSION.max_payload_bytes)
-            asked = Asked(session=decode(RequestHeader, message.header).session, id=request.id)
+            asked = RequestId(session=decode(RequestHeader, message.header).session, id=request.id)
             answers.missions.setdefault(asked, request)
     return len(scans - set(answers.scans)) + len(missions - set(answers.missions))
 

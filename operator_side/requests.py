@@ -16,7 +16,7 @@ from protocol.channels import REPLY, REQUEST, STATUS
 from protocol.codec import decode, encode
 from protocol.errors import LinkError, WireError
 from protocol.messages import Echo, Reply, Request, RequestHeader, Stamp, State, Status, Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link import Link, Message
 
 SOURCE: Final = "operator"
@@ -93,7 +93,7 @@ class Operator:
         """Arm; while the robot says that something is missing (live commands, wheels at zero) ask again."""
         deadline_s = time.monotonic() + patience_s
         reply = self.ask(Verb.ARM)
-        while not reply.ok and reply.detail.startswith(Refusal.NOT_ALLOWED) and time.monotonic() < deadline_s:
+        while not reply.ok and reply.detail.startswith(RejectReason.NOT_ALLOWED) and time.monotonic() < deadline_s:
             self.wait_report()
             reply = self.ask(Verb.ARM)
         return reply
@@ -137,7 +137,7 @@ class Operator:
         try:
             report = read_report(message)
         except WireError as error:
-            if error.reason is Refusal.UNSUPPORTED_VERSION:
+            if error.reason is RejectReason.UNSUPPORTED_VERSION:
                 with self._news:
                     self._version_trouble = error.detail
                     self._news.notify_all()

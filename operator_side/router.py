@@ -8,9 +8,9 @@ import threading
 from collections.abc import Sequence
 from contextlib import closing
 
-from protocol.transports.endpoints import check_endpoints
-from protocol.transports.secured import ROBOT, secured_for
-from protocol.transports.zenoh_log import refusals_told
+from protocol.transports.endpoints import check_zenoh_endpoints
+from protocol.transports.secured import ROBOT_ROLE, load_role_keys
+from protocol.transports.zenoh_log import log_rejected_peers
 from protocol.transports.zenoh_session import open_session
 
 _REACH_S = 5.0
@@ -18,18 +18,18 @@ _REACH_S = 5.0
 
 def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
     """Serve until SIGTERM or SIGINT. Raises ConfigError, LinkError as `open_session` does."""
-    check_endpoints(listen, connect)
-    secured = secured_for(secure, ROBOT)
+    check_zenoh_endpoints(listen, connect)
+    secured = load_role_keys(secure, ROBOT_ROLE)
     ending = threading.Event()
-    with refusals_told(listen, secure, _say), closing(open_session(listen, connect, _REACH_S, secured)):
+    with log_rejected_peers(listen, secure, _print_line), closing(open_session(listen, connect, _REACH_S, secured)):
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: ending.set())
         rules = f"keys of {secure}, access rules on" if secure else "plain, open to whoever reaches it"
-        _say(f"on {', '.join(listen)}; {rules}")
+        _print_line(f"on {', '.join(listen)}; {rules}")
         ending.wait()
-    _say("ended")
+    _print_line("ended")
     return 0
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     print(f"router: {line}", flush=True)

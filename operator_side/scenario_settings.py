@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from protocol.errors import ConfigError
 from robot_side.config import RobotConfig
-from robot_side.dead_zone import DeadZoneError, check_dead_zone
+from robot_side.dead_zone import BlindZoneError, check_blind_zone
 from robot_side.ports import Ranges
 from sim.body import outline
 from sim.robot_model import RobotModel, load_robot
@@ -103,8 +103,8 @@ def _check_sight(config: RobotConfig, model: RobotModel) -> None:
     free = array.array("f", [math.inf] * lidar.rays)
     scan = Ranges(0, math.radians(lidar.first_deg), lidar.increment_rad, lidar.range_min_m, lidar.range_max_m, free)
     try:
-        check_dead_zone(config.guard, scan)
-    except DeadZoneError as error:
+        check_blind_zone(config.guard, scan)
+    except BlindZoneError as error:
         raise ConfigError(f"robot {model.name}: [settings] {error}") from None
 
 

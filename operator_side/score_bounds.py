@@ -51,7 +51,7 @@ _ACQUIRES = ("bearing_rms_deg", "distance_rms_m", "lost_percent")
 """Figures that are taken from the first acquisition on."""
 
 
-def judge(scenario: str, result: Score, latency_ms: float = 0.0, factor: float = 1.0) -> list[Check]:
+def checks_of(scenario: str, result: Score, latency_ms: float = 0.0, factor: float = 1.0) -> list[Check]:
     """Hold `result` against the bounds of `scenario`, each times `factor` but for those that leave no room."""
     if latency_ms >= STANDS_STILL_FROM_MS:
         return [_check("travelled_m", result, 0.05), _check("wall_contacts", result, 0.0)]

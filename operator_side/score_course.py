@@ -13,7 +13,7 @@ from sim.scenario import Scenario
 from sim.truth import Truth
 
 Figures = dict[str, float | None]
-Said = Sequence[tuple[int, str, str]]
+MissionPhases = Sequence[tuple[int, str, str]]
 """Capture time of each frame answered, and the mission's phase and note."""
 
 STEP_S = 0.004
@@ -31,7 +31,7 @@ SETTLED_S = 0.35
 """After a change of colour: a frame's way there and back, and a second look."""
 
 
-def figures_of(scenario: Scenario, samples: Sequence[Truth], said: Said = ()) -> Figures:
+def figures_of(scenario: Scenario, samples: Sequence[Truth], said: MissionPhases = ()) -> Figures:
     """Whatever `scenario` is judged by besides what every following is."""
     figures: Figures = {"wall_contact_s": (samples[-1].wall_contacts - samples[0].wall_contacts) * STEP_S}
     if scenario.target.shape == "legs":
@@ -54,7 +54,7 @@ def legs_figures(samples: Sequence[Truth], stand_off_m: float) -> Figures:
     }
 
 
-def goal_figures(scenario: Scenario, samples: Sequence[Truth], said: Said) -> Figures:
+def goal_figures(scenario: Scenario, samples: Sequence[Truth], said: MissionPhases) -> Figures:
     """When the last waypoint was reached, each after the one before; how near to anything; when it said it cannot."""
     goals, reached_s = list(scenario.goals_m), None
     for truth in samples:
@@ -69,7 +69,7 @@ def goal_figures(scenario: Scenario, samples: Sequence[Truth], said: Said) -> Fi
     }
 
 
-def light_figures(samples: Sequence[Truth], said: Said) -> Figures:
+def light_figures(samples: Sequence[Truth], said: MissionPhases) -> Figures:
     """Crossings of the stop line and what the light showed, how soon it starts, and how often it misread the light."""
     crossings = list(_crossings(samples))
     starts = list(_starts(samples))
@@ -103,7 +103,7 @@ def _starts(samples: Sequence[Truth]) -> Iterator[float]:
             green_us = None
 
 
-def _wrong_percent(samples: Sequence[Truth], said: Said) -> float | None:
+def _wrong_percent(samples: Sequence[Truth], said: MissionPhases) -> float | None:
     """Of the frames on the way to the line, those in which the mission names another colour than is lit, or none."""
     times_us = [truth.t_us for truth in samples]
     changes = [now.t_us for before, now in pairwise(samples) if before.light != now.light]

@@ -9,51 +9,51 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from sim.scenes import Scene, Truth
+from sim.scenes import Scene, LabelledBox
 from vision_side.detect.overlap import corners, overlap
 from vision_side.detect.port import Detection
 
-ASKED: Final = ("ball", "target")
+BALL_LABELS: Final = ("ball", "target")
 HIT_OVERLAP: Final = 0.5
 """Intersection by union, with the box of what is in view or of the whole ball, whichever is nearer."""
 CENTRED_FROM: Final = 0.98
 """Seen share from which a hit's centre is compared with the ball's: the rest is cut off or behind something."""
 
-Verdict = Literal["hit", "wrong object", "nowhere", "none"]
+Answer = Literal["hit", "wrong object", "nowhere", "none"]
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class FrameResult:
     """One frame: was there a ball, what was the answer, how sure, how far off, how long it took (None: no answer)."""
 
     has_ball: bool
-    verdict: Verdict
+    verdict: Answer
     score: float = 0.0
     off_px: float | None = None
     compute_us: int | None = None
 
 
-def ball_of(scene: Scene) -> Truth | None:
+def ball_of(scene: Scene) -> LabelledBox | None:
     """The ball, if there is one."""
     return next((one for one in scene.truths if one.label == "ball"), None)
 
 
-def judged(
-    detections: Sequence[Detection] | None, scene: Scene, compute_us: int | None = None, balls: Sequence[str] = ASKED
-) -> Judged:
+def frame_result(
+    detections: Sequence[Detection] | None, scene: Scene, compute_us: int | None = None, balls: Sequence[str] = BALL_LABELS
+) -> FrameResult:
     """The verdict on one frame; None is no answer, which is no hit. `balls` is what a ball may be called."""
     ball = ball_of(scene)
     asked = [one for one in detections or () if one.label in balls]
     if not asked:
-        return Judged(ball is not None, "none", compute_us=compute_us)
+        return FrameResult(ball is not None, "none", compute_us=compute_us)
     best = asked[0]  # detectors give the best first, each by its own measure
     if ball is not None and is_hit(best, ball):
-        return Judged(True, "hit", best.score, _off_px(best, ball), compute_us)
-    verdict: Verdict = "wrong object" if _is_on_another(best, scene) else "nowhere"
-    return Judged(ball is not None, verdict, best.score, compute_us=compute_us)
+        return FrameResult(True, "hit", best.score, _off_px(best, ball), compute_us)
+    verdict: Answer = "wrong object" if _is_on_another(best, scene) else "nowhere"
+    return FrameResult(ball is not None, verdict, best.score, compute_us=compute_us)
 
 
-def is_hit(one: Detection, ball: Truth) -> bool:
+def is_hit(one: Detection, ball: LabelledBox) -> bool:
     """Whether the detection is that ball."""
     boxes = [ball.box] if ball.whole is None else [ball.box, ball.whole]
     drawn = [corners(one)]
@@ -63,7 +63,7 @@ def is_hit(one: Detection, ball: Truth) -> bool:
     return max(overlap(mine, true) for mine in drawn for true in boxes) >= HIT_OVERLAP
 
 
-def _off_px(one: Detection, ball: Truth) -> float | None:
+def _off_px(one: Detection, ball: LabelledBox) -> float | None:
     """From the ball's centre, where all of it is in view."""
     if ball.whole is None or ball.seen < CENTRED_FROM:
         return None
@@ -100,7 +100,7 @@ class Figures:
     compute_p50_us: float | None
 
 
-def figures(frames: Sequence[Judged]) -> Figures:
+def figures(frames: Sequence[FrameResult]) -> Figures:
     """Count them."""
     balls = [one for one in frames if one.has_ball]
     empty = [one for one in frames if not one.has_ball]
@@ -125,7 +125,7 @@ def _quantile(values: Sequence[float], share: float) -> float | None:
 
 
 @dataclass
-class Found:
+class LabelMatches:
     """One label over many frames: how many there are, and every detection of it with whether it was right."""
 
     objects: int = 0
@@ -144,7 +144,7 @@ class Found:
             elif not any(overlap(own, box) > 0 for box in scene.unclear):
                 self.marks.append((one.score, False))
 
-    def take(self, more: "Found") -> None:
+    def take(self, more: "LabelMatches") -> None:
         """What was found of this label in other frames."""
         self.objects += more.objects
         self.marks += more.marks
@@ -164,7 +164,7 @@ class Found:
         return area + best * last
 
 
-def precisions(found: Mapping[str, Found]) -> dict[str, tuple[int, float | None]]:
+def precisions(found: Mapping[str, LabelMatches]) -> dict[str, tuple[int, float | None]]:
     """Objects and AP50 of each label; of a label that was never found too, but nothing of who finds none of them."""
     if not any(one.marks for one in found.values()):
         return {}

@@ -28,13 +28,13 @@ LEAST_OBJECTS: Final = 300
 """Of each label; a figure of fewer says too little."""
 
 
-def judge_all(report: Report) -> list[Check]:
+def all_detector_checks(report: Report) -> list[Check]:
     """The checks of every detector, by name."""
     names = dict.fromkeys(name for own in report.columns.values() for name in own)
-    return [replace(check, name=f"{name}: {check.name}") for name in names for check in judge(report, name)]
+    return [replace(check, name=f"{name}: {check.name}") for name in names for check in detector_checks(report, name)]
 
 
-def judge(report: Report, name: str) -> list[Check]:
+def detector_checks(report: Report, name: str) -> list[Check]:
     """Hold one detector's figures against all that is demanded, in the columns that were shown."""
     checks = [check for column, own in report.columns.items() for check in _of_column(column, own[name])]
     return checks + [check for label in LABELLED for check in _of_label(label, report.precision[name].get(label))]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from operator_side.score import Check
-from operator_side.score_detectors import ASKED, Figures
+from operator_side.score_detectors import BALL_LABELS, Figures
 from operator_side.score_scenes import Report
 
 _HEAD = ("column", "detector", "hits", "missed", "wrong object", "false alarms", "centre p50 / p95 px", "ms p50")
@@ -61,7 +61,7 @@ def silence_lines(report: Report) -> list[str]:
     """One for each detector that did not always answer, and for each that calls things what nobody asks for."""
     silent = [f"{name}: no answer to {one.scenes} of {one.of} scenes, which count as missed: {one.why}"
               for name, one in report.silent.items()]
-    calls = [f"{name}: not counted is what it calls {_some(labels)}; a ball is {' or '.join(ASKED)}, and target.label"
+    calls = [f"{name}: not counted is what it calls {_some(labels)}; a ball is {' or '.join(BALL_LABELS)}, and target.label"
              for name, labels in report.uncounted.items()]
     return [" ".join(line.split()) for line in (*silent, *calls)]
 

@@ -12,16 +12,16 @@ from typing import Any, Final
 from operator_side.lockstep import Conditions, Run, run_lockstep
 from operator_side.scenario_settings import robot_of, vision_config
 from operator_side.score import Check, Score, median_and_worst, score
-from operator_side.score_bounds import judge
+from operator_side.score_bounds import checks_of
 from operator_side.score_course import figures_of
 from operator_side.worker_pool import worker_pool
 from protocol.errors import ConfigError
 from sim.look import look_named
 from sim.scenario import Scenario, load_scenario
 from vision_side.detect.choice import check_choice
-from vision_side.missions.choice import FAMILY, configured
+from vision_side.missions.choice import REGISTRY, configured_mission
 
-_MOST_NEWS: Final = 3
+_MOST_NOTICES: Final = 3
 """Of each group: later ones repeat the first with higher counts."""
 
 
@@ -48,7 +48,7 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class ScoredFigure:
     """One figure of one group: its median and its worst over the seeds; the worst is what is judged."""
 
     group: str
@@ -65,7 +65,7 @@ class ScoreReport:
     """All runs, and what was demanded of them."""
 
     runs: list[tuple[Case, Score]]
-    judged: list[Judged]
+    judged: list[ScoredFigure]
     news: dict[str, list[str]] = field(default_factory=dict)
     """What the detector had to tell a person, by group: why it gave no answer, for one."""
 
@@ -95,12 +95,12 @@ def cases(
 ) -> list[Case]:
     """Every combination, those of one group together. Raises ConfigError for a name or number that is none."""
     if mission is not None:
-        FAMILY.load(mission)
+        REGISTRY.load(mission)
     for name in scenarios:
         scenario = load_scenario(name)
         config = vision_config(scenario, robot_of(scenario, robot), 0, mission)
         try:
-            configured(config)
+            configured_mission(config)
         except ConfigError as error:
             if mission is None:
                 raise
@@ -150,22 +150,22 @@ def run_cases(wanted: Sequence[Case], jobs: int, on_done: Callable[[Case], None]
     for case in wanted:
         for line in results[case][1]:
             news.setdefault(case.group, []).append(line)
-    told = {group: list(dict.fromkeys(lines))[:_MOST_NEWS] for group, lines in news.items()}
-    return ScoreReport(runs, judge_runs(runs), told)
+    told = {group: list(dict.fromkeys(lines))[:_MOST_NOTICES] for group, lines in news.items()}
+    return ScoreReport(runs, scored_figures(runs), told)
 
 
-def judge_runs(runs: Sequence[tuple[Case, Score]]) -> list[Judged]:
+def scored_figures(runs: Sequence[tuple[Case, Score]]) -> list[ScoredFigure]:
     """Each group's figures: median, worst, and whether every run of it is within the bound."""
     judged = []
     for name, members in groupby(runs, key=lambda run: run[0].group):
         group = list(members)
-        checks = [judge(case.scenario, result, case.latency_ms) for case, result in group]
+        checks = [checks_of(case.scenario, result, case.latency_ms) for case, result in group]
         results = [result for _, result in group]
-        judged += [_judge_figure(name, list(same), results) for same in zip(*checks, strict=True)]
+        judged += [_scored_figure(name, list(same), results) for same in zip(*checks, strict=True)]
     return judged
 
 
-def _judge_figure(group: str, checks: list[Check], results: list[Score]) -> Judged:
+def _scored_figure(group: str, checks: list[Check], results: list[Score]) -> ScoredFigure:
     first = checks[0]
     median, worst = median_and_worst(results, first.name)
-    return Judged(group, first.name, median, worst, first.unit, first.bound, all(check.ok for check in checks))
+    return ScoredFigure(group, first.name, median, worst, first.unit, first.bound, all(check.ok for check in checks))

@@ -9,16 +9,24 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from operator_side.score_detectors import ASKED, Figures, Found, Judged, figures, judged, precisions
+from operator_side.score_detectors import (
+    BALL_LABELS,
+    Figures,
+    LabelMatches,
+    FrameResult,
+    figures,
+    frame_result,
+    precisions,
+)
 from protocol.messages import FrameHeader
 from sim.scene_defects import as_seen
 from sim.scene_render import SceneRenderer
 from sim.scenes import COLUMNS, HEIGHT_PX, JUDGED_FROM, LABELS, THINGS, WIDTH_PX, Column, Scene
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
-from vision_side.detect.around import close_detector, news_of
-from vision_side.detect.checking import asked as checked_answers
-from vision_side.detect.choice import check_looks, choose_detector
+from vision_side.detect.around import close_detector, notices_of
+from vision_side.detect.checking import checked_results as checked_answers
+from vision_side.detect.choice import check_takes_pictures, build_detector
 from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Detector
 
 _FRAME_US: Final = 33_333
@@ -36,12 +44,12 @@ class Subject:
 
     name: str
     detector: Detector
-    balls: tuple[str, ...] = ASKED
+    balls: tuple[str, ...] = BALL_LABELS
     """What it may call a ball."""
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ScoredScene:
     """One scene as it was shown, and what each subject said of it."""
 
     scene: Scene
@@ -87,12 +95,12 @@ def subjects(
     needs is missing, and HardwareError for a device that is not there.
     """
     settings, given, asked = config or VisionConfig(), options or {}, list[Subject]()
-    balls = (*ASKED, settings.target.label) if settings.target.label else ASKED
+    balls = (*BALL_LABELS, settings.target.label) if settings.target.label else BALL_LABELS
     with ExitStack() as ending:
         ending.callback(close_subjects, asked)
         for name in dict.fromkeys(names):
-            check_looks(name)
-            asked.append(Subject(name, choose_detector(name, given.get(name, {}), settings), balls))
+            check_takes_pictures(name)
+            asked.append(Subject(name, build_detector(name, given.get(name, {}), settings), balls))
         ending.pop_all()
     return asked
 
@@ -104,7 +112,7 @@ def close_subjects(asked: Sequence[Subject]) -> None:
             ending.callback(close_detector, one.detector)
 
 
-def shown(column: Column, seeds: Iterable[int], asked: Sequence[Subject], looks: int) -> Iterable[Seen]:
+def shown(column: Column, seeds: Iterable[int], asked: Sequence[Subject], looks: int) -> Iterable[ScoredScene]:
     """Each scene of the column in turn, in front of every subject, `looks` times in a row: some have to make sure."""
     decoder = Decoder(WIDTH_PX, HEIGHT_PX, WIDTH_PX * HEIGHT_PX)
     with SceneRenderer() as renderer:
@@ -112,7 +120,7 @@ def shown(column: Column, seeds: Iterable[int], asked: Sequence[Subject], looks:
             scene = renderer.scene(seed, column)
             jpeg = as_seen(scene)
             said = [_answer(one.detector, seed, jpeg, decoder, looks) for one in asked]
-            yield Seen(scene, jpeg, tuple(one if isinstance(one, DetectionResult) else None for one in said),
+            yield ScoredScene(scene, jpeg, tuple(one if isinstance(one, DetectionResult) else None for one in said),
                        tuple(one if isinstance(one, str) else "" for one in said))
 
 
@@ -127,7 +135,7 @@ def _answer(detector: Detector, seed: int, jpeg: bytes, decoder: Decoder, looks:
 
 def score_scenes(
     asked: Sequence[Subject], frames: int, first_seed: int = JUDGED_FROM, *, looks: int = 1,
-    columns: Sequence[str] = tuple(COLUMNS), each: Callable[[Seen], None] = lambda _seen: None,
+    columns: Sequence[str] = tuple(COLUMNS), each: Callable[[ScoredScene], None] = lambda _seen: None,
 ) -> Report:
     """All columns, `frames` scenes each, and `LIGHT_SHARE` times as many of lights and legs.
 
@@ -139,7 +147,7 @@ def score_scenes(
         for seen in shown(COLUMNS[name], seeds, asked, looks):
             each(seen)
             for count, result, why in zip(counts, seen.answers, seen.whys, strict=True):
-                count.verdicts[name].append(verdict(result, seen.scene, count.balls))
+                count.verdicts[name].append(scene_result(result, seen.scene, count.balls))
                 count.note(result, why)
     for seen in shown(THINGS, range(first_seed, first_seed + int(LIGHT_SHARE * frames)), asked, looks):
         each(seen)
@@ -162,8 +170,8 @@ class _Count:
 
     def __init__(self, subject: Subject, columns: Sequence[str]) -> None:
         self.name = subject.name
-        self.verdicts: dict[str, list[Judged]] = {name: [] for name in columns}
-        self.found = {label: Found() for label in LABELLED}
+        self.verdicts: dict[str, list[FrameResult]] = {name: [] for name in columns}
+        self.found = {label: LabelMatches() for label in LABELLED}
         self.made_by: dict[str, str] = {}
         self.scenes = self.unanswered = 0
         self.uncounted: set[str] = set()
@@ -180,7 +188,7 @@ class _Count:
 
     def silence(self) -> Silence:
         """With what the detector itself says, if it says anything."""
-        said = news_of(self._detector)[:_MOST_SAID]
+        said = notices_of(self._detector)[:_MOST_SAID]
         return Silence(self.unanswered, self.scenes, "; ".join(dict.fromkeys([self._why, *said])))
 
 
@@ -189,6 +197,6 @@ def detections(result: DetectionResult | None) -> tuple[Detection, ...]:
     return () if result is None else result.detections
 
 
-def verdict(result: DetectionResult | None, scene: Scene, balls: Sequence[str] = ASKED) -> Judged:
+def scene_result(result: DetectionResult | None, scene: Scene, balls: Sequence[str] = BALL_LABELS) -> FrameResult:
     """Of one answer; `balls` is what a ball may be called."""
-    return judged(None, scene) if result is None else judged(result.detections, scene, result.compute_us, balls)
+    return frame_result(None, scene) if result is None else frame_result(result.detections, scene, result.compute_us, balls)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import simplejpeg
 
-from operator_side.score_scenes import Seen, Subject, detections, verdict
+from operator_side.score_scenes import ScoredScene, Subject, detections, scene_result
 
 _ACROSS: Final = 6
 _TRUE_BGR: Final = (255, 255, 255)
@@ -24,7 +24,7 @@ class Sheet:
         self._asked = asked
         self._rows: dict[str, list[npt.NDArray[np.uint8]]] = {}
 
-    def add(self, seen: Seen) -> None:
+    def add(self, seen: ScoredScene) -> None:
         """The first few of each column are kept."""
         row = self._rows.setdefault(seen.scene.plan.column.name, [])
         if len(row) < _ACROSS:
@@ -34,7 +34,7 @@ class Sheet:
         """One row for each column."""
         return np.vstack([_row(name, pictures) for name, pictures in self._rows.items()])
 
-    def _drawn(self, seen: Seen) -> npt.NDArray[np.uint8]:
+    def _drawn(self, seen: ScoredScene) -> npt.NDArray[np.uint8]:
         picture: npt.NDArray[np.uint8] = simplejpeg.decode_jpeg(seen.jpeg, "BGR")
         for truth in seen.scene.truths:
             _box(picture, truth.box, _TRUE_BGR)
@@ -44,7 +44,7 @@ class Sheet:
                 _box(picture, (one.x1_px, one.y1_px, one.x2_px, one.y2_px), colour)
                 at = (int(one.x1_px), max(9, int(one.y1_px) - 2))
                 cv2.putText(picture, f"{one.label} {one.score:.2f}", at, _FONT, 0.3, colour, 1, cv2.LINE_AA)
-            said = f"{subject.name}: {verdict(result, seen.scene, subject.balls).verdict}"
+            said = f"{subject.name}: {scene_result(result, seen.scene, subject.balls).verdict}"
             cv2.putText(picture, said, (3, 12 + 12 * number), _FONT, 0.36, colour, 1, cv2.LINE_AA)
         return picture
 

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from operator_side.check_text import number
-from operator_side.score_runs import Judged, ScoreReport
+from operator_side.score_runs import ScoredFigure, ScoreReport
 
 
 @contextmanager
@@ -32,6 +32,6 @@ def score_text(report: ScoreReport) -> str:
     return "\n".join([*lines, f"{len(report.runs)} runs, {'all within bounds' if report.ok else 'NOT within bounds'}"])
 
 
-def _line(one: Judged) -> str:
+def _line(one: ScoredFigure) -> str:
     figures = f"median {number(one.median):>7}  worst {number(one.worst):>7} {one.unit:<5}"
     return f"  {one.name:<16} {figures}  bound {number(one.bound):>6}  {'ok' if one.ok else 'FAIL'}"

@@ -19,12 +19,12 @@ from operator_side.settings_keys import is_known, known_keys
 from protocol.channels import check_robot_id
 from protocol.config import Config
 from protocol.errors import ConfigError
-from protocol.log_lines import ENV_NAME
+from protocol.log_lines import LOG_FORMAT_VARIABLE
 from protocol.transports.opening import check_endpoint
 
 SERVICES: Final = ("robot", "vision", "sim")
 ENV_PREFIX: Final = "SIGHTLINE_"
-OTHER_ENV_NAMES: Final = ("SIGHTLINE_DEBUG", ENV_NAME)
+OTHER_ENV_NAMES: Final = ("SIGHTLINE_DEBUG", LOG_FORMAT_VARIABLE)
 PROFILES: Final = Path(__file__).parent / "profiles"
 
 Key = tuple[str, ...]

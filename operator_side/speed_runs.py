@@ -20,7 +20,7 @@ _ACROSS: Final = 5  # samples to either side: an acceleration over 0.2 s, for th
 
 
 @dataclass(frozen=True, slots=True)
-class SpeedWish:
+class SpeedCase:
     """One drive to make."""
 
     law: str
@@ -32,7 +32,7 @@ class SpeedWish:
 class SpeedRun:
     """What came of it, in world truth: one entry of each list per sample."""
 
-    wish: SpeedWish
+    wish: SpeedCase
     times_s: list[float]
     speeds_mps: list[float]
     accelerations_mps2: list[float]
@@ -47,9 +47,9 @@ class SpeedRun:
         return max(self.speeds_mps)
 
 
-def speed_wishes(seed: int) -> list[SpeedWish]:
+def speed_cases(seed: int) -> list[SpeedCase]:
     """Every law to every waypoint."""
-    return [SpeedWish(law, goal_m, seed) for law in LAWS for goal_m in GOALS_M]
+    return [SpeedCase(law, goal_m, seed) for law in LAWS for goal_m in GOALS_M]
 
 
 def free_way(goal_m: float) -> Scenario:
@@ -62,7 +62,7 @@ def free_way(goal_m: float) -> Scenario:
     })
 
 
-def speed_run(wish: SpeedWish) -> SpeedRun:
+def speed_run(wish: SpeedCase) -> SpeedRun:
     """Drive it, under the conditions of the page."""
     scenario = free_way(wish.goal_m)
     mission = None if wish.law == scenario.mission else wish.law
@@ -70,7 +70,7 @@ def speed_run(wish: SpeedWish) -> SpeedRun:
     return speeds_of(wish, run.samples)
 
 
-def speeds_of(wish: SpeedWish, samples: Sequence[Truth]) -> SpeedRun:
+def speeds_of(wish: SpeedCase, samples: Sequence[Truth]) -> SpeedRun:
     """The figures of a drive along x."""
     times_s = [(truth.t_us - samples[0].t_us) / 1e6 for truth in samples]
     speeds_mps = [truth.linear_mps for truth in samples]

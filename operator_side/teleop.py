@@ -26,17 +26,17 @@ from protocol.messages import (
     Twist,
     Verb,
 )
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link import Message
 from protocol.twist_text import format_twist
 
 SOURCE: Final = "teleop"
 PERIOD_US: Final = 30_000
 """Between commands, about one per frame. What a person does is sent at once."""
-_ASK_AGAIN_US: Final = 60_000
+_REPEAT_AFTER_US: Final = 60_000
 _ARM_FOR_US: Final = 2_000_000
 """A press arms for this long: five live commands and a request take a fraction of it."""
-_ASK_ON: Final = (Refusal.NOT_ALLOWED, Refusal.STALE, Refusal.OTHER_SESSION, Refusal.UNKNOWN_FRAME)
+_ASK_ON: Final = (RejectReason.NOT_ALLOWED, RejectReason.STALE, RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME)
 """What only time mends: live commands that are still missing, a status from before the link or the robot came back."""
 _HAND_OVER_FOR_US: Final = 5_000_000
 """After that nobody is there to take over."""
@@ -229,7 +229,7 @@ class Teleop:
         if now_us > self._ask_until_us and (verb is not None or self.mode is Mode.HANDING_OVER):
             self._gave_up()
         elif verb is not None and self._may_ask(verb, now_us):
-            self._ask_due_us = now_us + _ASK_AGAIN_US
+            self._ask_due_us = now_us + _REPEAT_AFTER_US
             yield self._request(verb)
 
     def _may_ask(self, verb: Verb, now_us: int) -> bool:

@@ -30,7 +30,7 @@ _SHOW_US: Final = 100_000
 _ALL: Final = 4096  # what a terminal holds: a pile of keys must be seen as one
 _FAREWELL_S: Final = 0.25
 """Last words are repeated this long, unless the robot answers."""
-_SAY_AGAIN_S: Final = 0.03
+_PRINT_AGAIN_S: Final = 0.03
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -136,7 +136,7 @@ class Cockpit:
         until_s = time.monotonic() + _FAREWELL_S
         while True:
             self._publish(self._teleop.leave())
-            time.sleep(_SAY_AGAIN_S)
+            time.sleep(_PRINT_AGAIN_S)
             self._take_messages()
             if self._teleop.has_left or time.monotonic() > until_s:
                 return

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from operator_side.score_detectors_bounds import judge
+from operator_side.score_detectors_bounds import detector_checks
 from operator_side.score_detectors_text import check_lines, markdown
 from operator_side.score_scenes import Report
 from operator_side.train_export import MOST_BOXES, OPSET
@@ -92,7 +92,7 @@ def _judged(card: Card) -> list[str]:
 
 
 def _demanded(report: Report) -> list[str]:
-    checks = judge(report, "onnx")
+    checks = detector_checks(report, "onnx")
     broken = [one for one in checks if not one.ok]
     kept = f"{len(checks) - len(broken)} of {len(checks)} demands are kept"
     return [f"{kept}; these are not:", "", "```", *check_lines(broken), "```"] if broken else [f"{kept}."]

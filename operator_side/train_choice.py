@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from operator_side.score_detectors import Found, Judged
+from operator_side.score_detectors import LabelMatches, FrameResult
 
 MOST_FALSE: Final = 0.02
 """Of false alarms and of wrong objects, in every column. A judge allows 5 of a hundred frames without a ball: what is
@@ -14,14 +14,14 @@ _TRIED: Final = tuple(round(float(one), 2) for one in np.arange(0.06, 0.95, 0.01
 _OTHERWISE: Final = 0.3  # for a label that no scene showed
 
 
-def ball_threshold(columns: Mapping[str, Sequence[Judged]]) -> float:
+def ball_threshold(columns: Mapping[str, Sequence[FrameResult]]) -> float:
     """The least score that keeps every column within `MOST_FALSE`; else the one that comes nearest to it."""
     worst = {least: max(_worst(frames, least) for frames in columns.values()) for least in _TRIED}
     within = [least for least, share in worst.items() if share <= MOST_FALSE]
     return within[0] if within else min(_TRIED, key=lambda least: worst[least])
 
 
-def _worst(frames: Sequence[Judged], least: float) -> float:
+def _worst(frames: Sequence[FrameResult], least: float) -> float:
     """The larger of the shares of false alarms and of wrong objects, if only scores from `least` on counted."""
     empty = [one for one in frames if not one.has_ball]
     alarms = sum(one.verdict != "none" and one.score >= least for one in empty)
@@ -29,7 +29,7 @@ def _worst(frames: Sequence[Judged], least: float) -> float:
     return max(alarms / max(1, len(empty)), wrong / max(1, len(frames)))
 
 
-def label_threshold(found: Found) -> float:
+def label_threshold(found: LabelMatches) -> float:
     """The score with the best balance of found objects and right answers, the former twice as important (F2; van
     Rijsbergen, Information Retrieval, 1979): legs or a light that is overlooked is worse than one too many."""
     if not found.objects or not found.marks:

@@ -20,7 +20,7 @@ _HARDER_FROM: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class SceneRange:
     """Which scenes a step draws from: the first `known`, of which those from `newest` on came with its round."""
 
     newest: int
@@ -64,11 +64,11 @@ class Training:
         done = min(1.0, (within - _WARM_UP) / max(1, steps - _WARM_UP))
         return highest * (_LEAST_RATE + (1 - _LEAST_RATE) * 0.5 * (1 + math.cos(math.pi * done)))
 
-    def shown_at(self, step: int, scenes: int) -> Shown:
+    def shown_at(self, step: int, scenes: int) -> SceneRange:
         """Which of so many scenes are shown then."""
         number = self._place(step)[0]
         known = max(1, scenes * (number + 1) // len(self.rounds))
-        return Shown(min(known - 1, scenes * number // len(self.rounds)), known, number >= _HARDER_FROM)
+        return SceneRange(min(known - 1, scenes * number // len(self.rounds)), known, number >= _HARDER_FROM)
 
     def whole_at(self, step: int) -> bool:
         """Whether whole pictures are shown, half as many."""

@@ -10,7 +10,7 @@ from operator_side.train_export import Weights, shifted
 from operator_side.train_loop import start_from, train
 from operator_side.train_rounds import Training
 from operator_side.train_scenes import drawn_scenes
-from operator_side.train_shipping import Progress, chosen, judged, written
+from operator_side.train_shipping import Progress, chosen_thresholds, final_report, written
 
 MODEL, CARD = "sightline.onnx", "sightline.md"
 
@@ -40,11 +40,11 @@ def run_training(options: TrainOptions, say: Callable[[str], None], progress: Pr
         start_from(options.start, scenes, options.training, options.out)
     weights = train(scenes, options.training, options.device, options.out, say)
     say("thresholds are being chosen on scenes of other seeds")
-    thresholds = chosen(options.out / "unchosen.onnx", weights, options.validated, options.jobs, progress)
+    thresholds = chosen_thresholds(options.out / "unchosen.onnx", weights, options.validated, options.jobs, progress)
     model = options.out / MODEL
     written(model, shifted(weights, thresholds))
     say(f"{model}: {model.stat().st_size} bytes; it is being judged on scenes that nothing was trained on")
-    report = judged(model, options.judged, progress)
+    report = final_report(model, options.judged, progress)
     digest = hashlib.sha256(model.read_bytes()).hexdigest()
     parameters = sum(int(one.size) for one in weights.values())
     card = Card(options.training, options.scenes, options.device, thresholds, parameters, model.stat().st_size, digest,

@@ -9,10 +9,10 @@ import numpy.typing as npt
 import simplejpeg
 
 from operator_side.train_network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
-from operator_side.train_rounds import Shown
+from operator_side.train_rounds import SceneRange
 from operator_side.train_scenes import DrawnScenes
-from sim.scene_defects import spoiled
-from sim.scenes import DEFECTS, HEIGHT_PX, LABELS, TRAINED, WIDTH_PX, Box, Column, Random, Truth
+from sim.scene_defects import with_defects
+from sim.scenes import DEFECTS, HEIGHT_PX, LABELS, TRAINED, WIDTH_PX, Box, Column, Random, LabelledBox
 
 CUT_PX: Final = (192, 160)
 """Width and height of the cut-outs that most of the training sees: less than half the time of a whole picture."""
@@ -42,7 +42,7 @@ class Sample:
     """(H/4, W/4): 0 where nobody can say what is right."""
 
 
-def sample(scenes: DrawnScenes, shown: Shown, numbers: tuple[int, int, int], size_px: tuple[int, int]) -> Sample:
+def sample(scenes: DrawnScenes, shown: SceneRange, numbers: tuple[int, int, int], size_px: tuple[int, int]) -> Sample:
     """One of the scenes, a cut, a side, defects; the same for the same seed, step, place in a batch."""
     draw = np.random.default_rng(numbers)
     number, around, column = (_harder if shown.harder else _plain)(draw, scenes, shown)
@@ -50,20 +50,20 @@ def sample(scenes: DrawnScenes, shown: Shown, numbers: tuple[int, int, int], siz
     rgb = scenes.pictures[number][top : top + size_px[1], left : left + size_px[0]]
     mirrored = bool(draw.random() < 0.5)
     picture = np.ascontiguousarray(rgb[:, ::-1] if mirrored else rgb)
-    bgr = simplejpeg.decode_jpeg(spoiled(picture, column, draw), "BGR")
+    bgr = simplejpeg.decode_jpeg(with_defects(picture, column, draw), "BGR")
     moved = [(one, _moved(one.box, left, top, size_px, mirrored)) for one in scenes.truths[number]]
     unclear, others = ([_moved(one, left, top, size_px, mirrored) for one in boxes]
                        for boxes in (scenes.unclear[number], scenes.others[number]))
     return _wanted(np.ascontiguousarray(bgr.transpose(2, 0, 1)), moved, unclear, others)
 
 
-def _plain(draw: Random, scenes: DrawnScenes, shown: Shown) -> tuple[int, list[Box], Column]:
+def _plain(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, list[Box], Column]:
     """A scene, what of it a cut is made around, its defects."""
     number = int(draw.integers(shown.known))
     return number, [one.box for one in scenes.truths[number]], TRAINED
 
 
-def _harder(draw: Random, scenes: DrawnScenes, shown: Shown) -> tuple[int, list[Box], Column]:
+def _harder(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, list[Box], Column]:
     """The same, with more of the newest scenes, of what nobody asks for, of bad pictures."""
     number = int(draw.integers(shown.newest if draw.random() < _NEW else 0, shown.known))
     asked = [one.box for one in scenes.truths[number]]
@@ -88,7 +88,7 @@ def _moved(box: Box, left: int, top: int, size_px: tuple[int, int], mirrored: bo
     return (size_px[0] - x2, y1, size_px[0] - x1, y2) if mirrored else (x1, y1, x2, y2)
 
 
-def _wanted(image: npt.NDArray[np.uint8], objects: list[tuple[Truth, Box]], unclear: list[Box],
+def _wanted(image: npt.NDArray[np.uint8], objects: list[tuple[LabelledBox, Box]], unclear: list[Box],
             others: list[Box]) -> Sample:
     rows, columns = image.shape[1] // STRIDE, image.shape[2] // STRIDE
     one = Sample(image, np.zeros((len(LABELS) + TAUGHT, rows, columns), np.float32),
@@ -117,7 +117,7 @@ def _blank(one: Sample, box: Box) -> None:
     one.counts[y1 : y2 + 1, x1 : x2 + 1] = 0
 
 
-def _mark(one: Sample, truth: Truth, whole: Box) -> None:
+def _mark(one: Sample, truth: LabelledBox, whole: Box) -> None:
     """A bump on the label's heat map; in its middle cells, where the edges are."""
     box = _within(whole, one)
     if _area(box) <= 0:

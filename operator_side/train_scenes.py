@@ -14,7 +14,7 @@ import numpy.typing as npt
 from operator_side.worker_pool import worker_pool
 from protocol.errors import ConfigError
 from sim.scene_render import SceneRenderer
-from sim.scenes import HARDER_FROM, HEIGHT_PX, LATER_FROM, VALIDATED_FROM, WIDTH_PX, Box, Truth, trained_column
+from sim.scenes import HARDER_FROM, HEIGHT_PX, LATER_FROM, VALIDATED_FROM, WIDTH_PX, Box, LabelledBox, trained_column
 
 _SLICE: Final = 100
 """Scenes that one process draws before it says so."""
@@ -27,7 +27,7 @@ class DrawnScenes:
     """Pictures (N, H, W, 3), RGB, on disk, and what is in each."""
 
     pictures: npt.NDArray[np.uint8]
-    truths: tuple[tuple[Truth, ...], ...]
+    truths: tuple[tuple[LabelledBox, ...], ...]
     unclear: tuple[tuple[Box, ...], ...]
     others: tuple[tuple[Box, ...], ...]
     """What stands about and is not asked for."""
@@ -74,9 +74,9 @@ def _would_be_the_same(pictures: Path, notes: Path, count: int) -> bool:
                    for first in (0, LATER_FROM, HARDER_FROM) for seed in range(first, min(count, first + _TRIED)))
 
 
-def _truth(one: list[Any]) -> Truth:
+def _truth(one: list[Any]) -> LabelledBox:
     label, box, seen = one
-    return Truth(label, (box[0], box[1], box[2], box[3]), seen)
+    return LabelledBox(label, (box[0], box[1], box[2], box[3]), seen)
 
 
 def _draw_all(pictures: Path, notes: Path, count: int, jobs: int, advance: Callable[[int], None]) -> None:

@@ -6,19 +6,28 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
-from operator_side.score_detectors import Found, Judged
-from operator_side.score_scenes import LABELLED, LIGHT_SHARE, Report, Subject, detections, score_scenes, shown, verdict
+from operator_side.score_detectors import LabelMatches, FrameResult
+from operator_side.score_scenes import (
+    LABELLED,
+    LIGHT_SHARE,
+    Report,
+    Subject,
+    detections,
+    score_scenes,
+    shown,
+    scene_result,
+)
 from operator_side.train_choice import ball_threshold, label_threshold
 from operator_side.train_export import Weights, onnx_bytes
 from operator_side.worker_pool import worker_pool
 from sim.scenes import COLUMNS, LABELS, THINGS, VALIDATED_FROM, Column
 from vision_side.config import VisionConfig
 from vision_side.decode import Picture
-from vision_side.detect.choice import choose_detector
+from vision_side.detect.choice import build_detector
 from vision_side.detect.golden import KEY, golden_picture, golden_text
 from vision_side.detect.onnx_engine import open_engine
 from vision_side.detect.onnx_header import read_onnx_header
-from vision_side.detect.onnx_reading import fit_picture, form_of, read_outputs
+from vision_side.detect.onnx_reading import fit_picture, model_format, read_outputs
 
 COUNTS_FROM: Final = 0.5
 """The score from which a detection counts, once each label's threshold has been worked into the model."""
@@ -26,7 +35,7 @@ Progress = Callable[[int, str], AbstractContextManager[Callable[[int], None]]]
 """Of how many, and of what; what it gives is told of each few that are done."""
 
 _ALL: Final = 0.02  # scores below are noise, and are not looked at when thresholds are chosen
-_ASKED: Final = (*COLUMNS.values(), THINGS)
+_LABELS: Final = (*COLUMNS.values(), THINGS)
 _SLICE: Final = 100
 """Scenes that one process looks at before it says so."""
 
@@ -36,7 +45,7 @@ def written(path: Path, weights: Weights) -> None:
     properties = {"min_score": str(COUNTS_FROM)}
     path.write_bytes(onnx_bytes(weights, properties))
     header = read_onnx_header(path.read_bytes())
-    form = form_of(header, (), "auto")
+    form = model_format(header, (), "auto")
     picture = Picture(golden_picture(), 1)
     pixels, fitting = fit_picture(picture, form)
     found = read_outputs(open_engine(path, header, "cpu", 1).run(pixels), form, fitting, picture, COUNTS_FROM)
@@ -45,15 +54,15 @@ def written(path: Path, weights: Weights) -> None:
     beside.replace(path)
 
 
-def chosen(path: Path, weights: Weights, frames: int, jobs: int, progress: Progress) -> tuple[float, ...]:
+def chosen_thresholds(path: Path, weights: Weights, frames: int, jobs: int, progress: Progress) -> tuple[float, ...]:
     """Each label's threshold, by `frames` scenes a column; the model without any goes to `path`."""
     path.write_bytes(onnx_bytes(weights, {"min_score": str(_ALL)}))
     last = VALIDATED_FROM + frames
     slices = [range(first, min(first + _SLICE, last)) for first in range(VALIDATED_FROM, last, _SLICE)]
-    balls: dict[str, list[Judged]] = {name: [] for name in COLUMNS}
-    found = {label: Found() for label in LABELLED}
-    with progress(frames * len(_ASKED), "scenes that choose") as advance, worker_pool(jobs) as pool:
-        for done in as_completed([pool.submit(_seen, path, column, one) for column in _ASKED for one in slices]):
+    balls: dict[str, list[FrameResult]] = {name: [] for name in COLUMNS}
+    found = {label: LabelMatches() for label in LABELLED}
+    with progress(frames * len(_LABELS), "scenes that choose") as advance, worker_pool(jobs) as pool:
+        for done in as_completed([pool.submit(_seen, path, column, one) for column in _LABELS for one in slices]):
             column, verdicts, marks = done.result()
             if column in balls:
                 balls[column] += verdicts
@@ -63,21 +72,21 @@ def chosen(path: Path, weights: Weights, frames: int, jobs: int, progress: Progr
     return tuple(ball_threshold(balls) if label == "ball" else label_threshold(found[label]) for label in LABELS)
 
 
-def _seen(path: Path, column: Column, seeds: Sequence[int]) -> tuple[str, list[Judged], dict[str, Found]]:
+def _seen(path: Path, column: Column, seeds: Sequence[int]) -> tuple[str, list[FrameResult], dict[str, LabelMatches]]:
     """The column's name, what is to be said of each scene's ball, and of lights and legs where those are asked for."""
-    verdicts, found = [], {label: Found() for label in LABELLED if column == THINGS}
+    verdicts, found = [], {label: LabelMatches() for label in LABELLED if column == THINGS}
     for seen in shown(column, seeds, [_subject(path)], 1):
-        verdicts.append(verdict(seen.answers[0], seen.scene))
+        verdicts.append(scene_result(seen.answers[0], seen.scene))
         for label, marks in found.items():
             marks.add(label, detections(seen.answers[0]), seen.scene)
     return column.name, verdicts, found
 
 
-def judged(path: Path, frames: int, progress: Progress) -> Report:
+def final_report(path: Path, frames: int, progress: Progress) -> Report:
     """On the seeds that only judges use."""
     with progress(int((len(COLUMNS) + LIGHT_SHARE) * frames), "scenes that judge") as advance:
         return score_scenes([_subject(path)], frames, each=lambda _: advance(1))
 
 
 def _subject(path: Path) -> Subject:
-    return Subject("onnx", choose_detector(f"onnx:{path}", {}, VisionConfig()))
+    return Subject("onnx", build_detector(f"onnx:{path}", {}, VisionConfig()))

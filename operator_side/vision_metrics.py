@@ -18,7 +18,7 @@ _WHERE: Final = re.compile(r"(?:([^\s:]+):)?([0-9]{1,5})")
 _LOOPBACK: Final = "127.0.0.1"
 
 
-class VisionTold:
+class VisionMetrics:
     """The counts of a vision service, as families of metrics. It is well while it hears a robot."""
 
     def __init__(self) -> None:
@@ -65,6 +65,6 @@ def served(where: str) -> Iterator[Observe]:
     match = _WHERE.fullmatch(where)
     if match is None or not 1 <= int(match[2]) <= 65_535:
         raise ConfigError(f"--metrics {where!r} is no place: write a port, or host:port; e.g. 9465 or 0.0.0.0:9465")
-    told = VisionTold()
+    told = VisionMetrics()
     with serving(told, match[1] or _LOOPBACK, int(match[2])):
         yield told.look_at

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from operator_side.loopback_page import Answer, Ask, as_json, page, served
-from operator_side.mission_asking import MissionDesk
+from operator_side.loopback_page import Answer, PageRequest, as_json, page, served
+from operator_side.mission_asking import MissionClient
 from operator_side.mission_text import detector_line, mission_line
 from operator_side.pictures import Pictures
-from operator_side.reel import Reel, fill
+from operator_side.reel import FrameBuffer, fill
 from operator_side.status_text import drops_text, encoding_text, millis, refusals_text, twist_text
 from protocol.channels import Channel
 from protocol.messages import Status
@@ -21,10 +21,10 @@ _SHOWN_PICTURES = 2  # the newest, and the one before, which a second page may b
 @contextmanager
 def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) -> Iterator[str]:
     """Serve the page while inside; gives its address. Raises LinkError for a port in use."""
-    pictures, desk, ending = Pictures(link, role, first, secure), MissionDesk(link), threading.Event()
-    reel = Reel(_SHOWN_PICTURES, pictures.age_us)
+    pictures, desk, ending = Pictures(link, role, first, secure), MissionClient(link), threading.Event()
+    reel = FrameBuffer(_SHOWN_PICTURES, pictures.age_us)
 
-    def state(_ask: Ask, _body: bytes) -> Answer:
+    def state(_ask: PageRequest, _body: bytes) -> Answer:
         return as_json(state_of(link.robot, desk, pictures.is_heard))
 
     routes = {
@@ -43,7 +43,7 @@ def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) ->
             filling.join(2.0)
 
 
-def state_of(robot: str, desk: MissionDesk, heard: bool) -> dict[str, Any]:
+def state_of(robot: str, desk: MissionClient, heard: bool) -> dict[str, Any]:
     """What the page says beside the picture; `heard` is false for a robot that is silent."""
     report = desk.operator.report
     lines = _robot_lines(report.status) if report is not None else []

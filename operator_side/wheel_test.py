@@ -14,15 +14,15 @@ from typing import Final
 
 from protocol.errors import ConfigError
 from robot_side.config import PluginChoice, RobotConfig
-from robot_side.ending import ENDING
-from robot_side.plugins import build, configured
+from robot_side.ending import EXIT_SIGNALS
+from robot_side.plugins import build_device, load_device
 from robot_side.ports import Drive
 
 TURN_S: Final = 1.0
 _SHARE: Final = 0.5
 """Of the robot's top speed: slow enough to see which way a wheel turns."""
-Ask = Callable[[str], str]
-Say = Callable[[str], None]
+Prompt = Callable[[str], str]
+Print = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ TURNS: Final = tuple(Turn(side, way, seen) for side in ("left", "right") for way
 _WRONG: Final = {"w": "the wrong way", "o": "the other wheel", "b": "both wheels", "n": "nothing"}
 
 
-def try_wheels(config: RobotConfig, ask: Ask | None, say: Say) -> bool:
+def try_wheels(config: RobotConfig, ask: Prompt | None, say: Print) -> bool:
     """Turn each wheel each way and compare with what should be seen; True if all is as it should be, or nobody says.
 
     Without `ask` nothing is asked: whoever calls has confirmed that the wheels are off the ground.
@@ -82,9 +82,9 @@ def opened_drive(config: RobotConfig) -> Iterator[Drive]:
     def end(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, end) for number in ENDING}
+    before = {number: signal.signal(number, end) for number in EXIT_SIGNALS}
     try:
-        drive: Drive = build("drives", config.motors)
+        drive: Drive = build_device("drives", config.motors)
         try:
             yield drive
         finally:
@@ -110,7 +110,7 @@ def _is_yes(answer: str) -> bool:
     return answer.strip().lower() in ("y", "yes")
 
 
-def _what_instead(ask: Ask) -> str:
+def _what_instead(ask: Prompt) -> str:
     question = "what turned? w = it, the wrong way; o = the other wheel; b = both; n = nothing"
     while (answer := ask(question).strip().lower()[:1]) not in _WRONG:
         question = "one of w, o, b, n"
@@ -119,7 +119,7 @@ def _what_instead(ask: Ask) -> str:
 
 def _advice(drive: PluginChoice, turn: Turn, wrong: str) -> str:
     """What to change. A drive with options for it is told so; any other is wired differently."""
-    plugin, options = configured("drives", drive)
+    plugin, options = load_device("drives", drive)
     known = plugin.Config.model_fields
     if wrong == "w" and "left_reversed" in known:
         name = f"{_pins_of(options, turn.side)}_reversed"

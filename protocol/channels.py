@@ -23,7 +23,7 @@ from protocol.messages import (
     ScanHeader,
     Stamp,
     Status,
-    Wire,
+    WireModel,
 )
 from protocol.mission_messages import MissionReport, MissionRequest
 from protocol.twist_text import MAX_TWIST_BYTES
@@ -54,8 +54,8 @@ class Channel:
 
     name: str
     direction: Direction
-    header: type[Wire]
-    payload: type[Wire] | None
+    header: type[WireModel]
+    payload: type[WireModel] | None
     encoding: str
     priority: Priority
     rate: str

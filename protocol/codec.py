@@ -12,13 +12,13 @@ from pydantic import ValidationError
 from protocol import VERSION
 from protocol.channels import MAX_HEADER_BYTES, SCAN, Channel
 from protocol.errors import WireError
-from protocol.messages import Wire
-from protocol.refusals import Refusal
+from protocol.messages import WireModel
+from protocol.refusals import RejectReason
 
-Model = TypeVar("Model", bound=Wire)
+Model = TypeVar("Model", bound=WireModel)
 
 
-def encode(message: Wire) -> bytes:
+def encode(message: WireModel) -> bytes:
     """`message` as compact JSON; None fields are left out, which every decoder reads as their default."""
     return message.__pydantic_serializer__.to_json(message, exclude_none=True)
 
@@ -26,7 +26,7 @@ def encode(message: Wire) -> bytes:
 def decode(model: type[Model], data: bytes, max_bytes: int = MAX_HEADER_BYTES) -> Model:
     """Read `data` as `model`. Raises WireError UNSUPPORTED_VERSION or MALFORMED with the first wrong field named."""
     if len(data) > max_bytes:
-        raise WireError(Refusal.MALFORMED, f"{model.__name__} is {len(data)} bytes, at most {max_bytes}")
+        raise WireError(RejectReason.MALFORMED, f"{model.__name__} is {len(data)} bytes, at most {max_bytes}")
     try:
         return cast(Model, model.__pydantic_validator__.validate_json(data))
     except ValidationError as error:
@@ -38,17 +38,17 @@ def _wire_error(name: str, error: ValidationError) -> WireError:
     where = ".".join(str(part) for part in first["loc"])
     if where == "v":
         got = repr(first["input"])[:20]
-        return WireError(Refusal.UNSUPPORTED_VERSION, f"{name} is of version {got}; this peer speaks {VERSION}")
-    return WireError(Refusal.MALFORMED, f"{name}{'.' + where if where else ''}: {first['msg']}"[:200])
+        return WireError(RejectReason.UNSUPPORTED_VERSION, f"{name} is of version {got}; this peer speaks {VERSION}")
+    return WireError(RejectReason.MALFORMED, f"{name}{'.' + where if where else ''}: {first['msg']}"[:200])
 
 
 def check_sizes(channel: Channel, header: bytes, payload: bytes) -> None:
     """Raise WireError MALFORMED unless both parts are within the channel's bounds."""
     if len(header) > MAX_HEADER_BYTES:
-        raise WireError(Refusal.MALFORMED, f"{channel.name} header is {len(header)} bytes, at most {MAX_HEADER_BYTES}")
+        raise WireError(RejectReason.MALFORMED, f"{channel.name} header is {len(header)} bytes, at most {MAX_HEADER_BYTES}")
     if len(payload) > channel.max_payload_bytes:
         raise WireError(
-            Refusal.MALFORMED, f"{channel.name} payload is {len(payload)} bytes, at most {channel.max_payload_bytes}"
+            RejectReason.MALFORMED, f"{channel.name} payload is {len(payload)} bytes, at most {channel.max_payload_bytes}"
         )
 
 
@@ -64,12 +64,12 @@ def decode_ranges(data: bytes) -> array.array[float]:
     """Read a scan payload. Raises WireError MALFORMED for a ragged length, NOT_FINITE for nan or negative ranges."""
     check_sizes(SCAN, b"", data)
     if len(data) % 4:
-        raise WireError(Refusal.MALFORMED, f"scan payload of {len(data)} bytes is no whole number of float32")
+        raise WireError(RejectReason.MALFORMED, f"scan payload of {len(data)} bytes is no whole number of float32")
     floats = array.array("f", data)
     if sys.byteorder == "big":
         floats.byteswap()
     if any(math.isnan(value) or value < 0 for value in floats):
-        raise WireError(Refusal.NOT_FINITE, "scan holds a nan or negative range")
+        raise WireError(RejectReason.NOT_FINITE, "scan holds a nan or negative range")
     return floats
 
 

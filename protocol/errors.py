@@ -7,7 +7,7 @@
      └─ WireError             bytes from a peer that are not the protocol; never ends a loop
 """
 
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 
 
 class SightlineError(Exception):
@@ -37,7 +37,7 @@ class LinkError(SightlineError):
 class WireError(SightlineError):
     """Bytes from a peer were refused. `reason` is what is counted; the text says what was wrong."""
 
-    def __init__(self, reason: Refusal, detail: str) -> None:
+    def __init__(self, reason: RejectReason, detail: str) -> None:
         super().__init__(f"{reason}: {detail}")
         self.reason = reason
         self.detail = detail

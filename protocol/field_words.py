@@ -20,7 +20,7 @@ UNITS: Final = {
 }
 """Ending of a name -> unit; the first that fits."""
 
-MEANINGS: Final = {
+FIELD_DOCS: Final = {
     "v": "version of this protocol",
     "session": "the sender's start: 8 hex digits drawn at random",
     "seq": "count of the sender's messages on this channel within the session",
@@ -129,6 +129,6 @@ def unit_of(field: str) -> str:
     return next((unit for ending, unit in UNITS.items() if field.endswith(ending)), "")
 
 
-def meaning_of(model: str, field: str) -> str:
+def doc_of(model: str, field: str) -> str:
     """What `field` of `model` means; "" where nobody has said so."""
-    return MEANINGS.get(f"{model}.{field}", MEANINGS.get(field, ""))
+    return FIELD_DOCS.get(f"{model}.{field}", FIELD_DOCS.get(field, ""))

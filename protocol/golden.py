@@ -18,9 +18,9 @@ from typing import Any
 from protocol.channels import ACK, JPEG, SCAN, TWIST, Channel, parse_key
 from protocol.codec import check_sizes, decode, decode_ranges
 from protocol.errors import WireError
-from protocol.golden_case import Case
+from protocol.golden_case import MessageCase
 from protocol.golden_cases import CASES
-from protocol.golden_wires import WIRE_CASES, WireCase, wire_outcome
+from protocol.golden_wires import FRAMING_CASES, FramingCase, framing_outcome
 from protocol.jpeg import read_jpeg_size
 from protocol.twist_text import parse_twist
 
@@ -65,7 +65,7 @@ def _read_payload(channel: Channel, payload: bytes) -> Any:
     return decode(channel.payload, payload, channel.max_payload_bytes).model_dump(mode="json")
 
 
-def vector(case: Case) -> Outcome:
+def vector(case: MessageCase) -> Outcome:
     """The case as it is written to its file. Raises ValueError if the decoders do not do what the case states."""
     got = outcome(case.key, case.header, case.payload)
     if got.get("refuse") != case.refuse:
@@ -79,8 +79,8 @@ def vector(case: Case) -> Outcome:
     }
 
 
-def _wire_vector(case: WireCase) -> Outcome:
-    got = wire_outcome(case.folder, case.given)
+def _wire_vector(case: FramingCase) -> Outcome:
+    got = framing_outcome(case.folder, case.given)
     if got.get("refuse") != case.refuse:
         raise ValueError(f"{case.folder}/{case.name}: stated {case.refuse or 'accept'}, decoded to {got}")
     return {"purpose": case.purpose, **case.given, **got}
@@ -90,13 +90,13 @@ def read_again(folder: str, vector: Outcome) -> Outcome:
     """What a receiver makes of a file's contents, from these alone."""
     if "key" in vector:
         return outcome(vector["key"], bytes.fromhex(vector["header_hex"]), bytes.fromhex(vector["payload_hex"]))
-    return wire_outcome(folder, {name: value for name, value in vector.items() if name not in _SAID})
+    return framing_outcome(folder, {name: value for name, value in vector.items() if name not in _SAID})
 
 
 def files() -> dict[Path, str]:
     """Every vector file below `vectors/` and its text."""
     vectors = {Path(case.channel, case.name): vector(case) for case in CASES}
-    vectors |= {Path(case.folder, case.name): _wire_vector(case) for case in WIRE_CASES}
+    vectors |= {Path(case.folder, case.name): _wire_vector(case) for case in FRAMING_CASES}
     return {Path(f"{path}.json"): _text(contents) + "\n" for path, contents in vectors.items()}
 
 
@@ -106,7 +106,7 @@ def _text(contents: Outcome) -> str:
 
 def vector_table() -> str:
     """How many vectors there are of what, as a Markdown table."""
-    stated = [(case.channel, case.refuse) for case in CASES] + [(case.folder, case.refuse) for case in WIRE_CASES]
+    stated = [(case.channel, case.refuse) for case in CASES] + [(case.folder, case.refuse) for case in FRAMING_CASES]
     rows = ["| folder | accepted | refused |", "|---|---|---|"]
     for folder in dict.fromkeys(name for name, _ in stated):
         accepted = sum(name == folder and refuse is None for name, refuse in stated)

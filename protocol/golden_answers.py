@@ -1,6 +1,6 @@
 """Golden cases of twists and acknowledgements. Pure."""
 
-from protocol.golden_case import ANSWER, ECHO, INEXACT, MALFORMED, NOT_FINITE, PEER, Case, case, echoing, without
+from protocol.golden_case import ANSWER, ECHO, INEXACT, MALFORMED, NOT_FINITE, PEER, MessageCase, case, echoing, without
 
 _TWISTS_GOOD = {
     "zero": b"0|0",
@@ -39,7 +39,7 @@ _TWISTS_MALFORMED = {
 _TWISTS_NOT_FINITE = {"nan": b"nan|0", "inf": b"0|inf", "minus_infinity": b"-Infinity|0", "overflow": b"1e999|0"}
 
 
-def twists() -> list[Case]:
+def twists() -> list[MessageCase]:
     good = [case("twist", f"text_{name}", "within the grammar", payload=text) for name, text in _TWISTS_GOOD.items()]
     bad = [
         case("twist", f"text_{name}", "outside the grammar", MALFORMED, payload=text)
@@ -51,7 +51,7 @@ def twists() -> list[Case]:
     ]
 
 
-def answers() -> list[Case]:
+def answers() -> list[MessageCase]:
     guest = "sightline/r1/twist/guest"
     return [
         case("twist", "guest", "a guest needs no header", header=b"", key=guest),

@@ -9,7 +9,7 @@ from protocol.channels import CHANNELS, key_for
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class MessageCase:
     """One message and what must become of it; `refuse` is None where it is accepted."""
 
     channel: str
@@ -74,12 +74,12 @@ def case(
     header: dict[str, Any] | bytes | None = None,
     payload: dict[str, Any] | bytes | None = None,
     key: str = "",
-) -> Case:
+) -> MessageCase:
     """A case that differs from the channel's valid message only in what is given."""
     source, usual_header, usual_payload = USUAL[channel]
     head = usual_header if header is None else header
     body = usual_payload if payload is None else payload
-    return Case(
+    return MessageCase(
         channel,
         name,
         purpose,

@@ -4,21 +4,21 @@ from typing import Any
 
 from protocol.channels import CHANNELS
 from protocol.golden_answers import answers, twists
-from protocol.golden_case import MALFORMED, USUAL, VERSION, Case, case, packed, without
+from protocol.golden_case import MALFORMED, USUAL, VERSION, MessageCase, case, packed, without
 from protocol.golden_frames import frames, pictures, views
 from protocol.golden_payloads import detections, missions, payloads, reports
 
 
-def _usual() -> list[Case]:
+def _usual() -> list[MessageCase]:
     return [case(channel, "usual", "a complete message") for channel in CHANNELS]
 
 
-def _stamps() -> list[Case]:
+def _stamps() -> list[MessageCase]:
     """What holds for every header, on every channel."""
     return [one for channel in CHANNELS for one in _header_cases(channel, USUAL[channel][1])]
 
 
-def _header_cases(channel: str, header: dict[str, Any]) -> list[Case]:
+def _header_cases(channel: str, header: dict[str, Any]) -> list[MessageCase]:
     return [
         case(channel, "unknown_field", "unknown fields are ignored", header=header | {"later": [1]}),
         case(channel, "version_2", "another version is refused by name", VERSION, header=header | {"v": 2}),
@@ -33,7 +33,7 @@ def _header_cases(channel: str, header: dict[str, Any]) -> list[Case]:
     ]
 
 
-CASES: tuple[Case, ...] = (
+CASES: tuple[MessageCase, ...] = (
     *_usual(), *_stamps(), *frames(), *pictures(), *twists(), *answers(), *payloads(), *detections(), *missions(),
     *reports(), *views(),
 )

@@ -7,7 +7,7 @@ from protocol.golden_case import (
     MALFORMED,
     PEER,
     STAMP,
-    Case,
+    MessageCase,
     case,
     jpeg,
     segments,
@@ -15,7 +15,7 @@ from protocol.golden_case import (
 )
 
 
-def frames() -> list[Case]:
+def frames() -> list[MessageCase]:
     return [
         case("frame", "stamp_only", "odometry and latency may be left out", header=STAMP),
         case("frame", "latency_null", "null is as good as absent", header=FRAME_HEADER | {"latency_us": None}),
@@ -36,7 +36,7 @@ def frames() -> list[Case]:
     ]
 
 
-def pictures() -> list[Case]:
+def pictures() -> list[MessageCase]:
     return [
         case("frame", "jpeg_progressive", "SOF2", payload=jpeg(320, 240, 0xC2)),
         case("frame", "jpeg_grey", "one component", payload=jpeg(320, 240, components=1)),
@@ -62,7 +62,7 @@ def pictures() -> list[Case]:
     ]
 
 
-def views() -> list[Case]:
+def views() -> list[MessageCase]:
     """Pictures that vision made for people."""
     return [
         case("overlay", "without_echo", "for showing only", header=without(ANSWER, "echo")),

@@ -16,14 +16,14 @@ from protocol.golden_case import (
     PEER,
     REPLY,
     REPORT,
-    Case,
+    MessageCase,
     case,
     packed,
     without,
 )
 
 
-def payloads() -> list[Case]:
+def payloads() -> list[MessageCase]:
     status = {"state": "ACTIVE", "reason": "driving", "holder": {"source": "vision", "session": PEER}}
     last = {"source": "vision", "reason": "STALE", "detail": "frame 41 is 410 ms old"}
     counted = status | {"refused": {"STALE": 3}, "last_refusal": last}
@@ -61,7 +61,7 @@ def _found(*boxes: dict[str, Any]) -> dict[str, Any]:
     return DETECTIONS | {"boxes": list(boxes)}
 
 
-def detections() -> list[Case]:
+def detections() -> list[MessageCase]:
     """Boxes that somebody found."""
     name, guest = "detections", ANSWER | {"source": "guest"}
     circle = {"cx_px": 320.0, "cy_px": 225.0, "radius_px": 40.0}
@@ -93,7 +93,7 @@ def detections() -> list[Case]:
     ]
 
 
-def missions() -> list[Case]:
+def missions() -> list[MessageCase]:
     """What vision is asked to do."""
     name, most = "mission", {"options": {f"option_{number}": 1 for number in range(16)}}
     return [
@@ -122,7 +122,7 @@ def missions() -> list[Case]:
     ]
 
 
-def reports() -> list[Case]:
+def reports() -> list[MessageCase]:
     """What vision does."""
     name = "report"
     return [

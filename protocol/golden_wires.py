@@ -24,7 +24,7 @@ Fields = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class WireCase:
+class FramingCase:
     """One thing off a wire and what must become of it; `refuse` is None where it is accepted."""
 
     folder: str
@@ -64,7 +64,7 @@ READERS: Final[dict[str, Callable[[Fields], Fields]]] = {
 }
 
 
-def wire_outcome(folder: str, given: Fields) -> Fields:
+def framing_outcome(folder: str, given: Fields) -> Fields:
     """What a receiver makes of the input: {"accept": {...}} or {"refuse": reason}. Never raises."""
     try:
         return {"accept": READERS[folder](given)}
@@ -84,11 +84,11 @@ def framed(block: bytes, payload: bytes = b"0.2000|-0.3500", size: int | None = 
     return struct.pack(">H", len(block) if size is None else size) + block + payload
 
 
-def _message(name: str, purpose: str, message: bytes, refuse: str | None = None, role: str = "vision") -> WireCase:
-    return WireCase("websocket", name, purpose, {"robot": "r1", "role": role, "message_hex": message.hex()}, refuse)
+def _message(name: str, purpose: str, message: bytes, refuse: str | None = None, role: str = "vision") -> FramingCase:
+    return FramingCase("websocket", name, purpose, {"robot": "r1", "role": role, "message_hex": message.hex()}, refuse)
 
 
-def _messages() -> list[WireCase]:
+def _messages() -> list[FramingCase]:
     late = packed(ANSWER | {"channel": "twist"})
     alone = b'{"channel":"twist","source":"guest"}'
     return [
@@ -120,12 +120,12 @@ def _messages() -> list[WireCase]:
     ]
 
 
-def _hello(name: str, purpose: str, text: str | Fields, refuse: str | None = None) -> WireCase:
+def _hello(name: str, purpose: str, text: str | Fields, refuse: str | None = None) -> FramingCase:
     given = text if isinstance(text, str) else packed(text).decode()
-    return WireCase("hello", name, purpose, {"text": given}, refuse)
+    return FramingCase("hello", name, purpose, {"text": given}, refuse)
 
 
-def _hellos() -> list[WireCase]:
+def _hellos() -> list[FramingCase]:
     usual = packed(HELLO).decode()
     return [
         _hello("usual", "a vision's", HELLO),
@@ -155,11 +155,11 @@ _PICTURE: Final = jpeg(640, 480) + bytes(range(256))
 _LINES: Final = encode_picture(_PICTURE).decode()
 
 
-def _picture(name: str, purpose: str, text: str, refuse: str | None = None) -> WireCase:
-    return WireCase("older_picture", name, purpose, {"max_bytes": len(_PICTURE), "text": text}, refuse)
+def _picture(name: str, purpose: str, text: str, refuse: str | None = None) -> FramingCase:
+    return FramingCase("older_picture", name, purpose, {"max_bytes": len(_PICTURE), "text": text}, refuse)
 
 
-def _pictures() -> list[WireCase]:
+def _pictures() -> list[FramingCase]:
     flat = _LINES.replace("\n", "")
     return [
         _picture("lines_of_76", "a newline after every 76 characters and at the end", _LINES),
@@ -206,19 +206,19 @@ _BOXES_MALFORMED: Final = {
 }  # fmt: skip
 
 
-def _texts(folder: str, good: dict[str, str], bad: dict[str, str]) -> list[WireCase]:
+def _texts(folder: str, good: dict[str, str], bad: dict[str, str]) -> list[FramingCase]:
     return [
-        *(WireCase(folder, name, "within the grammar", {"text": text}, None) for name, text in good.items()),
-        *(WireCase(folder, name, "outside the grammar", {"text": text}, MALFORMED) for name, text in bad.items()),
+        *(FramingCase(folder, name, "within the grammar", {"text": text}, None) for name, text in good.items()),
+        *(FramingCase(folder, name, "outside the grammar", {"text": text}, MALFORMED) for name, text in bad.items()),
     ]
 
 
-WIRE_CASES: tuple[WireCase, ...] = (
+FRAMING_CASES: tuple[FramingCase, ...] = (
     *_messages(),
     *_hellos(),
     *_pictures(),
     *_texts("older_dashed", _DASHED_GOOD, _DASHED_MALFORMED),
-    WireCase("older_dashed", "overflow", "not a finite number", {"text": "1e999-0"}, NOT_FINITE),
+    FramingCase("older_dashed", "overflow", "not a finite number", {"text": "1e999-0"}, NOT_FINITE),
     *_texts("older_boxes", _BOXES_GOOD, _BOXES_MALFORMED),
 )
 """Every case; what is made of what is not a message by itself but carries messages."""

@@ -7,7 +7,7 @@ Marker layout: ITU-T T.81, annex B.
 from dataclasses import dataclass
 
 from protocol.errors import WireError
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 
 MAX_SEGMENTS = 64
 _SOF_BASELINE_AND_PROGRESSIVE = (0xC0, 0xC1, 0xC2)
@@ -69,4 +69,4 @@ def _size_from_sof(data: bytes, at: int, max_pixels: int) -> JpegSize:
 
 
 def _bad(what: str) -> WireError:
-    return WireError(Refusal.MALFORMED, f"picture: {what}")
+    return WireError(RejectReason.MALFORMED, f"picture: {what}")

@@ -16,7 +16,7 @@ from typing import Final
 from protocol.errors import WireError
 from protocol.jpeg import JpegSize
 from protocol.messages import DetectedBox, Detections, Twist
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.twist_text import MAX_TWIST_BYTES, parse_twist
 
 LINE_CHARACTERS: Final = 76
@@ -25,8 +25,8 @@ MAX_BOXES_BYTES: Final = 1024
 BOX_LABEL: Final = "box"
 """What a box is called whose text does not say what is in it."""
 
-_NUMBER: Final = rb"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
-_DASHED: Final = re.compile(rb"(%b)-(%b)" % (_NUMBER, _NUMBER))
+_DASHED_NUMBER: Final = rb"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
+_DASHED: Final = re.compile(rb"(%b)-(%b)" % (_DASHED_NUMBER, _DASHED_NUMBER))
 _FRACTION: Final = rb"(0(?:\.[0-9]{1,17})?|1(?:\.0{1,17})?)"
 _BOX: Final = re.compile(rb",".join([_FRACTION] * 4))
 _CLASSED_BOX: Final = re.compile(rb"([A-Za-z0-9_ ]{1,32})," + _BOX.pattern)
@@ -52,13 +52,13 @@ def decode_picture(text: bytes, max_bytes: int) -> bytes:
     Security limit: `max_bytes` of picture. Raises WireError MALFORMED for anything else than base64 within it.
     """
     if len(text) > text_bound(max_bytes):
-        raise WireError(Refusal.MALFORMED, f"picture text is {len(text)} characters, at most {text_bound(max_bytes)}")
+        raise WireError(RejectReason.MALFORMED, f"picture text is {len(text)} characters, at most {text_bound(max_bytes)}")
     try:
         jpeg = binascii.a2b_base64(text.replace(b"\r", b"").replace(b"\n", b""), strict_mode=True)
     except binascii.Error as error:
-        raise WireError(Refusal.MALFORMED, f"picture text is no base64: {error}") from None
+        raise WireError(RejectReason.MALFORMED, f"picture text is no base64: {error}") from None
     if len(jpeg) > max_bytes:
-        raise WireError(Refusal.MALFORMED, f"picture is {len(jpeg)} bytes, at most {max_bytes}")
+        raise WireError(RejectReason.MALFORMED, f"picture is {len(jpeg)} bytes, at most {max_bytes}")
     return jpeg
 
 
@@ -69,13 +69,13 @@ def parse_dashed(text: bytes, swapped: bool = False) -> Twist:
     """
     match = _DASHED.fullmatch(text) if len(text) <= MAX_TWIST_BYTES else None
     if match is None:
-        raise WireError(Refusal.MALFORMED, f"twist {text[:MAX_TWIST_BYTES]!r} is not `linear-angular`, e.g. 0.2--0.35")
+        raise WireError(RejectReason.MALFORMED, f"twist {text[:MAX_TWIST_BYTES]!r} is not `linear-angular`, e.g. 0.2--0.35")
     first, second = match.groups()
     return parse_twist(second + b"|" + first if swapped else first + b"|" + second)
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class LegacyBox:
     """A bounding box as fractions 0..1 of the picture, from its top-left corner."""
 
     y_min: float
@@ -90,22 +90,22 @@ class Box:
             raise ValueError(f"{self} does not lie in the picture")
 
 
-def format_boxes(boxes: Sequence[Box]) -> bytes:
+def format_boxes(boxes: Sequence[LegacyBox]) -> bytes:
     """`boxes` as text with four decimals, without their labels; empty for none. Raises ValueError for more than 16."""
     if len(boxes) > MAX_BOXES:
         raise ValueError(f"{len(boxes)} boxes, at most {MAX_BOXES}")
     return "-".join(f"{box.y_min:.4f},{box.x_min:.4f},{box.y_max:.4f},{box.x_max:.4f}" for box in boxes).encode("ascii")
 
 
-def parse_boxes(text: bytes) -> tuple[Box, ...]:
+def parse_boxes(text: bytes) -> tuple[LegacyBox, ...]:
     """Read boxes joined by `-`. Raises WireError MALFORMED for anything outside the grammar or over a bound."""
     parts = text.split(b"-") if text else []
     if len(text) > MAX_BOXES_BYTES or len(parts) > MAX_BOXES:
-        raise WireError(Refusal.MALFORMED, f"{len(parts)} boxes in {len(text)} bytes, at most {MAX_BOXES}")
+        raise WireError(RejectReason.MALFORMED, f"{len(parts)} boxes in {len(text)} bytes, at most {MAX_BOXES}")
     return tuple(_parse_box(part) for part in parts)
 
 
-def detections_of(boxes: Sequence[Box], size: JpegSize) -> Detections:
+def detections_from_boxes(boxes: Sequence[LegacyBox], size: JpegSize) -> Detections:
     """`boxes` in pixels of a picture of `size`, in their order. They carry no score of their own."""
     width_px, height_px = size.width_px, size.height_px
     found = tuple(
@@ -116,15 +116,15 @@ def detections_of(boxes: Sequence[Box], size: JpegSize) -> Detections:
     return Detections(width_px=width_px, height_px=height_px, boxes=found)
 
 
-def _parse_box(text: bytes) -> Box:
+def _parse_box(text: bytes) -> LegacyBox:
     try:
         if plain := _BOX.fullmatch(text):
             y_min, x_min, y_max, x_max = (float(number) for number in plain.groups())
-            return Box(y_min, x_min, y_max, x_max)
+            return LegacyBox(y_min, x_min, y_max, x_max)
         if classed := _CLASSED_BOX.fullmatch(text):
             x_min, y_min, x_max, y_max = (float(number) for number in classed.groups()[1:])
-            return Box(y_min, x_min, y_max, x_max, classed[1].decode("ascii"))
+            return LegacyBox(y_min, x_min, y_max, x_max, classed[1].decode("ascii"))
     except ValueError:
         pass
     said = f"box {text[:80]!r} is neither y_min,x_min,y_max,x_max nor class,x_min,y_min,x_max,y_max within 0..1"
-    raise WireError(Refusal.MALFORMED, said)
+    raise WireError(RejectReason.MALFORMED, said)

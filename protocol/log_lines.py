@@ -19,13 +19,13 @@ from typing import Final, TextIO
 
 from protocol.errors import ConfigError
 
-ENV_NAME: Final = "SIGHTLINE_LOG"
-FORMS: Final = ("text", "json")
+LOG_FORMAT_VARIABLE: Final = "SIGHTLINE_LOG"
+LOG_FORMATS: Final = ("text", "json")
 _LONGEST_LINE: Final = 10_000
 """More without an end is no line of a log; it is cut there."""
 
 _LINES_WAITING: Final = 32
-_PATIENCE_S: Final = 0.1
+_WRITE_TIMEOUT_S: Final = 0.1
 """Once, for a line to be read; whoever tells more meanwhile does not wait at all."""
 
 _FIRST_PERIOD_US: Final = 1_000_000
@@ -35,16 +35,16 @@ _LONGEST_PERIOD_US: Final = 60_000_000
 _MOST_CAUSES: Final = 16
 
 
-class JsonLines(io.TextIOBase):
+class JsonLineStream(io.TextIOBase):
     """A text stream that writes every finished line to `stream` as one JSON object."""
 
     def __init__(self, stream: TextIO, service: str, level: str) -> None:
         self._stream, self._service, self._level = stream, service, level
         self._begun = ""
 
-    def over(self, stream: TextIO) -> JsonLines:
+    def over(self, stream: TextIO) -> JsonLineStream:
         """The same on another stream."""
-        return JsonLines(stream, self._service, self._level)
+        return JsonLineStream(stream, self._service, self._level)
 
     def write(self, text: str) -> int:
         """Keep `text` until its line ends."""
@@ -53,7 +53,7 @@ class JsonLines(io.TextIOBase):
             lines, self._begun = [*lines, self._begun], ""
         for line in lines:
             if line.strip():
-                self._stream.write(as_json(line, self._service, self._level, datetime.now(UTC)) + "\n")
+                self._stream.write(to_json_line(line, self._service, self._level, datetime.now(UTC)) + "\n")
         return len(text)
 
     def flush(self) -> None:
@@ -69,7 +69,7 @@ class JsonLines(io.TextIOBase):
         return True
 
 
-def as_json(line: str, service: str, level: str, time: datetime) -> str:
+def to_json_line(line: str, service: str, level: str, time: datetime) -> str:
     """One line as an object; whatever begins with `error: ` is an error on any stream."""
     message = line.removeprefix("error: ")
     return json.dumps({
@@ -80,23 +80,23 @@ def as_json(line: str, service: str, level: str, time: datetime) -> str:
     }, separators=(",", ":"))
 
 
-def use_form(form: str | None, service: str) -> None:
+def set_log_format(form: str | None, service: str) -> None:
     """Say everything in `form` from now on, here and in processes started from here; None is what the environment says.
 
     Raises ConfigError for a form that is none.
     """
-    chosen = form or os.environ.get(ENV_NAME) or FORMS[0]
-    if chosen not in FORMS:
-        where = "--log" if form else ENV_NAME
-        raise ConfigError(f"{where} {chosen!r} is no form of a log: {' or '.join(FORMS)}")
+    chosen = form or os.environ.get(LOG_FORMAT_VARIABLE) or LOG_FORMATS[0]
+    if chosen not in LOG_FORMATS:
+        where = "--log" if form else LOG_FORMAT_VARIABLE
+        raise ConfigError(f"{where} {chosen!r} is no form of a log: {' or '.join(LOG_FORMATS)}")
     if form:
-        os.environ[ENV_NAME] = form
-    if chosen == "json" and not isinstance(sys.stdout, JsonLines):
-        sys.stdout = JsonLines(sys.stdout, service, "info")
-        sys.stderr = JsonLines(sys.stderr, service, "warning")
+        os.environ[LOG_FORMAT_VARIABLE] = form
+    if chosen == "json" and not isinstance(sys.stdout, JsonLineStream):
+        sys.stdout = JsonLineStream(sys.stdout, service, "info")
+        sys.stderr = JsonLineStream(sys.stderr, service, "warning")
 
 
-class Teller:
+class AsyncLineWriter:
     """Prints on a thread of its own, for who must not wait: a terminal that nobody reads costs lines."""
 
     def __init__(self) -> None:
@@ -115,7 +115,7 @@ class Teller:
         with suppress(queue.Full):
             self._lines.put_nowait((line, where, told))
             if not self._stuck:
-                self._stuck = not told.wait(_PATIENCE_S)
+                self._stuck = not told.wait(_WRITE_TIMEOUT_S)
 
     def _be_there(self) -> None:
         with self._begin:
@@ -132,10 +132,10 @@ class Teller:
             self._stuck = False
 
 
-tell: Final = Teller().tell
+log_line: Final = AsyncLineWriter().tell
 
 
-class RefusalLines:
+class RepeatLimiter:
     """Per cause a line at once, then after 1, 2, 4 ... 60 s for as long as it goes on, each with how often."""
 
     def __init__(self) -> None:

@@ -33,13 +33,13 @@ Pose = tuple[Number, Number, Number]
 """(x_m, y_m, yaw_rad) in the odometry frame."""
 
 
-class Wire(BaseModel):
+class WireModel(BaseModel):
     """Base of everything on the wire. Unknown fields are ignored, so that a newer minor peer is understood."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", ser_json_inf_nan="constants")
 
 
-class Twist(Wire):
+class Twist(WireModel):
     """A velocity: forward speed and turn rate. Finite; the robot clamps it to its own limits."""
 
     linear_mps: Annotated[float, Field(allow_inf_nan=False)]
@@ -52,7 +52,7 @@ STILL = Twist(linear_mps=0.0, angular_rad_s=0.0)
 # --- headers -----------------------------------------------------------------------------------------------------
 
 
-class Stamp(Wire):
+class Stamp(WireModel):
     """Header of everything a robot publishes: its session (new at each start), a count per channel, its clock."""
 
     v: Version = VERSION
@@ -83,7 +83,7 @@ class ScanHeader(Stamp):
     range_max_m: Number
 
 
-class Echo(Wire):
+class Echo(WireModel):
     """Names one thing the robot issued, field for field, so that the robot can judge its age by its own record."""
 
     channel: Literal["frame", "status", "beat"]
@@ -92,14 +92,14 @@ class Echo(Wire):
     t_us: Microseconds
 
 
-class Asked(Wire):
+class RequestId(WireModel):
     """Names a mission that somebody asked for: the asker's session, and the id in the payload."""
 
     session: SessionId
     id: Counter
 
 
-class AnswerHeader(Wire):
+class AnswerHeader(WireModel):
     """Header of a twist and of an ack: who answers, which frame, and how long the computing took.
 
     `scan` and `mission` name what else it went by, so that a recording can be answered again, byte for byte.
@@ -112,10 +112,10 @@ class AnswerHeader(Wire):
     echo: Echo
     compute_us: Microseconds = 0
     scan: Counter | None = None
-    mission: Asked | None = None
+    mission: RequestId | None = None
 
 
-class RequestHeader(Wire):
+class RequestHeader(WireModel):
     """Header of a request or mission. `echo` names the newest `status` seen; only stop, disarm, release may lack it."""
 
     v: Version = VERSION
@@ -125,7 +125,7 @@ class RequestHeader(Wire):
     echo: Echo | None = None
 
 
-class DetectionsHeader(Wire):
+class DetectionsHeader(WireModel):
     """Header of what vision says beside its twists: who looked, at which frame; without `echo` for showing only."""
 
     v: Version = VERSION
@@ -147,14 +147,14 @@ class Verb(StrEnum):
     RELEASE = "release"
 
 
-class Request(Wire):
+class Request(WireModel):
     """A request; `id` is the asker's own and comes back in the reply."""
 
     id: Counter
     verb: Annotated[Verb, Field(strict=False)]
 
 
-class Reply(Wire):
+class Reply(WireModel):
     """The answer to a request: `to` and `id` name it; `detail` is one line for a person."""
 
     to: SessionId
@@ -175,14 +175,14 @@ class State(StrEnum):
     FAULT = "FAULT"
 
 
-class Holder(Wire):
+class Holder(WireModel):
     """The driver of the moment."""
 
     source: Source
     session: SessionId
 
 
-class LastRefusal(Wire):
+class LastRejection(WireModel):
     """The newest refusal, in words."""
 
     source: Annotated[str, Field(max_length=32)]
@@ -190,7 +190,7 @@ class LastRefusal(Wire):
     detail: Annotated[str, Field(max_length=200)]
 
 
-class StreamStatus(Wire):
+class StreamStatus(WireModel):
     """What the robot's stream does: frames sent, answers that never came, frames allowed in flight, rate."""
 
     sent: Counter = 0
@@ -212,7 +212,7 @@ class StreamStatus(Wire):
     """How pictures are encoded to fit the link: shares of the configured quality and of the side lengths."""
 
 
-class Status(Wire):
+class Status(WireModel):
     """Everything a person needs to know why the robot moves or does not. Published at 10 Hz."""
 
     state: Annotated[State, Field(strict=False)]
@@ -223,7 +223,7 @@ class Status(Wire):
     latency_us: Microseconds | None = None
     accepted: Counter = 0
     refused: dict[str, Counter] = {}
-    last_refusal: LastRefusal | None = None
+    last_refusal: LastRejection | None = None
     stream: StreamStatus = StreamStatus()
     auto_arm: bool = False
     tick_late_max_us: Microseconds = 0
@@ -232,14 +232,14 @@ class Status(Wire):
     max_angular_rad_s: Number = 0.0
 
 
-class Odometry(Wire):
+class Odometry(WireModel):
     """Where the wheels say the robot is, and how it moves."""
 
     pose: Pose
     moving: Planar
 
 
-class DetectedCircle(Wire):
+class DetectedCircle(WireModel):
     """A circle in pixels of the encoded picture, where the detector knows one."""
 
     cx_px: Number
@@ -247,7 +247,7 @@ class DetectedCircle(Wire):
     radius_px: Annotated[float, Field(gt=0, le=1e6)]
 
 
-class DetectedBox(Wire):
+class DetectedBox(WireModel):
     """One object in pixels of the encoded picture; `x2_px` >= `x1_px` and `y2_px` >= `y1_px`, which are exclusive."""
 
     label: Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,64}$")]
@@ -267,7 +267,7 @@ class DetectedBox(Wire):
         return self
 
 
-class Detections(Wire):
+class Detections(WireModel):
     """What was found in one picture of this size, best first. No boxes: looked, and saw nothing."""
 
     width_px: PixelCount
@@ -278,7 +278,7 @@ class Detections(Wire):
     model: Annotated[str, Field(max_length=64)] = ""
 
 
-class CameraModel(Wire):
+class CameraModel(WireModel):
     """Pinhole model of the encoded picture. Pixel (0, 0) is the top-left corner of the top-left pixel.
 
     Mounting: the lens at (`x_m`, `y_m`, `z_m`) from the axle's midpoint on the floor, looking forward,

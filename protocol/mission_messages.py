@@ -4,7 +4,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from protocol.messages import Asked, Counter, Microseconds, Number, Wire
+from protocol.messages import RequestId, Counter, Microseconds, Number, WireModel
 
 MAX_WAYPOINTS: Final = 64
 """Of one mission; a longer way is several."""
@@ -19,7 +19,7 @@ OptionValue = bool | Number | Annotated[str, Field(max_length=64)]
 Metres = Annotated[float, Field(ge=-MAX_WAYPOINT_M, le=MAX_WAYPOINT_M)]
 
 
-class MissionRequest(Wire):
+class MissionRequest(WireModel):
     """What vision is to do from now on; `id` is the asker's own and comes back in the report."""
 
     id: Counter
@@ -30,7 +30,7 @@ class MissionRequest(Wire):
     """For the mission's own configuration; a dot reaches into its tables."""
 
 
-class MissionReport(Wire):
+class MissionReport(WireModel):
     """What vision does at the moment.
 
     `phase` is one or two words for a person, `note` the rest of the line. `asked` names the newest mission that was
@@ -41,7 +41,7 @@ class MissionReport(Wire):
     phase: Annotated[str, Field(max_length=32)]
     note: Annotated[str, Field(max_length=200)] = ""
     done: bool = False
-    asked: Asked | None = None
+    asked: RequestId | None = None
     refused: Annotated[str, Field(max_length=200)] = ""
     detector: Annotated[str, Field(max_length=64)] = ""
     device: Annotated[str, Field(max_length=32)] = ""

@@ -3,7 +3,7 @@
 from enum import StrEnum
 
 
-class Refusal(StrEnum):
+class RejectReason(StrEnum):
     """A reason a robot gives for not obeying. The names are on the wire (status counters, replies)."""
 
     MALFORMED = "MALFORMED"  # not the protocol: grammar, size, type, range of a header field

@@ -19,8 +19,8 @@ from pydantic.json_schema import models_json_schema
 from protocol import golden, refusals
 from protocol.asyncapi import document
 from protocol.channels import CHANNELS, key_for
-from protocol.field_words import meaning_of, unit_of
-from protocol.refusals import CLAMPED, Refusal
+from protocol.field_words import doc_of, unit_of
+from protocol.refusals import CLAMPED, RejectReason
 from protocol.transports.websocket_framing import Hello
 
 HERE: Final = Path(__file__).parent
@@ -46,11 +46,11 @@ def channel_table() -> str:
     return "\n".join([*rows, "", *carried]) + "\n"
 
 
-def refusal_table() -> str:
+def reject_reason_table() -> str:
     """Every reason for not obeying and what it means, as a Markdown table."""
     rows = ["| reason | meaning |", "|---|---|"]
     meanings = dict(re.findall(r'"(\w+)"  # (.*)', inspect.getsource(refusals)))
-    rows += [f"| `{reason}` | {meanings[reason]} |" for reason in Refusal]
+    rows += [f"| `{reason}` | {meanings[reason]} |" for reason in RejectReason]
     rows.append(f"| `{CLAMPED}` | no refusal: the command was accepted, but cut to the robot's limits |")
     return "\n".join(rows) + "\n"
 
@@ -84,7 +84,7 @@ def _model_table(name: str, schema: Schema) -> str:
     required = schema.get("required", [])
     for field, definition in schema["properties"].items():
         default = "refused" if field in required else _default_of(definition)
-        words = f"{unit_of(field)} | {default} | {meaning_of(name, field)}"
+        words = f"{unit_of(field)} | {default} | {doc_of(name, field)}"
         rows.append(f"| `{field}` | {_type_of(definition)} | {words} |")
     return "\n".join(rows) + "\n"
 
@@ -143,7 +143,7 @@ def _bounds(schema: Schema) -> Iterator[str]:
 GENERATED: Final = {
     "channels": channel_table,
     "fields": field_tables,
-    "refusals": refusal_table,
+    "refusals": reject_reason_table,
     "vectors": golden.vector_table,
     "examples": golden.examples,
 }

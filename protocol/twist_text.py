@@ -9,7 +9,7 @@ import re
 
 from protocol.errors import WireError
 from protocol.messages import Twist
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 
 MAX_TWIST_BYTES = 64
 
@@ -34,18 +34,18 @@ def parse_twist(data: bytes) -> Twist:
     Raises WireError MALFORMED for anything outside the grammar or over 64 bytes, NOT_FINITE for nan, inf or overflow.
     """
     if len(data) > MAX_TWIST_BYTES:
-        raise WireError(Refusal.MALFORMED, f"twist text is {len(data)} bytes, at most {MAX_TWIST_BYTES}")
+        raise WireError(RejectReason.MALFORMED, f"twist text is {len(data)} bytes, at most {MAX_TWIST_BYTES}")
     match = _TWIST.fullmatch(data)
     if match is None:
         raise _refuse(data)
     linear, angular = float(match[1]), float(match[2])
     if not (math.isfinite(linear) and math.isfinite(angular)):
-        raise WireError(Refusal.NOT_FINITE, f"twist {data!r} overflows")
+        raise WireError(RejectReason.NOT_FINITE, f"twist {data!r} overflows")
     return Twist(linear_mps=linear, angular_rad_s=angular)
 
 
 def _refuse(data: bytes) -> WireError:
     fields = data.split(b"|")
     if len(fields) == 2 and any(_NON_FINITE.fullmatch(field) for field in fields):
-        return WireError(Refusal.NOT_FINITE, f"twist {data!r} is not finite")
-    return WireError(Refusal.MALFORMED, f"twist {data!r} is not `linear|angular`, e.g. 0.2000|-0.3500")
+        return WireError(RejectReason.NOT_FINITE, f"twist {data!r} is not finite")
+    return WireError(RejectReason.MALFORMED, f"twist {data!r} is not `linear|angular`, e.g. 0.2000|-0.3500")

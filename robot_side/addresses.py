@@ -11,7 +11,7 @@ _ASK_ADDRESS: Final = 0x8915  # SIOCGIFADDR of linux/sockios.h
 _ANYWHERE: Final = ("/0.0.0.0:", "/[::]:")
 
 
-def reached_at(endpoints: Sequence[str]) -> list[str]:
+def reachable_endpoints(endpoints: Sequence[str]) -> list[str]:
     """Those of `endpoints` that listen on every address, with each address in place of none."""
     open_ends = [(endpoint, anywhere) for endpoint in endpoints for anywhere in _ANYWHERE if anywhere in endpoint]
     here = own_addresses() if open_ends else []

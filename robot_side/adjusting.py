@@ -4,21 +4,21 @@ from collections.abc import Mapping
 
 from protocol.errors import HardwareError
 from protocol.messages import MAX_CHANNELS_SHOWN, CameraModel, StreamStatus
-from robot_side.encoding import Wish
+from robot_side.encoding import EncodingTarget
 from robot_side.ports import Adjustable, Camera, Picture, scaled_model
 
 
-class Adjusting:
+class CameraAdaptation:
     """Passes the stream's wish on, once per change, to a camera that can follow it."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._told = Wish()
+        self._told = EncodingTarget()
         self._scale_percent = 100
-        self.shown = Wish()
+        self.shown = EncodingTarget()
         """What the camera does: unchanged where it passes its own JPEGs through."""
 
-    def follow(self, wish: Wish) -> None:
+    def follow(self, wish: EncodingTarget) -> None:
         """Ask for `wish` unless that was asked already; a camera that is gone is asked when it is back."""
         if wish == self._told or not isinstance(self._camera, Adjustable):
             return

@@ -16,7 +16,7 @@ from robot_side.config import RobotConfig
 
 _PACKETS_PER_WAKE = 64  # a flood is drained in portions, so that no tick waits for its end
 _PACKETS_ASIDE = 1024  # more than that socket holds: all of it, but not for ever
-_LAST_WORDS_US = 500_000  # to read what a dead process sent; a descendant may hold its end open
+_DRAIN_US = 500_000  # to read what a dead process sent; a descendant may hold its end open
 _FIRST_BACKOFF_US = 700_000  # the wheels are at zero before anybody can drive them again
 _LONGEST_BACKOFF_US = 2_000_000
 _WEDGED_US = 2_000_000
@@ -29,7 +29,7 @@ _CHILD: Final = (
 may be called as one of Python's, nor in another copy of this package than the driver's."""
 
 
-class Setup(Config):
+class NetworkSetup(Config):
     """What the network process is told at its start, as its first packet."""
 
     config: RobotConfig
@@ -37,7 +37,7 @@ class Setup(Config):
     first_seq: int
 
 
-class NetworkChild:
+class DriverEnd:
     """The network process as the driver sees it. No method waits for it, except `close`."""
 
     def __init__(self, config: RobotConfig, session: str, say: Callable[[str], None]) -> None:
@@ -82,7 +82,7 @@ class NetworkChild:
             for end in (ours, aside):
                 undo.callback(end.close)
                 end.setblocking(False)
-            setup = Setup(config=self._config, session=self._session, first_seq=first_seq)
+            setup = NetworkSetup(config=self._config, session=self._session, first_seq=first_seq)
             ours.send(setup.model_dump_json().encode())
             ends = (theirs.fileno(), their_aside.fileno())
             self._process = subprocess.Popen(_command(ends), pass_fds=ends, stdin=subprocess.DEVNULL)
@@ -93,7 +93,7 @@ class NetworkChild:
     def _is_read(self, now_us: int) -> bool:
         """Whether all is read that the dead process sent: its last packet may be a STOP."""
         self._gone_us = self._gone_us or now_us
-        return self.socket is None or now_us - self._gone_us >= _LAST_WORDS_US
+        return self.socket is None or now_us - self._gone_us >= _DRAIN_US
 
     def _on_exit(self, code: int, now_us: int) -> None:
         self._process, self._gone_us = None, 0
@@ -112,11 +112,11 @@ class NetworkChild:
 
     def send(self, packet: bytes) -> None:
         """Hand over a packet or drop it: a child that does not read must not slow the driver."""
-        _send(self.socket, packet)
+        _send_or_drop(self.socket, packet)
 
     def send_aside(self, packet: bytes) -> None:
         """As `send`, without waking it: it looks when it needs to know."""
-        _send(self._aside, packet)
+        _send_or_drop(self._aside, packet)
 
     def packets(self) -> Iterator[bytes]:
         """What it has sent, a bounded portion: first all that it sent aside before."""
@@ -163,7 +163,7 @@ def _command(ends: Sequence[int]) -> list[str]:
     return [sys.executable, "-P", "-c", _CHILD, *map(str, ends), json.dumps(folders)]
 
 
-def _send(end: socket.socket | None, packet: bytes) -> None:
+def _send_or_drop(end: socket.socket | None, packet: bytes) -> None:
     if end:
         try:
             end.send(packet)

@@ -11,11 +11,11 @@ from robot_side.guard import GuardConfig
 from robot_side.ports import Ranges
 
 
-class DeadZoneError(ConfigError):
+class BlindZoneError(ConfigError):
     """A sensor that is blind beyond the stop zone."""
 
 
-def check_dead_zone(guard: GuardConfig, scan: Ranges) -> None:
+def check_blind_zone(guard: GuardConfig, scan: Ranges) -> None:
     """Raise DeadZoneError unless whatever this sensor cannot see is nearer to the robot than `guard.stop_m`.
 
     Of `scan`, what counts is where the sensor looks and its minimum, not what it saw. Raises ValueError where one of
@@ -26,7 +26,7 @@ def check_dead_zone(guard: GuardConfig, scan: Ranges) -> None:
         raise ValueError(f"the range sensor's least range and angles are {said}: no numbers")
     reach_m = max(_blind(guard, scan), default=0.0)
     if reach_m >= guard.stop_m:
-        raise DeadZoneError(
+        raise BlindZoneError(
             f"guard.stop_m = {guard.stop_m:g}: the range sensor sees nothing nearer than {scan.range_min_m:.3g} m, "
             f"which reaches {reach_m:.3f} m beyond the robot's outline; set guard.stop_m above that (docs/robots.md)"
         )

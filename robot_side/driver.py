@@ -16,20 +16,20 @@ from protocol.channels import REQUEST, TWIST, check_robot_id
 from protocol.clock import monotonic_us
 from protocol.codec import decode
 from protocol.errors import WireError
-from protocol.messages import LastRefusal, State, StreamStatus
+from protocol.messages import LastRejection, State, StreamStatus
 from robot_side import ipc
-from robot_side.child import NetworkChild
+from robot_side.child import DriverEnd
 from robot_side.config import RobotConfig
-from robot_side.dead_zone import DeadZoneError, check_dead_zone
-from robot_side.driving import Driving
-from robot_side.ending import ENDING, IGNORED
+from robot_side.dead_zone import BlindZoneError, check_blind_zone
+from robot_side.driving import DriverCore
+from robot_side.ending import EXIT_SIGNALS, IGNORED_SIGNALS
 from robot_side.latch import StopLatch
 from robot_side.limits import MIN_TICK_US, TICK_US
-from robot_side.plugins import build
+from robot_side.plugins import build_device
 from robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
-from robot_side.refusal_log import RefusalLog
-from robot_side.scribe import Scribe
-from robot_side.supervision import ServiceManager, become_punctual
+from robot_side.refusal_log import RejectionLog
+from robot_side.scribe import BackgroundWriter
+from robot_side.supervision import SystemdNotifier, request_real_time
 
 _SHUTDOWN_US = 2_000_000
 _WATCHDOG_PERIOD_US = 100_000
@@ -46,9 +46,9 @@ def run(config: RobotConfig) -> int:
     """
     check_robot_id(config.robot)
     with ExitStack() as ending:
-        drive: Drive = build("drives", config.motors)
+        drive: Drive = build_device("drives", config.motors)
         ending.callback(drive.close)
-        ranges: RangeSensor | None = build("range_sensors", config.ranging) if config.ranging else None
+        ranges: RangeSensor | None = build_device("range_sensors", config.ranging) if config.ranging else None
         if ranges is not None:
             ending.callback(ranges.close)
         driver = Driver(config, drive, ranges)
@@ -65,7 +65,7 @@ def _zero(drive: Drive) -> None:
 
 def zero_motors(config: RobotConfig) -> int:
     """Tell the motors to stand still, without gate or network: for whoever cleans up after a dead driver."""
-    drive: Drive = build("drives", config.motors)
+    drive: Drive = build_device("drives", config.motors)
     try:
         drive.set(0.0, 0.0)
     finally:
@@ -78,23 +78,23 @@ class Driver:
 
     def __init__(self, config: RobotConfig, drive: Drive, ranges: RangeSensor | None) -> None:
         latch = StopLatch(config.state_dir, config.robot)
-        self.scribe = Scribe(latch)
+        self.scribe = BackgroundWriter(latch)
         self._drive = drive
         self._ranges = ranges
-        self._driving = Driving(config, secrets.token_hex(4), stopped=latch.is_set())
+        self._driving = DriverCore(config, secrets.token_hex(4), stopped=latch.is_set())
         self._shown = self._driving.gate.state
         self._ending_since_us: int | None = None
-        self._manager = ServiceManager()
+        self._manager = SystemdNotifier()
         self._watchdog_due_us = self._ticked_us = 0
         self._obeyed = False
         self._sight: tuple[float, ...] = ()
-        self._verdicts: list[ipc.Judged] = []
-        self._refusals = RefusalLog()
+        self._verdicts: list[ipc.CommandAck] = []
+        self._refusals = RejectionLog()
         self._counted: Counter[str] = Counter()
-        self.child = NetworkChild(config, self._driving.session, self.scribe.say)
-        for number in ENDING:
+        self.child = DriverEnd(config, self._driving.session, self.scribe.say)
+        for number in EXIT_SIGNALS:
             signal.signal(number, self._on_signal)
-        for number in IGNORED:
+        for number in IGNORED_SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
@@ -121,7 +121,7 @@ class Driver:
 
     def _greet(self) -> None:
         """What this robot lacks is said before it moves."""
-        missing = list(become_punctual())
+        missing = list(request_real_time())
         for line in [*missing, *([] if self._manager.is_there else [_WARNING])]:
             self.scribe.say(f"robot {self._driving.config.robot}: {line}")
 
@@ -144,7 +144,7 @@ class Driver:
         self._answer()
         if punctual:
             for message in self._driving.messages(now_us):
-                self.child.send(ipc.pack_message(ipc.Kind.PUBLISH, message))
+                self.child.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
             self.child.keep_alive(now_us, self._driving.gate.issued.last_seq("frame") + 1)
             self._driving.network_restarts = max(0, self.child.restarts)
             self._show(self._driving.gate.state, self._driving.gate.reason)
@@ -155,7 +155,7 @@ class Driver:
         self.child.send_aside(ipc.pack_motion(self._driving.motion()))
         verdicts, self._verdicts = self._verdicts, []
         for judged in verdicts:
-            self.child.send(ipc.pack_judged(judged))
+            self.child.send(ipc.pack_ack(judged))
 
     def _feed_watchdog(self, now_us: int) -> None:
         if now_us >= self._watchdog_due_us:
@@ -174,7 +174,7 @@ class Driver:
             wheels = self._drive.wheels()
             scan = self._scanned()
             speeds = self._driving.tick(monotonic_us(), wheels, scan)
-        except DeadZoneError:  # with the first scan, and without one nothing moves
+        except BlindZoneError:  # with the first scan, and without one nothing moves
             raise
         except Exception as error:  # a plug-in is foreign code; a reading may be no number
             self._driving.gate.fault(f"{error or type(error).__name__}")
@@ -200,7 +200,7 @@ class Driver:
             return None
         sight = (scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, float(len(scan.ranges_m)))
         if sight != self._sight:
-            check_dead_zone(self._driving.config.guard, scan)
+            check_blind_zone(self._driving.config.guard, scan)
             self._sight = sight
         return scan
 
@@ -223,16 +223,16 @@ class Driver:
         return commanded
 
     def _on_packet(self, packet: bytes) -> bool:
-        kind = ipc.kind_of(packet)
-        if kind is ipc.Kind.RAW:
+        kind = ipc.packet_kind(packet)
+        if kind is ipc.PacketKind.RAW:
             return self._on_raw(packet)
-        if kind is ipc.Kind.ISSUED:
+        if kind is ipc.PacketKind.ISSUED:
             self._driving.on_issued(*ipc.unpack_issued(packet))
-        elif kind is ipc.Kind.STREAM:
+        elif kind is ipc.PacketKind.STREAM:
             self._driving.stream = decode(StreamStatus, packet[1:])
-        elif kind is ipc.Kind.REFUSED:
-            self._on_turned_away(ipc.unpack_refused(packet))
-        elif kind is ipc.Kind.READY:
+        elif kind is ipc.PacketKind.REFUSED:
+            self._on_turned_away(ipc.unpack_rejected(packet))
+        elif kind is ipc.PacketKind.READY:
             self._counted.clear()
             self.child.on_ready()
         return False
@@ -242,7 +242,7 @@ class Driver:
         more, self._counted = Counter(counts) - self._counted, Counter(counts)
         self._driving.turned_away += more
         for reason, count in more.items():
-            refusal = LastRefusal(source="the network", reason=reason, detail="turned away by the transport")
+            refusal = LastRejection(source="the network", reason=reason, detail="turned away by the transport")
             self._tell(refusal, count)
 
     def _on_raw(self, packet: bytes) -> bool:
@@ -258,6 +258,6 @@ class Driver:
             self._tell(refusal)
         return True
 
-    def _tell(self, refusal: LastRefusal, times: int = 1) -> None:
+    def _tell(self, refusal: LastRejection, times: int = 1) -> None:
         if line := self._refusals.line(refusal, monotonic_us(), times):
             self.scribe.say(f"robot {self._driving.config.robot}: {line}")

@@ -20,20 +20,20 @@ from protocol.messages import (
     Stamp,
     Status,
     StreamStatus,
-    Wire,
+    WireModel,
 )
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link import Message
 from protocol.twist_text import parse_twist
 from robot_side.config import RobotConfig
 from robot_side.guard import RangeGuard
-from robot_side.ipc import Judged, Motion
+from robot_side.ipc import CommandAck, Motion
 from robot_side.kinematics import Odometer, wheel_speeds
 from robot_side.ports import Ranges, WheelAngles
 from robot_side.safety import SafetyGate
 
 _PERIODS_US = {STATUS.name: 100_000, ODOMETRY.name: 50_000}
-_CITES_NOTHING_OF_OURS = (Refusal.OTHER_SESSION, Refusal.UNKNOWN_FRAME, Refusal.FROM_FUTURE)
+_CITES_NOTHING_OF_OURS = (RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME, RejectReason.FROM_FUTURE)
 
 
 _WIRE_LIMIT = 1e6  # of every number on the wire: an encoder that wraps around must not end anything
@@ -51,7 +51,7 @@ def _within(value: float) -> float:
     return max(-_WIRE_LIMIT, min(_WIRE_LIMIT, value))
 
 
-class Driving:
+class DriverCore:
     """One robot session. The shell hands in what arrives and calls `tick` at 50 Hz."""
 
     def __init__(self, config: RobotConfig, session: str, *, stopped: bool = False) -> None:
@@ -76,7 +76,7 @@ class Driving:
         self.gate.issued.add("frame", seq, t_us)
         self.gate.pictures.add(t_us, fingerprint)
 
-    def on_twist(self, message: Message, now_us: int) -> Judged | None:
+    def on_twist(self, message: Message, now_us: int) -> CommandAck | None:
         """Decode and offer a command. Returns the credit it gives back: whatever answers a frame of ours does."""
         try:
             check_sizes(message.channel, message.header, message.payload)
@@ -89,7 +89,7 @@ class Driving:
         if header is None or verdict.reason in _CITES_NOTHING_OF_OURS:
             return None
         sender = Holder(source=header.source, session=header.session)
-        return Judged(sender, header.echo.seq, header.compute_us, self.gate.holder(now_us))
+        return CommandAck(sender, header.echo.seq, header.compute_us, self.gate.holder(now_us))
 
     def on_request(self, message: Message, now_us: int) -> None:
         """Carry out a request; the reply waits in `messages`."""
@@ -102,7 +102,7 @@ class Driving:
             return
         try:
             if header.source != message.source:
-                raise WireError(Refusal.UNKNOWN_SOURCE, "key and header disagree on the source")
+                raise WireError(RejectReason.UNKNOWN_SOURCE, "key and header disagree on the source")
             detail, granted = self.gate.request(header, request, now_us), True
         except WireError as error:
             self.gate.refuse(message.source, error)
@@ -192,7 +192,7 @@ class Driving:
         self._due_us[channel.name] = max(due_us + _PERIODS_US[channel.name], now_us)
         return True
 
-    def _post(self, channel: Channel, payload: Wire, now_us: int) -> None:
+    def _post(self, channel: Channel, payload: WireModel, now_us: int) -> None:
         self._outbox.append(Message(channel, "", encode(self._stamp(channel, now_us)), encode(payload)))
 
     def _stamp(self, channel: Channel, now_us: int) -> Stamp:

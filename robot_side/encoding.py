@@ -6,7 +6,7 @@ themselves can follow (`robot_side.ports.Adjustable`); for the others the wish i
 
 from typing import Final, NamedTuple
 
-from robot_side.window import Full
+from robot_side.window import LinkCapacity
 
 PICTURE_US: Final = 28_000
 """For how long a picture may occupy the link: its age grows by as much, and thirty a second pass with room to spare."""
@@ -33,7 +33,7 @@ _FROM_SCALE_US: Final = 3_000_000
 """A new size makes vision begin anew, so it is not changed more often."""
 
 
-class Wish(NamedTuple):
+class EncodingTarget(NamedTuple):
     """Shares of the configured quality and of the side lengths."""
 
     quality_percent: int = 100
@@ -48,11 +48,11 @@ class _Cut(NamedTuple):
     us_per_byte: float
 
 
-class Encoding:
+class BitrateControl:
     """Told of what was sent and how it fared; `wish` is what the camera should do next."""
 
     def __init__(self) -> None:
-        self.wish = Wish()
+        self.wish = EncodingTarget()
         self._budget_bytes: float | None = None
         self._bytes = 0.0
         self._frames = 0
@@ -86,7 +86,7 @@ class Encoding:
             self._budget_bytes += _STEP_BYTES
             self._step_at_us = now_us + _STEP_US
 
-    def on_full(self, full: Full, now_us: int) -> None:
+    def on_full(self, full: LinkCapacity, now_us: int) -> None:
         """No more than this gets through."""
         self._cut(full.bytes_per_s * PICTURE_US / 1e6, full.delay_us, 1e6 / max(1.0, full.bytes_per_s))
         self._step_at_us = now_us + _STEP_US
@@ -139,18 +139,18 @@ class Encoding:
         if quality == 100 and scale == 100 and share > 1.5:
             self._budget_bytes = None
         elif quality == LEAST_QUALITY_PERCENT and share < 0.8 and scale != SCALES_PERCENT[-1]:
-            self._rescale(Wish(60, SCALES_PERCENT[-1]), now_us)
+            self._rescale(EncodingTarget(60, SCALES_PERCENT[-1]), now_us)
         elif quality == 100 and share > 1.3 and scale != 100:
-            self._rescale(Wish(40, 100), now_us)
+            self._rescale(EncodingTarget(40, 100), now_us)
         elif not 0.9 < share < 1.1:
-            self._set(Wish(max(LEAST_QUALITY_PERCENT, min(100, round(quality * share))), scale))
+            self._set(EncodingTarget(max(LEAST_QUALITY_PERCENT, min(100, round(quality * share))), scale))
 
-    def _rescale(self, wish: Wish, now_us: int) -> None:
+    def _rescale(self, wish: EncodingTarget, now_us: int) -> None:
         if now_us - self._scaled_at_us >= _FROM_SCALE_US:
             self._scaled_at_us = now_us
             self._set(wish)
 
-    def _set(self, wish: Wish) -> None:
+    def _set(self, wish: EncodingTarget) -> None:
         if wish != self.wish:
             self.wish = wish
             self._frames, self._bytes = 0, 0.0

@@ -3,8 +3,8 @@
 import signal
 from typing import Final
 
-ENDING: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
+EXIT_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """Whatever a key or a terminal can send ends it by way of zero, Ctrl-\\ and Ctrl-Z too: a driver that is killed or held
 up on the spot leaves the wheels turning."""
-IGNORED: Final = (signal.SIGTTIN, signal.SIGTTOU)
+IGNORED_SIGNALS: Final = (signal.SIGTTIN, signal.SIGTTOU)
 """Nor may a terminal that it is in the background of hold it up."""

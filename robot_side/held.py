@@ -11,10 +11,10 @@ from protocol.errors import WireError
 from protocol.messages import Request, Verb
 from protocol.transports.link import Message
 
-MOST_HELD: Final = 32
+MAX_PENDING: Final = 32
 
 
-class HeldRequests:
+class PendingRequests:
     """The newest request per (source, verb), at most 32; a STOP always finds a place."""
 
     def __init__(self) -> None:
@@ -31,7 +31,7 @@ class HeldRequests:
         except WireError:
             return False
         name = (message.source, verb)
-        if len(self._waiting) >= MOST_HELD and name not in self._waiting and not self._gives_way(verb):
+        if len(self._waiting) >= MAX_PENDING and name not in self._waiting and not self._gives_way(verb):
             return False
         self._waiting[name] = message
         return True

@@ -27,11 +27,11 @@ from protocol.transports.link import Message
 MAX_PACKET_BYTES = 65_536
 _ISSUED = struct.Struct("<BQQI")
 _MOTION = struct.Struct("<B7dq")
-_VERDICT = struct.Struct("<BQQ16s8s16s8s")
+_ACK = struct.Struct("<BQQ16s8s16s8s")
 _PARTS = struct.Struct("<B16s16sH")
 
 
-class Kind(IntEnum):
+class PacketKind(IntEnum):
     """First byte of a packet."""
 
     ISSUED = 1
@@ -55,7 +55,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class CommandAck:
     """A twist was judged (accepted or refused): it answers frame `seq`; `holder` drives now."""
 
     sender: Holder
@@ -64,14 +64,14 @@ class Judged:
     holder: Holder | None
 
 
-def kind_of(packet: bytes) -> Kind:
+def packet_kind(packet: bytes) -> PacketKind:
     """The kind of a packet of ours."""
-    return Kind(packet[0])
+    return PacketKind(packet[0])
 
 
 def pack_issued(seq: int, t_us: int, fingerprint: int) -> bytes:
     """A frame is about to be published."""
-    return _ISSUED.pack(Kind.ISSUED, seq, t_us, fingerprint)
+    return _ISSUED.pack(PacketKind.ISSUED, seq, t_us, fingerprint)
 
 
 def unpack_issued(packet: bytes) -> tuple[int, int, int]:
@@ -83,7 +83,7 @@ def unpack_issued(packet: bytes) -> tuple[int, int, int]:
 def pack_motion(motion: Motion) -> bytes:
     """The robot at this moment."""
     latency_us = -1 if motion.latency_us is None else motion.latency_us
-    return _MOTION.pack(Kind.MOTION, *motion.pose, *motion.moving, *motion.applied, latency_us)
+    return _MOTION.pack(PacketKind.MOTION, *motion.pose, *motion.moving, *motion.applied, latency_us)
 
 
 def unpack_motion(packet: bytes) -> Motion:
@@ -93,20 +93,20 @@ def unpack_motion(packet: bytes) -> Motion:
     return Motion((x, y, yaw), (linear, angular), (applied_linear, applied_angular), latency)
 
 
-def pack_judged(judged: Judged) -> bytes:
+def pack_ack(judged: CommandAck) -> bytes:
     """A twist was judged."""
-    return _VERDICT.pack(
-        Kind.VERDICT, judged.seq, judged.compute_us, *_pack_holder(judged.sender), *_pack_holder(judged.holder)
+    return _ACK.pack(
+        PacketKind.VERDICT, judged.seq, judged.compute_us, *_pack_holder(judged.sender), *_pack_holder(judged.holder)
     )
 
 
-def unpack_judged(packet: bytes) -> Judged:
+def unpack_ack(packet: bytes) -> CommandAck:
     """The inverse."""
-    _, seq, compute_us, source, session, holder_source, holder_session = _VERDICT.unpack(packet)
+    _, seq, compute_us, source, session, holder_source, holder_session = _ACK.unpack(packet)
     sender = _unpack_holder(source, session)
     if sender is None:
         raise ValueError("a judged twist has a sender")
-    return Judged(sender, seq, compute_us, _unpack_holder(holder_source, holder_session))
+    return CommandAck(sender, seq, compute_us, _unpack_holder(holder_source, holder_session))
 
 
 def _pack_holder(holder: Holder | None) -> tuple[bytes, bytes]:
@@ -118,18 +118,18 @@ def _unpack_holder(source: bytes, session: bytes) -> Holder | None:
     return Holder(source=name, session=session.decode()) if name else None
 
 
-def pack_refused(counts: Mapping[str, int]) -> bytes:
+def pack_rejected(counts: Mapping[str, int]) -> bytes:
     """What never reached the driver, by reason."""
-    return bytes([Kind.REFUSED]) + json.dumps(dict(counts)).encode()
+    return bytes([PacketKind.REFUSED]) + json.dumps(dict(counts)).encode()
 
 
-def unpack_refused(packet: bytes) -> dict[str, int]:
+def unpack_rejected(packet: bytes) -> dict[str, int]:
     """The inverse."""
     counts = json.loads(packet[1:])
     return {str(reason): int(count) for reason, count in counts.items()}
 
 
-def pack_message(kind: Kind, message: Message) -> bytes:
+def pack_message(kind: PacketKind, message: Message) -> bytes:
     """RAW or PUBLISH: a message of the wire, undecoded."""
     head = _PARTS.pack(kind, message.channel.name.encode(), message.source.encode(), len(message.header))
     return head + message.header + message.payload

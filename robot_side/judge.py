@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 from protocol.errors import WireError
 from protocol.messages import AnswerHeader, Echo, State, Twist
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 
 _KEPT_PER_CHANNEL = 256  # 8 s of 30 fps frames; anything older is STALE long before
 _KEPT_SENDERS = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class CommandResult:
     """What became of a command. `reason` is None when it was accepted."""
 
-    reason: Refusal | None
+    reason: RejectReason | None
     detail: str = ""
     age_us: int | None = None
 
@@ -29,7 +29,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True)
-class Accepted:
+class AcceptedCommand:
     """An accepted command. `echo_us` is when the frame behind it was captured (arrival for a guest)."""
 
     twist: Twist
@@ -73,24 +73,24 @@ class IssuedRecord:
     def check_request(self, echo: Echo | None, now_us: int, max_age_us: int) -> None:
         """Raise WireError unless `echo` names a status young enough, and issued since requests were last denied."""
         if echo is None or echo.channel != "status":
-            raise WireError(Refusal.MALFORMED, "what lets a robot move again must cite a status")
+            raise WireError(RejectReason.MALFORMED, "what lets a robot move again must cite a status")
         self.age_us(echo, now_us, max_age_us)
         if echo.seq <= self._denied_seq:
-            raise WireError(Refusal.STALE, "cites a status from before the last STOP or disarm; ask again")
+            raise WireError(RejectReason.STALE, "cites a status from before the last STOP or disarm; ask again")
 
     def age_us(self, echo: Echo, now_us: int, max_age_us: int) -> int:
         """Age of what `echo` names. Raises WireError OTHER_SESSION, UNKNOWN_FRAME, FROM_FUTURE or STALE."""
         if echo.session != self.session:
-            raise WireError(Refusal.OTHER_SESSION, f"cites robot session {echo.session}, this is {self.session}")
+            raise WireError(RejectReason.OTHER_SESSION, f"cites robot session {echo.session}, this is {self.session}")
         times = self._times.get(echo.channel, OrderedDict())
         if times.get(echo.seq) != echo.t_us:
-            raise WireError(Refusal.UNKNOWN_FRAME, f"cites {echo.channel} {echo.seq}, which was not issued so")
+            raise WireError(RejectReason.UNKNOWN_FRAME, f"cites {echo.channel} {echo.seq}, which was not issued so")
         age_us = now_us - echo.t_us
         if age_us < 0:
-            raise WireError(Refusal.FROM_FUTURE, f"cites {echo.channel} {echo.seq} of {-age_us / 1e3:.0f} ms from now")
+            raise WireError(RejectReason.FROM_FUTURE, f"cites {echo.channel} {echo.seq} of {-age_us / 1e3:.0f} ms from now")
         if age_us > max_age_us:
             raise WireError(
-                Refusal.STALE, f"{echo.channel} {echo.seq} is {age_us / 1e3:.0f} ms old, at most {max_age_us / 1e3:.0f}"
+                RejectReason.STALE, f"{echo.channel} {echo.seq} is {age_us / 1e3:.0f} ms old, at most {max_age_us / 1e3:.0f}"
             )
         return age_us
 
@@ -128,7 +128,7 @@ class SequenceRecord:
         sender = (header.source, header.session)
         last = self._last.get(sender, -1)
         if header.seq <= last:
-            raise WireError(Refusal.OUT_OF_ORDER, f"seq {header.seq} of {header.source} is not newer than {last}")
+            raise WireError(RejectReason.OUT_OF_ORDER, f"seq {header.seq} of {header.source} is not newer than {last}")
         self._last[sender] = header.seq
         self._last.move_to_end(sender)
         if len(self._last) > _KEPT_SENDERS:

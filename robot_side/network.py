@@ -17,19 +17,19 @@ from protocol.channels import ACK, FRAME, REQUEST, TWIST
 from protocol.clock import monotonic_us
 from protocol.codec import encode
 from protocol.errors import HardwareError, SightlineError, WireError
-from protocol.log_lines import tell, use_form
+from protocol.log_lines import log_line, set_log_format
 from protocol.transports.link import Link, Message
 from protocol.transports.opening import open_link
 from protocol.transports.relay import Relay
-from protocol.transports.zenoh_log import refusals_told
+from protocol.transports.zenoh_log import log_rejected_peers
 from robot_side import ipc
-from robot_side.addresses import reached_at
-from robot_side.adjusting import Adjusting
-from robot_side.child import Setup
-from robot_side.parent import ParentDriver
-from robot_side.plugins import build
+from robot_side.addresses import reachable_endpoints
+from robot_side.adjusting import CameraAdaptation
+from robot_side.child import NetworkSetup
+from robot_side.parent import NetworkEnd
+from robot_side.plugins import build_device
 from robot_side.ports import Camera, Picture
-from robot_side.sending import Sending
+from robot_side.sending import NetworkCore
 
 _STREAM_STATUS_US = 200_000
 _CAMERA_TIMEOUT_S = 0.2
@@ -42,13 +42,13 @@ _KEYS = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP)  # Ctrl-C, Ctrl-\ and Ct
 class Network:
     """The camera loop (main thread), the driver's packets (a thread), the link's callbacks (its thread)."""
 
-    def __init__(self, setup: Setup, driver: ParentDriver, link: Link, camera: Camera) -> None:
+    def __init__(self, setup: NetworkSetup, driver: NetworkEnd, link: Link, camera: Camera) -> None:
         self._driver = driver
         self._link = link
         self._camera = camera
-        self._adjusting = Adjusting(camera)
+        self._adjusting = CameraAdaptation(camera)
         config = setup.config
-        self._sending = Sending(config.stream, setup.session, setup.first_seq, config.max_frame_bytes)
+        self._sending = NetworkCore(config.stream, setup.session, setup.first_seq, config.max_frame_bytes)
         self._lock = threading.Lock()
         self._credit = threading.Event()
         self._camera_fault = ""
@@ -58,7 +58,7 @@ class Network:
 
     def run(self) -> None:
         """Until the driver closes its end."""
-        self._driver.tell(bytes([ipc.Kind.READY]))
+        self._driver.tell(bytes([ipc.PacketKind.READY]))
         self._link.subscribe(TWIST, self._driver.forward)
         self._link.subscribe(REQUEST, self._driver.forward)
         self._link.subscribe(ACK, self._on_ack)
@@ -90,12 +90,12 @@ class Network:
             picture = self._camera.read(_CAMERA_TIMEOUT_S)
         except HardwareError as error:
             if not self._camera_fault:
-                tell(f"camera: {error}")
+                log_line(f"camera: {error}")
             self._camera_fault = str(error)
             time.sleep(_CAMERA_RETRY_S)
             return None
         if self._camera_fault and picture is not None:
-            tell("camera: back", sys.stdout)
+            log_line("camera: back", sys.stdout)
             self._camera_fault = ""
         return picture
 
@@ -135,12 +135,12 @@ class Network:
             os._exit(1)
 
     def _on_packet(self, packet: bytes) -> None:
-        kind = ipc.kind_of(packet)
-        if kind is ipc.Kind.VERDICT:
+        kind = ipc.packet_kind(packet)
+        if kind is ipc.PacketKind.VERDICT:
             with self._lock:
-                self._sending.on_judged(ipc.unpack_judged(packet), monotonic_us())
+                self._sending.on_judged(ipc.unpack_ack(packet), monotonic_us())
             self._credit.set()
-        elif kind is ipc.Kind.PUBLISH:
+        elif kind is ipc.PacketKind.PUBLISH:
             message = ipc.unpack_message(packet)
             self._link.publish(message.channel, message.header, message.payload)
 
@@ -150,7 +150,7 @@ class Network:
             status = self._sending.status(now_us, self._driver.dropped_commands)
             status = self._adjusting.shown_in(status, getattr(self._link, "dropped", {}))
             camera = self._sending.camera_message(self._adjusting.model, now_us)
-        self._driver.tell(bytes([ipc.Kind.STREAM]) + encode(status))
+        self._driver.tell(bytes([ipc.PacketKind.STREAM]) + encode(status))
         self._relay.look()
         self._report_refused()
         if camera is not None:
@@ -160,7 +160,7 @@ class Network:
         """What never reached the driver is shown in `status` too."""
         by_link: dict[str, int] = dict(getattr(self._link, "refused", {}))  # copied at once: other threads count in it
         refused = Counter(dict(self._refused_acks)) + Counter(by_link)
-        if refused != self._refused_told and self._driver.tell(ipc.pack_refused(refused)):
+        if refused != self._refused_told and self._driver.tell(ipc.pack_rejected(refused)):
             self._refused_told = refused
 
     def _on_ack(self, message: Message) -> None:
@@ -177,13 +177,13 @@ def _say(robot: str, line: str) -> None:
     print(f"robot {robot}: {line}", flush=True)
 
 
-def _run(driver: ParentDriver) -> None:
-    setup = Setup.model_validate_json(driver.receive())
+def _run(driver: NetworkEnd) -> None:
+    setup = NetworkSetup.model_validate_json(driver.receive())
     config = setup.config
     with ExitStack() as ending:
-        camera: Camera = build("cameras", config.camera)
+        camera: Camera = build_device("cameras", config.camera)
         ending.callback(camera.close)
-        ending.enter_context(refusals_told(config.doors, config.secure, lambda line: _say(config.robot, line)))
+        ending.enter_context(log_rejected_peers(config.doors, config.secure, lambda line: _say(config.robot, line)))
         link = ending.enter_context(
             open_link(
                 config.robot, listen=config.doors, connect=config.connect, role="robot", secure=config.secure,
@@ -193,17 +193,17 @@ def _run(driver: ParentDriver) -> None:
         where = ", ".join(config.listen) or "no port of its own"
         where += f", connected to {', '.join(config.connect)}" if config.connect else ""
         print(f"robot {config.robot}: on {where}, camera {config.camera.kind}", flush=True)
-        if reached := reached_at(config.listen):
+        if reached := reachable_endpoints(config.listen):
             _say(config.robot, f"others reach it at {', '.join(reached)}")
         Network(setup, driver, link, camera).run()
 
 
 def main() -> None:
     """Entry of the child process: argv[1] and argv[2] are the sockets' descriptors."""
-    use_form(None, "robot")
+    set_log_format(None, "robot")
     for number in _KEYS:  # they reach the whole group; the driver ends us, after zero
         signal.signal(number, signal.SIG_IGN)
-    driver = ParentDriver(*(socket.socket(fileno=int(number)) for number in sys.argv[1:3]))
+    driver = NetworkEnd(*(socket.socket(fileno=int(number)) for number in sys.argv[1:3]))
     code = 1
     try:
         _run(driver)

@@ -7,15 +7,15 @@ from contextlib import suppress
 from protocol.channels import REQUEST
 from protocol.transports.link import Message
 from robot_side import ipc
-from robot_side.held import HeldRequests
+from robot_side.held import PendingRequests
 
 
-class ParentDriver:
+class NetworkEnd:
     """The driver as its network process sees it. Only `receive` waits; any thread may call."""
 
     def __init__(self, waited: socket.socket, aside: socket.socket) -> None:
         self._waited, self._aside = waited, aside
-        self._held = HeldRequests()
+        self._held = PendingRequests()
         self._order = threading.Lock()
         self.dropped_commands = 0
 
@@ -35,11 +35,11 @@ class ParentDriver:
 
     def tell(self, packet: bytes) -> bool:
         """Hand over a packet that the driver waits for; False if there is no room."""
-        return _send(self._waited, packet)
+        return _send_if_room(self._waited, packet)
 
     def tell_aside(self, packet: bytes) -> bool:
         """Hand over what the driver reads when it needs it; False if there is no room."""
-        return _send(self._aside, packet)
+        return _send_if_room(self._aside, packet)
 
     def forward(self, message: Message) -> None:
         """A command goes on at once, undecoded. Without room a request waits; a twist is dropped and counted."""
@@ -56,10 +56,10 @@ class ParentDriver:
                 self._held.flush(self._pass)
 
     def _pass(self, message: Message) -> bool:
-        return self.tell(ipc.pack_message(ipc.Kind.RAW, message))
+        return self.tell(ipc.pack_message(ipc.PacketKind.RAW, message))
 
 
-def _send(end: socket.socket, packet: bytes) -> bool:
+def _send_if_room(end: socket.socket, packet: bytes) -> bool:
     try:
         end.send(packet, socket.MSG_DONTWAIT)
     except OSError:

@@ -15,17 +15,17 @@ from robot_side.config import PluginChoice
 _WORDS: Final = {"cameras": "camera", "drives": "drive", "range_sensors": "range sensor"}
 
 
-def build(group: str, choice: PluginChoice) -> Any:
+def build_device(group: str, choice: PluginChoice) -> Any:
     """The device `choice` names, from the entry points of `sightline.<group>`.
 
     Raises ConfigError for an unknown kind (nearest named), a missing package or a wrong option; HardwareError as the
     device itself does.
     """
-    plugin, config = configured(group, choice)
+    plugin, config = load_device(group, choice)
     return plugin(config)
 
 
-def configured(group: str, choice: PluginChoice) -> tuple[Any, Any]:
+def load_device(group: str, choice: PluginChoice) -> tuple[Any, Any]:
     """The class and its checked `Config`, without touching the device. Raises ConfigError."""
     plugin = _load(group, choice.kind)
     try:

@@ -127,6 +127,6 @@ def scaled_model(model: CameraModel, scale_percent: int) -> CameraModel:
     })
 
 
-def share_of(quality: int, percent: int) -> int:
+def scaled_quality(quality: int, percent: int) -> int:
     """That share of a configured JPEG quality, never below what decoders take."""
     return max(1, round(quality * percent / 100))

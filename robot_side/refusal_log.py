@@ -3,7 +3,7 @@
 from collections import Counter
 from typing import Final
 
-from protocol.messages import LastRefusal
+from protocol.messages import LastRejection
 
 _FIRST_PERIOD_US: Final = 1_000_000
 _LONGEST_PERIOD_US: Final = 60_000_000
@@ -11,7 +11,7 @@ _FORGOTTEN_US: Final = 10_000_000
 """A reason that was not given for so long is news again."""
 
 
-class RefusalLog:
+class RejectionLog:
     """Per reason a line at once, then after 1, 2, 4 ... 60 s for as long as it goes on, each with how often."""
 
     def __init__(self) -> None:
@@ -20,7 +20,7 @@ class RefusalLog:
         self._told_us: dict[str, int] = {}
         self._seen_us: dict[str, int] = {}
 
-    def line(self, refusal: LastRefusal, now_us: int, times: int = 1) -> str:
+    def line(self, refusal: LastRejection, now_us: int, times: int = 1) -> str:
         """What to log of a refusal, given `times` since the last call; "" while its reason has had its share."""
         reason = refusal.reason
         self._untold[reason] += times

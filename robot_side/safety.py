@@ -8,13 +8,13 @@ import math
 from collections import Counter
 
 from protocol.errors import WireError
-from protocol.messages import STILL, AnswerHeader, Holder, LastRefusal, Request, RequestHeader, State, Twist, Verb
-from protocol.refusals import CLAMPED, Refusal
+from protocol.messages import STILL, AnswerHeader, Holder, LastRejection, Request, RequestHeader, State, Twist, Verb
+from protocol.refusals import CLAMPED, RejectReason
 from robot_side.guard import RangeGuard
-from robot_side.judge import Accepted, Decision, FreshnessRecord, IssuedRecord, SequenceRecord, Verdict
+from robot_side.judge import AcceptedCommand, Decision, FreshnessRecord, IssuedRecord, SequenceRecord, CommandResult
 from robot_side.lease import HUMANS, RANKS, Lease
 from robot_side.limits import Ramp, SafetyConfig, age_factor, clamp_twist
-from robot_side.states import Event, after, is_armed
+from robot_side.states import Event, next_state, is_armed
 
 _GUEST = Holder(source="guest", session="00000000")
 _MAX_REQUEST_AGE_US = 2_000_000  # an `arm` that a link kept back must not arm when it is delivered at last
@@ -32,7 +32,7 @@ class SafetyGate:
         self.pictures = FreshnessRecord()
         self.counters: Counter[str] = Counter()
         self.accepted = 0
-        self.last_refusal: LastRefusal | None = None
+        self.last_refusal: LastRejection | None = None
         self.latency_us: int | None = None
         self.state = State.STOPPED if stopped else State.DISARMED
         self.reason = "STOP was set before the restart" if stopped else "not armed"
@@ -41,7 +41,7 @@ class SafetyGate:
         self._lease = Lease(config.lease_ms * 1000)
         self._ramp = Ramp(config)
         self._guard = guard
-        self._command: Accepted | None = None
+        self._command: AcceptedCommand | None = None
         self._live_commands = 0
         self.arms_itself = config.auto_arm and not stopped
         self._last_step_us: int | None = None
@@ -49,54 +49,54 @@ class SafetyGate:
 
     # --- commands ------------------------------------------------------------------------------------------------
 
-    def offer(self, source: str, header: AnswerHeader | None, twist: Twist, now_us: int) -> Verdict:
+    def offer(self, source: str, header: AnswerHeader | None, twist: Twist, now_us: int) -> CommandResult:
         """Judge one command on arrival. Never raises; every refusal is typed, counted and kept in words."""
         try:
             age_us = self._judge(source, header, twist, now_us)
         except WireError as error:
             return self.refuse(source, error)
         self.accepted += 1
-        return Verdict(None, age_us=age_us)
+        return CommandResult(None, age_us=age_us)
 
-    def refuse(self, source: str, error: WireError) -> Verdict:
+    def refuse(self, source: str, error: WireError) -> CommandResult:
         """Count a refusal; also for what the decoder refused before it could be offered."""
         self.counters[error.reason] += 1
-        self.last_refusal = LastRefusal(source=source[:32], reason=error.reason, detail=error.detail[:200])
-        return Verdict(error.reason, error.detail)
+        self.last_refusal = LastRejection(source=source[:32], reason=error.reason, detail=error.detail[:200])
+        return CommandResult(error.reason, error.detail)
 
     def _judge(self, source: str, header: AnswerHeader | None, twist: Twist, now_us: int) -> int:
         if not (math.isfinite(twist.linear_mps) and math.isfinite(twist.angular_rad_s)):
-            raise WireError(Refusal.NOT_FINITE, "twist is not finite")
+            raise WireError(RejectReason.NOT_FINITE, "twist is not finite")
         who, age_us = self._identify(source, header, now_us)
         if self.state in (State.STOPPED, State.FAULT):
-            raise WireError(Refusal(self.state), self.reason)
+            raise WireError(RejectReason(self.state), self.reason)
         self._notice_lost_human(now_us)
         holder = self._lease.live_holder(now_us)
         if not self._lease.may_take(who, now_us):
-            raise WireError(Refusal.NOT_HOLDER, f"{holder.source} {holder.session} drives" if holder else "")
+            raise WireError(RejectReason.NOT_HOLDER, f"{holder.source} {holder.session} drives" if holder else "")
         self._live_commands = self._live_commands + 1 if holder == who else 1
         self._lease.take(who, now_us)
         if not is_armed(self.state):
-            raise WireError(Refusal.DISARMED, self.reason)
+            raise WireError(RejectReason.DISARMED, self.reason)
         self._keep(source, twist, now_us, age_us)
         return age_us
 
     def _identify(self, source: str, header: AnswerHeader | None, now_us: int) -> tuple[Holder, int]:
         """Who sends, and how old the frame behind it is."""
         if source not in RANKS or (header is not None and header.source != source):
-            raise WireError(Refusal.UNKNOWN_SOURCE, f"no driver is called {source!r}, or key and header disagree")
+            raise WireError(RejectReason.UNKNOWN_SOURCE, f"no driver is called {source!r}, or key and header disagree")
         if source == "guest" and not self.config.guests:
-            raise WireError(Refusal.UNKNOWN_SOURCE, "guests are switched off (safety.guests)")
+            raise WireError(RejectReason.UNKNOWN_SOURCE, "guests are switched off (safety.guests)")
         if header is None:
             if source != "guest":
-                raise WireError(Refusal.MALFORMED, f"a twist of {source} needs a header that cites a frame")
+                raise WireError(RejectReason.MALFORMED, f"a twist of {source} needs a header that cites a frame")
             return _GUEST, 0
         if header.echo.channel == "status":
-            raise WireError(Refusal.UNKNOWN_FRAME, "a twist must cite a frame, not a status")
+            raise WireError(RejectReason.UNKNOWN_FRAME, "a twist must cite a frame, not a status")
         self.issued.age_us(header.echo, now_us, self.config.max_age_us)
         age_us = now_us - self.pictures.shown_since_us(header.echo.t_us)
         if age_us > self.config.max_age_us:
-            raise WireError(Refusal.STALE, f"the camera's picture has not changed for {age_us / 1e3:.0f} ms")
+            raise WireError(RejectReason.STALE, f"the camera's picture has not changed for {age_us / 1e3:.0f} ms")
         self._sequence.check(header)
         return Holder(source=header.source, session=header.session), age_us
 
@@ -110,7 +110,7 @@ class SafetyGate:
         if limited != twist:
             self.counters[CLAMPED] += 1
         life_ms = min(config.silence_ms, config.guest_life_ms) if guest else config.silence_ms
-        self._command = Accepted(limited, now_us - age_us, now_us, life_ms * 1000)
+        self._command = AcceptedCommand(limited, now_us - age_us, now_us, life_ms * 1000)
         if not guest:
             self.latency_us = age_us
 
@@ -187,7 +187,7 @@ class SafetyGate:
 
     def fault(self, reason: str) -> None:
         """The drive failed: wheels to zero until `reset`."""
-        if after(self.state, Event.FAULT) is not self.state:  # once: one that lasts does not stand against a reset
+        if next_state(self.state, Event.FAULT) is not self.state:  # once: one that lasts does not stand against a reset
             self._end(Event.FAULT, reason)
 
     def halt(self, reason: str) -> None:
@@ -207,7 +207,7 @@ class SafetyGate:
         if self.state not in (State.STOPPED, State.FAULT):
             return f"nothing to reset: {self.state}"
         if self.applied != STILL:
-            raise WireError(Refusal.NOT_ALLOWED, "the wheels are not at zero yet; ask again")
+            raise WireError(RejectReason.NOT_ALLOWED, "the wheels are not at zero yet; ask again")
         self._leave(Event.RESET, f"reset by {who.source}; not armed")
         return "reset; arm to drive"
 
@@ -217,10 +217,10 @@ class SafetyGate:
         if is_armed(self.state):
             return "already armed"
         if self.state is not State.DISARMED:
-            raise WireError(Refusal(self.state), f"{self.reason}; reset first")
+            raise WireError(RejectReason(self.state), f"{self.reason}; reset first")
         missing = self._missing_to_arm(now_us)
         if missing:
-            raise WireError(Refusal.NOT_ALLOWED, missing)
+            raise WireError(RejectReason.NOT_ALLOWED, missing)
         self.arms_itself = self.config.auto_arm
         self._begin(f"armed by {who.source}", now_us)
         return "armed"
@@ -229,7 +229,7 @@ class SafetyGate:
         """Take the lease ahead of the first command. It is not renewed so: only commands do that."""
         if who.source not in RANKS or not self._lease.may_take(who, now_us):
             holder = self._lease.live_holder(now_us)
-            raise WireError(Refusal.NOT_HOLDER, f"{holder.source if holder else 'nobody'} drives")
+            raise WireError(RejectReason.NOT_HOLDER, f"{holder.source if holder else 'nobody'} drives")
         if self._lease.live_holder(now_us) == who:
             return "already held"
         self._live_commands, self._command = 0, None  # the driver before neither arms nor drives for this one
@@ -257,7 +257,7 @@ class SafetyGate:
     def _refuse_beside_human(self, who: Holder, now_us: int) -> None:
         holder = self._lease.live_holder(now_us)
         if holder is not None and holder.source in HUMANS and holder != who:
-            raise WireError(Refusal.NOT_ALLOWED, f"{holder.source} {holder.session} drives")
+            raise WireError(RejectReason.NOT_ALLOWED, f"{holder.source} {holder.session} drives")
 
     def _missing_to_arm(self, now_us: int) -> str:
         """What still stands against arming, "" if nothing."""
@@ -290,10 +290,10 @@ class SafetyGate:
 
     def _leave(self, event: Event, reason: str) -> None:
         """Go where the wheels are off; auto_arm, where it is on, may take it up again."""
-        if after(self.state, event) is not self.state:
+        if next_state(self.state, event) is not self.state:
             self._command, self._live_commands = None, 0
             self._go(event, reason)
 
     def _go(self, event: Event, reason: str) -> None:
-        self.state = after(self.state, event)
+        self.state = next_state(self.state, event)
         self.reason = reason

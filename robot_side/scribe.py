@@ -19,7 +19,7 @@ _CLOSE_S: Final = 1.0
 _STACK_BYTES: Final = 256 * 1024
 
 
-class Scribe:
+class BackgroundWriter:
     """Prints lines, and keeps the STOP latch as it was last wanted: a level, tried again until it is kept.
 
     Each on a thread of its own, so that a terminal that nobody reads does not hold up the mark.

@@ -4,15 +4,15 @@ from protocol.channels import CAMERA, FRAME
 from protocol.codec import decode, encode
 from protocol.messages import AnswerHeader, CameraModel, FrameHeader, Holder, Planar, Pose, Stamp, StreamStatus
 from protocol.transports.link import Message
-from robot_side.encoding import Wish
-from robot_side.ipc import Judged, Motion
+from robot_side.encoding import EncodingTarget
+from robot_side.ipc import CommandAck, Motion
 from robot_side.ports import Picture
 from robot_side.stream import Stream, StreamConfig
 
 _CAMERA_PERIOD_US = 500_000
 
 
-class Sending:
+class NetworkCore:
     """One network process of one robot session; `first_seq` continues where an earlier process ended."""
 
     def __init__(self, config: StreamConfig, session: str, first_seq: int, max_frame_bytes: int) -> None:
@@ -58,7 +58,7 @@ class Sending:
             latency_us=motion.latency_us,
         )
 
-    def on_judged(self, judged: Judged, now_us: int) -> None:
+    def on_judged(self, judged: CommandAck, now_us: int) -> None:
         """The driver judged a twist: credit comes back, and goes to who drives."""
         self._stream.on_holder(judged.holder, now_us)
         self._answer(judged.sender, judged.seq, judged.compute_us, now_us)
@@ -75,7 +75,7 @@ class Sending:
             self._stream.on_answer(who, seq, compute_us, now_us)
 
     @property
-    def wish(self) -> Wish:
+    def wish(self) -> EncodingTarget:
         """How the next picture should be encoded, where the camera can."""
         return self._stream.wish
 

@@ -47,7 +47,7 @@ TRANSITIONS: dict[tuple[State, Event], State] = {
 }
 
 
-def after(state: State, event: Event) -> State:
+def next_state(state: State, event: Event) -> State:
     """The state that `event` leads to; pairs outside the table change nothing."""
     return TRANSITIONS.get((state, event), state)
 

@@ -14,8 +14,8 @@ from pydantic import Field
 
 from protocol.config import Config
 from protocol.messages import Holder, StreamStatus
-from robot_side.encoding import Encoding, Wish
-from robot_side.window import Answered, Window
+from robot_side.encoding import BitrateControl, EncodingTarget
+from robot_side.window import AckSample, CongestionWindow
 
 _FIRST_TIMEOUT_US = 120_000
 _REMEMBERED = 64
@@ -57,8 +57,8 @@ class Stream:
         self._sent_frames: OrderedDict[int, _Sent] = OrderedDict()  # also of frames whose credit has timed out
         self._owner: Holder | None = None
         self._owner_until_us = 0
-        self._window = Window(self._interval_us, config.max_window)
-        self._encoding = Encoding()
+        self._window = CongestionWindow(self._interval_us, config.max_window)
+        self._encoding = BitrateControl()
         self._answer_us: float | None = None
         self._spread_us = 0.0
         self._answered_at_us = 0
@@ -82,9 +82,9 @@ class Stream:
         return len(self._in_flight) < self.window
 
     @property
-    def wish(self) -> Wish:
+    def wish(self) -> EncodingTarget:
         """How the next picture should be encoded."""
-        return self._encoding.wish if self._config.adapt else Wish()
+        return self._encoding.wish if self._config.adapt else EncodingTarget()
 
     # --- sending -------------------------------------------------------------------------------------------------
 
@@ -154,7 +154,7 @@ class Stream:
         """A slow successor must not be held to a quick one's times, nor to what the way to that one carried."""
         self._owner = owner
         self._answer_us, self._spread_us, self._overdue = None, 0.0, 0
-        self._window = Window(self._interval_us, self._config.max_window)
+        self._window = CongestionWindow(self._interval_us, self._config.max_window)
 
     def _measure(self, sent: _Sent, passed: list[_Sent], compute_us: int, now_us: int) -> None:
         answer_us = now_us - sent.at_us
@@ -166,7 +166,7 @@ class Stream:
         carried = sum(one.size_bytes for one in passed)
         self._answered_at_us = now_us
         gap_us = now_us - carrying_since_us
-        answered = Answered(
+        answered = AckSample(
             delay_us, sent.behind, sent.followed, sent.held_back, gap_us, len(passed), carried, compute_us
         )
         full = self._window.on_answer(answered, now_us)

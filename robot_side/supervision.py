@@ -14,7 +14,7 @@ _PRIORITY: Final = 50  # above ordinary threads and the kernel's own soft work, 
 _MCL_CURRENT_AND_FUTURE: Final = 3
 
 
-def become_punctual() -> Iterator[str]:
+def request_real_time() -> Iterator[str]:
     """Freeze the garbage collector's survivors, ask for real-time scheduling and locked memory; yields what failed."""
     gc.collect()
     gc.freeze()
@@ -27,7 +27,7 @@ def become_punctual() -> Iterator[str]:
         yield "locking memory is not permitted (needs CAP_IPC_LOCK or LimitMEMLOCK); swapping may delay a tick"
 
 
-class ServiceManager:
+class SystemdNotifier:
     """systemd's notification socket (sd_notify(3)); without one every call does nothing."""
 
     def __init__(self) -> None:

@@ -42,7 +42,7 @@ _KEEPS_UP: Final = 1.05
 
 
 @dataclass(frozen=True, slots=True)
-class Answered:
+class AckSample:
     """A frame's answer. `delay_us` is without the peer's computing; `held_back`: it was due before there was credit.
 
     `behind`: something was in flight when it left. `followed`: something left before its answer came, which waits
@@ -62,7 +62,7 @@ class Answered:
 
 
 @dataclass(frozen=True, slots=True)
-class Full:
+class LinkCapacity:
     """The link carries no more than this; a frame took `delay_us` behind others."""
 
     bytes_per_s: float
@@ -70,7 +70,7 @@ class Full:
 
 
 @dataclass(frozen=True, slots=True)
-class _Thin:
+class _MeasuredRate:
     """What the link carried when a wider window made frames wait; by itself a frame took `own_us` then."""
 
     bytes_per_s: float
@@ -82,19 +82,19 @@ class _Thin:
         return frame_bytes * 1e6 / self.bytes_per_s
 
 
-class Window:
+class CongestionWindow:
     """The number of `frames` that may be in flight, from 1 to `most`; one more for each `interval_us` of delay."""
 
     def __init__(self, interval_us: int, most: int) -> None:
         self._interval_us, self._most = interval_us, most
         self._alone_us: deque[int] = deque(maxlen=_ALONE_KEPT)
-        self._behind: deque[Answered] = deque(maxlen=_BEHIND_KEPT)
+        self._behind: deque[AckSample] = deque(maxlen=_BEHIND_KEPT)
         self._since_change = self._carried_us = self._carried_bytes = 0
         self._compute_us = 0.0
         self._grow_at_us = self._changed_at_us = 0
         self._pause_us = _FIRST_PAUSE_US
         self._failed = False
-        self._thin: _Thin | None = None
+        self._thin: _MeasuredRate | None = None
         self._rate_bytes_per_s = 0.0
         self._frame_bytes = 0.0
         self.frames = 1
@@ -104,7 +104,7 @@ class Window:
         """What the link itself takes, as far as it is known."""
         return min(self._alone_us, default=None)
 
-    def on_answer(self, answered: Answered, now_us: int) -> Full | None:
+    def on_answer(self, answered: AckSample, now_us: int) -> LinkCapacity | None:
         """Learn from an answer. Returns what the link carries where it falls behind the camera."""
         self._since_change += 1
         self._compute_us += 0.3 * (answered.compute_us - self._compute_us)
@@ -145,7 +145,7 @@ class Window:
     def _waited_us(self) -> int:
         return min(one.delay_us for one in self._behind)
 
-    def _narrowed(self, now_us: int) -> Full | None:
+    def _narrowed(self, now_us: int) -> LinkCapacity | None:
         full, own_us = self._full(), self.own_delay_us or 0
         kept = round(self.frames * own_us / max(1, self._waited_us()))
         if kept < self.frames:
@@ -158,19 +158,19 @@ class Window:
         self._behind.clear()  # what waited is told once
         return full
 
-    def _note_rate(self, full: Full | None, own_us: int, now_us: int) -> None:
+    def _note_rate(self, full: LinkCapacity | None, own_us: int, now_us: int) -> None:
         before, now = self._rate_bytes_per_s, self._carried_bytes * 1e6 / max(1, self._carried_us) if full else 0.0
         if min(now, before) * _ALIKE > max(now, before):
-            self._thin = _Thin(now, own_us, now_us + _THIN_US)
+            self._thin = _MeasuredRate(now, own_us, now_us + _THIN_US)
         self._rate_bytes_per_s = now
 
-    def _full(self) -> Full | None:
+    def _full(self) -> LinkCapacity | None:
         gap_us = sum(one.gap_us for one in self._behind)
         keeps_up = gap_us <= _KEEPS_UP * self._interval_us * sum(one.gap_frames for one in self._behind)
         peer_bound = sum(one.compute_us for one in self._behind) > _PEER_BOUND_SHARE * gap_us
         if keeps_up or peer_bound:
             return None
-        return Full(sum(one.gap_bytes for one in self._behind) * 1e6 / gap_us, self._waited_us())
+        return LinkCapacity(sum(one.gap_bytes for one in self._behind) * 1e6 / gap_us, self._waited_us())
 
     def _widen(self, now_us: int) -> None:
         """More, once it is seen that nobody waits; by doubling until it was once too much."""

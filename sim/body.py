@@ -7,31 +7,31 @@ radii differ are hung so that both touch the floor and the plate stays level.
 from dataclasses import dataclass
 from pathlib import Path
 
-from sim.frames import Frame
+from sim.frames import Transform
 from sim.robot_model import Caster, Chassis, RobotModel
 from sim.urdf import Outline, Urdf
 from sim.xacro import urdf_text
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class UrdfBody:
     """What PyBullet is to load, and what it must know of it."""
 
     text: str
     joints: tuple[str, str] = ("left", "right")
     signs: tuple[float, float] = (1.0, 1.0)
     """-1 where the joint's positive turn rolls the wheel backwards."""
-    foot: Frame | None = None
+    foot: Transform | None = None
     """The axle's midpoint on the floor, seen from the root link; None where it is the root link."""
 
 
-def body_of(robot: RobotModel) -> Body:
+def urdf_body(robot: RobotModel) -> UrdfBody:
     """The body of `robot`. Raises ConfigError for a URDF that has gone or changed since."""
     if not robot.urdf:
-        return Body(urdf(robot))
+        return UrdfBody(urdf_from_model(robot))
     file, wheels = Urdf(urdf_text(Path(robot.urdf)), robot.urdf), robot.wheels
     left, right = file.wheels(wheels.left_joint, wheels.right_joint, robot.front)
-    return Body(
+    return UrdfBody(
         file.text(left.joint, right.joint, wheels.mismatch), (left.joint, right.joint), (left.sign, right.sign),
         file.foot(left.joint, right.joint, robot.front),
     )
@@ -50,7 +50,7 @@ def outline(robot: RobotModel) -> Outline:
     )
 
 
-def urdf(robot: RobotModel) -> str:
+def urdf_from_model(robot: RobotModel) -> str:
     """The body written from its TOML."""
     wheels = robot.wheels
     left_m = wheels.radius_m * (1 + wheels.mismatch / 2)

@@ -245,7 +245,7 @@ class SimRange:
         self._connection.close()
 
 
-class Simulated(Config):
+class SimulationInfo(Config):
     """What a simulation says of itself: enough to load its scenario and robot again."""
 
     scenario: str
@@ -259,7 +259,7 @@ class TruthReader:
 
     def __init__(self, socket_dir: str) -> None:
         self._connection = Connection(socket_dir, TRUTH)
-        self.simulated = Simulated.model_validate_json(self._connection.hello())
+        self.simulated = SimulationInfo.model_validate_json(self._connection.hello())
 
     def read(self, timeout_s: float) -> Truth | None:
         """The next report in order, None if none came in time. Raises HardwareError when the simulation is gone."""

@@ -1,7 +1,7 @@
 """Says when something periodic is due. Pure."""
 
 
-class Cadence:
+class PeriodicTimer:
     """On average exactly at its rate, whatever the steps in which it is asked."""
 
     def __init__(self, period_us: float) -> None:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import simplejpeg
 
 from protocol.messages import CameraModel
-from robot_side.ports import scaled_size, share_of
+from robot_side.ports import scaled_size, scaled_quality
 from sim.engine import pybullet
 from sim.look import Look
 from sim.scenario import Wall
@@ -147,7 +147,7 @@ class Defects:
             cv2.GaussianBlur(picture, (0, 0), look.blur_px, picture)
         if self._pool is not None:
             cv2.add(picture, self._noise(self._pool), picture, dtype=cv2.CV_8U)
-        quality = share_of(look.jpeg_quality, quality_percent)
+        quality = scaled_quality(look.jpeg_quality, quality_percent)
         return bytes(simplejpeg.encode_jpeg(self._scaled(picture, scale_percent), quality, "RGB", "420"))
 
     def _scaled(self, picture: Picture, scale_percent: int) -> Picture:

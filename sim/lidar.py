@@ -14,7 +14,7 @@ import numpy.typing as npt
 from robot_side.ports import Ranges
 from sim.engine import pybullet
 from sim.physics import TARGET, WALL, Vector
-from sim.robot_model import LidarModel, RangeEye
+from sim.robot_model import LidarModel, RangeSensorMount
 
 Numbers = npt.NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class Lidar:
             np.minimum.at(merged, numbers[inside], away[inside])
         return merged
 
-    def _echoes(self, eye: RangeEye, place: Vector, yaw_rad: float) -> tuple[Numbers, Numbers]:
+    def _echoes(self, eye: RangeSensorMount, place: Vector, yaw_rad: float) -> tuple[Numbers, Numbers]:
         """Of one eye: how far its echoes are from the scan's place, and in which direction of the robot."""
         half_rad = math.radians(eye.span_deg) / 2
         angles_rad: Numbers = math.radians(eye.facing_deg) + np.linspace(-half_rad, half_rad, eye.rays)

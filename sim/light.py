@@ -10,11 +10,11 @@ from typing import Annotated, Literal, NamedTuple
 from pydantic import Field
 
 from protocol.config import Config
-from sim.things import Amounts, Colour, Degrees, Point, Side
+from sim.things import Amounts, Color, Degrees, Point, Side
 
 State = Literal["red", "yellow", "green"]
 
-LIT: dict[str, Colour] = {"red": (0.95, 0.10, 0.08), "yellow": (0.98, 0.80, 0.06), "green": (0.06, 0.80, 0.22)}
+LIT: dict[str, Color] = {"red": (0.95, 0.10, 0.08), "yellow": (0.98, 0.80, 0.06), "green": (0.06, 0.80, 0.22)}
 UNLIT = 0.22  # of its lit colour: glass that nothing shines behind
 
 
@@ -93,7 +93,7 @@ class Light(Config):
         return (line_x_m - x_m) * math.cos(faces_rad) + (line_y_m - y_m) * math.sin(faces_rad)
 
 
-def colour_of(part: Part, state: State) -> Colour:
+def color_of(part: Part, state: State) -> Color:
     """What a part looks like while `state` is lit."""
     if part.state == "":
         return 0.07, 0.07, 0.08

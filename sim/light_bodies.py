@@ -3,7 +3,7 @@
 import math
 
 from sim.engine import pybullet
-from sim.light import Light, Part, colour_of
+from sim.light import Light, Part, color_of
 from sim.physics import FLOOR, ROBOT, TARGET, WALL, group
 from sim.thing_bodies import ball_visual
 
@@ -36,11 +36,11 @@ class LightBodies:
             return
         self.state = state
         for part, body in self._parts:
-            rgba = [*colour_of(part, state), 1]
+            rgba = [*color_of(part, state), 1]
             pybullet.changeVisualShape(body, -1, rgbaColor=rgba, physicsClientId=self._client)
 
     def _add(self, part: Part) -> int:
-        client, half, colour = self._client, [side / 2 for side in part.size_m], colour_of(part, self.state)
+        client, half, colour = self._client, [side / 2 for side in part.size_m], color_of(part, self.state)
         if part.shape == "ball":
             visual = ball_visual(client, part.size_m[0], colour)
             return int(pybullet.createMultiBody(0, _NOTHING, visual, part.at_m, self._turn, physicsClientId=client))

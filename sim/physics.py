@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from protocol.errors import ConfigError
-from sim.body import Body, body_of
+from sim.body import UrdfBody, urdf_body
 from sim.engine import pybullet
-from sim.frames import Frame
+from sim.frames import Transform
 from sim.path import Place
 from sim.robot_model import RobotModel
 from sim.scenario import Wall
@@ -67,7 +67,7 @@ def add_wall(client: int, wall: Wall) -> int:
 
 def add_robot(client: int, robot: RobotModel, at: Place) -> "RobotBody":
     """The robot with its axle's midpoint at `at`, motors off. Raises ConfigError for a URDF that PyBullet refuses."""
-    body = body_of(robot)
+    body = urdf_body(robot)
     loaded = _load(client, robot, body, at)
     moving = {
         str(pybullet.getJointInfo(loaded, joint, physicsClientId=client)[1], "utf-8"): joint
@@ -86,7 +86,7 @@ def add_robot(client: int, robot: RobotModel, at: Place) -> "RobotBody":
     return RobotBody(client, loaded, wheels, body, robot.wheels.max_torque_nm)
 
 
-def _load(client: int, robot: RobotModel, body: Body, at: Place) -> int:
+def _load(client: int, robot: RobotModel, body: UrdfBody, at: Place) -> int:
     """PyBullet reads files only."""
     place, turn = (at.x_m, at.y_m, 0.0), pybullet.getQuaternionFromEuler([0, 0, at.heading_rad])
     if body.foot is not None:
@@ -112,7 +112,7 @@ def _loosen(client: int, body: int, joints: list[int]) -> None:
         pybullet.changeVisualShape(body, link, rgbaColor=[0, 0, 0, 0], physicsClientId=client)
 
 
-def _as_bullet(frame: Frame) -> tuple[Vector, tuple[float, float, float, float]]:
+def _as_bullet(frame: Transform) -> tuple[Vector, tuple[float, float, float, float]]:
     """A level frame as position and quaternion."""
     return frame.at, pybullet.getQuaternionFromEuler([0, 0, frame.yaw_rad])
 
@@ -127,7 +127,7 @@ def group(client: int, body: int, own: int, meets: int) -> None:
 class RobotBody:
     """The robot's pose, speed and wheels in one client."""
 
-    def __init__(self, client: int, body: int, wheels: list[int], drawn: Body, max_torque_nm: float) -> None:
+    def __init__(self, client: int, body: int, wheels: list[int], drawn: UrdfBody, max_torque_nm: float) -> None:
         self.body = body
         self._client = client
         self._wheels, self._signs = wheels, drawn.signs

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from protocol.config import Config
 from protocol.errors import ConfigError
 from protocol.messages import CameraModel
-from sim.frames import Frame
+from sim.frames import Transform
 from sim.toml_file import check, find, names_in, read_table
 from sim.urdf import Front, Urdf
 from sim.xacro import urdf_text
@@ -74,7 +74,7 @@ class Caster(Config):
     x_m: Place
 
 
-class Eye(Config):
+class CameraMount(Config):
     """The camera: where the lens is, what it sees. Straight ahead, no distortion."""
 
     link: str = ""
@@ -95,7 +95,7 @@ class Eye(Config):
         )
 
 
-class RangeEye(Config):
+class RangeSensorMount(Config):
     """One of several small range sensors whose echoes are merged into one scan."""
 
     link: str = ""
@@ -126,7 +126,7 @@ class LidarModel(Config):
     rate_hz: Annotated[float, Field(gt=0, le=50)]
     noise_m: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Standard deviation of each range."""
-    eyes: Annotated[tuple[RangeEye, ...], Field(max_length=16)] = ()
+    eyes: Annotated[tuple[RangeSensorMount, ...], Field(max_length=16)] = ()
 
     @model_validator(mode="after")
     def _sees_something(self) -> Self:
@@ -155,7 +155,7 @@ class RobotModel(Config):
     wheels: Wheels
     chassis: Chassis | None = None
     caster: Caster | None = None
-    camera: Eye
+    camera: CameraMount
     lidar: LidarModel
     settings: dict[str, Any] = Field(default_factory=dict)
 
@@ -209,7 +209,7 @@ def _table(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     return found
 
 
-def _mount(sensor: dict[str, Any], where: Frame, is_eye: bool) -> None:
+def _mount(sensor: dict[str, Any], where: Transform, is_eye: bool) -> None:
     """Put a sensor where its link is; an eye, which lies in the scan's plane, faces as its link does."""
     sensor["x_m"] = where.at[0]
     if is_eye:

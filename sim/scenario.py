@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from protocol.config import Config
 from sim.light import Light
 from sim.look import Look, look_named
-from sim.things import Amounts, Colour, Forced, Moving, OnPath, Point, Pushed, Span, Standing, Static
+from sim.things import Amounts, Color, Forced, Moving, OnPath, Point, Pushed, Span, Standing, Static
 from sim.toml_file import check, find, names_in, read_table
 
 __all__ = ["Forced", "OnPath", "Pushed", "Scenario", "Start", "Static", "Wall", "load_scenario", "scenario_names"]
@@ -47,7 +47,7 @@ class Wall(Config):
     end_m: Point
     thickness_m: Annotated[float, Field(gt=0, le=10)] = 0.05
     height_m: Annotated[float, Field(gt=0, le=10)] = 0.35
-    colour: Colour = (0.62, 0.64, 0.68)
+    colour: Color = (0.62, 0.64, 0.68)
 
     @model_validator(mode="after")
     def _has_length(self) -> Self:

@@ -16,10 +16,10 @@ _POOL_SIDE = 1024
 
 def as_seen(scene: Scene) -> bytes:
     """The scene's JPEG, with the defects that its seed draws from its column."""
-    return spoiled(scene.rgb, scene.plan.column, np.random.default_rng([scene.plan.seed, 13]))
+    return with_defects(scene.rgb, scene.plan.column, np.random.default_rng([scene.plan.seed, 13]))
 
 
-def spoiled(rgb: Picture, column: Column, draw: Random) -> bytes:
+def with_defects(rgb: Picture, column: Column, draw: Random) -> bytes:
     """`rgb` as JPEG, as bad as the column says."""
     gains = draw.uniform(*column.gain) * (1 + draw.uniform(-column.white_balance, column.white_balance, 3))
     steps = np.clip(np.rint(np.arange(256)[:, None] * gains), 0, 255).astype(np.uint8)

@@ -27,7 +27,7 @@ from sim.scenes import (
     Surface,
     is_judged,
 )
-from sim.things import Colour
+from sim.things import Color
 
 _YELLOW = {"saturation": (0.72, 1.0), "value": (0.75, 1.0), "hue_deg": (42.0, 58.0)}
 _JUDGED_LIGHT_DEG = ((30.0, 50.0),)  # how high the light stands; between those of training, and never trained on
@@ -137,7 +137,7 @@ def _distractor(draw: Random, lens: Lens, floor_m: float) -> Solid:
     return Solid(shape, (x, y, z + sides[2] / 2), sides, _any_colour(draw), draw.uniform(0, math.tau))
 
 
-def _any_colour(draw: Random) -> Colour:
+def _any_colour(draw: Random) -> Color:
     return any_rgb(draw, (0.0, 1.0), (0.1, 1.0))
 
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from sim.camera import FAR_M, NEAR_M, NOTHING_DEPTH
 from sim.engine import pybullet
-from sim.light import LIT, Light, Part, State, colour_of
+from sim.light import LIT, Light, Part, State, color_of
 from sim.scene_backdrop import backdrop
 from sim.scene_plan import plan_scene, with_more_of_the_ball
 from sim.scenes import (
@@ -25,10 +25,10 @@ from sim.scenes import (
     Scene,
     ScenePlan,
     Solid,
-    Truth,
+    LabelledBox,
 )
 from sim.thing_bodies import ball_visual
-from sim.things import Colour, Legs
+from sim.things import Color, Legs
 
 Mask = npt.NDArray[Any]
 
@@ -117,7 +117,7 @@ class SceneRenderer:
         added: list[tuple[int, str]] = []
         for part in model.parts():
             at, size = _placed(part, model, one), tuple(side * scale for side in part.size_m)
-            colour = colour_of(part, state)
+            colour = color_of(part, state)
             visual = ball_visual(self._client, size[0], colour) if part.shape == "ball" else self._box_visual(
                 (size[0], size[1], size[2]), colour)
             body = self._body(visual, at, turn)
@@ -131,7 +131,7 @@ class SceneRenderer:
             specularColor=[0, 0, 0], physicsClientId=self._client,
         )), at)
 
-    def _box_visual(self, size: tuple[float, float, float], colour: Colour) -> int:
+    def _box_visual(self, size: tuple[float, float, float], colour: Color) -> int:
         return int(pybullet.createVisualShape(
             pybullet.GEOM_BOX, halfExtents=[side / 2 for side in size], rgbaColor=[*colour, 1],
             specularColor=[0, 0, 0], physicsClientId=self._client,
@@ -142,7 +142,7 @@ class SceneRenderer:
         return int(pybullet.createMultiBody(0, -1, visual, at, turn, physicsClientId=self._client))
 
 
-def _has_ball(ones: Sequence[Solid] | Sequence[Truth]) -> bool:
+def _has_ball(ones: Sequence[Solid] | Sequence[LabelledBox]) -> bool:
     return any(one.label == "ball" for one in ones)
 
 
@@ -200,14 +200,14 @@ def _box(mask: Mask) -> Box | None:
     return (float(x), float(y), float(x + width), float(y + height)) if width else None
 
 
-def _truth(lens: Lens, solid: Solid, seen: Box | None, which: Mask, own: list[tuple[int, str]]) -> Truth | None:
+def _truth(lens: Lens, solid: Solid, seen: Box | None, which: Mask, own: list[tuple[int, str]]) -> LabelledBox | None:
     if seen is None:
         return None
     if solid.shape == "ball":
         whole = lens.ball_box(solid.at_m, solid.size_m[0] / 2)
         area = math.pi / 4 * (whole[2] - whole[0]) * (whole[3] - whole[1])
-        return Truth(solid.label, seen, min(1.0, int(np.count_nonzero(which == own[0][0])) / area), whole)
-    return Truth(solid.label, seen, _seen_share(lens, solid, seen))
+        return LabelledBox(solid.label, seen, min(1.0, int(np.count_nonzero(which == own[0][0])) / area), whole)
+    return LabelledBox(solid.label, seen, _seen_share(lens, solid, seen))
 
 
 def _seen_share(lens: Lens, solid: Solid, seen: Box) -> float:
@@ -233,7 +233,7 @@ def _corners(solid: Solid) -> npt.NDArray[np.float64]:
     return np.array([[x - a * wide * sin, y + a * wide * cos, z + b * high] for a in (-1, 1) for b in (-1, 1)])
 
 
-def _is_clear(truth: Truth) -> bool:
+def _is_clear(truth: LabelledBox) -> bool:
     x1, y1, x2, y2 = truth.box
     if truth.label == "ball":
         return truth.seen >= 1 - MOST_HIDDEN

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sim.light import State
-from sim.things import Colour
+from sim.things import Color
 
 JUDGED_FROM: Final = 900_000
 """Seeds from here on are for judging only."""
@@ -135,7 +135,7 @@ class Solid:
     """Middle of a ball, a box, a cylinder; where legs stand; middle of a light's housing."""
     size_m: Point
     """Sides of a box; radius, radius, height of a cylinder or a leg; scale of a light."""
-    colour: Colour
+    colour: Color
     turn_rad: float = 0.0
     label: str = ""
     step: float = 0.0
@@ -175,7 +175,7 @@ class ScenePlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Truth:
+class LabelledBox:
     """One object that is asked for, in pixels."""
 
     label: str
@@ -193,7 +193,7 @@ class Scene:
 
     plan: ScenePlan
     rgb: npt.NDArray[np.uint8]
-    truths: tuple[Truth, ...]
+    truths: tuple[LabelledBox, ...]
     others: tuple[Box, ...]
     unclear: tuple[Box, ...]
     """Things that are asked for, but hardly in view: neither right nor wrong."""

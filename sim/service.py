@@ -18,13 +18,23 @@ from pydantic import Field
 from protocol.clock import monotonic_us
 from protocol.codec import encode
 from protocol.errors import ConfigError
-from sim.bus import CAMERA, MOTION, MOTION_ANGLES, PICTURE_HEAD, RANGE, RANGE_HEAD, TRUTH, SimSocketConfig, Simulated
-from sim.cadence import Cadence
+from sim.bus import (
+    CAMERA,
+    MOTION,
+    MOTION_ANGLES,
+    PICTURE_HEAD,
+    RANGE,
+    RANGE_HEAD,
+    TRUTH,
+    SimSocketConfig,
+    SimulationInfo,
+)
+from sim.cadence import PeriodicTimer
 from sim.label_bus import to_json
 from sim.motor_port import MotorPort
 from sim.robot_model import load_robot
 from sim.scenario import load_scenario
-from sim.sockets import Clients, Folder
+from sim.sockets import BusClients, SocketFolder
 
 if TYPE_CHECKING:
     from sim.world import World
@@ -51,13 +61,13 @@ class SimConfig(SimSocketConfig):
 class Simulation:
     """A world, its clients and the clock that drives it."""
 
-    def __init__(self, config: SimConfig, world: World, folder: Folder) -> None:
+    def __init__(self, config: SimConfig, world: World, folder: SocketFolder) -> None:
         self._config, self._world = config, world
         self._motors = MotorPort(config.motor_log)
-        self._clients = Clients(folder, self._hellos(), self._motors.take)
-        self._encoders, self._truth = Cadence(ENCODERS_US), Cadence(TRUTH_US)
-        self._frames = Cadence(1e6 / world.robot.camera.fps)
-        self._scans = Cadence(1e6 / world.robot.lidar.rate_hz)
+        self._clients = BusClients(folder, self._hellos(), self._motors.take)
+        self._encoders, self._truth = PeriodicTimer(ENCODERS_US), PeriodicTimer(TRUTH_US)
+        self._frames = PeriodicTimer(1e6 / world.robot.camera.fps)
+        self._scans = PeriodicTimer(1e6 / world.robot.lidar.rate_hz)
         self._offset_us = monotonic_us()
         self._lag_us = 0
         self._told_lag = False
@@ -66,7 +76,7 @@ class Simulation:
     def _hellos(self) -> dict[str, bytes]:
         config = self._config
         robot = config.robot or self._world.scenario.robot
-        about = Simulated(scenario=config.scenario, robot=robot, seed=config.seed, pid=os.getpid())
+        about = SimulationInfo(scenario=config.scenario, robot=robot, seed=config.seed, pid=os.getpid())
         return {CAMERA: encode(self._world.camera_model), TRUTH: about.model_dump_json().encode()}
 
     def run(self) -> None:
@@ -135,7 +145,7 @@ def run(config: SimConfig) -> int:
     """
     scenario = load_scenario(config.scenario)
     robot = load_robot(config.robot or scenario.robot)
-    folder = Folder(config.socket_dir)
+    folder = SocketFolder(config.socket_dir)
     try:
         with _world_class()(scenario, robot, config.seed) as world:
             _simulate(Simulation(config, world, folder), config, robot.name)

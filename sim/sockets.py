@@ -20,7 +20,7 @@ SEND_BYTES = {MOTION: 4096, RANGE: 16_384, CAMERA: 1 << 20, TRUTH: 1 << 17}
 STOP_POLL_S = 0.2
 
 
-class Folder:
+class SocketFolder:
     """The folder of sockets, held by one simulation at a time through a lock that dies with its process."""
 
     def __init__(self, path: str) -> None:
@@ -64,10 +64,10 @@ class Folder:
             self._lock = -1
 
 
-class Clients:
+class BusClients:
     """Everybody connected to the four sockets of a folder."""
 
-    def __init__(self, folder: Folder, hellos: dict[str, bytes], on_motion: Callable[[bytes], None]) -> None:
+    def __init__(self, folder: SocketFolder, hellos: dict[str, bytes], on_motion: Callable[[bytes], None]) -> None:
         self._hellos, self._on_motion = hellos, on_motion
         self._lock = threading.Lock()
         self._clients: dict[str, set[socket.socket]] = {name: set() for name in SEND_BYTES}

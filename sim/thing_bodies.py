@@ -6,7 +6,7 @@ from functools import cache
 from sim.engine import pybullet
 from sim.path import Place
 from sim.physics import FLOOR, ROBOT, TARGET, WALL, Vector, group
-from sim.things import Colour, Rolling, Thing
+from sim.things import Color, Rolling, Thing
 
 _NO_TURN = (0.0, 0.0, 0.0, 1.0)
 
@@ -94,7 +94,7 @@ def _visual(client: int, thing: Thing) -> int:
     ))
 
 
-def ball_visual(client: int, radius_m: float, colour: Colour) -> int:
+def ball_visual(client: int, radius_m: float, colour: Color) -> int:
     """A smooth ball to look at."""
     normals, triangles = round_mesh()
     return int(pybullet.createVisualShape(

@@ -15,7 +15,7 @@ Metres = Annotated[float, Field(ge=-100, le=100)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 Side = Annotated[float, Field(gt=0, le=10)]
-Colour = tuple[Unit, Unit, Unit]
+Color = tuple[Unit, Unit, Unit]
 """Red, green, blue."""
 Point = tuple[Metres, Metres]
 
@@ -59,7 +59,7 @@ class Thing(Config):
     height_m: Side = 0.4
     """Of a cylinder or a leg."""
     legs: Legs = Legs()
-    colour: Colour = (0.95, 0.78, 0.05)
+    colour: Color = (0.95, 0.78, 0.05)
 
     @property
     def middle_m(self) -> float:

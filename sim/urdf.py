@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from protocol.errors import ConfigError
-from sim.frames import Frame, Vector, frame
+from sim.frames import Transform, Vector, transform
 
 Front = Literal["+x", "-x"]
 
@@ -62,12 +62,12 @@ class Urdf:
 
     # --- what a robot asks of it -------------------------------------------------------------------------------------
 
-    def foot(self, left_joint: str, right_joint: str, front: Front) -> Frame:
+    def foot(self, left_joint: str, right_joint: str, front: Front) -> Transform:
         """The axle's midpoint on the floor, x forward, seen from the root link."""
         left, right = self._wheel_place(left_joint), self._wheel_place(right_joint)
         radius_m = self._wheel_radius(left_joint)
         middle = ((left[0] + right[0]) / 2, (left[1] + right[1]) / 2, (left[2] + right[2]) / 2 - radius_m)
-        return frame(middle, yaw_rad=math.pi if front == "-x" else 0.0)
+        return transform(middle, yaw_rad=math.pi if front == "-x" else 0.0)
 
     def wheels(self, left_joint: str, right_joint: str, front: Front) -> tuple[Wheel, Wheel]:
         """Left and right, about the axle's midpoint on the floor."""
@@ -82,13 +82,13 @@ class Urdf:
             )
         return left, right
 
-    def place(self, link: str, foot: Frame) -> Frame:
+    def place(self, link: str, foot: Transform) -> Transform:
         """Where a link is, about the axle's midpoint on the floor."""
         if link not in self._links:
             raise self._wrong(f"has no link {link!r}{_nearest(link, self._links)}")
         return foot.inverse().of(self._frames[link])
 
-    def outline(self, foot: Frame) -> Outline:
+    def outline(self, foot: Transform) -> Outline:
         """Of all collision shapes, wheels included."""
         back = foot.inverse()
         corners = [
@@ -148,7 +148,7 @@ class Urdf:
             if link.find("collision/geometry/mesh") is not None:
                 raise self._wrong(f"link {name!r} collides as a mesh; write it as <box>, <cylinder> or <sphere>")
 
-    def _link_frames(self) -> dict[str, Frame]:
+    def _link_frames(self) -> dict[str, Transform]:
         """Every link, seen from the root, joints at zero."""
         above: dict[str, Element] = {}
         for name, joint in self._joints.items():
@@ -162,7 +162,7 @@ class Urdf:
             raise self._wrong(f"must have one root link, it has {len(roots)}: {', '.join(roots)[:80]}")
         return {name: self._chain(name, above) for name in self._links}
 
-    def _chain(self, link: str, above: dict[str, Element]) -> Frame:
+    def _chain(self, link: str, above: dict[str, Element]) -> Transform:
         seen, joints = {link}, []
         while link in above:
             joints.append(above[link])
@@ -170,7 +170,7 @@ class Urdf:
             if link in seen:
                 raise self._wrong(f"link {link!r} hangs from itself")
             seen.add(link)
-        whole = Frame()
+        whole = Transform()
         for joint in reversed(joints):
             whole = whole.of(_origin(joint))
         return whole
@@ -196,7 +196,7 @@ class Urdf:
             raise self._wrong(f"link {link!r}, a wheel, has no round <collision>; give it a <cylinder> or a <sphere>")
         return radii[0]
 
-    def _wheel(self, name: str, seen_from: Frame) -> Wheel:
+    def _wheel(self, name: str, seen_from: Transform) -> Wheel:
         joint = self._wheel_joint(name)
         here = seen_from.of(self._frames[_end(joint, "child")])
         axis = joint.find("axis")
@@ -216,12 +216,12 @@ def _end(joint: Element, name: str) -> str:
     return found.get("link", "") if found is not None else ""
 
 
-def _origin(element: Element) -> Frame:
+def _origin(element: Element) -> Transform:
     origin = element.find("origin")
     if origin is None:
-        return Frame()
+        return Transform()
     x, y, z = _numbers(origin.get("xyz", "0 0 0"))
-    return frame((x, y, z), *_numbers(origin.get("rpy", "0 0 0")))
+    return transform((x, y, z), *_numbers(origin.get("rpy", "0 0 0")))
 
 
 def _numbers(text: str) -> list[float]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from protocol.messages import CameraModel
 from sim.scenario import Wall
 
-Matrix = npt.NDArray[np.float64]
+PoseMatrix = npt.NDArray[np.float64]
 SUBPIXEL_BITS = 4
 AMBIENT = 0.62  # of a face turned away from the light
 
@@ -22,13 +22,13 @@ _NORMALS = np.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, 1]], d
 class Face:
     """One side of a wall: corners and outward normal in the world, colour as lit."""
 
-    def __init__(self, corners: Matrix, normal: Matrix, colour: Matrix, light_from: Matrix) -> None:
+    def __init__(self, corners: PoseMatrix, normal: PoseMatrix, colour: PoseMatrix, light_from: PoseMatrix) -> None:
         self.corners, self.normal = corners, normal
         lit = AMBIENT + (1 - AMBIENT) * max(0.0, float(normal @ light_from))
         self.rgb = np.clip(np.rint(255 * colour * lit), 0, 255).astype(np.uint8)
 
 
-def faces_of(wall: Wall, light_from: Matrix) -> list[Face]:
+def faces_of(wall: Wall, light_from: PoseMatrix) -> list[Face]:
     """The four sides and the top."""
     start, end = np.array(wall.start_m), np.array(wall.end_m)
     along = end - start
@@ -61,7 +61,7 @@ class WallPainter:
         self.nearness = np.zeros(size, np.float32)
         """One over the depth of the wall in each pixel, per metre; 0 where there is none."""
 
-    def paint(self, picture: npt.NDArray[np.uint8], lens: Matrix, seen_axes: Matrix) -> None:
+    def paint(self, picture: npt.NDArray[np.uint8], lens: PoseMatrix, seen_axes: PoseMatrix) -> None:
         """Paint into `picture`. `seen_axes`: columns right, down, forward of the camera, in the world."""
         self.nearness.fill(0)
         self._which.fill(0)
@@ -71,7 +71,7 @@ class WallPainter:
         np.take(self._palette, self._which, axis=0, out=self._colours, mode="clip")
         cv2.copyTo(self._colours, (self._which > 0).view(np.uint8), picture)
 
-    def _add_face(self, number: int, corners: Matrix, normal: Matrix) -> None:
+    def _add_face(self, number: int, corners: PoseMatrix, normal: PoseMatrix) -> None:
         """Note where this face is the nearest so far; `corners` and `normal` as the camera sees them."""
         outline = clipped(corners, self._near_m)
         if len(outline) < 3:
@@ -95,9 +95,9 @@ class WallPainter:
         np.copyto(self._which[box], np.uint16(number), where=in_front)
 
 
-def clipped(corners: Matrix, near_m: float) -> Matrix:
+def clipped(corners: PoseMatrix, near_m: float) -> PoseMatrix:
     """The convex polygon's part at depth (third coordinate) `near_m` or more; may be empty."""
-    kept: list[Matrix] = []
+    kept: list[PoseMatrix] = []
     for here, following in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if here[2] >= near_m:
             kept.append(here)

@@ -21,7 +21,7 @@ Chance = Annotated[float, Field(ge=0, le=1)]
 Milliseconds = Annotated[float, Field(ge=0, le=60_000)]
 
 
-class Shape(Config):
+class LinkShape(Config):
     """What one direction does to packets. The default is a perfect wire."""
 
     delay_ms: Milliseconds = 0
@@ -44,11 +44,11 @@ class Shape(Config):
     """Nothing passes, and what was under way is lost."""
 
 
-class Shapes(Config):
+class LinkShapes(Config):
     """Both directions: from A to B and back. `half_duplex`: one medium, on which both spend their time."""
 
-    ab: Shape = Shape()
-    ba: Shape = Shape()
+    ab: LinkShape = LinkShape()
+    ba: LinkShape = LinkShape()
     half_duplex: bool = False
     seed: Annotated[int, Field(ge=0)] | None = None
     """From now on chance is drawn from this seed."""
@@ -81,7 +81,7 @@ class Leg:
     """One direction. The caller puts packets in and takes out what is due; times never go back."""
 
     def __init__(self, seed: str) -> None:
-        self.shape = Shape()
+        self.shape = LinkShape()
         self.medium = Medium()
         self.counts = Counts()
         self.random = Random(seed)
@@ -160,13 +160,13 @@ def _flipped(packet: bytes, random: Random) -> bytes:
     return bytes(changed)
 
 
-class Wire:
+class EmulatedLink:
     """Two legs and one medium, or two."""
 
     def __init__(self, seed: int = 1) -> None:
         self.ab, self.ba = Leg(f"{seed} ab"), Leg(f"{seed} ba")
 
-    def shape(self, shapes: Shapes) -> None:
+    def shape(self, shapes: LinkShapes) -> None:
         """From now on packets fare so."""
         self.ab.shape, self.ba.shape = shapes.ab, shapes.ba
         if shapes.seed is not None:

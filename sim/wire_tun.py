@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, HardwareError
-from sim.wire import Leg, Shapes, Wire
+from sim.wire import Leg, LinkShapes, EmulatedLink
 
 ADDRESS_A: Final = "10.213.77.1"
 ADDRESS_B: Final = "10.213.77.2"
@@ -90,7 +90,7 @@ def _open_tun(namespace: str, address: str) -> int:
 
 def run(namespace_a: str, namespace_b: str) -> int:
     """Carry packets until stdin closes. Prints `wire ready`. Raises HardwareError, ConfigError."""
-    wire = Wire()
+    wire = EmulatedLink()
     legs = {_open_tun(namespace_a, ADDRESS_A): wire.ab, _open_tun(namespace_b, ADDRESS_B): wire.ba}
     far_ends = dict(zip(reversed(legs), legs.values(), strict=True))
     print("wire ready", flush=True)
@@ -105,7 +105,7 @@ def run(namespace_a: str, namespace_b: str) -> int:
             return 0
 
 
-def _reshape(wire: Wire) -> bool:
+def _reshape(wire: EmulatedLink) -> bool:
     """Take a line of stdin; False at its end."""
     line = sys.stdin.readline()
     if line:
@@ -114,7 +114,7 @@ def _reshape(wire: Wire) -> bool:
     return bool(line)
 
 
-def _wait_s(wire: Wire) -> float:
+def _wait_s(wire: EmulatedLink) -> float:
     due_us = min((leg.next_us for leg in (wire.ab, wire.ba) if leg.next_us is not None), default=float("inf"))
     return max(0.0, min(_LONGEST_WAIT_S, (due_us - monotonic_us()) / 1e6))
 
@@ -131,9 +131,9 @@ def _write(leg: Leg, tun: int) -> None:
             os.write(tun, packet)
 
 
-def _read_shapes(line: str) -> Shapes:
+def _read_shapes(line: str) -> LinkShapes:
     try:
-        return Shapes.model_validate_json(line)
+        return LinkShapes.model_validate_json(line)
     except ValidationError as error:
         raise ConfigError(f"wire: {line.strip()[:80]!r}: {error.errors(include_url=False)[0]['msg']}") from None
 

@@ -14,7 +14,7 @@ from protocol.messages import STILL, FrameHeader, Pose, Twist
 from tests.vision_rig import camera
 from vision_side.decode import Picture
 from vision_side.detect.port import Detection
-from vision_side.missions.body import Body
+from vision_side.missions.body import Footprint
 from vision_side.missions.port import Mission, Plan, RangeScan, View
 from vision_side.missions.ranging import about_robot
 
@@ -138,7 +138,7 @@ class Drive:
     course: Callable[[float], Course] | Course
     start: Pose = (0.0, 0.0, 0.0)
     sensor: Eyes | Lidar = field(default_factory=Eyes)
-    body: Body = field(default_factory=Body)
+    body: Footprint = field(default_factory=Footprint)
     latency_s: float = 0.05
     loss: float = 0.1
     seed: int = 1

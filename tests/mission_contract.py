@@ -14,15 +14,15 @@ from protocol.messages import CameraModel, FrameHeader
 from protocol.twist_text import MAX_TWIST_BYTES, format_twist
 from vision_side.decode import Picture
 from vision_side.detect.port import Circle, Detection
-from vision_side.missions.choice import Chosen
-from vision_side.missions.duty import MAX_ASKED
+from vision_side.missions.choice import MissionSpec
+from vision_side.missions.duty import MAX_COMMAND
 from vision_side.missions.port import Plan, RangeScan, View
 
 CAMERA = CameraModel(width_px=320, height_px=240, fx_px=190.7, fy_px=190.7, cx_px=160.0, cy_px=120.0, z_m=0.1)
 LABELS = ("target", "legs", "light", "person")
 
 
-def check_mission(chosen: Chosen, frames: int = 200, seed: int = 7) -> None:
+def check_mission(chosen: MissionSpec, frames: int = 200, seed: int = 7) -> None:
     """Every promise in turn; an AssertionError names the one that is broken."""
     plans = _plans(chosen, views(seed, frames))
     assert plans == _plans(chosen, views(seed, frames)), "the same frames give the same plans"
@@ -36,14 +36,14 @@ def check_mission(chosen: Chosen, frames: int = 200, seed: int = 7) -> None:
 def _check_plan(plan: Plan) -> None:
     assert isinstance(plan, Plan), f"a plan for every frame, not {plan!r}"
     speeds = (plan.twist.linear_mps, plan.twist.angular_rad_s)
-    assert all(math.isfinite(one) and abs(one) <= MAX_ASKED for one in speeds), f"finite, sane twists, not {speeds}"
+    assert all(math.isfinite(one) and abs(one) <= MAX_COMMAND for one in speeds), f"finite, sane twists, not {speeds}"
     assert len(format_twist(plan.twist)) <= MAX_TWIST_BYTES
     assert 1 <= len(plan.phase) <= 32 and "\n" not in plan.phase + plan.note, "words for a person, on one line"
     assert plan.bearing_rad is None or math.isfinite(plan.bearing_rad)
     assert plan.distance_m is None or math.isfinite(plan.distance_m)
 
 
-def _plans(chosen: Chosen, seen: Iterator[View]) -> list[Plan]:
+def _plans(chosen: MissionSpec, seen: Iterator[View]) -> list[Plan]:
     """A mission's plans up to the one that ends it: nobody asks it any further."""
     mission, plans = chosen.build(CAMERA), []
     for view in seen:

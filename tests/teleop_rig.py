@@ -10,7 +10,7 @@ from protocol.messages import AnswerHeader, Echo, FrameHeader, Request
 from protocol.transports.link import Message
 from protocol.twist_text import parse_twist
 from robot_side.config import PluginChoice, RobotConfig
-from robot_side.driving import Driving
+from robot_side.driving import DriverCore
 
 ROBOT, PERSON, VISION = "0000000a", "0000000b", "0000000c"
 STEP_US = 2_000
@@ -23,7 +23,7 @@ class TeleopRig:
 
     def __init__(self, *, vision=False, delay_us=2_000, loss=0.0, seed=1, stopped=False):
         self._config = RobotConfig(drive=PluginChoice(kind="log"), camera=PluginChoice(kind="folder"))
-        self.driving = Driving(self._config, ROBOT, stopped=stopped)
+        self.driving = DriverCore(self._config, ROBOT, stopped=stopped)
         self.teleop = Teleop(PERSON, Speeds(0.2, 1.0))
         self.vision, self.delay_us, self.loss = vision, delay_us, loss
         self.now_us = 5_000_000
@@ -51,7 +51,7 @@ class TeleopRig:
 
     def restart(self, session):
         """The robot's service begins anew."""
-        self.driving = Driving(self._config, session)
+        self.driving = DriverCore(self._config, session)
 
     # --- time ----------------------------------------------------------------------------------------------------
 

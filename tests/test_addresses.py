@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from robot_side import addresses
-from robot_side.addresses import own_addresses, reached_at
+from robot_side.addresses import own_addresses, reachable_endpoints
 
 
 @pytest.mark.parametrize(("endpoints", "said"), [
@@ -16,7 +16,7 @@ from robot_side.addresses import own_addresses, reached_at
 ])  # fmt: skip
 def test_only_what_listens_everywhere_is_told_address_by_address(endpoints, said, monkeypatch):
     monkeypatch.setattr(addresses, "own_addresses", lambda: ["10.0.0.7", "192.168.1.20"])
-    assert reached_at(endpoints) == said
+    assert reachable_endpoints(endpoints) == said
 
 
 def test_they_are_this_machines_own():
@@ -28,4 +28,4 @@ def test_they_are_this_machines_own():
 
 def test_a_machine_with_loopback_alone_says_nothing(monkeypatch):
     monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo"), (2, "nothing0")])
-    assert own_addresses() == [] == reached_at(["tcp/0.0.0.0:7447"])
+    assert own_addresses() == [] == reachable_endpoints(["tcp/0.0.0.0:7447"])

@@ -10,10 +10,10 @@ from protocol.channels import CAMERA
 from protocol.codec import decode
 from protocol.errors import HardwareError
 from protocol.messages import MAX_CHANNELS_SHOWN, CameraModel, FrameHeader, StreamStatus
-from robot_side.adjusting import Adjusting
-from robot_side.encoding import Wish
+from robot_side.adjusting import CameraAdaptation
+from robot_side.encoding import EncodingTarget
 from robot_side.ports import Picture, scaled_model, scaled_size
-from robot_side.sending import Sending
+from robot_side.sending import NetworkCore
 from robot_side.stream import StreamConfig
 from vision_side.config import VisionConfig
 from vision_side.pipeline import Frame, Pipeline
@@ -60,34 +60,34 @@ class PlainEye:
 
 def test_a_wish_is_passed_on_once_per_change():
     eye = Eye()
-    adjusting = Adjusting(eye)
-    for wish in (Wish(), Wish(80, 100), Wish(80, 100), Wish(80, 50), Wish()):
+    adjusting = CameraAdaptation(eye)
+    for wish in (EncodingTarget(), EncodingTarget(80, 100), EncodingTarget(80, 100), EncodingTarget(80, 50), EncodingTarget()):
         adjusting.follow(wish)
     assert eye.asked == [(80, 100), (80, 50), (100, 100)]
 
 
 def test_a_camera_that_was_gone_is_asked_again():
     eye = Eye()
-    adjusting = Adjusting(eye)
+    adjusting = CameraAdaptation(eye)
     eye.gone = True
-    adjusting.follow(Wish(80, 100))
-    assert adjusting.shown == Wish()
+    adjusting.follow(EncodingTarget(80, 100))
+    assert adjusting.shown == EncodingTarget()
     eye.gone = False
-    adjusting.follow(Wish(80, 100))
-    assert adjusting.shown == Wish(80, 100)
+    adjusting.follow(EncodingTarget(80, 100))
+    assert adjusting.shown == EncodingTarget(80, 100)
 
 
 @pytest.mark.parametrize("camera", [Eye(follows=False), PlainEye()])
 def test_what_is_passed_through_is_shown_as_it_is(camera):
-    adjusting = Adjusting(camera)
-    adjusting.follow(Wish(30, 50))
+    adjusting = CameraAdaptation(camera)
+    adjusting.follow(EncodingTarget(30, 50))
     shown = adjusting.shown_in(StreamStatus(quality_percent=30, scale_percent=50), {})
     assert (shown.quality_percent, shown.scale_percent, shown.missed_captures) == (100, 100, 0)
 
 
 def test_drops_are_shown_by_channel_and_bounded():
     dropped = {f"channel{number:02}": number for number in range(40)}
-    shown = Adjusting(Eye()).shown_in(StreamStatus(), dropped)
+    shown = CameraAdaptation(Eye()).shown_in(StreamStatus(), dropped)
     assert len(shown.dropped) == MAX_CHANNELS_SHOWN and shown.dropped["channel39"] == 39
     assert StreamStatus.model_validate_json(shown.model_dump_json()) == shown
 
@@ -106,8 +106,8 @@ def test_a_scaled_model_sees_every_pixel_along_the_same_ray(scale_percent):
 
 
 def test_a_new_model_is_sent_before_the_first_picture_of_it():
-    sending = Sending(StreamConfig(), "0000aaaa", 0, 400_000)
-    adjusting = Adjusting(Eye())
+    sending = NetworkCore(StreamConfig(), "0000aaaa", 0, 400_000)
+    adjusting = CameraAdaptation(Eye())
     first = sending.camera_message(adjusting.seen(Picture(b"", 1)), 0)
     assert first is not None and first.channel is CAMERA
     assert sending.camera_message(adjusting.seen(Picture(b"", 2)), 1_000) is None, "known, and not yet due"

@@ -9,7 +9,7 @@ from operator_side.behaviours import write_page
 from operator_side.behaviours_page import kept, page_lines, picture_name
 from operator_side.behaviours_rows import CHARACTER, LOOKS, ROWS, Row
 from operator_side.score import Score
-from operator_side.speed_runs import GOALS_M, LAWS, SpeedWish, free_way, speed_run, speed_wishes, speeds_of
+from operator_side.speed_runs import GOALS_M, LAWS, SpeedCase, free_way, speed_run, speed_cases, speeds_of
 from sim.scenario import load_scenario, scenario_names
 from tests.test_score import truth
 
@@ -73,7 +73,7 @@ def test_every_behaviour_and_every_baseline_has_its_row():
 
 
 def test_both_laws_drive_every_way():
-    wishes = speed_wishes(901)
+    wishes = speed_cases(901)
     assert {(wish.law, wish.goal_m) for wish in wishes} == {(law, goal_m) for law in LAWS for goal_m in GOALS_M}
     assert GOALS_M == (0.2, 2.0, 10.0)
     for goal_m in GOALS_M:
@@ -84,7 +84,7 @@ def test_both_laws_drive_every_way():
 @pytest.mark.parametrize("slope_mps2", [0.5, -1.25])
 def test_an_acceleration_is_the_slope_of_the_speed(slope_mps2):
     run = [replace(truth(at / 50, x_m=at / 100), linear_mps=1.0 + slope_mps2 * at / 50) for at in range(101)]
-    drive = speeds_of(SpeedWish("goto", 1.0, 901), run)
+    drive = speeds_of(SpeedCase("goto", 1.0, 901), run)
     assert drive.accelerations_mps2 == pytest.approx([slope_mps2] * 101)
     assert drive.arrived_s == pytest.approx(1.9) and drive.off_m == pytest.approx(0.0)
     assert drive.top_mps == max(1.0, 1.0 + 2 * slope_mps2)
@@ -93,7 +93,7 @@ def test_an_acceleration_is_the_slope_of_the_speed(slope_mps2):
 def test_both_laws_reach_a_near_waypoint():
     """In the real lockstep, the one that stops; the older law arrives too, for nothing is in the way."""
     for law in LAWS:
-        drive = speed_run(SpeedWish(law, 0.2, 901))
+        drive = speed_run(SpeedCase(law, 0.2, 901))
         assert drive.arrived_s is not None and drive.arrived_s < 5.0
         assert drive.off_m < 0.06 and 0.05 < drive.top_mps <= 0.5 and abs(drive.speeds_mps[-1]) < 0.01
 

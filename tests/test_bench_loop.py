@@ -9,18 +9,18 @@ from hypothesis import strategies as st
 
 from benchmarks.loop import run_race
 from benchmarks.loop_course import Course, Sample, course_of_headers, course_of_tally, joined
-from benchmarks.loop_figures import figures_of, judge, percentile
+from benchmarks.loop_figures import figures_of, loop_checks, percentile
 from benchmarks.loop_machine import Reading, taken_percent
 from benchmarks.loop_overload import overloaded, with_overload
 from benchmarks.loop_pictures import write_pictures
 from benchmarks.loop_setting import (
     FLOOR,
     MAX_FPS,
-    OUR_EYES,
+    OUR_DETECTOR,
     OURS,
     PEERS,
     TCP,
-    WITH_OUR_EYES,
+    WITH_OUR_DETECTOR,
     LoopSetting,
     peers_of,
     size_of,
@@ -39,7 +39,7 @@ def sample(name, ages_ms, cpu_s=0.1, answered_percent=100.0, taken=0.0):
 
 def judged(setting=SMALL, **samples):
     figures = {name: figures_of(one) for name, one in samples.items()}
-    return {check.name: check.ok for check in judge(figures, setting)}
+    return {check.name: check.ok for check in loop_checks(figures, setting)}
 
 
 # --- figures -----------------------------------------------------------------------------------------------------
@@ -166,7 +166,7 @@ def test_overload_by_rate_has_the_ages_of_an_80_ms_detector():
 
 def test_transports_with_our_eyes_are_shown_and_not_judged():
     samples = {FLOOR: sample(FLOOR, [1.0] * 100), OURS: sample(OURS, [2.0] * 100)}
-    alone = {name + OUR_EYES: sample(name + OUR_EYES, [1.5] * 100) for name in WITH_OUR_EYES}
+    alone = {name + OUR_DETECTOR: sample(name + OUR_DETECTOR, [1.5] * 100) for name in WITH_OUR_DETECTOR}
     assert judged(**samples, **alone) == judged(**samples)
 
 
@@ -208,7 +208,7 @@ def test_sizes_and_peers_are_read():
 def test_a_peer_that_is_quick_also_runs_with_our_eyes():
     assert replace(SMALL, peers=()).contestants == (FLOOR, OURS)
     assert replace(SMALL, peers=("older", "callback")).contestants == (
-        FLOOR, OURS, TCP, "older", "callback", "callback" + OUR_EYES
+        FLOOR, OURS, TCP, "older", "callback", "callback" + OUR_DETECTOR
     )
 
 

@@ -15,14 +15,14 @@ import typer
 from benchmarks.camera import measure_camera
 from benchmarks.loop import run_race
 from benchmarks.loop_crew import free_port
-from benchmarks.loop_eyes import Eyes
+from benchmarks.loop_eyes import PipelineVision
 from benchmarks.loop_machine import children_of
 from benchmarks.loop_pictures import COUNT, camera_of, write_pictures
-from benchmarks.loop_setting import FLOOR, OUR_EYES, OURS, PEERS, TCP, WITH_OUR_EYES, LoopSetting
+from benchmarks.loop_setting import FLOOR, OUR_DETECTOR, OURS, PEERS, TCP, WITH_OUR_DETECTOR, LoopSetting
 from benchmarks.loop_sockets import carried_between, carried_bytes
-from benchmarks.peers.classic_eyes import ClassicEyes
+from benchmarks.peers.classic_eyes import ClassicVision
 from benchmarks.watchers import measure_watchers
-from operator_side.cli_bench_loop import register_bench
+from operator_side.cli_bench_loop import register_loop_benches
 from protocol.errors import HardwareError
 from robot_side.hardware.folder_camera import FolderCamera, FolderCameraConfig
 from tests.link_rigs import until
@@ -35,7 +35,7 @@ def test_the_pictures_are_those_of_the_camera_and_every_one_is_answered(tmp_path
     assert 40_000 < mean_bytes < 52_000
     camera = FolderCamera(FolderCameraConfig(path=tmp_path))
     assert camera.model == camera_of(640, 480)
-    eyes = Eyes(640, 480, 0.0)
+    eyes = PipelineVision(640, 480, 0.0)
     answers = {eyes.answer(33_333 * at, path.read_bytes()) for at, path in enumerate(sorted(tmp_path.iterdir()), 1)}
     assert len(answers) > 20  # the ball goes round, and the command with it
 
@@ -44,7 +44,7 @@ def test_a_users_own_eyes_see_the_same_ball(tmp_path):
     write_pictures(tmp_path, 640, 480)
     turned = 0
     for number, path in enumerate(sorted(tmp_path.iterdir())):
-        linear, angular = map(float, ClassicEyes(0.0, 0.0).answer(1, path.read_bytes()).split("|"))
+        linear, angular = map(float, ClassicVision(0.0, 0.0).answer(1, path.read_bytes()).split("|"))
         right = math.cos(math.tau * number / COUNT)  # that is how the ball goes round
         assert linear > 0 and angular * right <= 0
         turned += angular != 0
@@ -56,9 +56,9 @@ def test_a_users_own_eyes_see_nothing_where_nothing_is_and_say_what_does_not_dec
     import numpy as np
 
     plain = cv2.imencode(".jpg", np.full((120, 160, 3), 130, np.uint8))[1].tobytes()
-    assert ClassicEyes(0.0, 0.0).answer(1, plain) == "0|0"
+    assert ClassicVision(0.0, 0.0).answer(1, plain) == "0|0"
     with pytest.raises(ValueError, match="decode"):
-        ClassicEyes(0.0, 0.0).answer(1, b"no picture")
+        ClassicVision(0.0, 0.0).answer(1, b"no picture")
 
 
 def test_the_kernel_counts_the_bytes_of_a_connection():
@@ -97,7 +97,7 @@ def test_a_short_race_of_the_services_over_each_transport(transport):
 def test_every_peer_answers(tmp_path):
     pytest.importorskip("zmq")
     race = run_race(replace(SMALL, detector_delay_ms=40.0), lambda _: None)
-    assert set(race.figures) == {FLOOR, OURS, TCP, *PEERS, *(name + OUR_EYES for name in WITH_OUR_EYES)}
+    assert set(race.figures) == {FLOOR, OURS, TCP, *PEERS, *(name + OUR_DETECTOR for name in WITH_OUR_DETECTOR)}
     for name, one in race.figures.items():
         assert one.captured > 10, name
         assert one.p50_ms >= 40, name
@@ -114,7 +114,7 @@ def test_viewers_come_and_stall_and_the_loop_goes_on():
 @pytest.mark.slow
 def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkeypatch):
     app = typer.Typer()
-    register_bench(app)
+    register_loop_benches(app)
     monkeypatch.setattr("benchmarks.loop_sample.TAKEN_BOUND_PERCENT", 100.0)
     asked = ["--size", "160x120", "--seconds", "2", "--peers", "none", "--out", str(tmp_path / "new"), "--json"]
     code = app(["loop", *asked], standalone_mode=False)

@@ -9,11 +9,11 @@ import pytest
 
 from benchmarks.loop_figures import LoopCheck, at_most
 from benchmarks.network import SCENES, write_film
-from benchmarks.network_figures import Stretch, figures_of, judge, sent_between, worst_of_seeds
-from benchmarks.network_rows import ROWS, Row, chosen, spans_s
+from benchmarks.network_figures import Stretch, figures_of, network_checks, sent_between, worst_of_seeds
+from benchmarks.network_rows import CASES, Case, chosen, spans_s
 from benchmarks.network_stage import NetworkSetting
 from protocol.errors import ConfigError
-from sim.wire import Shape, Shapes, Wire
+from sim.wire import LinkShape, LinkShapes, EmulatedLink
 from sim.wire_tun import why_impossible
 
 SECOND_US = 1_000_000
@@ -40,19 +40,19 @@ def seen(frame_rows=(), statuses=(), end_s=10.0, judged_s=0.0):
 
 
 def test_every_row_harms_packets_and_demands_something():
-    for row in ROWS:
-        assert any(leg != Shape() for phase in row.phases for leg in (phase.shapes.ab, phase.shapes.ba)), row.name
+    for row in CASES:
+        assert any(leg != LinkShape() for phase in row.phases for leg in (phase.shapes.ab, phase.shapes.ba)), row.name
         demanded = (row.least_fps, row.p50_ms, row.p95_ms, row.over_first_ms, row.flows_again_s)
         assert row.scene or any(bound is not None for bound in demanded), row.name
 
 
 def test_every_scene_that_a_row_names_is_there():
-    assert {row.scene for row in ROWS if row.scene} == {*SCENES, "medium"}
+    assert {row.scene for row in CASES if row.scene} == {*SCENES, "medium"}
 
 
 def test_rows_are_chosen_by_name():
     assert [row.name for row in chosen(["rtt40", "cut"])] == ["rtt40", "cut"]
-    assert chosen([]) == ROWS
+    assert chosen([]) == CASES
     with pytest.raises(ConfigError, match="'rtt4' is no row over zenoh; there are: rtt40"):
         chosen(["rtt4"])
 
@@ -65,11 +65,11 @@ def test_rows_with_a_router_are_not_offered_over_websocket():
 
 
 def test_only_rows_where_packets_are_lost_differ_by_seed():
-    assert [row.name for row in ROWS if row.draws] == ["radio", "bursts"]
+    assert [row.name for row in CASES if row.draws] == ["radio", "bursts"]
 
 
 def test_time_is_shared_among_phases_without_a_length_of_their_own():
-    cut = next(row for row in ROWS if row.name == "cut")
+    cut = next(row for row in CASES if row.name == "cut")
     assert spans_s(cut, 20.0) == [10.0, 5.0, 10.0]
 
 
@@ -81,8 +81,8 @@ def test_a_setting_that_cannot_be_run_is_refused(changes):
 
 def test_a_seed_makes_the_wire_lose_the_same_packets_again():
     def lost(seed):
-        wire = Wire()
-        wire.shape(Shapes(ab=Shape(loss=0.3), seed=seed))
+        wire = EmulatedLink()
+        wire.shape(LinkShapes(ab=LinkShape(loss=0.3), seed=seed))
         for number in range(200):
             wire.ab.put(bytes(40) + bytes([number]), number)
         return [packet[-1] for packet in wire.ab.take_due(10**9)]
@@ -127,10 +127,10 @@ def test_flowing_again_is_the_first_acceptance_of_a_frame_of_the_stretch():
 
 
 def test_a_bound_that_is_broken_is_not_ok_and_none_is_never_ok():
-    row = Row("x", "x", ROWS[0].phases, least_fps=28, p50_ms=55, p95_ms=60, flows_again_s=1, most_holds=0)
-    good = judge(row, [seen(frames(*range(40, 50), begin_s=0.1), [status(0), status(9.9, accepted=300)])])
+    row = Case("x", "x", CASES[0].phases, least_fps=28, p50_ms=55, p95_ms=60, flows_again_s=1, most_holds=0)
+    good = network_checks(row, [seen(frames(*range(40, 50), begin_s=0.1), [status(0), status(9.9, accepted=300)])])
     assert all(check.ok for check in good)
-    bad = {check.name: check.ok for check in judge(row, [seen((), [status(0), status(1, "HOLD"), status(2)])])}
+    bad = {check.name: check.ok for check in network_checks(row, [seen((), [status(0), status(1, "HOLD"), status(2)])])}
     assert bad == {
         "age p50": False, "age p95": False, "answered": False, "holds": False, "flows again": False,
         "oldest executed": True,

@@ -6,10 +6,10 @@ import sys
 
 import pytest
 
-from benchmarks.network_fleet import ROBOTS, judge_fleet
-from benchmarks.network_wheels import moves_again_s, on_old_sight, read_told
-from operator_side.faults.judge import Motors
-from operator_side.network_medium import judge_said, judge_stops, reached_ms
+from benchmarks.network_fleet import ROBOTS, fleet_checks
+from benchmarks.network_wheels import moves_again_s, on_old_sight, read_wheel_commands
+from operator_side.faults.judge import MotorRow
+from operator_side.network_medium import reported_check, stop_checks_of, reached_ms
 from sim.wire_tun import why_impossible
 
 TICK_US = 20_000
@@ -19,14 +19,14 @@ SECOND_US = 1_000_000
 def told(*spans):
     """Lines of the log drive: (speed, seconds) after one another."""
     speeds = [speed for speed, seconds in spans for _ in range(round(seconds * 50))]
-    return read_told("".join(f"{number * TICK_US},{speed},{speed}\n" for number, speed in enumerate(speeds)))
+    return read_wheel_commands("".join(f"{number * TICK_US},{speed},{speed}\n" for number, speed in enumerate(speeds)))
 
 
 # --- wheels ------------------------------------------------------------------------------------------------------
 
 
 def test_a_line_being_written_is_left_out():
-    assert read_told("1,0.5,0.5\n2,0.0,0.0\n3,0.") == [(1, 0.5, 0.5), (2, 0.0, 0.0)]
+    assert read_wheel_commands("1,0.5,0.5\n2,0.0,0.0\n3,0.") == [(1, 0.5, 0.5), (2, 0.0, 0.0)]
 
 
 def test_moving_again_is_the_end_of_the_longest_standstill_after_it():
@@ -61,7 +61,7 @@ def test_wheels_that_gain_speed_or_go_on_without_a_young_frame_are_counted(speed
 
 def test_without_any_answer_wheels_may_only_stand():
     assert on_old_sight(told((0, 3)), []) == 0
-    assert on_old_sight(read_told("1000000,0,0\n1020000,3.0,3.0\n"), []) == 1
+    assert on_old_sight(read_wheel_commands("1000000,0,0\n1020000,3.0,3.0\n"), []) == 1
 
 
 # --- STOP --------------------------------------------------------------------------------------------------------
@@ -70,7 +70,7 @@ def test_without_any_answer_wheels_may_only_stand():
 def motors(*rad_s):
     angle, rows = 0.0, []
     for number, speed in enumerate(rad_s):
-        rows.append(Motors(number * TICK_US, speed, speed, angle, angle))
+        rows.append(MotorRow(number * TICK_US, speed, speed, angle, angle))
         angle += speed * 0.02
     return rows
 
@@ -86,28 +86,28 @@ def test_a_stop_reaches_the_wheels_with_the_first_line_of_the_fall_that_ends_at_
 
 def test_one_stop_in_vain_is_no_p99():
     heard = motors(*[15.0] * 10, *FALL, *[0.0] * 20, *[15.0] * 20)
-    reached, zero = judge_stops(heard, [5 * TICK_US], [35 * TICK_US])
+    reached, zero = stop_checks_of(heard, [5 * TICK_US], [35 * TICK_US])
     assert reached.ok and zero.ok and reached.value == pytest.approx(20 * (10 - 5))
-    reached, zero = judge_stops(heard, [5 * TICK_US, 45 * TICK_US], [35 * TICK_US, 50 * TICK_US])
+    reached, zero = stop_checks_of(heard, [5 * TICK_US, 45 * TICK_US], [35 * TICK_US, 50 * TICK_US])
     assert not reached.ok and reached.value is None and not zero.ok
 
 
 def test_wheels_that_stood_for_lack_of_young_frames_had_not_heard_the_stop():
     heard = motors(*[15.0] * 4, *FALL, *[15.0] * 6, *FALL, *[0.0] * 10)
-    reached, zero = judge_stops(heard, [2 * TICK_US], [30 * TICK_US])
+    reached, zero = stop_checks_of(heard, [2 * TICK_US], [30 * TICK_US])
     assert reached.value == pytest.approx(20 * (17 - 2)), "the second fall is the one that lasts"
     assert zero.value == pytest.approx(20 * (21 - 2), abs=20)
 
 
 def test_a_robot_that_never_says_it_is_stopped_is_not_ok():
-    assert judge_said([1_000_000, 5_000_000], [1_200_000, 5_300_000]).value == pytest.approx(300)
-    assert not judge_said([1_000_000], [1_500_000]).ok
-    assert judge_said([1_000_000, 5_000_000], [1_200_000]).value is None
+    assert reported_check([1_000_000, 5_000_000], [1_200_000, 5_300_000]).value == pytest.approx(300)
+    assert not reported_check([1_000_000], [1_500_000]).ok
+    assert reported_check([1_000_000, 5_000_000], [1_200_000]).value is None
 
 
 def test_a_late_stop_is_over_its_bound():
     late = motors(*[15.0] * 25, *FALL, *[0.0] * 20)
-    reached, zero = judge_stops(late, [5 * TICK_US], [40 * TICK_US])
+    reached, zero = stop_checks_of(late, [5 * TICK_US], [40 * TICK_US])
     assert not reached.ok and reached.value == pytest.approx(20 * (25 - 5)) and zero.ok
 
 
@@ -120,11 +120,11 @@ def answers(fps=15, age_ms=20, seconds=10):
 
 def test_a_fleet_is_judged_by_the_robot_that_fares_worst():
     seen = {f"r{number}": answers() for number in range(ROBOTS)}
-    assert all(check.ok for check in judge_fleet(seen, 0, 10 * SECOND_US))
+    assert all(check.ok for check in fleet_checks(seen, 0, 10 * SECOND_US))
     for spoiled, wrong in ((answers(fps=13), "answered, least"), (answers(age_ms=90), "age p95, worst robot")):
-        bad = judge_fleet({**seen, "r3": spoiled}, 0, 10 * SECOND_US)
+        bad = fleet_checks({**seen, "r3": spoiled}, 0, 10 * SECOND_US)
         assert [check.name for check in bad if not check.ok] == [wrong]
-    bad = judge_fleet({**seen, "r3": []}, 0, 10 * SECOND_US)
+    bad = fleet_checks({**seen, "r3": []}, 0, 10 * SECOND_US)
     assert {check.name: check.value for check in bad if not check.ok} == {
         "answered, least": 0.0, "age p95, worst robot": None,
     }
@@ -132,7 +132,7 @@ def test_a_fleet_is_judged_by_the_robot_that_fares_worst():
 
 def test_a_robot_that_is_missing_is_noticed():
     few = {f"r{number}": answers() for number in range(ROBOTS - 1)}
-    assert [check.name for check in judge_fleet(few, 0, 10 * SECOND_US) if not check.ok] == ["robots"]
+    assert [check.name for check in fleet_checks(few, 0, 10 * SECOND_US) if not check.ok] == ["robots"]
 
 
 # --- for real ----------------------------------------------------------------------------------------------------

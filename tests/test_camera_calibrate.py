@@ -38,7 +38,7 @@ def found() -> tuple[np.ndarray, ...]:
 
 def run(*arguments):
     app = typer.Typer()
-    cli_calibrate.register(app)
+    cli_calibrate.register_calibrate(app)
     return app(["calibrate", "camera", *map(str, arguments)], standalone_mode=False)
 
 

@@ -13,8 +13,8 @@ from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.config import VisionConfig
-from vision_side.dry_run import AckingService, Telling, watch_camera, watch_robot
-from vision_side.pipeline import Answer, Seen
+from vision_side.dry_run import AckingService, ProgressPrinter, watch_camera, watch_robot
+from vision_side.pipeline import PipelineAnswer, Observation
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -80,9 +80,9 @@ def test_a_camera_that_is_unplugged_is_said_once_and_waited_for(monkeypatch):
 
 def test_it_tells_at_most_twice_a_second():
     said = []
-    telling = Telling(said.append)
+    telling = ProgressPrinter(said.append)
     for picture in range(301):
-        telling.step(Answer(None, Seen("lost")), 100 + picture / 30)
+        telling.step(PipelineAnswer(None, Observation("lost")), 100 + picture / 30)
     assert len(said) == 21
     assert said[0] == "lost: no target in sight"
     assert said[-1] == "lost: no target in sight (30 pictures/s)"
@@ -90,8 +90,8 @@ def test_it_tells_at_most_twice_a_second():
 
 def test_the_sign_of_a_bearing_and_what_would_be_driven_are_told():
     said = []
-    seen = Seen("tracking", bearing_rad=-0.1, distance_m=1.234)
-    Telling(said.append).step(Answer(Twist(linear_mps=0.2, angular_rad_s=-0.5), seen), 0.0)
+    seen = Observation("tracking", bearing_rad=-0.1, distance_m=1.234)
+    ProgressPrinter(said.append).step(PipelineAnswer(Twist(linear_mps=0.2, angular_rad_s=-0.5), seen), 0.0)
     assert said == ["tracking: bearing -5.7 degrees, distance 1.23 m; would steer +0.20 m/s, -0.50 rad/s"]
 
 

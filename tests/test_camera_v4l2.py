@@ -13,11 +13,11 @@ import pytest
 
 from protocol.errors import ConfigError, HardwareError
 from robot_side.config import PluginChoice
-from robot_side.hardware.buffer_time import Clocks, StampClock
+from robot_side.hardware.buffer_time import Clocks, CaptureClock
 from robot_side.hardware.v4l2_camera import V4l2Camera
 from robot_side.hardware.v4l2_device import whole_jpeg
-from robot_side.hardware.v4l2_trouble import check_device, device_owner, not_opened
-from robot_side.plugins import build
+from robot_side.hardware.v4l2_trouble import check_device, device_owner, open_error
+from robot_side.plugins import build_device
 from tests.camera_contract import next_picture
 from tests.camera_rig import FakeDevice, jpeg
 
@@ -166,13 +166,13 @@ def test_without_a_time_of_its_own_a_picture_is_as_old_as_configured(opened):
     ],
 )
 def test_a_stamp_is_read_on_the_clock_it_was_taken_from(stamp_us, expected_us):
-    assert StampClock(30_000).captured_us(stamp_us, NOW) == expected_us
+    assert CaptureClock(30_000).captured_us(stamp_us, NOW) == expected_us
 
 
 @pytest.mark.parametrize("clock_us", [NOW.monotonic_us, NOW.boot_us, NOW.day_us])
 @pytest.mark.parametrize("age_us", [0, 2_000_000, 2_000_001, 9_000_000])
 def test_once_a_stamp_has_told_the_clock_it_is_believed_however_old(clock_us, age_us):
-    stamps = StampClock(30_000)
+    stamps = CaptureClock(30_000)
     stamps.captured_us(clock_us - 10_000, NOW)
     assert stamps.captured_us(clock_us - age_us, NOW) == NOW.monotonic_us - age_us
     assert stamps.captured_us(clock_us - 10_000, NOW) == NOW.monotonic_us - 10_000, "and is not forgotten"
@@ -180,7 +180,7 @@ def test_once_a_stamp_has_told_the_clock_it_is_believed_however_old(clock_us, ag
 
 def test_a_stamp_from_the_future_of_its_clock_is_of_another_or_tells_nothing():
     """Monotonic time and time since boot are one until the machine is first put to sleep."""
-    stamps = StampClock(30_000)
+    stamps = CaptureClock(30_000)
     awake = Clocks(monotonic_us=9_000_000, boot_us=9_000_000, day_us=1_700_000_000_000_000)
     assert stamps.captured_us(8_990_000, awake) == 8_990_000
     assert stamps.captured_us(NOW.boot_us - 10_000, NOW) == 9_990_000
@@ -266,7 +266,7 @@ def test_a_camera_frozen_from_the_start_is_no_camera(opened):
 
 def test_absent_device_lists_what_there_is(tmp_path):
     with pytest.raises(HardwareError, match=r"video9 is not there \((there are|no /dev/video\*)"):
-        build("cameras", PluginChoice(kind="v4l2", options={"device": str(tmp_path / "video9")}))
+        build_device("cameras", PluginChoice(kind="v4l2", options={"device": str(tmp_path / "video9")}))
 
 
 def test_a_plain_file_is_no_camera(tmp_path):
@@ -277,7 +277,7 @@ def test_a_plain_file_is_no_camera(tmp_path):
 
 def test_a_device_that_is_no_camera_does_not_open():
     with pytest.raises(HardwareError, match=r"/dev/full does not open"):
-        build("cameras", PluginChoice(kind="v4l2", options={"device": "/dev/full"}))
+        build_device("cameras", PluginChoice(kind="v4l2", options={"device": "/dev/full"}))
 
 
 def test_no_permission_names_the_group_and_the_command():
@@ -302,6 +302,6 @@ def test_who_keeps_a_device_busy_is_named(node):
     with subprocess.Popen([sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout.readline()
         assert device_owner(node).endswith(f"(pid {process.pid})")
-        assert f"(pid {process.pid}) has it open" in str(not_opened(node))
+        assert f"(pid {process.pid}) has it open" in str(open_error(node))
         process.stdin.close()
     assert device_owner(node) == ""

@@ -11,7 +11,7 @@ import pytest
 
 from protocol.clock import monotonic_us
 from robot_side import ipc, plugins
-from robot_side.child import NetworkChild
+from robot_side.child import DriverEnd
 from robot_side.config import PluginChoice, RobotConfig
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import JPEG, RobotProcess
@@ -45,11 +45,11 @@ def test_the_folder_it_starts_in_has_cameras_and_stands_in_for_nothing_else(fold
     camera = PluginChoice(kind=kind, options={"path": "pictures"})
     listen = (free_endpoint(), free_endpoint().replace("tcp/", "ws://"))
     config = RobotConfig(camera=camera, listen=listen, state_dir=folder)
-    child, packets = NetworkChild(config, "0000beef", print), []
+    child, packets = DriverEnd(config, "0000beef", print), []
     try:
         child.keep_alive(monotonic_us(), 0)
         assert until(lambda: packets.extend(child.packets()) or packets or child._process.poll() is not None, 20)
-        assert packets and packets[0][0] == ipc.Kind.READY
+        assert packets and packets[0][0] == ipc.PacketKind.READY
     finally:
         child.close()
 
@@ -58,8 +58,8 @@ def test_a_class_of_the_folder_comes_after_all_that_is_installed(folder, monkeyp
     before = list(sys.path)
     monkeypatch.setattr(sys, "path", list(before))
     choice = PluginChoice(kind="my_camera:MyCamera", options={"path": "pictures"})
-    plugins.configured("cameras", choice)
-    plugins.configured("cameras", choice)
+    plugins.load_device("cameras", choice)
+    plugins.load_device("cameras", choice)
     assert sys.path == [*before, str(folder)]
 
 

@@ -10,7 +10,7 @@ import pytest
 from operator_side.scenario_settings import robot_config
 from protocol.config import Config
 from protocol.errors import ConfigError
-from robot_side.dead_zone import DeadZoneError, check_dead_zone
+from robot_side.dead_zone import BlindZoneError, check_blind_zone
 from robot_side.guard import GuardConfig
 from robot_side.ports import Ranges
 from sim.robot_model import load_robot
@@ -27,8 +27,8 @@ def scan(least_m, first_rad=0.0, each_rad=0.0, rays=1):
 
 def is_refused(sees, **guard):
     try:
-        check_dead_zone(GuardConfig(**{**BOX, **guard}), sees)
-    except DeadZoneError:
+        check_blind_zone(GuardConfig(**{**BOX, **guard}), sees)
+    except BlindZoneError:
         return True
     return False
 
@@ -65,13 +65,13 @@ def test_it_is_judged_only_where_the_sensor_looks(first_rad, each_rad, refused):
 @pytest.mark.parametrize("least_m", [math.nan, math.inf])
 def test_a_minimum_that_is_no_number_is_a_bad_reading(least_m):
     with pytest.raises(ValueError, match="no numbers") as caught:
-        check_dead_zone(GuardConfig(**BOX), scan(least_m))
-    assert not isinstance(caught.value, DeadZoneError)
+        check_blind_zone(GuardConfig(**BOX), scan(least_m))
+    assert not isinstance(caught.value, BlindZoneError)
 
 
 def test_the_words_say_what_to_set():
-    with pytest.raises(DeadZoneError, match=r"guard.stop_m = 0.25: .* nearer than 1 m, .* 0.500 m beyond .* outline"):
-        check_dead_zone(GuardConfig(**BOX), scan(1.0))
+    with pytest.raises(BlindZoneError, match=r"guard.stop_m = 0.25: .* nearer than 1 m, .* 0.500 m beyond .* outline"):
+        check_blind_zone(GuardConfig(**BOX), scan(1.0))
 
 
 def test_a_simulated_robot_is_refused_with_its_name():

@@ -6,8 +6,8 @@ import pytest
 
 from vision_side.config import HsvConfig
 from vision_side.decode import Picture
-from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveEye
-from vision_side.detect.chroma import Chroma
+from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveTracker
+from vision_side.detect.chroma import ColorModel
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.pixel_track import PixelTrack
 from vision_side.detect.port import Circle
@@ -30,7 +30,7 @@ class Course:
     """Pictures one after the other."""
 
     def __init__(self, config: AdaptiveConfig | None = None) -> None:
-        self.eye = AdaptiveEye(config or AdaptiveConfig())
+        self.eye = AdaptiveTracker(config or AdaptiveConfig())
         self.t_us = 0
 
     def see(self, picture: Picture):
@@ -121,7 +121,7 @@ def test_no_picture_makes_it_raise(seed: int) -> None:
 
 def test_colour_does_not_depend_on_exposure_and_tells_yellow_from_orange() -> None:
     pixels = np.random.default_rng(1).normal(YELLOW, 3, (300, 3)).clip(0, 255).astype(np.uint8)
-    chroma = Chroma(pixels)
+    chroma = ColorModel(pixels)
     assert chroma.distance((pixels * 0.35).astype(np.uint8)) < 2
     assert chroma.distance(np.full((50, 3), (20, 120, 240), np.uint8)) > 4
     assert chroma.distance(np.full((50, 3), (140, 150, 155), np.uint8)) > 4
@@ -129,7 +129,7 @@ def test_colour_does_not_depend_on_exposure_and_tells_yellow_from_orange() -> No
 
 def test_no_single_picture_moves_the_colour_far() -> None:
     yellow, blue = (np.full((300, 3), one, np.uint8) for one in (YELLOW, (220, 60, 30)))
-    chroma = Chroma(yellow)
+    chroma = ColorModel(yellow)
     chroma.learn(blue, 1.0)
     assert chroma.distance(yellow) < 2
 

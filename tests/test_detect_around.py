@@ -6,7 +6,7 @@ from protocol.config import Config as Settings
 from protocol.errors import ConfigError, HardwareError
 from vision_side.config import VisionConfig
 from vision_side.detect import choice
-from vision_side.detect.around import attach_detector, close_detector, news_of
+from vision_side.detect.around import attach_detector, close_detector, notices_of
 
 
 class Failing:
@@ -29,9 +29,9 @@ def test_what_a_plug_in_raises_is_one_line_that_says_where() -> None:
 
 
 def test_who_only_talks_badly_may_go_on_looking() -> None:
-    (line,) = news_of(Failing(KeyError("x" * 500)))
+    (line,) = notices_of(Failing(KeyError("x" * 500)))
     assert "news() raises KeyError" in line and len(line) <= 160
-    assert news_of(object()) == []
+    assert notices_of(object()) == []
 
 
 def test_a_plug_in_that_cannot_be_made_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,4 +44,4 @@ def test_a_plug_in_that_cannot_be_made_is_one_line(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(choice, "_checked", lambda *_: (Broken, Broken.Config()))
     with pytest.raises(ConfigError, match="mine:Broken, when it is made, raises RuntimeError: no memory"):
-        choice.choose_detector("mine:Broken", {}, VisionConfig())
+        choice.build_detector("mine:Broken", {}, VisionConfig())

@@ -15,14 +15,14 @@ from tests.onnx_rig import brightness_model, without_gpu
 from vision_side import plugin_choice
 from vision_side.config import DetectorConfig, VisionConfig
 from vision_side.decode import Decoder
-from vision_side.detect.choice import FAMILY, GROUP, choose_detector, configured_detector, is_plain, split
-from vision_side.detect.colour_filter import ColourFilter
+from vision_side.detect.choice import REGISTRY, GROUP, build_detector, configured_detector, is_plain, split_kind
+from vision_side.detect.colour_filter import ColorFilter
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.local import Adaptive, Hsv
 from vision_side.detect.onnx_detector import OnnxDetector
 from vision_side.detect.port import DetectFrame, result_of
-from vision_side.detect.shadow import Shadowed
-from vision_side.detect.tracked import Tracked
+from vision_side.detect.shadow import ShadowDetector
+from vision_side.detect.tracked import TrackIds
 
 
 @pytest.fixture(autouse=True)
@@ -59,9 +59,9 @@ def config(**detector: object) -> VisionConfig:
 
 
 def test_every_built_in_name_can_be_imported() -> None:
-    assert {"hsv", "adaptive", "onnx", "zenoh", "oip+http", "oip+grpc", "http+jpeg"} <= set(FAMILY.names())
-    for name in FAMILY.built_in:
-        assert hasattr(FAMILY.load(name), "detect") and hasattr(FAMILY.load(name), "Config")
+    assert {"hsv", "adaptive", "onnx", "zenoh", "oip+http", "oip+grpc", "http+jpeg"} <= set(REGISTRY.names())
+    for name in REGISTRY.built_in:
+        assert hasattr(REGISTRY.load(name), "detect") and hasattr(REGISTRY.load(name), "Config")
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_every_built_in_name_can_be_imported() -> None:
      ("zenoh:operator", ("zenoh", "operator"))],
 )
 def test_a_name_and_what_stands_after_it(kind: str, parts: tuple[str, str]) -> None:
-    assert split(kind) == parts
+    assert split_kind(kind) == parts
 
 
 def test_the_plain_colour_detector_needs_nothing_around_it() -> None:
@@ -84,24 +84,24 @@ def test_the_plain_colour_detector_needs_nothing_around_it() -> None:
 
 
 def test_a_class_of_ones_own_gets_its_options_and_what_vision_knows() -> None:
-    made = choose_detector(MINE, {"sure": True}, config(deadline_s=0.2))
+    made = build_detector(MINE, {"sure": True}, config(deadline_s=0.2))
     assert isinstance(made, Mine)
     assert made.config == Mine.Config(robot="r7", deadline_s=0.2, sure=True)
-    assert choose_detector(MINE, {"robot": "other"}, config()).config.robot == "other"
+    assert build_detector(MINE, {"robot": "other"}, config()).config.robot == "other"
 
 
 def test_hsv_takes_the_section_of_its_name_with_its_options_over_it() -> None:
     settings = VisionConfig.model_validate({"hsv": {"min_radius_px": 9.0}})
-    made = choose_detector("hsv", {"hsv": {"max_contours": 2}}, settings)
+    made = build_detector("hsv", {"hsv": {"max_contours": 2}}, settings)
     assert (made._eye._config.min_radius_px, made._eye._config.max_contours) == (9.0, 2)
 
 
 def test_what_is_around_it_is_built_from_the_inside_out() -> None:
     made = configured_detector(config(labels=("ball",), only_colour=True, tracked=True, shadow="adaptive"))
-    assert isinstance(made, Shadowed)
+    assert isinstance(made, ShadowDetector)
     made.close()
     tracked = made._eyes[0]
-    assert isinstance(tracked, Tracked) and isinstance(tracked.inner, ColourFilter)
+    assert isinstance(tracked, TrackIds) and isinstance(tracked.inner, ColorFilter)
     assert isinstance(tracked.inner.inner, LabelFilter) and isinstance(tracked.inner.inner.inner, Hsv)
 
 
@@ -158,14 +158,14 @@ class Entry:
 def test_an_installed_package_brings_its_detectors_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     installed = [Entry("lens", Mine), Entry("broken", ImportError("no module named lens"))]
     monkeypatch.setattr(plugin_choice, "entry_points", lambda group: installed if group == GROUP else [])
-    made = choose_detector("lens:/dev/lens0", {"sure": True}, config())
+    made = build_detector("lens:/dev/lens0", {"sure": True}, config())
     assert isinstance(made, Mine) and made.config == Mine.Config(address="/dev/lens0", robot="r7", deadline_s=0.1,
                                                                  sure=True)
     assert isinstance(configured_detector(config(kind="lens", tracked=True)).inner, Mine)
     with pytest.raises(ConfigError, match="'broken' cannot be loaded: no module named lens"):
-        choose_detector("broken", {}, config())
+        build_detector("broken", {}, config())
     with pytest.raises(ConfigError, match="did you mean 'lens'"):
-        choose_detector("lense", {}, config())
+        build_detector("lense", {}, config())
 
 
 def test_a_device_is_handed_to_who_can_have_one(tmp_path: Path) -> None:

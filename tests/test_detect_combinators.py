@@ -11,7 +11,7 @@ from tests.detector_rig import Told, box
 from tests.vision_rig import YELLOW_BGR, jpeg_of
 from vision_side.config import HsvConfig
 from vision_side.decode import Decoder
-from vision_side.detect.colour_filter import ColourFilter
+from vision_side.detect.colour_filter import ColorFilter
 from vision_side.detect.formats import foxglove_annotations, supervision_fields, vision_msgs_fields
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.overlap import corners, overlap
@@ -23,7 +23,7 @@ from vision_side.detect.port import (
     DetectionResult,
     clipped,
 )
-from vision_side.detect.tracked import KEPT_US, MAX_TRACKS, Tracked
+from vision_side.detect.tracked import KEPT_US, MAX_TRACKS, TrackIds
 
 GREY = np.full((240, 320, 3), 140, np.uint8)
 
@@ -53,7 +53,7 @@ def test_the_model_says_ball_and_the_colour_says_which(scale: int) -> None:
     for x, colour in ((60, YELLOW_BGR), (160, (200, 60, 30)), (260, (140, 140, 140))):
         cv2.circle(picture, (x * scale, 120 * scale), 20 * scale, colour, -1)
     balls = [box((x - 20) * scale, 100 * scale, 40 * scale) for x in (160, 60, 260)]
-    detector = ColourFilter(Told(balls), HsvConfig().ranges)
+    detector = ColorFilter(Told(balls), HsvConfig().ranges)
     assert look(detector, frame(bgr=picture)) == (balls[1],)
 
 
@@ -61,12 +61,12 @@ def test_the_model_says_ball_and_the_colour_says_which(scale: int) -> None:
 def test_any_box_in_the_picture_has_a_colour(x: float, y: float, size: float) -> None:
     inside = clipped(box(x, y, size), 320, 240)
     if inside is not None:
-        assert look(ColourFilter(Told([inside]), HsvConfig().ranges), frame()) == ()
+        assert look(ColorFilter(Told([inside]), HsvConfig().ranges), frame()) == ()
 
 
 def test_without_a_picture_the_colour_filter_has_no_answer() -> None:
     bad = DetectFrame("r1", frame().header, b"no picture", Decoder(320, 240, 10**7))
-    assert ColourFilter(Told([box(1)]), HsvConfig().ranges).detect([bad], NO_DEADLINE) == [None]
+    assert ColorFilter(Told([box(1)]), HsvConfig().ranges).detect([bad], NO_DEADLINE) == [None]
 
 
 def ids(detector, *frames: DetectFrame) -> list[list[int | None]]:
@@ -74,31 +74,31 @@ def ids(detector, *frames: DetectFrame) -> list[list[int | None]]:
 
 
 def test_what_moves_a_little_keeps_its_id_whatever_the_order() -> None:
-    detector = Tracked(Told([box(10), box(200)], [box(205), box(16)], [box(22), box(120), box(210)]))
+    detector = TrackIds(Told([box(10), box(200)], [box(205), box(16)], [box(22), box(120), box(210)]))
     assert ids(detector, frame(1), frame(2), frame(3)) == [[1, 2], [2, 1], [1, 3, 2]]
 
 
 def test_two_that_meet_do_not_share_an_id() -> None:
-    detector = Tracked(Told([box(10), box(40)], [box(24), box(27)]))
+    detector = TrackIds(Told([box(10), box(40)], [box(24), box(27)]))
     first, second = ids(detector, frame(1), frame(2))
     assert sorted(second) == sorted(first) == [1, 2]
 
 
 def test_another_label_or_a_second_away_is_another_thing() -> None:
-    detector = Tracked(Told([box(10)], [box(10, label="legs")], [box(10)], [box(10)]))
+    detector = TrackIds(Told([box(10)], [box(10, label="legs")], [box(10)], [box(10)]))
     late = frame(9, t_us=10 * 33_333 + KEPT_US + 1)
     assert ids(detector, frame(1), frame(2), frame(3), late) == [[1], [2], [1], [3]]
 
 
 def test_robots_and_sessions_have_ids_of_their_own() -> None:
-    detector = Tracked(Told([box(10)], [box(10)], [box(10)], [box(200)]))
+    detector = TrackIds(Told([box(10)], [box(10)], [box(10)], [box(200)]))
     frames = frame(1), frame(1, robot="r2"), frame(2), frame(1, session="0000beef")
     assert ids(detector, *frames) == [[1], [1], [1], [1]]
 
 
 def test_ever_more_things_cost_no_more_memory() -> None:
     many = [box(4.0 * index, size=3.0) for index in range(MAX_TRACKS + 20)]
-    detector = Tracked(Told(*[many] * 4))
+    detector = TrackIds(Told(*[many] * 4))
     for seq in range(1, 5):
         given_ids = ids(detector, frame(seq))[0]
         assert given_ids[:MAX_TRACKS] == list(range(1, MAX_TRACKS + 1)) and set(given_ids[MAX_TRACKS:]) == {None}

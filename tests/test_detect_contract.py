@@ -8,15 +8,15 @@ import pytest
 from protocol.messages import MAX_DETECTED_BOXES
 from tests.detector_contract import assert_kept
 from vision_side.config import VisionConfig
-from vision_side.detect.choice import choose_detector
-from vision_side.detect.colour_filter import ColourFilter
+from vision_side.detect.choice import build_detector
+from vision_side.detect.colour_filter import ColorFilter
 from vision_side.detect.contract import check_detector
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.local import Hsv
 from vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Detection, DetectionResult
 from vision_side.detect.remote.fallback import Fallback
-from vision_side.detect.shadow import Shadowed
-from vision_side.detect.tracked import Tracked
+from vision_side.detect.shadow import ShadowDetector
+from vision_side.detect.tracked import TrackIds
 
 CONFIG = VisionConfig()
 
@@ -27,13 +27,13 @@ def hsv() -> Hsv:
 
 @pytest.mark.parametrize("name", ["hsv", "adaptive"])
 def test_our_own_keep_every_promise(name: str) -> None:
-    assert_kept(lambda: choose_detector(name, {}, CONFIG))
+    assert_kept(lambda: build_detector(name, {}, CONFIG))
 
 
 @pytest.mark.parametrize(
     "around",
-    [Tracked, lambda one: ColourFilter(one, CONFIG.hsv.ranges), lambda one: LabelFilter(one, ("target",)),
-     lambda one: Shadowed(one, hsv(), "hsv", 10**7), lambda one: Fallback(one, hsv())],
+    [TrackIds, lambda one: ColorFilter(one, CONFIG.hsv.ranges), lambda one: LabelFilter(one, ("target",)),
+     lambda one: ShadowDetector(one, hsv(), "hsv", 10**7), lambda one: Fallback(one, hsv())],
     ids=["tracked", "colour", "label", "shadow", "fallback"],
 )
 def test_what_is_around_a_detector_keeps_them_too(around) -> None:

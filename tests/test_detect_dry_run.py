@@ -9,7 +9,7 @@ from tests.detector_rig import BALL, MODEL
 from tests.detector_rig import Bench as DrivingBench
 from vision_side.config import DetectorConfig, VisionConfig
 from vision_side.detect.port import Maker, result_of
-from vision_side.dry_run import AckingService, Watching
+from vision_side.dry_run import AckingService, LocalRun
 
 STARTS, GONE = "m.onnx runs on cpu: no GPU runtime is installed", "detector far: no answer: LATE"
 
@@ -73,7 +73,7 @@ class Camera:
 
 
 def test_a_detector_has_as_long_as_when_it_drives():
-    watching = Watching(CONFIG, Camera(), lambda _line: None)
+    watching = LocalRun(CONFIG, Camera(), lambda _line: None)
     heard, step = [], watching._pipeline.step
     watching._pipeline.step = lambda frame: heard.append(frame.deadline_us) or step(frame)
     before_us = monotonic_us()
@@ -84,7 +84,7 @@ def test_a_detector_has_as_long_as_when_it_drives():
 
 def test_in_the_pictures_of_a_camera_of_this_machine():
     said = []
-    watching = Watching(CONFIG, Camera(), said.append)
+    watching = LocalRun(CONFIG, Camera(), said.append)
     assert said == [f"vision: {STARTS}"]
     watching.turn()
     assert f"vision: {GONE}" in said

@@ -19,7 +19,7 @@ from vision_side.detect.golden import difference, golden_picture, golden_text, r
 from vision_side.detect.onnx_detector import OnnxDetector
 from vision_side.detect.onnx_engine import open_engine
 from vision_side.detect.onnx_header import OnnxHeader, Tensor, read_onnx_header
-from vision_side.detect.onnx_reading import Fitting, Form, fit_picture, form_of, read_outputs
+from vision_side.detect.onnx_reading import Letterbox, ModelFormat, fit_picture, model_format, read_outputs
 from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection
 
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 400.0, 300.0]]
@@ -82,7 +82,7 @@ def test_a_broken_model_is_one_error(tmp_path_factory: pytest.TempPathFactory, a
     data[at % len(data)] = byte
     for broken in (bytes(data), bytes(data[:at])):
         try:
-            form_of(read_onnx_header(broken), (), "auto")
+            model_format(read_onnx_header(broken), (), "auto")
         except ValueError as error:
             assert str(error)
 
@@ -220,15 +220,15 @@ def test_a_file_that_is_no_model_is_one_line(tmp_path: Path, content: bytes | No
 def test_a_model_of_another_kind_says_what_it_should_be() -> None:
     image = Tensor("x", "float32", (1, 3, 64, 64))
     with pytest.raises(ValueError, match=r"gives y \(1, 1000\)"):
-        form_of(OnnxHeader((image,), (Tensor("y", "float32", (1, 1000)),)), (), "auto")
+        model_format(OnnxHeader((image,), (Tensor("y", "float32", (1, 1000)),)), (), "auto")
     with pytest.raises(ValueError, match="float32 \\(1, 128\\)"):
-        form_of(OnnxHeader((Tensor("x", "float32", (1, 128)),), (Tensor("y", "float32", (1, 6)),)), (), "auto")
+        model_format(OnnxHeader((Tensor("x", "float32", (1, 128)),), (Tensor("y", "float32", (1, 6)),)), (), "auto")
     with pytest.raises(ValueError, match="labels"):
-        form_of(OnnxHeader((image,), (Tensor("y", "float32", (None, 6)),), {"labels": "{"}), (), "auto")
+        model_format(OnnxHeader((image,), (Tensor("y", "float32", (None, 6)),), {"labels": "{"}), (), "auto")
 
 
-FORM = Form(False, False, (240, 320), "triple", ("ball",))
-STRAIGHT = Fitting(1.0, 0, 0)
+FORM = ModelFormat(False, False, (240, 320), "triple", ("ball",))
+STRAIGHT = Letterbox(1.0, 0, 0)
 
 
 def _found_beside_a_good_one(box: float, score: float, label: float) -> tuple[Detection, ...]:
@@ -264,7 +264,7 @@ def test_a_million_boxes_and_other_shapes_are_refused() -> None:
 def test_floats_are_planes_of_red_green_blue() -> None:
     bgr = np.zeros((64, 64, 3), np.uint8)
     bgr[:] = (0, 51, 255)
-    pixels, _ = fit_picture(Picture(bgr, 1), Form(True, True, (64, 64), "yolo", (), "float32"))
+    pixels, _ = fit_picture(Picture(bgr, 1), ModelFormat(True, True, (64, 64), "yolo", (), "float32"))
     assert pixels.shape == (1, 3, 64, 64) and pixels.dtype == np.float32
     assert pixels[0, :, 0, 0] == pytest.approx([1.0, 0.2, 0.0])
 

@@ -9,7 +9,7 @@ from tests.onnx_rig import brightness_model, several_model
 from tests.test_detect_onnx import NEEDS_RUNTIME, detector, frame
 from vision_side.decode import Decoder
 from vision_side.detect.onnx_header import read_onnx_header
-from vision_side.detect.onnx_reading import form_of
+from vision_side.detect.onnx_reading import model_format
 from vision_side.detect.port import NO_DEADLINE, DetectFrame
 
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 300.0, 200.0]]
@@ -91,7 +91,7 @@ def test_opencv_is_asked_about_one_after_the_other(tmp_path: Path, monkeypatch) 
 
 def test_only_a_model_that_leaves_the_number_open_takes_several(tmp_path: Path) -> None:
     def is_batched(path: Path) -> bool:
-        return form_of(read_onnx_header(path.read_bytes()), (), "auto").batched
+        return model_format(read_onnx_header(path.read_bytes()), (), "auto").batched
 
     assert is_batched(several_model(tmp_path / "several.onnx", BOXES))
     assert not is_batched(brightness_model(tmp_path / "one.onnx", BOXES, [0, 1]))

@@ -84,10 +84,10 @@ def test_the_model_that_comes_along_opens_with_any_names_and_least_score(options
 
 def test_labels_of_the_metadata_and_of_the_options_are_made_sayable(tmp_path: Path) -> None:
     path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], words=("", "a\x1b[2J" + "x" * 99))
-    assert onnx_detector.read_model(onnx_detector.OnnxDetector.Config(address=str(path))).form.labels == (
+    assert onnx_detector.read_onnx_model(onnx_detector.OnnxDetector.Config(address=str(path))).form.labels == (
         "thing", ("a[2J" + "x" * 99)[:64])
     named = onnx_detector.OnnxDetector.Config(address=str(path), names=("\n", "b"))
-    assert onnx_detector.read_model(named).form.labels == ("thing", "b")
+    assert onnx_detector.read_onnx_model(named).form.labels == ("thing", "b")
 
 
 def test_a_cup_on_a_plate_is_there_beside_the_plate(tmp_path: Path, engine: str) -> None:

@@ -11,7 +11,7 @@ from tests.detector_rig import Bench, Told, box
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.config import DetectorConfig, TargetConfig, VisionConfig
 from vision_side.decode import Decoder
-from vision_side.detect.checking import asked, checked
+from vision_side.detect.checking import checked_results, validated
 from vision_side.detect.local import Hsv
 from vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Maker, result_of
 from vision_side.pipeline import NO_ANSWER, Frame, Pipeline
@@ -131,7 +131,7 @@ class OfOneOdd:
 def test_what_fails_for_one_robots_frame_costs_no_other_robot_its_answer() -> None:
     decoder = Decoder(320, 240, 10**6)
     frames = [DetectFrame(robot, frame(1).header, BALL, decoder) for robot in ("r1", "odd", "r2")]
-    first, odd, second = asked(OfOneOdd(), frames, NO_DEADLINE)
+    first, odd, second = checked_results(OfOneOdd(), frames, NO_DEADLINE)
     assert (first.robot, second.robot) == ("r1", "r2") and "an odd picture" in odd
 
 
@@ -146,17 +146,17 @@ def test_nobody_is_asked_frame_by_frame_once_the_time_is_over() -> None:
     decoder, slow = Decoder(320, 240, 10**6), Slow()
     frames = [DetectFrame(robot, frame(1).header, BALL, decoder) for robot in ("r1", "odd", "r2", "r3")]
     clock = iter([100, 101, 102, 103])
-    first, odd, *late = asked(slow, frames, 101, lambda: next(clock))
+    first, odd, *late = checked_results(slow, frames, 101, lambda: next(clock))
     assert first.robot == "r1" and "an odd picture" in odd and late == [odd, odd] and slow.calls == 3
 
 
 def test_boxes_beyond_the_picture_are_cut_and_those_outside_left_out() -> None:
     one = DetectFrame("r1", frame(1).header, BALL, Decoder(320, 240, 10**6))
     found = result_of(one, (box(-20), box(500), box(100)), Maker("x"))
-    inside = checked(one, found).detections
+    inside = validated(one, found).detections
     assert [(one.x1_px, one.x2_px) for one in inside] == [(0, 20), (100, 140)]
     whole = result_of(one, (box(100),), Maker("x"))
-    assert checked(one, whole) is whole
+    assert validated(one, whole) is whole
 
 
 def test_a_picture_is_decoded_once_for_all_who_share_it() -> None:

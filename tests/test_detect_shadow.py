@@ -14,11 +14,11 @@ from tests.detector_rig import BALL, Bench
 from tests.link_rigs import until
 from vision_side.config import DetectorConfig, VisionConfig
 from vision_side.decode import Decoder
-from vision_side.detect.agreement import TELL_US, Agreement, differs
+from vision_side.detect.agreement import REPORT_EVERY_US, Agreement, disagreement
 from vision_side.detect.local import Hsv
 from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Maker, result_of
-from vision_side.detect.shadow import Shadowed
-from vision_side.missions.choice import configured
+from vision_side.detect.shadow import ShadowDetector
+from vision_side.missions.choice import configured_mission
 
 
 def result(t_us: int, *boxes: tuple[float, float, float, float], name: str = "hsv") -> DetectionResult:
@@ -39,7 +39,7 @@ HERE, NEAR, AWAY = (10, 10, 50, 50), (14, 8, 52, 50), (200, 10, 240, 50)
      ((HERE,), (), "onnx nothing"), ((), (HERE,), "hsv nothing")],
 )
 def test_what_counts_is_what_would_be_steered_by(mine: tuple, other: tuple, words: str) -> None:
-    what = differs(result(1, *mine), result(1, *other, name="onnx"), anything)
+    what = disagreement(result(1, *mine), result(1, *other, name="onnx"), anything)
     assert words in what if words else not what
 
 
@@ -60,15 +60,15 @@ MISSIONS = {
     ("band", "ball", (("light-red", NEAR),), True),
 ])  # fmt: skip
 def test_what_the_mission_does_not_go_by_is_no_disagreement(mission: str, mine: str, boxes: tuple, agree: bool) -> None:
-    goes_by = configured(MISSIONS[mission]).goes_by
+    goes_by = configured_mission(MISSIONS[mission]).goes_by
     found = tuple(Detection(*box, 0.9, label) for label, box in boxes)
     driving = replace(result(1), detections=(Detection(*HERE, 0.9, mine),))
-    assert (differs(driving, replace(result(1), detections=found), goes_by) == "") is agree
+    assert (disagreement(driving, replace(result(1), detections=found), goes_by) == "") is agree
 
 
 def test_what_a_mission_does_not_go_by_counts_as_nothing() -> None:
     legs = replace(result(1), detections=(Detection(*NEAR, 0.9, "legs"),))
-    assert differs(result(1), legs, configured(VisionConfig()).goes_by) == ""
+    assert disagreement(result(1), legs, configured_mission(VisionConfig()).goes_by) == ""
 
 
 def test_disagreement_is_told_now_and_then_only() -> None:
@@ -77,7 +77,7 @@ def test_disagreement_is_told_now_and_then_only() -> None:
         other = () if index % 2 else (HERE,)
         lines.append(agreement.add(result(index * 33_333, HERE), result(index * 33_333, *other, name="onnx"), anything))
     told = [line for line in lines if line]
-    assert len(told) == 1 + 600 * 33_333 // TELL_US
+    assert len(told) == 1 + 600 * 33_333 // REPORT_EVERY_US
     assert "50%" in told[-1]
     assert (agreement.compared, agreement.differed, agreement.share) == (600, 300, 0.5)
 
@@ -106,7 +106,7 @@ def frame(seq: int, robot: str = "r1") -> DetectFrame:
 @pytest.fixture
 def pair():
     driving, shadow = Eye(10, "one"), Eye(200, "two")
-    both = Shadowed(driving, shadow, "two", 10**7)
+    both = ShadowDetector(driving, shadow, "two", 10**7)
     yield driving, shadow, both
     shadow.gate.set()
     both.close()
@@ -248,7 +248,7 @@ def test_a_shadow_that_raises_is_told_and_goes_on(pair) -> None:
 
 
 def test_a_person_promotes_it_live_and_the_report_says_who_looks() -> None:
-    eyes = Shadowed(Hsv(Hsv.Config()), Eye(200, "two"), "two", 10**7)
+    eyes = ShadowDetector(Hsv(Hsv.Config()), Eye(200, "two"), "two", 10**7)
     bench = Bench(VisionConfig(), eyes)
     try:
         bench.frame()
@@ -282,5 +282,5 @@ def test_the_configuration_builds_it() -> None:
 
 
 def test_grey_pictures_agree_on_nothing() -> None:
-    assert differs(result(1), result(1, name="onnx"), anything) == ""
+    assert disagreement(result(1), result(1, name="onnx"), anything) == ""
     assert np.isfinite(Agreement().share)

@@ -7,13 +7,13 @@ import sys
 import pytest
 
 from protocol.transports.zenoh_around import find_listeners
-from protocol.transports.zenoh_discovery import NO_MULTICAST, multicast_section
+from protocol.transports.zenoh_discovery import MULTICAST_OFF, multicast_section
 from protocol.transports.zenoh_session import session_config
 
 INSIDE = """
 import fcntl, os, socket, struct, subprocess, sys
 from operator_side import cli
-from protocol.transports.zenoh_discovery import GROUP
+from protocol.transports.zenoh_discovery import MULTICAST_GROUP as GROUP
 
 ROBOT = '''
 import sys, time
@@ -48,7 +48,7 @@ with socket.socket(type=socket.SOCK_DGRAM) as taken:
 
 @pytest.mark.parametrize("listen", [(), ("tcp/127.0.0.1:7447",), ("tls/localhost:1", "tcp/[::1]:2")])
 def test_who_listens_on_loopback_only_is_not_to_be_found(listen):
-    assert multicast_section(listen) == NO_MULTICAST
+    assert multicast_section(listen) == MULTICAST_OFF
 
 
 @pytest.mark.parametrize("listen", [("tcp/0.0.0.0:7447",), ("tcp/127.0.0.1:1", "quic/192.168.1.20:2"), ("tcp/[::]:1",)])

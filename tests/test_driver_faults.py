@@ -13,11 +13,11 @@ from protocol.messages import Twist
 from robot_side import ipc
 from robot_side.config import PluginChoice, RobotConfig
 from robot_side.driver import Driver, run
-from robot_side.ending import ENDING, IGNORED
+from robot_side.ending import EXIT_SIGNALS, IGNORED_SIGNALS
 from robot_side.latch import StopLatch
 from robot_side.limits import SafetyConfig
 from robot_side.ports import WheelAngles
-from robot_side.scribe import Scribe
+from robot_side.scribe import BackgroundWriter
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, Vision, driving
 
@@ -55,7 +55,7 @@ def driver(tmp_path):
         state_dir=tmp_path,
         safety=SafetyConfig(auto_arm=True),
     )
-    handlers = {number: signal.getsignal(number) for number in (*ENDING, *IGNORED)}
+    handlers = {number: signal.getsignal(number) for number in (*EXIT_SIGNALS, *IGNORED_SIGNALS)}
     BrokenDrive.fails = BrokenDrive.reading = None
     made = Driver(config, BrokenDrive(), None)
     yield made
@@ -109,7 +109,7 @@ def test_a_drive_that_raises_anything_is_a_fault(driver, error):
     assert driver._driving.gate.state == "FAULT" and not driver._obeyed
 
 
-@pytest.mark.parametrize("packet", [b"\xff", b"\x01", b"\x02", b"\x03{", bytes([ipc.Kind.RAW]) + b"x" * 40])
+@pytest.mark.parametrize("packet", [b"\xff", b"\x01", b"\x02", b"\x03{", bytes([ipc.PacketKind.RAW]) + b"x" * 40])
 def test_a_packet_that_is_none_is_dropped(driver, packet):
     driver.child.packets = lambda: iter([packet])
     assert driver._drain() is False
@@ -124,7 +124,7 @@ def test_however_the_loop_ends_the_motors_are_told_zero(tmp_path, monkeypatch):
         raise ZeroDivisionError
 
     monkeypatch.setattr(Driver, "loop", breaks)
-    handlers = {number: signal.getsignal(number) for number in (*ENDING, *IGNORED)}
+    handlers = {number: signal.getsignal(number) for number in (*EXIT_SIGNALS, *IGNORED_SIGNALS)}
     with pytest.raises(ZeroDivisionError):
         run(config)
     assert BrokenDrive.told == (0.0, 0.0)
@@ -135,7 +135,7 @@ def test_however_the_loop_ends_the_motors_are_told_zero(tmp_path, monkeypatch):
 def test_a_latch_that_cannot_be_written_is_tried_again_and_holds_nobody_up(tmp_path, capsys):
     latch = StopLatch(tmp_path / "state", "r1")
     (tmp_path / "state").rmdir()
-    scribe = Scribe(latch)
+    scribe = BackgroundWriter(latch)
     began_s = time.monotonic()
     scribe.keep(stopped=True)
     assert time.monotonic() - began_s < 0.1

@@ -12,12 +12,12 @@ from protocol.codec import encode
 from protocol.messages import AnswerHeader, Echo
 from protocol.transports.link import Message
 from robot_side import ipc
-from robot_side.child import NetworkChild
+from robot_side.child import DriverEnd
 from robot_side.config import RobotConfig
 from robot_side.driver import Driver
-from robot_side.ending import ENDING, IGNORED
+from robot_side.ending import EXIT_SIGNALS, IGNORED_SIGNALS
 from robot_side.limits import SafetyConfig
-from robot_side.parent import ParentDriver
+from robot_side.parent import NetworkEnd
 
 SEQ, T_US = 7, 1_000
 
@@ -39,18 +39,18 @@ class StillDrive:
 def ends(tmp_path):
     """The driver's hold on its child and the child's on its driver, joined by real sockets."""
     waited, aside = (socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2))
-    child = NetworkChild(RobotConfig(state_dir=tmp_path), "0a0a0a0a", lambda line: None)
+    child = DriverEnd(RobotConfig(state_dir=tmp_path), "0a0a0a0a", lambda line: None)
     child.socket, child._aside = waited[0], aside[0]
     for end in (waited[0], aside[0]):
         end.setblocking(False)
-    yield child, ParentDriver(waited[1], aside[1])
+    yield child, NetworkEnd(waited[1], aside[1])
     for end in (*waited, *aside):
         end.close()
 
 
 @pytest.fixture
 def driver(tmp_path, ends):
-    handlers = {number: signal.getsignal(number) for number in (*ENDING, *IGNORED)}
+    handlers = {number: signal.getsignal(number) for number in (*EXIT_SIGNALS, *IGNORED_SIGNALS)}
     config = RobotConfig(state_dir=tmp_path, safety=SafetyConfig(auto_arm=True))
     made = Driver(config, StillDrive(), None)
     made.child = ends[0]
@@ -70,7 +70,7 @@ def test_a_frame_that_is_told_after_its_answer_is_still_read_before_it(ends):
     child, parent = ends
     parent.forward(answer("0a0a0a0a"))
     parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
-    assert [ipc.kind_of(packet) for packet in child.packets()] == [ipc.Kind.ISSUED, ipc.Kind.RAW]
+    assert [ipc.packet_kind(packet) for packet in child.packets()] == [ipc.PacketKind.ISSUED, ipc.PacketKind.RAW]
 
 
 def test_all_frames_are_read_before_a_portion_of_commands(ends):
@@ -79,16 +79,16 @@ def test_all_frames_are_read_before_a_portion_of_commands(ends):
         assert parent.tell_aside(ipc.pack_issued(seq, T_US, 0))
     for _ in range(80):
         parent.forward(answer("0a0a0a0a"))
-    kinds = [ipc.kind_of(packet) for packet in child.packets()]
-    assert kinds == [ipc.Kind.ISSUED] * 100 + [ipc.Kind.RAW] * 64
-    assert [ipc.kind_of(packet) for packet in child.packets()] == [ipc.Kind.RAW] * 16
+    kinds = [ipc.packet_kind(packet) for packet in child.packets()]
+    assert kinds == [ipc.PacketKind.ISSUED] * 100 + [ipc.PacketKind.RAW] * 64
+    assert [ipc.packet_kind(packet) for packet in child.packets()] == [ipc.PacketKind.RAW] * 16
 
 
 def test_a_frame_that_leaves_does_not_wake_the_driver(ends):
     child, parent = ends
     parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
     assert select.select([child.socket], [], [], 0.05)[0] == []
-    assert [ipc.kind_of(packet) for packet in child.packets()] == [ipc.Kind.ISSUED]
+    assert [ipc.packet_kind(packet) for packet in child.packets()] == [ipc.PacketKind.ISSUED]
 
 
 def test_a_tick_does_not_wake_the_network_process_and_the_newest_motion_is_what_it_reads(ends):
@@ -114,7 +114,7 @@ def test_the_frame_that_a_verdict_permits_carries_the_latency_of_that_verdict(dr
     driver._driving.gate.arms_itself = False
     told = []
     monkeypatch.setattr(driver.child, "send_aside", lambda packet: told.append(ipc.unpack_motion(packet)))
-    monkeypatch.setattr(driver.child, "send", lambda packet: told.append(ipc.unpack_judged(packet)))
+    monkeypatch.setattr(driver.child, "send", lambda packet: told.append(ipc.unpack_ack(packet)))
     driver._driving.gate.latency_us = None
     monkeypatch.setattr("robot_side.driver.monotonic_us", lambda: T_US + 4_000)
     _arm(driver)
@@ -132,7 +132,7 @@ def test_a_verdict_is_told_though_the_next_tick_is_not_due(driver, ends):
     parent.forward(answer(driver._driving.session))
     assert driver._drain()
     driver._answer()
-    assert ipc.unpack_judged(parent.receive()).seq == SEQ
+    assert ipc.unpack_ack(parent.receive()).seq == SEQ
     driver._answer()
     assert select.select([parent._waited], [], [], 0.05)[0] == [], "once"
 

@@ -9,12 +9,12 @@ from operator_side.status_text import drops_text, encoding_text, status_lines
 from protocol.channels import FRAME
 from protocol.messages import CameraModel, State, Status, StreamStatus
 from protocol.transports.memory import MemoryNetwork
-from protocol.transports.opening import ManyLinks
-from robot_side.child import Setup
+from protocol.transports.opening import LinkGroup
+from robot_side.child import NetworkSetup
 from robot_side.config import RobotConfig
-from robot_side.hardware.newest import Newest
+from robot_side.hardware.newest import LatestPicture
 from robot_side.network import Network
-from robot_side.parent import ParentDriver
+from robot_side.parent import NetworkEnd
 from robot_side.ports import Picture
 from tests.camera_rig import jpeg
 from tests.link_rigs import until
@@ -45,9 +45,9 @@ class CountingCamera:
 def running(link, camera):
     """The network process's own loop, here as a thread; its driver's ends stay open and silent."""
     pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2)]
-    setup = Setup(config=RobotConfig(), session="0000aaaa", first_seq=0)
+    setup = NetworkSetup(config=RobotConfig(), session="0000aaaa", first_seq=0)
     OPEN.extend(pairs)
-    network = Network(setup, ParentDriver(*(theirs for _, theirs in pairs)), link, camera)
+    network = Network(setup, NetworkEnd(*(theirs for _, theirs in pairs)), link, camera)
     threading.Thread(target=network.run, daemon=True).start()
     return network, pairs
 
@@ -80,12 +80,12 @@ class SilentLink:
 
 
 def test_several_links_count_together():
-    links = ManyLinks([CountingLink({"frame": 3}, {"OVERSIZE": 1}), SilentLink(), CountingLink({"frame": 4}, {})])
+    links = LinkGroup([CountingLink({"frame": 3}, {"OVERSIZE": 1}), SilentLink(), CountingLink({"frame": 4}, {})])
     assert links.dropped == {"frame": 7} and links.refused == {"OVERSIZE": 1}
 
 
 def test_a_cameras_slot_counts_what_nobody_took():
-    newest = Newest()
+    newest = LatestPicture()
     for number in range(4):
         newest.put(Picture(b"", number))
     assert newest.dropped == 3

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from operator_side import cli_faults
 from operator_side.faults import camera
 from operator_side.faults.attacks import ATTACKS, MALFORMED, OVERSIZED
-from operator_side.faults.bench import run_row, watched_us
+from operator_side.faults.bench import run_case, watched_us
 from operator_side.faults.judge import (
     Blind,
-    Motors,
-    Sent,
+    MotorRow,
+    SentCommand,
     at_most,
     last_valid_us,
     measure_stop,
@@ -27,11 +27,11 @@ from operator_side.faults.judge import (
     read_motors,
     stop_checks,
 )
-from operator_side.faults.ledger import GOOD, INJECTED, Ledger, read_ledger
+from operator_side.faults.ledger import GOOD, INJECTED, EventLog, read_events
 from operator_side.faults.machine import describe_machine
 from operator_side.faults.report import markdown, passed, run_line, to_dict, worst_checks
 from operator_side.faults.row import Outcome
-from operator_side.faults.rows import ROWS, chosen
+from operator_side.faults.rows import CASES, chosen
 from operator_side.faults.sampler import read_holes, stalled_us
 from operator_side.score import Check
 from protocol.channels import TWIST
@@ -49,7 +49,7 @@ def log(speeds_mps, lag_rows=0):
     """A motors' log of one row a tick; the wheels follow `lag_rows` later."""
     rows, angle_rad = [], 0.0
     for index, speed_mps in enumerate(speeds_mps):
-        rows.append(Motors(index * TICK_US, speed_mps / RADIUS_M, speed_mps / RADIUS_M, angle_rad, angle_rad))
+        rows.append(MotorRow(index * TICK_US, speed_mps / RADIUS_M, speed_mps / RADIUS_M, angle_rad, angle_rad))
         angle_rad += speeds_mps[max(0, index - lag_rows)] / RADIUS_M * TICK_US / 1e6
     return rows
 
@@ -59,7 +59,7 @@ def drive_and_stop(plateau=50, ramp=10, rest=50, top_mps=0.5):
 
 
 def commands(until_us, age_us=5_000):
-    return [Sent(t_us, t_us - age_us) for t_us in range(0, until_us + 1, SENT_EVERY_US)]
+    return [SentCommand(t_us, t_us - age_us) for t_us in range(0, until_us + 1, SENT_EVERY_US)]
 
 
 # --- the judge ---------------------------------------------------------------------------------------------------
@@ -98,9 +98,9 @@ def test_a_dip_does_not_count_as_falling():
 
 
 def test_turning_on_the_spot_is_motion():
-    turning = [Motors(index * TICK_US, -5.0, 5.0, -0.1 * index, 0.1 * index) for index in range(50)]
+    turning = [MotorRow(index * TICK_US, -5.0, 5.0, -0.1 * index, 0.1 * index) for index in range(50)]
     assert measure_stop(turning, 0).zero_ms is None
-    assert moved_on_old_sight(turning, [Sent(0, -2_000_000)], None) > 0
+    assert moved_on_old_sight(turning, [SentCommand(0, -2_000_000)], None) > 0
 
 
 @pytest.mark.parametrize(("late_ms", "ok"), [(300, True), (340, True), (360, False), (700, False)])
@@ -111,7 +111,7 @@ def test_the_bound_on_falling_is_a_bound(late_ms, ok):
 
 def test_a_log_is_read_without_its_unfinished_line():
     text = "t_us,left_rad_s,right_rad_s,left_rad,right_rad\n1,2.0,3.0,4.0,5.0\n2,2.0,3."
-    assert read_motors(text) == [Motors(1, 2.0, 3.0, 4.0, 5.0)]
+    assert read_motors(text) == [MotorRow(1, 2.0, 3.0, 4.0, 5.0)]
 
 
 # --- old sight ---------------------------------------------------------------------------------------------------
@@ -141,7 +141,7 @@ def test_commands_while_blind_allow_nothing_until_sight_is_back():
 
 def test_a_picture_under_way_when_pictures_are_cut_off_may_still_be_answered():
     rows = log([0.5] * 51 + [0.5 - 0.02 * k for k in range(25)] + [0.0] * 40)
-    sent = [*commands(900_000), Sent(1_090_000, 990_000)]
+    sent = [*commands(900_000), SentCommand(1_090_000, 990_000)]
     assert moved_on_old_sight(rows, sent, Blind(1_000_000)) > 0
     assert moved_on_old_sight(rows, sent, Blind(1_000_000, by_frame=True)) == 0
     assert last_valid_us(sent, Blind(1_000_000, by_frame=True)) == 1_090_000
@@ -159,7 +159,7 @@ def test_without_any_command_no_motion_is_allowed():
 
 @given(st.lists(st.integers(0, 10**6), max_size=20), st.integers(0, 10**6))
 def test_the_last_valid_command_is_from_before_the_blindness(times_us, from_us):
-    last_us = last_valid_us([Sent(t_us, t_us) for t_us in times_us], Blind(from_us))
+    last_us = last_valid_us([SentCommand(t_us, t_us) for t_us in times_us], Blind(from_us))
     assert last_us == max((t_us for t_us in times_us if t_us <= from_us), default=None)
 
 
@@ -174,13 +174,13 @@ def test_the_hardest_change_is_found(gain_mps2):
 
 def test_a_ledger_is_read_as_it_was_written_and_a_torn_line_is_left_out(tmp_path):
     path = tmp_path / "a.ledger"
-    ledger = Ledger(path)
+    ledger = EventLog(path)
     ledger.note(GOOD, 7)
     ledger.note(INJECTED)
     with path.open("a") as torn:
         torn.write("good,12")
-    assert [one.frame_us for one in read_ledger(path, GOOD)] == [7] and len(read_ledger(path, INJECTED)) == 1
-    assert read_ledger(tmp_path / "none", GOOD) == []
+    assert [one.frame_us for one in read_events(path, GOOD)] == [7] and len(read_events(path, INJECTED)) == 1
+    assert read_events(tmp_path / "none", GOOD) == []
 
 
 def test_only_holes_in_the_window_spoil_a_row(tmp_path):
@@ -214,16 +214,16 @@ def test_the_cameras_spare_pictures_are_what_they_are_called(tmp_path):
 # --- rows and report ---------------------------------------------------------------------------------------------
 
 
-def outcome(row=ROWS[0], value=1.0, bound=2.0, **changes):
+def outcome(row=CASES[0], value=1.0, bound=2.0, **changes):
     check = Check("zero", value, "ms", bound, value is not None and value <= bound)
     return Outcome(row, **{"checks": (check,), **changes})
 
 
 def test_rows_are_told_apart_and_say_what_they_demand():
-    assert len({row.id for row in ROWS}) == len(ROWS) == len({row.what for row in ROWS})
-    assert all(row.demanded and row.id.count(".") == 1 and "|" not in row.what + row.demanded for row in ROWS)
-    assert all(row.setup.fault in ATTACKS for row in ROWS if row.setup.driver == "driver" and row.setup.fault)
-    assert 6 <= sum(row.short for row in ROWS) < len(ROWS)
+    assert len({row.id for row in CASES}) == len(CASES) == len({row.what for row in CASES})
+    assert all(row.demanded and row.id.count(".") == 1 and "|" not in row.what + row.demanded for row in CASES)
+    assert all(row.setup.fault in ATTACKS for row in CASES if row.setup.driver == "driver" and row.setup.fault)
+    assert 6 <= sum(row.short for row in CASES) < len(CASES)
 
 
 def test_rows_are_chosen_by_id_group_and_length():
@@ -257,12 +257,12 @@ def test_the_worst_run_is_reported(values):
 
 
 def test_a_failure_outweighs_a_larger_figure_and_less_injected_is_worse():
-    few, many = (Outcome(ROWS[0], (Check("injected", value, "times", 1, value >= 1),)) for value in (1.0, 50.0))
+    few, many = (Outcome(CASES[0], (Check("injected", value, "times", 1, value >= 1),)) for value in (1.0, 50.0))
     assert worst_checks([many, few])[0].value == 1.0
 
 
 def test_the_report_is_one_object_and_one_table():
-    results = [[outcome(), outcome(value=1.5)], [outcome(ROWS[1], value=3.0)]]
+    results = [[outcome(), outcome(value=1.5)], [outcome(CASES[1], value=3.0)]]
     report = json.loads(json.dumps(to_dict(results)))
     assert [check["value"] for check in report["checks"]] == [1.5, 3.0]
     assert [row["ok"] for row in report["rows"]] == [True, False]
@@ -279,10 +279,10 @@ def test_the_machine_is_described_without_naming_it():
 
 def test_the_command_lists_and_refuses(capsys, tmp_path):
     app = typer.Typer()
-    cli_faults.register(app)
+    cli_faults.register_faults(app)
     app.callback()(lambda: None)
     assert app(["faults", "--list", "--only", "stop"], standalone_mode=False) == 0
-    assert len(capsys.readouterr().out.splitlines()) == sum(row.id.startswith("stop.") for row in ROWS)
+    assert len(capsys.readouterr().out.splitlines()) == sum(row.id.startswith("stop.") for row in CASES)
     with pytest.raises(ConfigError, match="no folder"):
         app(["faults", "--only", "stop", "--out", str(tmp_path / "none" / "f.md")], standalone_mode=False)
 
@@ -291,7 +291,7 @@ def test_the_command_lists_and_refuses(capsys, tmp_path):
 
 
 def run_once(row, tmp_path):
-    done = run_row(row, tmp_path)
+    done = run_case(row, tmp_path)
     if done.skipped:
         pytest.skip(done.skipped)
     assert done.ok, run_line(done)
@@ -305,7 +305,7 @@ def test_the_short_set(row, tmp_path):
 
 
 @pytest.mark.faults
-@pytest.mark.parametrize("row", [row for row in ROWS if not row.short], ids=lambda row: row.id)
+@pytest.mark.parametrize("row", [row for row in CASES if not row.short], ids=lambda row: row.id)
 def test_the_long_set(row, tmp_path):
     run_once(row, tmp_path)
 

@@ -6,18 +6,18 @@ import pytest
 import typer
 
 from operator_side import cli_faults
-from operator_side.faults.judge import Motors
+from operator_side.faults.judge import MotorRow
 from operator_side.faults.report import with_rows_of
 from operator_side.faults.rows_crowd import _tick_checks, permille_us, undisturbed_gaps_us
 from operator_side.faults.sampler import Hole
-from operator_side.faults.worst import page_with_worst
+from operator_side.faults.worst import page_with_summary
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGE = "before\n<!-- worst values: x -->\nold\n<!-- /worst values -->\nafter\n"
 
 
 def motors(times_us):
-    return [Motors(t_us, 0.0, 0.0, 0.0, 0.0) for t_us in times_us]
+    return [MotorRow(t_us, 0.0, 0.0, 0.0, 0.0) for t_us in times_us]
 
 
 # --- ticks -------------------------------------------------------------------------------------------------------
@@ -84,7 +84,7 @@ REPORT = """Written by `sightline faults --repeat 2`; do not edit.
 
 
 def block(report):
-    return page_with_worst(PAGE, report).splitlines()
+    return page_with_summary(PAGE, report).splitlines()
 
 
 def test_the_worst_of_each_kind_and_bound_is_shown():
@@ -100,21 +100,21 @@ def test_what_stands_around_the_marks_stays():
     lines = block(REPORT)
     assert lines[0] == "before" and lines[-1] == "after" and "old" not in lines
     assert "`sightline faults --repeat 2`" in lines[2]
-    assert page_with_worst("no marks", REPORT) == "no marks"
+    assert page_with_summary("no marks", REPORT) == "no marks"
 
 
 def test_the_page_of_promises_shows_the_report_that_is_committed():
     page = (DOCS / "safety.md").read_text()
-    assert page_with_worst(page, (DOCS / "faults.md").read_text()) == page and "| vision |" in page
+    assert page_with_summary(page, (DOCS / "faults.md").read_text()) == page and "| vision |" in page
 
 
 def test_the_command_writes_both_pages(tmp_path, monkeypatch):
     from operator_side.faults import parallel
 
     (tmp_path / "safety.md").write_text(PAGE)
-    monkeypatch.setattr(parallel, "run_rows", lambda rows, *_: [[_measured(row)] for row in rows])
+    monkeypatch.setattr(parallel, "run_cases", lambda rows, *_: [[_measured(row)] for row in rows])
     app = typer.Typer()
-    cli_faults.register(app)
+    cli_faults.register_faults(app)
     app.callback()(lambda: None)
     assert app(["faults", "--only", "vision.kill", "--out", str(tmp_path / "faults.md")], standalone_mode=False) == 0
     assert "| vision | 1 |" in (tmp_path / "safety.md").read_text()

@@ -9,17 +9,17 @@ from pathlib import Path
 import pytest
 
 from operator_side.faults import parallel
-from operator_side.faults.parallel import run_rows
+from operator_side.faults.parallel import run_cases
 from operator_side.faults.report import progress_line
 from operator_side.faults.rig import Setup
-from operator_side.faults.row import Outcome, Row
+from operator_side.faults.row import Outcome, Case
 from operator_side.score import Check
 
 GOOD = (Check("zero", 1.0, "ms", 2.0, True),)
 
 
 def row(name, **changes):
-    return Row(f"made.{name}", f"made up: {name}", lambda rig: None, Setup(), **changes)
+    return Case(f"made.{name}", f"made up: {name}", lambda rig: None, Setup(), **changes)
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def bench(monkeypatch, tmp_path):
         (folder / f"{made.id}-{number}").write_text(f"{began_s} {time.monotonic()}")
         return Outcome(made, () if skipped else GOOD, skipped=skipped)
 
-    monkeypatch.setattr(parallel, "run_row", run)
+    monkeypatch.setattr(parallel, "run_case", run)
     return tmp_path
 
 
@@ -50,14 +50,14 @@ def overlaps(one, other):
 def test_the_results_stand_in_the_order_of_the_rows_and_each_run_is_told(bench):
     told = []
     rows = [row("a"), row("b"), row("c")]
-    results = run_rows(rows, 2, bench, 2, lambda outcome, progress: told.append((outcome.row.id, progress)))
+    results = run_cases(rows, 2, bench, 2, lambda outcome, progress: told.append((outcome.row.id, progress)))
     assert [[one.row.id for one in outcomes] for outcomes in results] == [[f"made.{name}"] * 2 for name in "abc"]
     assert [progress.done for _, progress in told] == [1, 2, 3, 4, 5, 6]
     assert told[-1][1].left_s == 0 and 0 < told[2][1].left_s < 5
 
 
 def test_as_many_run_at_once_as_was_said(bench):
-    run_rows([row("a"), row("b")], 2, bench, 2, lambda *_: None)
+    run_cases([row("a"), row("b")], 2, bench, 2, lambda *_: None)
     everything = spans(bench, "a") + spans(bench, "b")
     beside = [sum(overlaps(one, other) for other in everything) - 1 for one in everything]
     assert max(beside) >= 1
@@ -66,20 +66,20 @@ def test_as_many_run_at_once_as_was_said(bench):
 
 
 def test_a_row_that_wants_the_machine_alone_gets_it_last(bench):
-    run_rows([row("alone", alone=True), row("a"), row("b")], 2, bench, 3, lambda *_: None)
+    run_cases([row("alone", alone=True), row("a"), row("b")], 2, bench, 3, lambda *_: None)
     (first, second), others = spans(bench, "alone"), spans(bench, "a") + spans(bench, "b")
     assert not overlaps(first, second) and first[0] > max(end for _, end in others)
 
 
 def test_what_is_skipped_is_told_but_not_repeated(bench):
     told = []
-    (outcomes,) = run_rows([row("skips")], 5, bench, 1, lambda outcome, progress: told.append(progress.done))
+    (outcomes,) = run_cases([row("skips")], 5, bench, 1, lambda outcome, progress: told.append(progress.done))
     assert [one.skipped for one in outcomes] == ["needs root"] and len(spans(bench, "skips")) == 1
     assert told == [1, 2, 3, 4, 5]
 
 
 def test_a_row_whose_own_process_dies_fails_and_ends_nothing_else(bench):
-    died, well = run_rows([row("dies"), row("a")], 1, bench, 1, lambda *_: None)
+    died, well = run_cases([row("dies"), row("a")], 1, bench, 1, lambda *_: None)
     assert "ended" in died[0].trouble and not died[0].ok and well[0].ok
 
 
@@ -89,7 +89,7 @@ def test_whoever_interrupts_the_bench_interrupts_its_rows(bench):
 
     began_s = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        run_rows([row("a"), row("b"), row("c")], 3, bench, 3, interrupt)
+        run_cases([row("a"), row("b"), row("c")], 3, bench, 3, interrupt)
     assert time.monotonic() - began_s < 5 and not multiprocessing.active_children()
 
 

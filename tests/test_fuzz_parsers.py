@@ -25,8 +25,8 @@ from protocol.legacy import (
     parse_dashed,
     text_bound,
 )
-from protocol.messages import Wire
-from protocol.refusals import Refusal
+from protocol.messages import WireModel
+from protocol.refusals import RejectReason
 from protocol.transports.websocket_framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
 from protocol.twist_text import MAX_TWIST_BYTES, format_twist, parse_twist
 
@@ -112,7 +112,7 @@ def check_packet(data):
 
 def check_model(model, size):
     def check(data):
-        message: Wire = decode(model, data, size)
+        message: WireModel = decode(model, data, size)
         assert len(data) <= size
         assert decode(model, encode(message), 1 << 20) == message
 
@@ -143,7 +143,7 @@ def read(name, data):
     try:
         PARSERS[name](data)
     except WireError as error:
-        assert isinstance(error.reason, Refusal) and error.detail and "\n" not in error.detail
+        assert isinstance(error.reason, RejectReason) and error.detail and "\n" not in error.detail
         str(error).encode()  # printable: no lone surrogate gets into a log
         return error.reason
     return None

@@ -9,13 +9,13 @@ import pytest
 
 from protocol.golden import INEXACT_KEY, outcome
 from protocol.golden_cases import CASES
-from protocol.golden_wires import WIRE_CASES, wire_outcome
+from protocol.golden_wires import FRAMING_CASES, framing_outcome
 from protocol.messages import MAX_INTEGER
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 
 ACCEPTED = [case for case in CASES if case.refuse is None]
-WIRED = [case for case in WIRE_CASES if case.refuse is None]
-REASONS = {*map(str, Refusal), INEXACT_KEY}
+WIRED = [case for case in FRAMING_CASES if case.refuse is None]
+REASONS = {*map(str, RejectReason), INEXACT_KEY}
 LONGEST_TEXT = 4_096
 WHOLE_UP_TO = 2_000  # longer payloads (bounds padded with blanks, 64 boxes) are cut at every 61st byte
 
@@ -80,12 +80,12 @@ def test_a_websocket_message_cut_or_changed_anywhere_is_taken_apart_or_refused(c
     block = 2 + int.from_bytes(message[:2])
     changed = [one + message[block:] for one in flipped(message[:block])]
     for one in (*cut(message), *changed):
-        got = wire_outcome("websocket", case.given | {"message_hex": one.hex()})
+        got = framing_outcome("websocket", case.given | {"message_hex": one.hex()})
         check(got)
         if "accept" in got:
             assert len(got["accept"]["header_hex"]) // 2 <= 576 and len(one) >= len(got["accept"]["payload_hex"]) // 2
     for one in cut(message[:block]):
-        assert check(wire_outcome("websocket", case.given | {"message_hex": one.hex()})), "a block cut short is refused"
+        assert check(framing_outcome("websocket", case.given | {"message_hex": one.hex()})), "a block cut short is refused"
 
 
 @pytest.mark.parametrize(
@@ -95,4 +95,4 @@ def test_a_text_cut_or_changed_anywhere_is_read_or_refused(case):
     """A transport hands over no text that is not UTF-8, so a changed byte stands for the character of that number."""
     text = case.given["text"].encode()
     for one in (*cut(text), *flipped(text)):
-        check(wire_outcome(case.folder, case.given | {"text": one.decode("latin-1")}))
+        check(framing_outcome(case.folder, case.given | {"text": one.decode("latin-1")}))

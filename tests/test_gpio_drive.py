@@ -18,7 +18,7 @@ from protocol.messages import Twist
 from robot_side.hardware.gpio_drive import GpioDrive
 from robot_side.hardware.gpio_table import DutyTable, table_of, table_text
 from robot_side.kinematics import DiffDriveConfig, wheel_speeds
-from robot_side.plugins import configured
+from robot_side.plugins import load_device
 from tests.drive_contract import check_drive
 from tests.gpio_rig import LEFT, RIGHT, NotingPin, both_ways, config
 
@@ -120,7 +120,7 @@ def test_the_radius_comes_from_the_robots_own_wheels():
 def test_the_cars_file_is_valid_and_drives_as_the_write_up_did(board):
     """60 % straight ahead and 40 % turning on the spot, at the limits of the file."""
     robot = load_service("robot", file=str(ROOT / "examples/raspberry-car.toml"), environ={}).config
-    plugin, options = configured("drives", robot.motors)
+    plugin, options = load_device("drives", robot.motors)
     assert options.pins == (10, 9, 8, 7) and options.pwm_hz == 2000
     drive, limits = plugin(options), robot.safety
     straight = Twist(linear_mps=limits.max_linear_mps, angular_rad_s=0.0)

@@ -16,7 +16,7 @@ from operator_side.service_settings import load_service
 from protocol.errors import ConfigError, HardwareError
 from robot_side.hardware import gpio_low, gpio_pins
 from robot_side.hardware.gpio_drive import GpioDrive
-from robot_side.plugins import configured
+from robot_side.plugins import load_device
 from tests.gpio_rig import NotingPin, config
 
 ROOT = Path(__file__).parent.parent
@@ -144,6 +144,6 @@ def test_the_drop_in_puts_the_examples_pins_low_first_and_keeps_the_units_own_co
     own = next(line for line in (systemd / "sightline-robot.service").read_text().splitlines() if "StopPost" in line)
     module, *numbers = lines[2].partition(" -m ")[2].split()
     car = load_service("robot", file=str(ROOT / "examples/raspberry-car.toml"), environ={}).config
-    _, options = configured("drives", car.motors)
+    _, options = load_device("drives", car.motors)
     assert lines[:2] == ["[Service]", "ExecStopPost="] and lines[3] == own
     assert module == gpio_low.__name__ and [int(text) for text in numbers] == [*options.pins, *options.enable_pins]

@@ -10,7 +10,7 @@ import pytest
 from operator_side import cli, cli_robot_tools, wheel_test
 from protocol.errors import ConfigError
 from robot_side.config import PluginChoice, RobotConfig
-from robot_side.ending import ENDING
+from robot_side.ending import EXIT_SIGNALS
 from tests.link_rigs import until
 from tests.terminal_rig import Terminal
 
@@ -94,7 +94,7 @@ def test_a_drive_that_fails_in_the_middle_is_told_zero_and_closed(monkeypatch, r
     assert told(log)[-1] == (0.0, 0.0) and len(told(log)) == 3
 
 
-@pytest.mark.parametrize("number", ENDING)
+@pytest.mark.parametrize("number", EXIT_SIGNALS)
 def test_whatever_a_key_or_a_terminal_sends_ends_with_zero(monkeypatch, robot, number):
     config, log = robot
     before = signal.getsignal(number)

@@ -14,12 +14,12 @@ from tests import demanded
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.config import DetectorConfig, VisionConfig
 from vision_side.decode import Decoder, Picture
-from vision_side.detect.choice import choose_detector
+from vision_side.detect.choice import build_detector
 from vision_side.detect.golden import KEY, difference, golden_picture, read_golden
 from vision_side.detect.onnx_detector import SHIPPED
 from vision_side.detect.onnx_engine import open_engine
 from vision_side.detect.onnx_header import read_onnx_header
-from vision_side.detect.onnx_reading import fit_picture, form_of, read_outputs
+from vision_side.detect.onnx_reading import fit_picture, model_format, read_outputs
 from vision_side.detect.port import NO_DEADLINE, DetectFrame
 
 GPU = "cuda"
@@ -29,7 +29,7 @@ JPEGS = [jpeg_of(golden_picture()), *(jpeg_of(scene(MODEL, far_m, aside, noise=0
 
 
 def _eyes(device):
-    return choose_detector("onnx", {}, VisionConfig(detector=DetectorConfig(kind="onnx", device=device)))
+    return build_detector("onnx", {}, VisionConfig(detector=DetectorConfig(kind="onnx", device=device)))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -66,7 +66,7 @@ def test_it_sees_what_it_sees_on_the_cpu(on_gpu):
 
 def test_it_gives_there_what_it_gave_where_it_was_made():
     header = read_onnx_header(SHIPPED.read_bytes())
-    form, picture = form_of(header, (), "auto"), Picture(golden_picture(), 1)
+    form, picture = model_format(header, (), "auto"), Picture(golden_picture(), 1)
     pixels, fitting = fit_picture(picture, form)
     found = read_outputs(open_engine(SHIPPED, header, GPU, 1).run(pixels), form, fitting, picture, 0.5)
     assert found and difference(read_golden(header.metadata[KEY]), found, 0.5) == ""

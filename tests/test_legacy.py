@@ -10,16 +10,16 @@ from protocol.errors import WireError
 from protocol.jpeg import JpegSize
 from protocol.legacy import (
     MAX_BOXES,
-    Box,
+    LegacyBox,
     decode_picture,
-    detections_of,
+    detections_from_boxes,
     encode_picture,
     format_boxes,
     parse_boxes,
     parse_dashed,
     text_bound,
 )
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.twist_text import parse_twist
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
@@ -49,7 +49,7 @@ def test_a_picture_is_read_with_any_line_ends_and_within_its_bound(jpeg, line_en
 def test_what_is_no_base64_is_refused(text):
     with pytest.raises(WireError) as refusal:
         decode_picture(text, 1000)
-    assert refusal.value.reason is Refusal.MALFORMED
+    assert refusal.value.reason is RejectReason.MALFORMED
 
 
 @given(st.binary(max_size=300))
@@ -57,7 +57,7 @@ def test_any_bytes_are_a_picture_or_a_wire_error(text):
     try:
         assert len(decode_picture(text, 100)) <= 100
     except WireError as refusal:
-        assert refusal.reason is Refusal.MALFORMED
+        assert refusal.reason is RejectReason.MALFORMED
 
 
 @given(FINITE, FINITE)
@@ -93,18 +93,18 @@ def test_negatives_and_exponents_in_dashed_twists(text, linear, angular):
 def test_what_is_no_dashed_twist_is_refused(text):
     with pytest.raises(WireError) as refusal:
         parse_dashed(text)
-    assert refusal.value.reason is Refusal.MALFORMED
+    assert refusal.value.reason is RejectReason.MALFORMED
 
 
 def test_a_dashed_twist_that_overflows_is_not_finite():
     with pytest.raises(WireError) as refusal:
         parse_dashed(b"1e999-0")
-    assert refusal.value.reason is Refusal.NOT_FINITE
+    assert refusal.value.reason is RejectReason.NOT_FINITE
 
 
 @given(st.lists(st.tuples(UNIT, UNIT, UNIT, UNIT), max_size=MAX_BOXES))
 def test_boxes_survive_the_way_there_and_back(corners):
-    boxes = [Box(min(a, b), min(c, d), max(a, b), max(c, d)) for a, b, c, d in corners]
+    boxes = [LegacyBox(min(a, b), min(c, d), max(a, b), max(c, d)) for a, b, c, d in corners]
     read = parse_boxes(format_boxes(boxes))
     assert len(read) == len(boxes)
     for box, got in zip(boxes, read, strict=True):
@@ -121,20 +121,20 @@ def test_boxes_survive_the_way_there_and_back(corners):
 def test_what_is_no_list_of_boxes_is_refused(text):
     with pytest.raises(WireError) as refusal:
         parse_boxes(text)
-    assert refusal.value.reason is Refusal.MALFORMED
+    assert refusal.value.reason is RejectReason.MALFORMED
 
 
 def test_a_box_outside_the_picture_cannot_exist():
     for corners in ((0, 0, 1, 1.01), (-0.1, 0, 1, 1), (0.5, 0, 0.4, 1), (float("nan"), 0, 1, 1)):
         with pytest.raises(ValueError, match="does not lie"):
-            Box(*corners)
+            LegacyBox(*corners)
     with pytest.raises(ValueError, match="at most 16"):
-        format_boxes([Box(0, 0, 1, 1)] * (MAX_BOXES + 1))
+        format_boxes([LegacyBox(0, 0, 1, 1)] * (MAX_BOXES + 1))
 
 
 def test_boxes_become_detections_in_pixels_of_the_picture_in_their_order():
-    found = detections_of(parse_boxes(b"0.25,0.5,0.75,1-0,0,1,0.125"), JpegSize(640, 480, 3))
+    found = detections_from_boxes(parse_boxes(b"0.25,0.5,0.75,1-0,0,1,0.125"), JpegSize(640, 480, 3))
     assert (found.width_px, found.height_px) == (640, 480)
     corners = [(box.label, box.x1_px, box.y1_px, box.x2_px, box.y2_px) for box in found.boxes]
     assert corners == [("box", 320, 120, 640, 360), ("box", 0, 0, 80, 480)]
-    assert detections_of((), JpegSize(16, 16, 1)).boxes == ()
+    assert detections_from_boxes((), JpegSize(16, 16, 1)).boxes == ()

@@ -4,7 +4,7 @@ import pytest
 
 from operator_side.lockstep import Conditions, run_lockstep
 from operator_side.score import score
-from operator_side.score_bounds import judge
+from operator_side.score_bounds import checks_of
 from protocol.messages import State
 from sim.robot_model import load_robot
 from sim.scenario import load_scenario
@@ -33,12 +33,12 @@ def test_a_run_repeats_bit_for_bit():
 ])
 def test_every_scenario_holds_its_figures(name, seconds):
     _, result = run(name, 103, Conditions(latency_ms=50, loss=0.1), seconds)
-    assert [check for check in judge(name, result, 50) if not check.ok] == []
+    assert [check for check in checks_of(name, result, 50) if not check.ok] == []
 
 
 def test_with_400_ms_the_robot_stands_still():
     result, figures = run("eight", 104, Conditions(latency_ms=400, loss=0.1), 6.0)
-    assert all(check.ok for check in judge("eight", figures, 400))
+    assert all(check.ok for check in checks_of("eight", figures, 400))
     assert State.ACTIVE not in result.states
     assert len(result.twists) > 5, "vision did answer; the gate refused"
 

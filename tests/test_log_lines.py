@@ -14,21 +14,21 @@ from datetime import UTC, datetime
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.log_lines import ENV_NAME, JsonLines, Teller, as_json, use_form
+from protocol.log_lines import LOG_FORMAT_VARIABLE, JsonLineStream, AsyncLineWriter, to_json_line, set_log_format
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 
 
 def _written(*texts):
     below = io.StringIO()
-    stream = JsonLines(below, "robot", "info")
+    stream = JsonLineStream(below, "robot", "info")
     for text in texts:
         stream.write(text)
     return [json.loads(line)["message"] for line in below.getvalue().splitlines()]
 
 
 def test_an_object_says_when_who_how_bad_and_what():
-    line = as_json('error: "x" is \u00e9', "vision", "warning", datetime(2026, 3, 1, 10, 0, 0, 123_456, UTC))
+    line = to_json_line('error: "x" is \u00e9', "vision", "warning", datetime(2026, 3, 1, 10, 0, 0, 123_456, UTC))
     assert json.loads(line) == {
         "time": "2026-03-01T10:00:00.123Z", "level": "error", "service": "vision", "message": '"x" is \u00e9',
     }  # fmt: skip
@@ -46,10 +46,10 @@ def test_an_unfinished_line_waits_and_an_endless_one_is_cut():
 
 def test_a_form_that_is_none_is_refused(monkeypatch):
     with pytest.raises(ConfigError, match=r"--log 'xml' is no form of a log: text or json"):
-        use_form("xml", "robot")
-    monkeypatch.setenv(ENV_NAME, "yaml")
-    with pytest.raises(ConfigError, match=ENV_NAME):
-        use_form(None, "robot")
+        set_log_format("xml", "robot")
+    monkeypatch.setenv(LOG_FORMAT_VARIABLE, "yaml")
+    with pytest.raises(ConfigError, match=LOG_FORMAT_VARIABLE):
+        set_log_format(None, "robot")
 
 
 def test_a_service_says_its_errors_as_json_too():
@@ -63,7 +63,7 @@ def test_a_service_says_its_errors_as_json_too():
 @pytest.mark.slow
 def test_both_processes_of_a_robot_speak_json(tmp_path, monkeypatch):
     """The driver says what it does by its command line; the network process by what it finds in its environment."""
-    monkeypatch.setenv(ENV_NAME, "json")
+    monkeypatch.setenv(LOG_FORMAT_VARIABLE, "json")
     with RobotProcess(tmp_path) as robot:
         assert until(lambda: "robot r1: on" in robot.output(), 20)
         network = next(line for line in robot.output().splitlines() if "robot r1: on" in line)
@@ -83,7 +83,7 @@ def unread(request):
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_who_tells_does_not_wait_for_who_reads(unread, wrapped):
     read, written = unread
-    stream, teller, begin_s = JsonLines(written, "robot", "info") if wrapped else written, Teller(), time.monotonic()
+    stream, teller, begin_s = JsonLineStream(written, "robot", "info") if wrapped else written, AsyncLineWriter(), time.monotonic()
     for number in range(300):
         teller.tell(f"{number} " + 100 * "\U0001f600", stream)
     assert time.monotonic() - begin_s < 2
@@ -96,7 +96,7 @@ def test_who_tells_does_not_wait_for_who_reads(unread, wrapped):
 
 def test_a_line_is_there_at_once_where_somebody_reads(unread):
     read, written = unread
-    Teller().tell("heard", written)
+    AsyncLineWriter().tell("heard", written)
     os.set_blocking(read.fileno(), False)
     assert read.read(99).strip() == b"heard"
 
@@ -104,7 +104,7 @@ def test_a_line_is_there_at_once_where_somebody_reads(unread):
 def test_a_line_for_nobody_at_all_is_dropped(monkeypatch):
     reader, writer = os.pipe()
     os.close(reader)
-    teller = Teller()
+    teller = AsyncLineWriter()
     with suppress(BrokenPipeError), os.fdopen(writer, "w") as written:
         teller.tell("gone", written)
     monkeypatch.setattr(sys, "stderr", None)

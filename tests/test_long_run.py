@@ -9,10 +9,10 @@ from protocol.transports.link import Message
 from protocol.transports.memory import MemoryNetwork
 from protocol.twist_text import format_twist
 from robot_side.config import PluginChoice, RobotConfig
-from robot_side.driving import Driving
+from robot_side.driving import DriverCore
 from robot_side.limits import STOP_TIME_BOUND_US, SafetyConfig
 from robot_side.ports import Picture, WheelAngles
-from robot_side.sending import Sending
+from robot_side.sending import NetworkCore
 
 TICK_US, FRAME_US = 20_000, 33_333
 OUTAGE_US = (300_000_000, 302_000_000)
@@ -24,8 +24,8 @@ class LongRun:
     def __init__(self, seed: int):
         config = RobotConfig(safety=SafetyConfig(auto_arm=True), range_sensor=PluginChoice(kind="none"))
         self.network = MemoryNetwork(seed, delay_us=40_000, jitter_us=60_000, loss=0.1)
-        self.driving = Driving(config, "0000aaaa")
-        self.sending = Sending(config.stream, "0000aaaa", 0, config.max_frame_bytes)
+        self.driving = DriverCore(config, "0000aaaa")
+        self.sending = NetworkCore(config.stream, "0000aaaa", 0, config.max_frame_bytes)
         self.robot, self.vision = self.network.link("r1"), self.network.link("r1", "vision")
         self.robot.subscribe(TWIST, self._on_twist)
         self.vision.subscribe(FRAME, self._on_frame)

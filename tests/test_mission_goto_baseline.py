@@ -9,11 +9,11 @@ import pytest
 from protocol.messages import FrameHeader, Pose
 from tests.course_rig import Course, Drive, Row
 from tests.vision_rig import camera
-from vision_side.missions.body import Body
+from vision_side.missions.body import Footprint
 from vision_side.missions.goto_baseline import GotoBaseline
 from vision_side.missions.port import Plan, RangeScan, View
 
-THYMIO = Body(front_m=0.08, rear_m=0.03, half_width_m=0.0635)
+THYMIO = Footprint(front_m=0.08, rear_m=0.03, half_width_m=0.0635)
 RAY_RAD = math.radians(3)
 FRONT_M = 0.077
 """Where its front sensor stands, ahead of the axle."""

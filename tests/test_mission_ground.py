@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from protocol.messages import FrameHeader
 from tests.vision_rig import camera
-from vision_side.missions.body import Body, braking_mps, clear_of
-from vision_side.missions.giving_up import Patience, PatienceConfig
-from vision_side.missions.ground import CELL_M, Ground, cells_of
+from vision_side.missions.body import Footprint, braking_mps, clear_of
+from vision_side.missions.giving_up import ProgressChecker, ProgressCheckerConfig
+from vision_side.missions.ground import CELL_M, Costmap, cells_of
 from vision_side.missions.port import RangeScan, View
 from vision_side.missions.ranging import PoseMemory, about_robot, echoes, in_odometry
-from vision_side.missions.route import HORIZON_M, Route
+from vision_side.missions.route import HORIZON_M, Planner
 
 LENGTH = st.floats(-5, 5)
 ANGLE = st.floats(-9, 9)
@@ -65,7 +65,7 @@ def test_echoes_leave_out_what_met_nothing_and_what_is_out_of_range() -> None:
 
 
 def test_one_echo_counts_at_once_and_rays_through_it_give_it_up_again() -> None:
-    ground = Ground()
+    ground = Costmap()
     ground.see((0.0, 0.0), np.array([[0.31, 0.0]]))
     assert len(ground.cells()) == 1 and ground.version == 1
     for _ in range(2):
@@ -76,7 +76,7 @@ def test_one_echo_counts_at_once_and_rays_through_it_give_it_up_again() -> None:
 
 
 def test_a_wall_at_a_grazing_angle_is_not_given_up() -> None:
-    ground = Ground()
+    ground = Costmap()
     wall = np.column_stack([np.linspace(0.05, 0.6, 40), np.full(40, 0.10)])
     for _ in range(30):
         ground.see((0.0, 0.0), wall)
@@ -85,7 +85,7 @@ def test_a_wall_at_a_grazing_angle_is_not_given_up() -> None:
 
 def test_the_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vision_side.missions.ground.MAX_CELLS", 100)
-    ground = Ground()
+    ground = Costmap()
     for step in range(300):
         ground.see((step * CELL_M, 0.5), np.array([[step * CELL_M, 0.6]]))
     assert len(ground.cells()) == 100
@@ -100,7 +100,7 @@ def wall(x: float, y1: float, y2: float) -> np.ndarray:
 
 
 def test_a_free_way_is_straight() -> None:
-    route = Route(np.empty((0, 2), np.int64), (0.0, 0.0), (3.0, 1.0), 0.2, 0.2)
+    route = Planner(np.empty((0, 2), np.int64), (0.0, 0.0), (3.0, 1.0), 0.2, 0.2)
     entry = route.entry((0.0, 0.0), 0.1)
     assert entry is not None and route.sees((0.0, 0.0), (3.0, 1.0))
     assert route.left_m(entry) == pytest.approx(math.hypot(3, 1), rel=0.08)
@@ -114,7 +114,7 @@ def test_the_way_round_a_wall_keeps_its_distance(keep: float, half: float, shift
     that are looked at, and 1.5 at its begin, which are not."""
     filled = wall(1.0, shift - half, shift + half)
     robot = (0.0, 0.0)
-    route = Route(filled, robot, (2.0, 0.0), keep, keep)
+    route = Planner(filled, robot, (2.0, 0.0), keep, keep)
     assert not route.sees(robot, (2.0, 0.0))
     points = (filled + 0.5) * CELL_M
     for _ in range(200):
@@ -135,12 +135,12 @@ def test_a_gap_that_is_too_narrow_is_no_way_and_one_wide_enough_is() -> None:
                       wall(1.0, -3.0, -3.0)])
     ends = [cells_of(np.column_stack([np.linspace(-1, 1, 200), np.full(200, y)])) for y in (-3.0, 3.0)]
     closed = np.vstack([room, *ends])
-    assert Route(closed, (0.0, 0.0), (2.0, 0.0), 0.15, 0.15).entry((0.0, 0.0), 0.1) is not None
-    assert Route(closed, (0.0, 0.0), (2.0, 0.0), 0.25, 0.25).entry((0.0, 0.0), 0.1) is None
+    assert Planner(closed, (0.0, 0.0), (2.0, 0.0), 0.15, 0.15).entry((0.0, 0.0), 0.1) is not None
+    assert Planner(closed, (0.0, 0.0), (2.0, 0.0), 0.25, 0.25).entry((0.0, 0.0), 0.1) is None
 
 
 def test_a_robot_too_near_to_a_wall_is_led_out_to_the_nearest_free_place() -> None:
-    route = Route(wall(0.15, -1.0, 1.0), (0.0, 0.0), (-1.0, 0.0), 0.25, 0.25)
+    route = Planner(wall(0.15, -1.0, 1.0), (0.0, 0.0), (-1.0, 0.0), 0.25, 0.25)
     entry = route.entry((0.0, 0.0), 0.2)
     assert entry is not None
     x, y = route.carrot((0.0, 0.0), entry)
@@ -149,7 +149,7 @@ def test_a_robot_too_near_to_a_wall_is_led_out_to_the_nearest_free_place() -> No
 
 @pytest.mark.parametrize("goal", [(50.0, 3.0), (-100.0, 100.0), (0.0, -80.0)])
 def test_a_goal_beyond_the_horizon_is_aimed_at(goal: tuple[float, float]) -> None:
-    route = Route(wall(0.8, -0.5, 0.5), (0.0, 0.0), goal, 0.2, 0.2)
+    route = Planner(wall(0.8, -0.5, 0.5), (0.0, 0.0), goal, 0.2, 0.2)
     entry = route.entry((0.0, 0.0), 0.1)
     assert entry is not None
     carrot = route.carrot((0.0, 0.0), entry)
@@ -172,7 +172,7 @@ def test_no_room_no_speed() -> None:
 
 
 def test_only_motion_towards_a_point_is_cut() -> None:
-    body, ahead = Body(), np.array([[0.25, 0.0]])
+    body, ahead = Footprint(), np.array([[0.25, 0.0]])
     assert clear_of(ahead, body, (0.5, 0.0), 0.1, 1.0) == pytest.approx(math.sqrt(2 * 0.07) / 0.5)
     assert clear_of(ahead, body, (-0.5, 0.0), 0.1, 1.0) == 1.0
     assert clear_of(np.array([[0.02, 0.1]]), body, (0.5, 0.0), 0.1, 1.0) == 1.0
@@ -188,7 +188,7 @@ def view(dt_s: float, applied=(0.2, 0.0)) -> View:
 
 
 def test_closed_for_long_enough_is_closed_and_a_way_found_meanwhile_is_not() -> None:
-    patience = Patience(PatienceConfig(closed_s=1.0))
+    patience = ProgressChecker(ProgressCheckerConfig(closed_s=1.0))
     assert patience.step(view(0.6), None, 0) == ""
     assert patience.step(view(0.3), 2.0, 0) == ""
     assert patience.step(view(0.6), None, 0) == ""
@@ -196,7 +196,7 @@ def test_closed_for_long_enough_is_closed_and_a_way_found_meanwhile_is_not() -> 
 
 
 def test_no_progress_is_driving_without_coming_nearer_or_seeing_anything_new() -> None:
-    patience = Patience(PatienceConfig(stuck_s=2.0))
+    patience = ProgressChecker(ProgressCheckerConfig(stuck_s=2.0))
     assert [patience.step(view(0.5), 3.0, 0) for _ in range(4)] == [""] * 4
     assert patience.step(view(0.5), 3.0, 0) == "no progress in 2 s"
     patience.start_again()

@@ -11,7 +11,7 @@ from protocol.messages import FrameHeader
 from tests.course_rig import Course, Drive, Lidar, Row
 from tests.vision_rig import camera
 from vision_side.detect.port import Detection
-from vision_side.missions.body import Body
+from vision_side.missions.body import Footprint
 from vision_side.missions.legs import Legs, nearest_legs
 from vision_side.missions.legs_baseline import LegsBaseline
 from vision_side.missions.port import RangeScan, View
@@ -19,7 +19,7 @@ from vision_side.track import from_odometry
 
 LENS = camera()
 LEG_M = 0.055
-RASPBERRY = Body(front_m=0.07, rear_m=0.10, half_width_m=0.09)
+RASPBERRY = Footprint(front_m=0.07, rear_m=0.10, half_width_m=0.09)
 Walk = Callable[[float], tuple[float, float, float]]
 """Where a person is at a time, and which way he walks."""
 

@@ -11,15 +11,15 @@ from sim.look import look_named
 from tests.course_rig import Course, Drive, Row
 from tests.lane_rig import BLOCK_M, LENS, LaneWorld
 from vision_side.decode import Picture
-from vision_side.missions.body import Body
-from vision_side.missions.lamp import COLOURS, UNKNOWN, BoxReader, HousingReader, LampConfig
+from vision_side.missions.body import Footprint
+from vision_side.missions.lamp import COLOURS, UNKNOWN, BoxLightReader, HousingLightReader, LampConfig
 from vision_side.missions.lane import Lane, LaneConfig
 from vision_side.missions.port import View
 from vision_side.missions.stop_line import StopConfig, StopLine
 from vision_side.missions.traffic_light import TrafficLight, TrafficLightBoxes
 
 LOOKS = ("plain", "dim", "bright", "warm", "cold", "desaturated", "quality30")
-RASPBERRY = Body(front_m=0.07, rear_m=0.10, half_width_m=0.09)
+RASPBERRY = Footprint(front_m=0.07, rear_m=0.10, half_width_m=0.09)
 CYCLE = (("red", 5.0), ("green", 5.0), ("yellow", 2.0))
 LINE_M = 2.4  # the light stands at 3.0, its line is 0.6 m before it
 
@@ -30,7 +30,7 @@ LINE_M = 2.4  # the light stands at 3.0, its line is 0.6 m before it
 @pytest.mark.parametrize("look", LOOKS)
 @pytest.mark.parametrize("is_box", [False, True], ids=["lamps", "box"])
 def test_every_state_is_read_right_in_every_look(look: str, is_box: bool) -> None:
-    reader = (BoxReader if is_box else HousingReader)(LampConfig())
+    reader = (BoxLightReader if is_box else HousingLightReader)(LampConfig())
     draw = random.Random(look)
     read = 0
     for number in range(36):
@@ -49,13 +49,13 @@ def test_no_light_is_read_where_there_is_none() -> None:
     world = LaneWorld(light=(-5.0, 0.0))
     for number in range(12):
         blocks, picture = world.sight((0.25 * number, 0.0, 0.05 * math.sin(number)), 0.0)
-        assert HousingReader(LampConfig()).read(picture) == []
-        assert BoxReader(LampConfig()).read(picture, blocks) == []
+        assert HousingLightReader(LampConfig()).read(picture) == []
+        assert BoxLightReader(LampConfig()).read(picture, blocks) == []
 
 
 def test_noise_is_no_light_and_breaks_nothing() -> None:
     draw = np.random.default_rng(3)
-    for reader in (HousingReader(LampConfig()), BoxReader(LampConfig())):
+    for reader in (HousingLightReader(LampConfig()), BoxLightReader(LampConfig())):
         for picture in (draw.integers(0, 256, (120, 160, 3)), np.zeros((120, 160, 3)), np.full((120, 160, 3), 255)):
             assert reader.read(Picture(picture.astype(np.uint8), 1)) == []
 

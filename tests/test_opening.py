@@ -4,7 +4,7 @@ import pytest
 
 from protocol.channels import FRAME, STATUS, TWIST
 from protocol.errors import ConfigError, LinkError
-from protocol.transports.opening import ManyLinks, open_link
+from protocol.transports.opening import LinkGroup, open_link
 from tests.link_rigs import free_endpoint, until
 
 
@@ -31,7 +31,7 @@ def test_a_failure_on_one_endpoint_leaves_none_open():
     with open_link("r1", listen=[web]), pytest.raises(LinkError):
         open_link("r1", listen=[zenoh, web])
     with open_link("r1", listen=[zenoh, web]) as again:
-        assert isinstance(again, ManyLinks)
+        assert isinstance(again, LinkGroup)
 
 
 @pytest.mark.parametrize("endpoint", ["ws:/127.0.0.1:1", "http://127.0.0.1:80", "wss//x:1", "ws://127.0.0.1:99999"])
@@ -42,4 +42,4 @@ def test_an_endpoint_that_is_none_is_named(endpoint):
 
 def test_links_of_several_robots_are_not_joined():
     with pytest.raises(ConfigError):
-        ManyLinks([])
+        LinkGroup([])

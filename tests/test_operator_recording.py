@@ -176,7 +176,7 @@ def test_recording_takes_nothing_from_the_network_it_listens_to(tmp_path):
 def test_a_disk_that_is_full_ends_the_recording_with_one_line(monkeypatch, capfd):
     """No thread dies, `close` comes back, and why it ends early is kept."""
     lines = []
-    monkeypatch.setattr(recording, "tell", lines.append)
+    monkeypatch.setattr(recording, "log_line", lines.append)
     wire = Wire()
     with Recorder(wire, Path("/dev/full"), {}, CHANNELS.values()) as recorder:
         for at in range(3 * MAX_WAITING):

@@ -14,7 +14,7 @@ from protocol.messages import AnswerHeader, Echo, Status, Verb
 from protocol.transports.link import Message
 from protocol.transports.memory import MemoryNetwork
 from robot_side.config import PluginChoice, RobotConfig
-from robot_side.driving import Driving
+from robot_side.driving import DriverCore
 
 
 class PumpedRobot:
@@ -23,7 +23,7 @@ class PumpedRobot:
     def __init__(self, *, drives: bool = True, hears: bool = True, says: str = "") -> None:
         config = RobotConfig(drive=PluginChoice(kind="log"), camera=PluginChoice(kind="folder"))
         self.network = MemoryNetwork()
-        self.driving = Driving(config, "0000000a")
+        self.driving = DriverCore(config, "0000000a")
         self.drives, self.version = drives, says
         self.link = self.network.link("r1")
         self.operator = Operator(self.network.link("r1", role="operator"))
@@ -161,7 +161,7 @@ def test_status_says_every_counter_and_the_last_refusal():
 
 
 def test_a_report_is_what_was_published():
-    driving = Driving(RobotConfig(), "0000000a")
+    driving = DriverCore(RobotConfig(), "0000000a")
     message = next(one for one in driving.messages(5) if one.channel is STATUS)
     report = read_report(message)
     assert report.stamp.t_us == 5

@@ -7,7 +7,7 @@ import pytest
 
 from operator_side import cli
 from operator_side.score import Score
-from operator_side.score_runs import Case, ScoreReport, cases, judge_runs, run_case, run_cases
+from operator_side.score_runs import Case, ScoreReport, cases, scored_figures, run_case, run_cases
 from operator_side.score_table import score_text
 from protocol.errors import ConfigError
 
@@ -44,9 +44,9 @@ def test_what_cannot_be_run_is_refused_before_anything_runs(arguments):
 @pytest.mark.parametrize("bad", [{"bearing_rms_deg": 0.9}, {"acquired_s": None}, {"wall_contacts": 1}])
 def test_one_bad_run_of_three_fails_its_figure_and_no_other(at, bad):
     runs = [(Case("static", 50, 0.1, seed, 5.0), GOOD) for seed in range(3)]
-    assert all(one.ok for one in judge_runs(runs))
+    assert all(one.ok for one in scored_figures(runs))
     runs[at] = (runs[at][0], replace(GOOD, **bad))
-    judged = judge_runs(runs)
+    judged = scored_figures(runs)
     assert [one.name for one in judged if not one.ok] == list(bad)
     failed = next(one for one in judged if not one.ok)
     assert failed.worst == next(iter(bad.values()))

@@ -16,14 +16,14 @@ from vision_side.overlay import (
     OUTLINE,
     RAW,
     TARGET,
-    Shown,
+    OverlayData,
     draw_overlay,
     draw_preview,
     filtered_px,
     radius_px,
     raw_px,
 )
-from vision_side.pipeline import Seen
+from vision_side.pipeline import Observation
 
 MODEL = camera()
 HEADER = FrameHeader(session="0000abcd", seq=7, t_us=1_000, applied=(0.1, -0.2), latency_us=34_000)
@@ -39,8 +39,8 @@ def ball(x_px=200.0, y_px=90.0, radius=20.0, **more):
 
 def shown(target=None, others=(), model=MODEL, **seen):
     found = (*((target,) if target else ()), *others)
-    about = Seen(seen.pop("phase", "tracking"), found, target, **seen)
-    return Shown(HEADER, about, Twist(linear_mps=0.2, angular_rad_s=-0.35), "follow", model, 0.1)
+    about = Observation(seen.pop("phase", "tracking"), found, target, **seen)
+    return OverlayData(HEADER, about, Twist(linear_mps=0.2, angular_rad_s=-0.35), "follow", model, 0.1)
 
 
 def near(canvas, colour, x_px, y_px, reach_px=4):
@@ -121,14 +121,14 @@ def test_any_width_keeps_the_cameras_shape(width_px):
 
 def test_no_command_is_said_as_such():
     told = shown(ball())
-    none = Shown(told.header, told.seen, None, "follow", MODEL, 0.1)
-    still = Shown(told.header, told.seen, STILL, "follow", MODEL, 0.1)
+    none = OverlayData(told.header, told.seen, None, "follow", MODEL, 0.1)
+    still = OverlayData(told.header, told.seen, STILL, "follow", MODEL, 0.1)
     assert not np.array_equal(draw_overlay(GREY, none, 640)[-25:], draw_overlay(GREY, still, 640)[-25:])
 
 
 def test_the_age_is_the_robots_own_measure_or_else_the_least_it_can_be():
     unmeasured = HEADER.model_copy(update={"latency_us": None})
-    strips = [draw_overlay(GREY, Shown(header, Seen("lost"), None, "follow", MODEL, 0.1, age_us), 640)[:20].tobytes()
+    strips = [draw_overlay(GREY, OverlayData(header, Observation("lost"), None, "follow", MODEL, 0.1, age_us), 640)[:20].tobytes()
               for header in (HEADER, unmeasured) for age_us in (None, 12_000)]
     assert strips[0] == strips[1] and len(set(strips)) == 3
 

@@ -5,11 +5,11 @@ from random import Random
 
 import pytest
 
-from vision_side.pace import Pace
+from vision_side.pace import RateLimiter
 
 
 def passed(rate_hz: float, frames_hz: float, seconds: float, jitter: float = 0.0, seed: int = 0) -> list[int]:
-    random, pace = Random(seed), Pace(rate_hz)
+    random, pace = Random(seed), RateLimiter(rate_hz)
     places = range(round(seconds * frames_hz))
     times_us = [round((at + random.uniform(-jitter, jitter)) * 1e6 / frames_hz) for at in places]
     return [at for at in times_us if pace.is_due(at)]
@@ -30,7 +30,7 @@ def test_jitter_costs_no_third_frame(seed):
 
 
 def test_after_a_pause_nothing_is_made_up_for():
-    pace = Pace(10)
+    pace = RateLimiter(10)
     assert pace.is_due(0) and not pace.is_due(50_000)
     assert pace.is_due(5_000_000)
     assert [pace.is_due(5_000_000 + at * 10_000) for at in range(1, 8)] == [False] * 7

@@ -9,7 +9,7 @@ import pytest
 from operator_side import pictures as pictures_module
 from operator_side import reel as reel_module
 from operator_side.pictures import Pictures, viewer_role
-from operator_side.reel import Reel, fill
+from operator_side.reel import FrameBuffer, fill
 from protocol.channels import ACK, FRAME, OVERLAY, STATUS
 from protocol.codec import decode, encode
 from protocol.golden_case import jpeg
@@ -109,7 +109,7 @@ def test_the_robots_silence_is_noticed(site, monkeypatch):
 
 def test_a_page_gets_the_next_picture_when_it_asks_and_none_is_fetched_for_nobody(site, monkeypatch):
     monkeypatch.setattr(reel_module, "IDLE_S", 0.4)
-    pictures, reel, ending = Pictures(site.link, "viewer"), Reel(2), threading.Event()
+    pictures, reel, ending = Pictures(site.link, "viewer"), FrameBuffer(2), threading.Event()
     filling = threading.Thread(target=fill, args=(reel, pictures, ending), daemon=True)
     filling.start()
     try:
@@ -133,7 +133,7 @@ def test_a_page_gets_the_next_picture_when_it_asks_and_none_is_fetched_for_nobod
 
 
 def test_the_reel_over_http_says_which_picture_it_is(site):
-    pictures, reel = Pictures(site.link, "viewer"), Reel(2, lambda shot: 7)
+    pictures, reel = Pictures(site.link, "viewer"), FrameBuffer(2, lambda shot: 7)
     reel.add(taken(pictures, site.overlay))
     answer = reel.route({"after": "0"}, b"")
     assert answer.body == jpeg(640, 480)

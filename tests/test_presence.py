@@ -11,19 +11,27 @@ from protocol.codec import encode
 from protocol.errors import ConfigError, LinkError
 from protocol.messages import Stamp, State, Status
 from protocol.transports.link import Message
-from protocol.transports.presence import MAX_PEERS, Peer, Presence, key_of, namesake, quickest, read_answer
-from protocol.transports.secured import SOURCES, certificate_role
+from protocol.transports.presence import (
+    MAX_PEERS,
+    PeerInfo,
+    Presence,
+    presence_key,
+    robot_with_same_id,
+    best_round_trips,
+    parse_presence_reply,
+)
+from protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
 from protocol.transports.zenoh import open_zenoh
-from protocol.transports.zenoh_around import look_around, peers_at
+from protocol.transports.zenoh_around import discover, peers_at
 from protocol.transports.zenoh_session import open_session
-from protocol.transports.zenoh_site import open_site
+from protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint
 
 ROBOT = Presence(role="robot", robot="r1", session="0000abcd", software="sightline 9", host="shed", up_us=5_000_000)
 
 
 def _peer(presence=ROBOT, round_trip_us=2_000, **changes):
-    return Peer(presence.model_copy(update=changes), round_trip_us, 0)
+    return PeerInfo(presence.model_copy(update=changes), round_trip_us, 0)
 
 
 # --- pure ------------------------------------------------------------------------------------------------------------
@@ -31,7 +39,7 @@ def _peer(presence=ROBOT, round_trip_us=2_000, **changes):
 
 def test_an_answer_gives_who_how_far_and_how_much_its_clock_is_ahead():
     said = ROBOT.model_copy(update={"clock_us": 1_000_000_000})
-    peer = read_answer(key_of("robot", "0000abcd"), encode(said), 50_000, 54_000, clock_us=999_000_000)
+    peer = parse_presence_reply(presence_key("robot", "0000abcd"), encode(said), 50_000, 54_000, clock_us=999_000_000)
     assert (peer.presence, peer.round_trip_us, peer.ahead_us) == (said, 4_000, 1_002_000)
 
 
@@ -40,22 +48,22 @@ def test_an_answer_gives_who_how_far_and_how_much_its_clock_is_ahead():
     encode(ROBOT).replace(b"0000abcd", b"0000ABCD"), encode(ROBOT).replace(b'"r1"', b'"a/b"'),
 ])  # fmt: skip
 def test_what_is_no_presence_is_nobody(payload):
-    assert read_answer(key_of("robot", "0000abcd"), payload, 0, 1, 2) is None
+    assert parse_presence_reply(presence_key("robot", "0000abcd"), payload, 0, 1, 2) is None
 
 
 @pytest.mark.parametrize("role", ["vision", "operator", "teleop", "viewer"])
 def test_who_answers_under_another_role_than_its_own_is_nobody(role):
-    assert read_answer(key_of(role, "0000abcd"), encode(ROBOT), 0, 1, 2) is None
+    assert parse_presence_reply(presence_key(role, "0000abcd"), encode(ROBOT), 0, 1, 2) is None
 
 
 def test_each_is_listed_once_as_it_answered_quickest_robots_first():
     vision = _peer(role="vision", session="00000002")
     rounds = [[vision, _peer(round_trip_us=900)], [_peer(round_trip_us=300), vision], [_peer(round_trip_us=400)]]
-    assert quickest(rounds) == [_peer(round_trip_us=300), vision]
+    assert best_round_trips(rounds) == [_peer(round_trip_us=300), vision]
 
 
 def test_a_flood_of_names_is_bounded():
-    assert len(quickest([[_peer(session=f"{n:08x}") for n in range(3 * MAX_PEERS)]])) == MAX_PEERS
+    assert len(best_round_trips([[_peer(session=f"{n:08x}") for n in range(3 * MAX_PEERS)]])) == MAX_PEERS
 
 
 @pytest.mark.parametrize(("other", "is_taken"), [
@@ -66,7 +74,7 @@ def test_a_flood_of_names_is_bounded():
     ({"session": "0000beef", "up_us": 9_000_000, "role": "vision"}, False),
 ])  # fmt: skip
 def test_an_id_is_taken_by_another_robot_that_was_there_before(other, is_taken):
-    taken = namesake(ROBOT, [_peer(robot="r7", session="00000001", up_us=9_999_999), _peer(**other)])
+    taken = robot_with_same_id(ROBOT, [_peer(robot="r7", session="00000001", up_us=9_999_999), _peer(**other)])
     assert (taken is not None) is is_taken
 
 
@@ -101,7 +109,7 @@ def test_everybody_at_a_router_is_listed_within_two_seconds(router):
     with (
         open_zenoh("r1", connect=[router], role="robot") as robot,
         open_zenoh("r1", connect=[router], role="vision"),
-        open_site("r*", connect=[router], role="vision"),
+        open_fleet("r*", connect=[router], role="vision"),
         open_zenoh("r1", connect=[router], role="detector"),
         open_zenoh("r1", connect=[router]),  # who has no role is not listed
     ):
@@ -132,7 +140,7 @@ def test_who_has_gone_is_not_listed(router):
 def test_a_robot_that_listens_is_listed_by_whoever_connects():
     endpoint = free_endpoint()
     with open_zenoh("r1", listen=[endpoint], role="robot"):
-        around = look_around([endpoint], 0.4)
+        around = discover([endpoint], 0.4)
     assert [peer.presence.robot for peer in around.peers] == ["r1"] and around.statuses == {}
 
 
@@ -176,7 +184,7 @@ def test_when_secured_each_role_is_listed_as_what_its_certificate_says(tmp_path)
             for link in links:
                 link.close()
     assert sorted(listed) == sorted(["robot", *roles])
-    assert {certificate_role(role) for role in listed} == {"robot", *SOURCES}
+    assert {certificate_role(role) for role in listed} == {"robot", *SOURCES_OF_ROLE}
 
 
 def test_when_secured_nobody_is_believed_to_be_a_robot_by_another_certificate(tmp_path):
@@ -184,11 +192,11 @@ def test_when_secured_nobody_is_believed_to_be_a_robot_by_another_certificate(tm
     folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
     keys.make(folder, [])
     with open_zenoh("r2", listen=[endpoint], role="robot", secure=str(folder)):
-        from protocol.transports.secured import secured_for
+        from protocol.transports.secured import load_role_keys
 
-        rogue = open_session((), [endpoint], 5.0, secured_for(str(folder), "viewer"))
+        rogue = open_session((), [endpoint], 5.0, load_role_keys(str(folder), "viewer"))
         try:
-            for key in (key_of("robot", "0000abcd"), key_of("viewer", "0000abcd")):
+            for key in (presence_key("robot", "0000abcd"), presence_key("viewer", "0000abcd")):
                 rogue.declare_queryable(key, lambda query, key=key: query.reply(key, encode(ROBOT)))
             listed = [peer.presence.robot for peer in peers_at([endpoint], 1.0, str(folder))]
         finally:

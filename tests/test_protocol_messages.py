@@ -22,8 +22,8 @@ from protocol.channels import (
 from protocol.codec import check_sizes, decode, decode_ranges, encode, encode_ranges
 from protocol.errors import ConfigError, WireError
 from protocol.golden_cases import CASES
-from protocol.messages import MAX_INTEGER, AnswerHeader, Asked, Echo, FrameHeader, RequestHeader, ScanHeader, Stamp
-from protocol.refusals import Refusal
+from protocol.messages import MAX_INTEGER, AnswerHeader, RequestId, Echo, FrameHeader, RequestHeader, ScanHeader, Stamp
+from protocol.refusals import RejectReason
 
 MODELS = sorted(
     {channel.header for channel in CHANNELS.values()} | {c.payload for c in CHANNELS.values() if c.payload},
@@ -55,7 +55,7 @@ headers = st.one_of(
         range_max_m=numbers,
     ),
     st.builds(AnswerHeader, source=sources, session=sessions, seq=integers, echo=echoes, compute_us=integers,
-              scan=st.none() | integers, mission=st.none() | st.builds(Asked, session=sessions, id=integers)),
+              scan=st.none() | integers, mission=st.none() | st.builds(RequestId, session=sessions, id=integers)),
     st.builds(RequestHeader, source=sources, session=sessions, seq=integers, echo=st.none() | echoes),
 )
 
@@ -92,7 +92,7 @@ def test_any_bytes_give_a_message_or_a_wire_error(model, data):
     try:
         read = decode(model, data)
     except WireError as error:
-        assert error.reason in (Refusal.MALFORMED, Refusal.UNSUPPORTED_VERSION)
+        assert error.reason in (RejectReason.MALFORMED, RejectReason.UNSUPPORTED_VERSION)
         assert "\n" not in str(error)
     else:
         assert isinstance(read, model)
@@ -113,7 +113,7 @@ def test_any_value_in_any_field_gives_a_message_or_a_wire_error(data, case, valu
     try:
         decode(CHANNELS[case.channel].header, json.dumps(header | {field: value}).encode())
     except WireError as error:
-        assert error.reason in (Refusal.MALFORMED, Refusal.UNSUPPORTED_VERSION)
+        assert error.reason in (RejectReason.MALFORMED, RejectReason.UNSUPPORTED_VERSION)
 
 
 @given(headers)
@@ -130,7 +130,7 @@ def test_another_version_is_named_in_the_refusal(model, version):
     usual = next(c for c in CASES if c.refuse is None and CHANNELS[c.channel].header is model)
     with pytest.raises(WireError, match="this peer speaks 1") as refusal:
         decode(model, json.dumps(json.loads(usual.header) | {"v": version}).encode())
-    assert refusal.value.reason is Refusal.UNSUPPORTED_VERSION
+    assert refusal.value.reason is RejectReason.UNSUPPORTED_VERSION
 
 
 @given(st.lists(st.floats(0, width=32, allow_nan=False), max_size=720))
@@ -143,7 +143,7 @@ def test_any_bytes_give_ranges_or_a_wire_error(data):
     try:
         ranges_m = decode_ranges(data)
     except WireError as error:
-        assert error.reason in (Refusal.MALFORMED, Refusal.NOT_FINITE)
+        assert error.reason in (RejectReason.MALFORMED, RejectReason.NOT_FINITE)
     else:
         assert len(ranges_m) * 4 == len(data)
         assert all(value >= 0 and not math.isnan(value) for value in ranges_m)
@@ -155,7 +155,7 @@ def test_sizes_are_exact(channel):
     for header, payload in ((MAX_HEADER_BYTES + 1, 0), (0, channel.max_payload_bytes + 1)):
         with pytest.raises(WireError) as refusal:
             check_sizes(channel, bytes(header), bytes(payload))
-        assert refusal.value.reason is Refusal.MALFORMED
+        assert refusal.value.reason is RejectReason.MALFORMED
     with pytest.raises(WireError):
         decode_ranges(bytes(SCAN.max_payload_bytes + 4))
 

@@ -14,7 +14,7 @@ from protocol.errors import WireError
 from protocol.golden_case import jpeg, segments
 from protocol.jpeg import MAX_SEGMENTS, JpegSize, read_jpeg_size
 from protocol.messages import Twist
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.twist_text import MAX_TWIST_BYTES, format_twist, parse_twist
 
 ABNF_NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
@@ -42,7 +42,7 @@ def test_only_the_grammar_is_read_and_only_finite(data):
     try:
         twist = parse_twist(data)
     except WireError as error:
-        assert error.reason in (Refusal.MALFORMED, Refusal.NOT_FINITE)
+        assert error.reason in (RejectReason.MALFORMED, RejectReason.NOT_FINITE)
         return
     assert len(data) <= MAX_TWIST_BYTES
     assert GRAMMAR.fullmatch(data.decode("ascii"))
@@ -59,7 +59,7 @@ def test_all_of_the_grammar_is_read(text):
     else:
         with pytest.raises(WireError) as refusal:
             parse_twist(text.encode())
-        assert refusal.value.reason is (Refusal.NOT_FINITE if fits else Refusal.MALFORMED)
+        assert refusal.value.reason is (RejectReason.NOT_FINITE if fits else RejectReason.MALFORMED)
 
 
 @given(st.binary(max_size=400), st.sampled_from([b"", b"\xff\xd8", b"\xff\xd8\xff", jpeg(64, 64)[:13]]))
@@ -67,7 +67,7 @@ def test_any_bytes_give_a_size_within_the_bound_or_an_error(tail, head):
     try:
         size = read_jpeg_size(head + tail, max_pixels=10_000)
     except WireError as error:
-        assert error.reason is Refusal.MALFORMED
+        assert error.reason is RejectReason.MALFORMED
     else:
         assert 0 < size.width_px * size.height_px <= 10_000
 

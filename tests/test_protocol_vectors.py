@@ -11,11 +11,11 @@ from pydantic import TypeAdapter
 
 from protocol import golden, schema
 from protocol.channels import CHANNELS
-from protocol.field_words import meaning_of, unit_of
-from protocol.golden_case import Case
+from protocol.field_words import doc_of, unit_of
+from protocol.golden_case import MessageCase
 from protocol.golden_cases import CASES
-from protocol.golden_wires import READERS, WIRE_CASES
-from protocol.refusals import Refusal
+from protocol.golden_wires import READERS, FRAMING_CASES
+from protocol.refusals import RejectReason
 from protocol.twist_text import MAX_TWIST_BYTES
 
 VECTORS = Path(schema.__file__).parent / "vectors"
@@ -42,16 +42,16 @@ def test_every_channel_has_vectors_that_are_accepted_and_refused():
 
 
 def test_every_transport_and_dialect_has_vectors_that_are_accepted_and_refused():
-    outcomes = {(case.folder, case.refuse is None) for case in WIRE_CASES}
+    outcomes = {(case.folder, case.refuse is None) for case in FRAMING_CASES}
     assert outcomes == {(folder, accepted) for folder in READERS for accepted in (True, False)}
     assert not set(READERS) & set(CHANNELS)
-    assert len(golden.files()) == len(CASES) + len(WIRE_CASES) >= 200
+    assert len(golden.files()) == len(CASES) + len(FRAMING_CASES) >= 200
 
 
 def test_a_case_that_the_decoders_contradict_is_no_vector():
     good = CASES[0]
     with pytest.raises(ValueError, match="stated MALFORMED"):
-        golden.vector(Case(good.channel, good.name, "", good.key, good.header, good.payload, "MALFORMED"))
+        golden.vector(MessageCase(good.channel, good.name, "", good.key, good.header, good.payload, "MALFORMED"))
 
 
 def test_verify_finds_what_was_changed_and_write_restores_it(tmp_path, monkeypatch, capsys):
@@ -78,7 +78,7 @@ def test_the_specification_holds_every_generated_table_once():
 
 
 def test_the_specification_names_every_refusal_and_bound():
-    assert all(f"`{reason}`" in README for reason in Refusal)
+    assert all(f"`{reason}`" in README for reason in RejectReason)
     assert f"{MAX_TWIST_BYTES} bytes" in README
 
 
@@ -86,7 +86,7 @@ def test_every_field_has_a_meaning_and_what_has_a_unit_says_it():
     models = schema.json_schema()["$defs"].items()
     named = [(name, field) for name, model in models for field in model.get("properties", ())]
     assert len(named) > 80
-    assert [field for field in named if not meaning_of(*field)] == [], "add them to protocol/field_words.py"
+    assert [field for field in named if not doc_of(*field)] == [], "add them to protocol/field_words.py"
     assert [unit_of(field) for field in ("t_us", "angular_rad_s", "pitch_rad", "x_m")] == ["µs", "rad/s", "rad", "m"]
     assert unit_of("seq") == unit_of("session") == ""
 

@@ -4,8 +4,8 @@ import pytest
 
 from protocol.errors import WireError
 from protocol.messages import AnswerHeader, Echo, Holder
-from protocol.refusals import Refusal
-from robot_side.judge import FreshnessRecord, IssuedRecord, SequenceRecord, Verdict
+from protocol.refusals import RejectReason
+from robot_side.judge import FreshnessRecord, IssuedRecord, SequenceRecord, CommandResult
 
 ROBOT, OTHER = "0000aaaa", "0000cccc"
 VISION, OTHER_VISION = Holder(source="vision", session="0000bbbb"), Holder(source="vision", session="0000cccc")
@@ -27,8 +27,8 @@ def refusal(judge, *args):
 
 
 def test_a_verdict_is_accepted_when_it_has_no_reason():
-    assert Verdict(None).accepted and Verdict(None) == Verdict(None, "", None)
-    assert not Verdict(Refusal.STALE).accepted
+    assert CommandResult(None).accepted and CommandResult(None) == CommandResult(None, "", None)
+    assert not CommandResult(RejectReason.STALE).accepted
 
 
 # --- issued frames -----------------------------------------------------------------------------------------------
@@ -43,7 +43,7 @@ def issued(*frames, channel="frame"):
 
 @pytest.mark.parametrize(
     ("age_us", "reason"),
-    [(-1, Refusal.FROM_FUTURE), (0, None), (1, None), (399, None), (400, None), (401, Refusal.STALE)],
+    [(-1, RejectReason.FROM_FUTURE), (0, None), (1, None), (399, None), (400, None), (401, RejectReason.STALE)],
 )
 def test_age_is_from_now_up_to_the_limit(age_us, reason):
     record = issued((7, 1_000))
@@ -65,12 +65,12 @@ def test_the_refusal_of_an_age_says_the_milliseconds():
 
 @pytest.mark.parametrize("cited", [echo(6), echo(8), echo(t_us=999), echo(t_us=1_001), echo(channel="status")])
 def test_only_what_was_issued_so_is_known(cited):
-    assert refusal(issued((7, 1_000)).age_us, cited, 1_000, 400).reason is Refusal.UNKNOWN_FRAME
+    assert refusal(issued((7, 1_000)).age_us, cited, 1_000, 400).reason is RejectReason.UNKNOWN_FRAME
 
 
 def test_only_this_session_counts():
     error = refusal(issued((7, 1_000)).age_us, echo(session=OTHER), 1_000, 400)
-    assert error.reason is Refusal.OTHER_SESSION and OTHER in error.detail and ROBOT in error.detail
+    assert error.reason is RejectReason.OTHER_SESSION and OTHER in error.detail and ROBOT in error.detail
 
 
 @pytest.mark.parametrize(("count", "first_is_known"), [(255, True), (256, True), (257, False)])
@@ -80,7 +80,7 @@ def test_256_frames_are_kept_per_channel(count, first_is_known):
     if first_is_known:
         assert record.age_us(echo(0), 1_000, 0) == 0
     else:
-        assert refusal(record.age_us, echo(0), 1_000, 0).reason is Refusal.UNKNOWN_FRAME
+        assert refusal(record.age_us, echo(0), 1_000, 0).reason is RejectReason.UNKNOWN_FRAME
     assert record.age_us(echo(1), 1_000, 0) == record.age_us(echo(count - 1), 1_000, 0) == 0
 
 
@@ -102,12 +102,12 @@ def test_a_request_cites_a_status(cited):
     record.add("frame", 0, 0)
     with pytest.raises(WireError) as caught:
         record.check_request(cited, 0, 100)
-    assert caught.value.reason is Refusal.MALFORMED
+    assert caught.value.reason is RejectReason.MALFORMED
     assert caught.value.detail == "what lets a robot move again must cite a status"
 
 
 @pytest.mark.parametrize(
-    ("now_us", "reason"), [(0, None), (100, None), (101, Refusal.STALE), (-1, Refusal.FROM_FUTURE)]
+    ("now_us", "reason"), [(0, None), (100, None), (101, RejectReason.STALE), (-1, RejectReason.FROM_FUTURE)]
 )
 def test_a_requests_status_is_judged_as_a_frame_is(now_us, reason):
     record = IssuedRecord(ROBOT)
@@ -131,7 +131,7 @@ def test_a_request_from_before_a_denial_is_stale(seq, denied):
     try:
         record.check_request(status(seq), 0, 100)
     except WireError as error:
-        assert denied and error.reason is Refusal.STALE
+        assert denied and error.reason is RejectReason.STALE
         assert error.detail == "cites a status from before the last STOP or disarm; ask again"
     else:
         assert not denied
@@ -210,7 +210,7 @@ def test_sequence_numbers_only_grow(first, then, accepted):
         record.check(header(then))
     else:
         error = refusal(record.check, header(then))
-        assert error.reason is Refusal.OUT_OF_ORDER
+        assert error.reason is RejectReason.OUT_OF_ORDER
         assert error.detail == f"seq {then} of vision is not newer than {first}"
 
 
@@ -218,7 +218,7 @@ def test_a_refused_number_is_not_kept():
     record = SequenceRecord()
     record.check(header(5))
     refusal(record.check, header(3))
-    assert refusal(record.check, header(4)).reason is Refusal.OUT_OF_ORDER
+    assert refusal(record.check, header(4)).reason is RejectReason.OUT_OF_ORDER
 
 
 def test_each_source_and_session_counts_for_itself():

@@ -5,15 +5,15 @@ import itertools
 import pytest
 
 from protocol.channels import ACK, TWIST, key_for
-from protocol.messages import LastRefusal
+from protocol.messages import LastRejection
 from protocol.transports.zenoh_session import open_session
-from robot_side.refusal_log import RefusalLog
+from robot_side.refusal_log import RejectionLog
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess, Vision
 
 
 def refusal(reason="STALE", detail="frame 7 is 900 ms old"):
-    return LastRefusal(source="vision", reason=reason, detail=detail)
+    return LastRejection(source="vision", reason=reason, detail=detail)
 
 
 def told(log, reason, from_us, until_us, step_us):
@@ -23,29 +23,29 @@ def told(log, reason, from_us, until_us, step_us):
 
 
 def test_the_first_is_told_at_once_with_source_reason_and_detail():
-    assert RefusalLog().line(refusal(), 5) == "refused STALE from vision: frame 7 is 900 ms old"
+    assert RejectionLog().line(refusal(), 5) == "refused STALE from vision: frame 7 is 900 ms old"
 
 
 @pytest.mark.parametrize("step_us", [100, 20_000, 100_000])
 def test_a_flood_is_told_after_one_two_and_four_seconds_with_its_count(step_us):
-    lines = told(RefusalLog(), "STALE", 0, 8_000_000, step_us)
+    lines = told(RejectionLog(), "STALE", 0, 8_000_000, step_us)
     assert [when_us for when_us, _ in lines] == [0, 1_000_000, 3_000_000, 7_000_000]
     assert f"({2_000_000 // step_us} times)" in lines[2][1]
 
 
 def test_it_never_falls_silent_for_more_than_a_minute():
-    times = [when_us for when_us, _ in told(RefusalLog(), "STALE", 0, 600_000_000, 1_000_000)]
+    times = [when_us for when_us, _ in told(RejectionLog(), "STALE", 0, 600_000_000, 1_000_000)]
     assert max(b - a for a, b in itertools.pairwise(times)) == 60_000_000
 
 
 def test_each_reason_has_its_own_share():
-    log = RefusalLog()
+    log = RejectionLog()
     assert log.line(refusal("STALE"), 0) and log.line(refusal("MALFORMED"), 1) and not log.line(refusal("STALE"), 2)
 
 
 @pytest.mark.parametrize(("gap_us", "again"), [(9_999_999, False), (10_000_000, True)])
 def test_a_reason_that_was_silent_for_ten_seconds_is_news_again(gap_us, again):
-    log = RefusalLog()
+    log = RejectionLog()
     last_us = told(log, "STALE", 0, 70_000_000, 1_000_000)[-1][0] + 1_000_000
     while log.line(refusal(), last_us):
         last_us += 1

@@ -12,9 +12,9 @@ from tests.link_rigs import until
 from tests.remote_rig import GREY_JPEG, frame, within
 from vision_side.config import HsvConfig
 from vision_side.detect.local import Hsv
-from vision_side.detect.own_decoders import MAX_DECODERS, OwnDecoders
+from vision_side.detect.own_decoders import MAX_DECODERS, DecoderPool
 from vision_side.detect.port import Detection, Maker, result_of
-from vision_side.detect.remote.by_deadline import FAILED, ByDeadline
+from vision_side.detect.remote.by_deadline import FAILED, DeadlineDetector
 from vision_side.detect.remote.fallback import GOOD_ANSWERS, RESERVE_US, Fallback
 
 
@@ -49,7 +49,7 @@ def held():
 
 @pytest.fixture
 def by_deadline(held):
-    one = ByDeadline(held)
+    one = DeadlineDetector(held)
     yield one
     held.free.set()
     one.close()
@@ -125,7 +125,7 @@ def test_pixels_of_a_frame_nobody_waits_for_any_more_do_not_get_into_the_next():
             seen.append((before == picture).all())
             return [None]
 
-    one = ByDeadline(Slow())
+    one = DeadlineDetector(Slow())
     first = frame(1)
     assert one.detect([first], within(0.5)) == [None] and looking.is_set()
     grey = type(first)("r1", frame(2).header, GREY_JPEG, first._decoder)
@@ -136,7 +136,7 @@ def test_pixels_of_a_frame_nobody_waits_for_any_more_do_not_get_into_the_next():
 
 
 def test_ever_new_robots_leave_no_more_decoders_than_there_may_be():
-    decoders = OwnDecoders(10**7)
+    decoders = DecoderPool(10**7)
     for number in range(2 * MAX_DECODERS):
         assert decoders.again(frame(1, robot=f"r{number}")).picture().bgr.shape == (240, 320, 3)
     assert len(decoders._decoders) == MAX_DECODERS
@@ -145,11 +145,11 @@ def test_ever_new_robots_leave_no_more_decoders_than_there_may_be():
 def test_what_fails_to_close_is_told_by_who_closes_it(held, monkeypatch):
     monkeypatch.setattr(type(held), "close", lambda _self: 1 / 0)
     with pytest.raises(ConfigError, match=r"close\(\) raises ZeroDivisionError"):
-        ByDeadline(held).close()
+        DeadlineDetector(held).close()
 
 
 def test_close_ends_the_thread_and_what_is_inside(held):
-    one = ByDeadline(held)
+    one = DeadlineDetector(held)
     one.detect([frame(1)], within(2))
     one.close()
     assert held.closed and until(lambda: not [some for some in threading.enumerate() if some.name == "detector"])

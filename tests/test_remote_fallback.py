@@ -12,7 +12,7 @@ from protocol.transports.link import Message
 from protocol.transports.zenoh_site import MAX_ROBOTS as MOST_AT_A_SITE
 from tests.remote_rig import frame, within
 from tests.test_remote_deadline import FakeRemote, Held, _who
-from vision_side.detect.by_session import MAX_ROBOTS, BySession
+from vision_side.detect.by_session import MAX_ROBOTS, PerSession
 from vision_side.detect.port import Maker, result_of
 from vision_side.detect.remote.fallback import GOOD_ANSWERS, Fallback
 from vision_side.detect.remote.zenoh_detector import ROLE, ZenohDetector
@@ -76,7 +76,7 @@ def test_ever_new_robots_cost_no_more_memory():
 
 
 def test_a_memory_is_kept_of_every_robot_that_a_site_meets():
-    kept = BySession(list)
+    kept = PerSession(list)
     robots = [f"r{number}" for number in range(MOST_AT_A_SITE)]
     memories = [kept.of(robot, "0000abcd") for robot in robots]
     assert all(kept.of(robot, "0000abcd") is memory for robot, memory in zip(robots, memories, strict=True))

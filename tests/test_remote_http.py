@@ -12,7 +12,7 @@ from protocol.errors import ConfigError
 from tests.link_rigs import until
 from tests.remote_rig import BALL_JPEG, GREY_JPEG, Server, box, frame, http_reply, said, within
 from vision_side.detect.remote.address import parse_address
-from vision_side.detect.remote.asking import Asking
+from vision_side.detect.remote.asking import ServerDetector
 from vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES, RETRY_US
 from vision_side.detect.remote.http_jpeg import HttpJpeg, JpegServer
 
@@ -21,7 +21,7 @@ GOOD = http_reply(said(box()))
 
 def _asking(server, min_score=0.25):
     address = f"http+jpeg://127.0.0.1:{server.port}/detect?size=320"
-    return Asking(address, JpegServer(parse_address(address), min_score))
+    return ServerDetector(address, JpegServer(parse_address(address), min_score))
 
 
 def _ask(detector, seconds=2.0, **about):

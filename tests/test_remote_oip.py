@@ -10,12 +10,21 @@ import pytest
 
 from tests.remote_rig import ASKED, BALL_JPEG, COLUMNS, JPEG_INPUT, OUTPUTS, frame, grpc_answer
 from vision_side.detect.protobuf import fields, put, put_integers, varint
-from vision_side.detect.remote.oip import Inferred, Looking, Model, Slot, Tensor, detections_of, model_of, tensor_of
+from vision_side.detect.remote.oip import (
+    Inferred,
+    OutputOptions,
+    OipModel,
+    Slot,
+    Tensor,
+    detections_of,
+    model_of,
+    tensor_of,
+)
 from vision_side.detect.remote.oip_json import read_infer, read_metadata
 from vision_side.detect.remote.oip_messages import infer_request, metadata_request
 from vision_side.detect.remote.oip_messages import read_infer as read_grpc
 from vision_side.detect.remote.oip_messages import read_metadata as read_grpc_metadata
-from vision_side.detect.remote.refusing import NoAnswerError, Reason
+from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 PIXELS = Slot("image", "UINT8", (-1, 240, 320, 3))
 SIZE = (320, 240)
@@ -37,7 +46,7 @@ def _binary(boxes, scores, labels, **more):
 
 
 def _found(answer, **looking):
-    return detections_of(answer, Looking(**looking), (1.0, 1.0), SIZE)
+    return detections_of(answer, OutputOptions(**looking), (1.0, 1.0), SIZE)
 
 
 # --- models ----------------------------------------------------------------------------------------------------------
@@ -45,7 +54,7 @@ def _found(answer, **looking):
 
 def test_metadata_tells_what_to_send():
     model = read_metadata(_metadata([JPEG_INPUT], OUTPUTS))
-    assert model == Model("ball", "3", JPEG_INPUT, ("boxes", "scores", "labels")) and model.takes_jpeg
+    assert model == OipModel("ball", "3", JPEG_INPUT, ("boxes", "scores", "labels")) and model.takes_jpeg
     assert not read_metadata(_metadata([PIXELS], OUTPUTS[:2])).takes_jpeg
 
 
@@ -59,7 +68,7 @@ def test_metadata_tells_what_to_send():
 def test_a_model_that_does_not_fit_is_said_in_words(inputs, outputs, why):
     with pytest.raises(NoAnswerError, match=why) as error:
         read_metadata(_metadata(inputs, outputs))
-    assert error.value.reason is Reason.UNFIT and "docs/remote-detectors.md" in error.value.detail
+    assert error.value.reason is NoAnswerReason.UNFIT and "docs/remote-detectors.md" in error.value.detail
 
 
 def test_a_jpeg_is_sent_as_one_bytes_element():
@@ -116,30 +125,30 @@ def test_padded_rows_are_no_boxes_whatever_the_batch_dimension(boxes, scores, la
 
 def test_boxes_in_the_models_pixels_become_those_of_the_picture():
     outputs = {"boxes": np.array([[10.0, 10, 20, 20]]), "scores": np.array([0.9])}
-    one = detections_of(Inferred(outputs), Looking(("ball",)), (2.0, 3.0), SIZE)[0]
+    one = detections_of(Inferred(outputs), OutputOptions(("ball",)), (2.0, 3.0), SIZE)[0]
     assert (one.x1_px, one.y1_px, one.x2_px, one.y2_px, one.label) == (20, 30, 40, 60, "ball")
 
 
 BOXES = [[10, 20, 30, 40]]
 ANSWERS = {
-    "nan box": (_binary([[np.nan, 0, 1, 1]], [0.9], [0]), Reason.NOT_FINITE),
-    "infinite score": (_binary(BOXES, [np.inf], [0]), Reason.NOT_FINITE),
-    "boxes of five": (_binary([[1, 2, 3, 4, 5]], [0.9], [0]), Reason.MALFORMED),
-    "flat boxes": (_binary([1, 2, 3, 4], [0.9], [0]), Reason.MALFORMED),
-    "two batches": (_binary(np.zeros((2, 1, 4)), np.zeros((2, 1)), np.zeros((2, 1))), Reason.MALFORMED),
-    "more scores": (_binary(BOXES, [0.9, 0.9], [0]), Reason.MALFORMED),
-    "more labels": (_binary(BOXES, [0.9], [0, 1]), Reason.MALFORMED),
-    "inside out": (_binary([[30, 20, 10, 40]], [0.9], [0]), Reason.MALFORMED),
-    "score of two": (_binary(BOXES, [2.0], [0]), Reason.MALFORMED),
-    "too many rows": (_binary(np.zeros((1025, 4)), np.zeros(1025), np.zeros(1025)), Reason.TOO_MANY),
-    "other frame": (_binary(BOXES, [0.9], [0], id="0000abcd-2"), Reason.OTHER_FRAME),
-    "no outputs": ((b'{"outputs":[]}', None), Reason.MALFORMED),
-    "html": ((b"<html>", None), Reason.MALFORMED),
-    "nested": ((b'{"outputs":' + b"[" * 50_000, None), Reason.MALFORMED),
-    "length of text": ((_binary(BOXES, [0.9], [0])[0], "many"), Reason.MALFORMED),
-    "length negative": ((_binary(BOXES, [0.9], [0])[0], "-1"), Reason.MALFORMED),
-    "length too long": ((_binary(BOXES, [0.9], [0])[0], "99999"), Reason.MALFORMED),
-    "binary cut": ((_binary(BOXES, [0.9], [0])[0][:-4], _binary(BOXES, [0.9], [0])[1]), Reason.MALFORMED),
+    "nan box": (_binary([[np.nan, 0, 1, 1]], [0.9], [0]), NoAnswerReason.NOT_FINITE),
+    "infinite score": (_binary(BOXES, [np.inf], [0]), NoAnswerReason.NOT_FINITE),
+    "boxes of five": (_binary([[1, 2, 3, 4, 5]], [0.9], [0]), NoAnswerReason.MALFORMED),
+    "flat boxes": (_binary([1, 2, 3, 4], [0.9], [0]), NoAnswerReason.MALFORMED),
+    "two batches": (_binary(np.zeros((2, 1, 4)), np.zeros((2, 1)), np.zeros((2, 1))), NoAnswerReason.MALFORMED),
+    "more scores": (_binary(BOXES, [0.9, 0.9], [0]), NoAnswerReason.MALFORMED),
+    "more labels": (_binary(BOXES, [0.9], [0, 1]), NoAnswerReason.MALFORMED),
+    "inside out": (_binary([[30, 20, 10, 40]], [0.9], [0]), NoAnswerReason.MALFORMED),
+    "score of two": (_binary(BOXES, [2.0], [0]), NoAnswerReason.MALFORMED),
+    "too many rows": (_binary(np.zeros((1025, 4)), np.zeros(1025), np.zeros(1025)), NoAnswerReason.TOO_MANY),
+    "other frame": (_binary(BOXES, [0.9], [0], id="0000abcd-2"), NoAnswerReason.OTHER_FRAME),
+    "no outputs": ((b'{"outputs":[]}', None), NoAnswerReason.MALFORMED),
+    "html": ((b"<html>", None), NoAnswerReason.MALFORMED),
+    "nested": ((b'{"outputs":' + b"[" * 50_000, None), NoAnswerReason.MALFORMED),
+    "length of text": ((_binary(BOXES, [0.9], [0])[0], "many"), NoAnswerReason.MALFORMED),
+    "length negative": ((_binary(BOXES, [0.9], [0])[0], "-1"), NoAnswerReason.MALFORMED),
+    "length too long": ((_binary(BOXES, [0.9], [0])[0], "99999"), NoAnswerReason.MALFORMED),
+    "binary cut": ((_binary(BOXES, [0.9], [0])[0][:-4], _binary(BOXES, [0.9], [0])[1]), NoAnswerReason.MALFORMED),
 }  # fmt: skip
 
 
@@ -204,7 +213,7 @@ def test_what_is_no_answer_over_grpc_is_refused(data):
 def test_an_answer_to_something_else_over_grpc_is_refused():
     with pytest.raises(NoAnswerError) as error:
         read_grpc(grpc_answer(COLUMNS, "0000abcd-9"), ASKED)
-    assert error.value.reason is Reason.OTHER_FRAME
+    assert error.value.reason is NoAnswerReason.OTHER_FRAME
 
 
 def _is_a_box(one):

@@ -9,19 +9,19 @@ import pytest
 
 from tests.remote_rig import COLUMNS, JPEG_INPUT, OUTPUTS, Server, frame, http_reply, within
 from vision_side.detect.remote.address import parse_address
-from vision_side.detect.remote.asking import Asking
-from vision_side.detect.remote.oip import Inferred, Looking, detections_of
+from vision_side.detect.remote.asking import ServerDetector
+from vision_side.detect.remote.oip import Inferred, OutputOptions, detections_of
 from vision_side.detect.remote.oip_http import HttpServer
-from vision_side.detect.remote.refusing import NoAnswerError, Reason, Tally
+from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason, ErrorCounters
 
 
 def _refuse(tally, count):
     for _ in range(count):
-        tally.refuse(NoAnswerError(Reason.LATE, "nothing by the deadline"))
+        tally.refuse(NoAnswerError(NoAnswerReason.LATE, "nothing by the deadline"))
 
 
 def _tally_after(answered, refused, good):
-    tally = Tally("far")
+    tally = ErrorCounters("far")
     for _ in range(answered):
         tally.good()
     _refuse(tally, refused)
@@ -30,11 +30,11 @@ def _tally_after(answered, refused, good):
     return tally
 
 
-@pytest.mark.parametrize("between", [Reason.REFUSED, None])
+@pytest.mark.parametrize("between", [NoAnswerReason.REFUSED, None])
 def test_a_refusal_is_told_at_the_1st_10th_100th_of_its_kind(between):
-    tally, told = Tally("far"), []
+    tally, told = ErrorCounters("far"), []
     for count in range(1, 1001):
-        tally.refuse(NoAnswerError(Reason.LATE, "nothing by the deadline"))
+        tally.refuse(NoAnswerError(NoAnswerReason.LATE, "nothing by the deadline"))
         if between and count < 10:
             tally.refuse(NoAnswerError(between, "status 503"))
         told += [(count, line) for line in tally.news.take() if "LATE" in line]
@@ -53,7 +53,7 @@ def test_what_goes_bad_again_is_told_again(good, bad):
 
 
 def test_one_robot_of_two_that_is_not_answered_is_not_two_lines_for_each_frame():
-    tally, told = Tally("far"), []
+    tally, told = ErrorCounters("far"), []
     for _ in range(1000):
         _refuse(tally, 1)
         tally.good()
@@ -92,7 +92,7 @@ def _column(name):
 def test_a_model_is_asked_for_once_and_again_after_an_error(closes):
     with ModelServer(closes) as server:
         address = f"oip+http://127.0.0.1:{server.port}/ball"
-        detector = Asking(address, HttpServer(parse_address(address), Looking(("ball", "box"))))
+        detector = ServerDetector(address, HttpServer(parse_address(address), OutputOptions(("ball", "box"))))
 
         def label(seq):
             result = detector.detect([frame(seq)], within(2))[0]
@@ -114,7 +114,7 @@ def test_a_model_is_asked_for_once_and_again_after_an_error(closes):
 def test_a_server_that_was_late_once_is_not_made_later_by_asking_for_its_model_again():
     """60 ms for each request of 100: once the model is known that is enough, with its metadata asked for it is not."""
     with ModelServer(closes=False) as server:
-        detector = Asking("oip", HttpServer(parse_address(f"oip+http://127.0.0.1:{server.port}/ball"), Looking(("b",))))
+        detector = ServerDetector("oip", HttpServer(parse_address(f"oip+http://127.0.0.1:{server.port}/ball"), OutputOptions(("b",))))
         assert detector.detect([frame(1)], within(2)) != [None]
         server.takes_s = 0.2
         assert detector.detect([frame(2)], within(0.1)) == [None]
@@ -129,7 +129,7 @@ def test_a_server_that_was_late_once_is_not_made_later_by_asking_for_its_model_a
 def test_numbers_of_labels_may_be_written_as_floats(kind):
     outputs = {"boxes": np.float32([[10, 20, 30, 40], [50, 60, 70, 80]]), "scores": np.float32([0.9, 0.8]),
                "labels": np.array([1, 7], kind)}
-    found = detections_of(Inferred(outputs), Looking(("ball", "box")), (1.0, 1.0), (320, 240))
+    found = detections_of(Inferred(outputs), OutputOptions(("ball", "box")), (1.0, 1.0), (320, 240))
     assert [one.label for one in found] == ["box", "7"]
 
 
@@ -137,5 +137,5 @@ def test_numbers_of_labels_may_be_written_as_floats(kind):
 def test_what_is_no_whole_number_is_no_label(bad):
     outputs = {"boxes": np.float32([[10, 20, 30, 40]]), "scores": np.float32([0.9]), "labels": np.float64([bad])}
     with pytest.raises(NoAnswerError) as error:
-        detections_of(Inferred(outputs), Looking(("ball",)), (1.0, 1.0), (320, 240))
-    assert error.value.reason is Reason.MALFORMED
+        detections_of(Inferred(outputs), OutputOptions(("ball",)), (1.0, 1.0), (320, 240))
+    assert error.value.reason is NoAnswerReason.MALFORMED

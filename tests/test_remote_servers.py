@@ -20,7 +20,7 @@ from tests.remote_rig import (
     within,
 )
 from vision_side.config import DetectorConfig, HsvConfig, VisionConfig
-from vision_side.detect.choice import choose_detector
+from vision_side.detect.choice import build_detector
 from vision_side.detect.contract import check_detector
 from vision_side.detect.local import Hsv
 from vision_side.detect.remote.fallback import Fallback
@@ -31,7 +31,7 @@ BALL = HSV.detect([frame()], 0)[0].detections[0]
 
 
 def _detector(kind, **options):
-    return choose_detector(kind, options, VisionConfig(detector=DetectorConfig(kind=kind)))
+    return build_detector(kind, options, VisionConfig(detector=DetectorConfig(kind=kind)))
 
 
 @contextmanager

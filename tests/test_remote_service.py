@@ -14,7 +14,7 @@ from vision_side.config import HsvConfig
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.local import Hsv
 from vision_side.detect.port import Circle, Detection, Maker, result_of
-from vision_side.detector_service import DetectorService, Serving
+from vision_side.detector_service import DetectorService, ServingOptions
 
 HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
 GOOD = Detection(10.0, 10.0, 50.0, 50.0, 0.9, "ball")
@@ -46,7 +46,7 @@ class Bench:
         self.network, self.words, self.seq = MemoryNetwork(seed=31), [], 0
         self.robot = self.network.link("r1")
         self.heard = self.robot.latest(DETECTIONS)
-        self.service = DetectorService(self, detector, Serving("says", **serving), self.words.append)
+        self.service = DetectorService(self, detector, ServingOptions("says", **serving), self.words.append)
 
     def robots(self):
         return ["r1"]

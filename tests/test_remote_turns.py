@@ -4,13 +4,13 @@ import random
 
 import pytest
 
-from vision_side.detector_turns import Turns
+from vision_side.detector_turns import FairQueue
 
 DEADLINE_US = 100_000
 
 
 def test_the_newest_takes_the_place_of_the_one_before_and_is_counted():
-    turns = Turns(8, DEADLINE_US)
+    turns = FairQueue(8, DEADLINE_US)
     for item in range(5):
         turns.offer("r1", item, item)
     assert [(turn.robot, turn.item) for turn in turns.take(5)] == [("r1", 4)] and turns.take(6) == []
@@ -19,7 +19,7 @@ def test_the_newest_takes_the_place_of_the_one_before_and_is_counted():
 
 
 def test_whatever_waits_is_one_batch_up_to_its_bound():
-    turns = Turns(3, DEADLINE_US)
+    turns = FairQueue(3, DEADLINE_US)
     for name in "abcde":
         turns.offer(name, name, 0)
     assert [turn.robot for turn in turns.take(1)] == ["a", "b", "c"]
@@ -27,7 +27,7 @@ def test_whatever_waits_is_one_batch_up_to_its_bound():
 
 
 def test_whoever_was_served_last_is_last_however_much_it_sends():
-    turns = Turns(1, DEADLINE_US)
+    turns = FairQueue(1, DEADLINE_US)
     served = []
     for step in range(30):
         for name in "abc":
@@ -38,7 +38,7 @@ def test_whoever_was_served_last_is_last_however_much_it_sends():
 
 
 def test_what_is_too_old_to_be_answered_in_time_is_not_looked_at():
-    turns = Turns(8, DEADLINE_US)
+    turns = FairQueue(8, DEADLINE_US)
     turns.offer("old", 1, 0)
     turns.offer("young", 2, 60_000)
     assert [turn.robot for turn in turns.take(95_000, each_us=10_000)] == ["young"]
@@ -49,7 +49,7 @@ def test_what_is_too_old_to_be_answered_in_time_is_not_looked_at():
 
 @pytest.mark.parametrize(("each_us", "batch"), [(0, 16), (1_000, 16), (5_000, 10), (20_000, 2), (80_000, 1)])
 def test_a_batch_takes_half_a_deadline_at_most(each_us, batch):
-    turns = Turns(16, DEADLINE_US)
+    turns = FairQueue(16, DEADLINE_US)
     for robot in range(20):
         turns.offer(f"r{robot}", 0, 0)
     assert len(turns.take(0, each_us)) == batch
@@ -58,7 +58,7 @@ def test_a_batch_takes_half_a_deadline_at_most(each_us, batch):
 @pytest.mark.parametrize("each_us", [DEADLINE_US + 1, 3_000_000])
 def test_after_one_slow_frame_a_fresh_one_is_looked_at_all_the_same(each_us):
     """The first of a device that warms up takes seconds: if that ruled out all others, nobody would measure again."""
-    turns = Turns(16, DEADLINE_US)
+    turns = FairQueue(16, DEADLINE_US)
     turns.offer("fresh", 0, 0)
     turns.offer("old", 0, -DEADLINE_US)
     assert [turn.robot for turn in turns.take(0, each_us)] == ["fresh"]
@@ -67,7 +67,7 @@ def test_after_one_slow_frame_a_fresh_one_is_looked_at_all_the_same(each_us):
 @pytest.mark.parametrize("seed", [21, 22, 23])
 def test_twice_the_load_is_shared_fairly_and_nothing_is_answered_late(seed):
     """40 streams at 30 per second, each picture 1.7 ms: half of them must go, of everybody the same share."""
-    rng, turns, now_us, each_us = random.Random(seed), Turns(16, DEADLINE_US), 0, 1_667
+    rng, turns, now_us, each_us = random.Random(seed), FairQueue(16, DEADLINE_US), 0, 1_667
     due = {f"r{robot}": rng.randrange(33_333) for robot in range(40)}
     served, ages = dict.fromkeys(due, 0), []
     while now_us < 20_000_000:

@@ -15,7 +15,7 @@ from protocol.codec import encode
 from protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader, Stamp, State, Status
 from protocol.transports.zenoh import open_zenoh
 from protocol.transports.zenoh_around import peers_at
-from protocol.transports.zenoh_site import open_site
+from protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 from tests.remote_rig import BALL_JPEG, GREY_JPEG, frame, within
 from tests.vision_rig import jpeg_of
@@ -24,7 +24,7 @@ from vision_side.decode import Decoder
 from vision_side.detect.local import Hsv
 from vision_side.detect.port import DetectFrame
 from vision_side.detect.remote.zenoh_detector import ZenohDetector
-from vision_side.detector_service import ROLE, DetectorService, Serving
+from vision_side.detector_service import ROLE, DetectorService, ServingOptions
 
 CORNERS = ("x1_px", "y1_px", "x2_px", "y2_px")
 DEADLINE_S = DetectorConfig().deadline_s
@@ -77,8 +77,8 @@ class Bench:
 
     def __init__(self, ending, detector=HSV, **serving):
         self.endpoint, self.words = free_endpoint(), []
-        site = ending.enter_context(open_site("*", listen=[self.endpoint], role=ROLE, about=self._about))
-        self.service = DetectorService(site, detector, Serving("hsv", **serving), self.words.append)
+        site = ending.enter_context(open_fleet("*", listen=[self.endpoint], role=ROLE, about=self._about))
+        self.service = DetectorService(site, detector, ServingOptions("hsv", **serving), self.words.append)
         ending.enter_context(_served(self.service))
         self._ending = ending
 
@@ -208,8 +208,8 @@ def test_a_service_that_is_gone_is_no_answer_by_the_deadline_and_back_by_itself(
         for _ in range(2):
             assert not _result(robot, detector, seconds=0.05)
             with (
-                open_site("*", connect=[endpoint], role=ROLE) as site,
-                _served(DetectorService(site, HSV, Serving("hsv"), lambda line: None)),
+                open_fleet("*", connect=[endpoint], role=ROLE) as site,
+                _served(DetectorService(site, HSV, ServingOptions("hsv"), lambda line: None)),
             ):
                 assert until(lambda: (robot.here(), _result(robot, detector, seconds=DEADLINE_S))[1], 3.0)
         assert "LATE" in detector.refused and any("answers again" in line for line in detector.news())

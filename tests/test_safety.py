@@ -4,7 +4,7 @@ import pytest
 
 from protocol.errors import WireError
 from protocol.messages import STILL, Echo, Request, RequestHeader, State, Twist, Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from robot_side.limits import (
     SafetyConfig,
     age_factor,
@@ -22,13 +22,13 @@ def refusal(rig, verb, **kwargs):
 # --- age ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("age_ms", "reason"), [(0, None), (399.999, None), (400, None), (400.001, Refusal.STALE)])
+@pytest.mark.parametrize(("age_ms", "reason"), [(0, None), (399.999, None), (400, None), (400.001, RejectReason.STALE)])
 def test_a_command_is_as_old_as_its_frame(age_ms, reason):
     rig = Rig().armed()
     assert rig.offer(age_ms=age_ms).reason == reason
 
 
-@pytest.mark.parametrize(("ahead_us", "reason"), [(0, None), (1, Refusal.FROM_FUTURE)])
+@pytest.mark.parametrize(("ahead_us", "reason"), [(0, None), (1, RejectReason.FROM_FUTURE)])
 def test_a_frame_of_the_future_is_refused(ahead_us, reason):
     rig = Rig().armed()
     assert rig.offer(age_ms=-ahead_us / MS).reason == reason
@@ -65,14 +65,14 @@ def test_degraded_keeps_the_curve():
 def test_only_frames_issued_by_this_session_count():
     rig = Rig().armed()
     frame = rig.frame()
-    assert rig.offer(header=rig.header(frame.model_copy(update={"session": OTHER}))).reason is Refusal.OTHER_SESSION
-    assert rig.offer(header=rig.header(frame.model_copy(update={"seq": 10_000}))).reason is Refusal.UNKNOWN_FRAME
+    assert rig.offer(header=rig.header(frame.model_copy(update={"session": OTHER}))).reason is RejectReason.OTHER_SESSION
+    assert rig.offer(header=rig.header(frame.model_copy(update={"seq": 10_000}))).reason is RejectReason.UNKNOWN_FRAME
     assert (
-        rig.offer(header=rig.header(frame.model_copy(update={"t_us": frame.t_us + 1}))).reason is Refusal.UNKNOWN_FRAME
+        rig.offer(header=rig.header(frame.model_copy(update={"t_us": frame.t_us + 1}))).reason is RejectReason.UNKNOWN_FRAME
     )
     status = Echo(channel="status", session=ROBOT, seq=1, t_us=rig.now_us)
     rig.gate.issued.add("status", 1, rig.now_us)
-    assert rig.offer(header=rig.header(status)).reason is Refusal.UNKNOWN_FRAME
+    assert rig.offer(header=rig.header(status)).reason is RejectReason.UNKNOWN_FRAME
     assert rig.offer(header=rig.header(frame)).accepted
 
 
@@ -82,10 +82,10 @@ def test_the_record_is_bounded_and_forgets_the_oldest():
         rig.gate.issued.add("frame", seq, rig.now_us)
     assert rig.gate.issued.last_seq("frame") == 999
     old = Echo(channel="frame", session=ROBOT, seq=0, t_us=rig.now_us)
-    assert rig.offer(header=rig.header(old)).reason is Refusal.UNKNOWN_FRAME
+    assert rig.offer(header=rig.header(old)).reason is RejectReason.UNKNOWN_FRAME
 
 
-@pytest.mark.parametrize(("seq", "reason"), [(99, Refusal.OUT_OF_ORDER), (100, Refusal.OUT_OF_ORDER), (101, None)])
+@pytest.mark.parametrize(("seq", "reason"), [(99, RejectReason.OUT_OF_ORDER), (100, RejectReason.OUT_OF_ORDER), (101, None)])
 def test_sequence_numbers_only_grow(seq, reason):
     rig = Rig().armed()
     assert rig.offer(header=rig.header(seq=100)).accepted
@@ -114,20 +114,20 @@ def test_refused_commands_refresh_nothing():
 @pytest.mark.parametrize("source", ["operator", "status", "vision2", ""])
 def test_unknown_sources_do_not_drive(source):
     rig = Rig().armed()
-    assert rig.gate.offer(source, rig.header(), STILL, rig.now_us).reason is Refusal.UNKNOWN_SOURCE
+    assert rig.gate.offer(source, rig.header(), STILL, rig.now_us).reason is RejectReason.UNKNOWN_SOURCE
 
 
 def test_key_and_header_must_agree():
     rig = Rig().armed()
-    assert rig.gate.offer("teleop", rig.header(source="vision"), STILL, rig.now_us).reason is Refusal.UNKNOWN_SOURCE
+    assert rig.gate.offer("teleop", rig.header(source="vision"), STILL, rig.now_us).reason is RejectReason.UNKNOWN_SOURCE
 
 
 def test_guests_are_off_unless_switched_on_and_slow_then():
     guest = Twist(linear_mps=0.5, angular_rad_s=0.0)
-    assert Rig().gate.offer("guest", None, guest, 0).reason is Refusal.UNKNOWN_SOURCE
-    assert Rig().gate.offer("vision", None, guest, 0).reason is Refusal.MALFORMED
+    assert Rig().gate.offer("guest", None, guest, 0).reason is RejectReason.UNKNOWN_SOURCE
+    assert Rig().gate.offer("vision", None, guest, 0).reason is RejectReason.MALFORMED
     rig = Rig().armed()
-    assert rig.offer(source="guest", session=OTHER).reason is Refusal.UNKNOWN_SOURCE, "with a header too"
+    assert rig.offer(source="guest", session=OTHER).reason is RejectReason.UNKNOWN_SOURCE, "with a header too"
     rig = Rig(guests=True)
     for _ in range(5):
         rig.gate.offer("guest", None, guest, rig.now_us)
@@ -138,15 +138,15 @@ def test_guests_are_off_unless_switched_on_and_slow_then():
         rig.step()
     assert rig.gate.applied.linear_mps == pytest.approx(0.2)
     assert rig.offer().accepted, "vision outranks a guest"
-    assert rig.gate.offer("guest", None, guest, rig.now_us).reason is Refusal.NOT_HOLDER
+    assert rig.gate.offer("guest", None, guest, rig.now_us).reason is RejectReason.NOT_HOLDER
 
 
 def test_one_vision_drives_at_a_time_and_the_next_takes_over_when_it_is_silent():
     rig = Rig().armed().drive(200)
     verdict = rig.offer(session=OTHER)
-    assert verdict.reason is Refusal.NOT_HOLDER and VISION in verdict.detail
+    assert verdict.reason is RejectReason.NOT_HOLDER and VISION in verdict.detail
     rig.silence(960)
-    assert rig.offer(session=OTHER).reason is Refusal.NOT_HOLDER
+    assert rig.offer(session=OTHER).reason is RejectReason.NOT_HOLDER
     rig.silence(40)
     assert rig.offer(session=OTHER).accepted
 
@@ -154,8 +154,8 @@ def test_one_vision_drives_at_a_time_and_the_next_takes_over_when_it_is_silent()
 def test_a_human_outranks_vision_and_losing_the_human_disarms():
     rig = Rig(auto_arm=True).armed().drive(200)
     rig.drive(200, source="teleop", session=HUMAN)
-    assert rig.offer().reason is Refusal.NOT_HOLDER
-    assert refusal(rig, Verb.ARM, session=OTHER) is Refusal.NOT_ALLOWED
+    assert rig.offer().reason is RejectReason.NOT_HOLDER
+    assert refusal(rig, Verb.ARM, session=OTHER) is RejectReason.NOT_ALLOWED
     for _ in range(100):  # vision goes on asking; nobody hands the robot back to it
         rig.offer()
         rig.step()
@@ -176,12 +176,12 @@ def test_release_by_a_human_disarms():
 def test_arming_needs_five_live_commands(commands, armed):
     rig = Rig()
     for _ in range(commands):
-        assert rig.offer().reason is Refusal.DISARMED
+        assert rig.offer().reason is RejectReason.DISARMED
         rig.step()
     if armed:
         assert rig.request(Verb.ARM) == "armed"
     else:
-        assert refusal(rig, Verb.ARM) is Refusal.NOT_ALLOWED
+        assert refusal(rig, Verb.ARM) is RejectReason.NOT_ALLOWED
     assert is_armed(rig.gate.state) == armed
 
 
@@ -231,14 +231,14 @@ def test_an_arm_request_that_was_kept_back_does_not_arm(age_us, granted):
     try:
         rig.gate.request(header, Request(id=1, verb=Verb.ARM), rig.now_us)
     except WireError as error:
-        assert error.reason is Refusal.STALE
+        assert error.reason is RejectReason.STALE
     assert is_armed(rig.gate.state) == granted
 
 
 def test_arm_reset_and_acquire_must_cite_a_status():
     rig = Rig()
     for verb in (Verb.ARM, Verb.RESET, Verb.ACQUIRE):
-        assert refusal(rig, verb, echo=False) is Refusal.MALFORMED
+        assert refusal(rig, verb, echo=False) is RejectReason.MALFORMED
 
 
 # --- STOP --------------------------------------------------------------------------------------------------------
@@ -247,11 +247,11 @@ def test_arm_reset_and_acquire_must_cite_a_status():
 def test_stop_latches_until_reset_and_reset_starts_nothing():
     rig = Rig(auto_arm=True).armed().drive(600)
     rig.request(Verb.STOP, source="operator", session=OTHER, echo=False)
-    assert rig.offer().reason is Refusal.STOPPED
-    assert refusal(rig, Verb.RESET) is Refusal.NOT_ALLOWED, "still rolling"
+    assert rig.offer().reason is RejectReason.STOPPED
+    assert refusal(rig, Verb.RESET) is RejectReason.NOT_ALLOWED, "still rolling"
     rig.drive(1000)
     assert rig.gate.applied == STILL and rig.gate.state is State.STOPPED
-    assert refusal(rig, Verb.ARM) is Refusal.STOPPED
+    assert refusal(rig, Verb.ARM) is RejectReason.STOPPED
     rig.request(Verb.RESET)
     rig.drive(2000)
     assert rig.gate.state is State.DISARMED and rig.gate.applied == STILL
@@ -267,6 +267,6 @@ def test_a_gate_that_was_stopped_starts_stopped():
 def test_a_fault_stops_and_a_reset_leaves_it():
     rig = Rig().armed().drive(400)
     rig.gate.fault("no drive")
-    assert rig.offer().reason is Refusal.FAULT
+    assert rig.offer().reason is RejectReason.FAULT
     rig.silence(600)
     assert rig.request(Verb.RESET) == "reset; arm to drive"

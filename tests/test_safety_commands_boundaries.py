@@ -5,11 +5,11 @@ import math
 import pytest
 
 from protocol.errors import WireError
-from protocol.messages import STILL, Echo, LastRefusal, State, Twist, Verb
-from protocol.refusals import Refusal
+from protocol.messages import STILL, Echo, LastRejection, State, Twist, Verb
+from protocol.refusals import RejectReason
 from robot_side.limits import SafetyConfig
 from robot_side.safety import Decision, SafetyGate
-from robot_side.states import TRANSITIONS, Event, after, is_armed
+from robot_side.states import TRANSITIONS, Event, next_state, is_armed
 from tests.gate_rig import GUEST, VISION_HOLDER, A, D, F, G, H, S, driving, guest, guest_driving
 from tests.safety_rig import HUMAN, OTHER, ROBOT, VISION, Rig
 
@@ -32,7 +32,7 @@ WHERE_TO = {
 def test_each_event_leads_from_each_state_where_it_should():
     for event in Event:
         for state in State:
-            assert after(state, event) is WHERE_TO[event].get(state, state), (state, event)
+            assert next_state(state, event) is WHERE_TO[event].get(state, state), (state, event)
     assert len(TRANSITIONS) == sum(map(len, WHERE_TO.values()))
 
 
@@ -70,7 +70,7 @@ def test_either_axis_must_be_finite(axis, value):
     rig = driving()
     bad = Twist.model_construct(**{"linear_mps": 0.0, "angular_rad_s": 0.0, axis: value})
     verdict = rig.gate.offer("vision", rig.header(), bad, rig.now_us)
-    assert (verdict.reason, verdict.accepted, verdict.age_us) == (Refusal.NOT_FINITE, False, None)
+    assert (verdict.reason, verdict.accepted, verdict.age_us) == (RejectReason.NOT_FINITE, False, None)
 
 
 def test_a_refusal_is_counted_and_kept_in_words_and_an_acceptance_has_its_age():
@@ -82,7 +82,7 @@ def test_a_refusal_is_counted_and_kept_in_words_and_an_acceptance_has_its_age():
     stale = rig.offer(age_ms=401)
     assert stale.detail == "frame 9 is 401 ms old, at most 400"
     assert rig.gate.counters["STALE"] == 1 and rig.gate.accepted == accepted + 1
-    assert rig.gate.last_refusal == LastRefusal(source="vision", reason="STALE", detail=stale.detail)
+    assert rig.gate.last_refusal == LastRejection(source="vision", reason="STALE", detail=stale.detail)
     rig.offer(age_ms=402)
     assert rig.gate.counters["STALE"] == 2 and rig.gate.latency_us == 12_000
 
@@ -90,28 +90,28 @@ def test_a_refusal_is_counted_and_kept_in_words_and_an_acceptance_has_its_age():
 @pytest.mark.parametrize("size", [31, 32, 33, 199, 200, 201])
 def test_the_last_refusal_is_cut_to_what_a_status_holds(size):
     rig = Rig()
-    verdict = rig.gate.refuse("s" * size, WireError(Refusal.MALFORMED, "d" * size))
-    assert rig.gate.last_refusal == LastRefusal(
+    verdict = rig.gate.refuse("s" * size, WireError(RejectReason.MALFORMED, "d" * size))
+    assert rig.gate.last_refusal == LastRejection(
         source="s" * min(size, 32), reason="MALFORMED", detail="d" * min(size, 200)
     )
-    assert verdict.detail == "d" * size and verdict.reason is Refusal.MALFORMED
+    assert verdict.detail == "d" * size and verdict.reason is RejectReason.MALFORMED
 
 
 @pytest.mark.parametrize("state", [S, F])
 def test_nothing_drives_in_stopped_and_fault_and_nobody_gets_the_lease(state):
     rig = driving(state)
     verdict = rig.offer()
-    assert (verdict.reason, verdict.detail) == (Refusal(str(state)), rig.gate.reason)
+    assert (verdict.reason, verdict.detail) == (RejectReason(str(state)), rig.gate.reason)
     assert rig.gate.holder(rig.now_us) is None
 
 
 def test_disarmed_commands_are_judged_and_form_the_lease():
     rig = Rig()
     verdict = rig.offer()
-    assert (verdict.reason, verdict.detail) == (Refusal.DISARMED, "not armed")
+    assert (verdict.reason, verdict.detail) == (RejectReason.DISARMED, "not armed")
     assert rig.gate.holder(rig.now_us) == VISION_HOLDER
     assert rig.gate.accepted == 0 and rig.gate.frame_age_us(rig.now_us) is None
-    assert rig.offer(age_ms=401).reason is Refusal.STALE
+    assert rig.offer(age_ms=401).reason is RejectReason.STALE
 
 
 def test_the_loser_is_told_who_drives():
@@ -119,7 +119,7 @@ def test_the_loser_is_told_who_drives():
     assert rig.offer(session=OTHER).detail == f"vision {VISION} drives"
     rig.drive(20, source="teleop", session=HUMAN)
     verdict = rig.offer()
-    assert (verdict.reason, verdict.detail) == (Refusal.NOT_HOLDER, f"teleop {HUMAN} drives")
+    assert (verdict.reason, verdict.detail) == (RejectReason.NOT_HOLDER, f"teleop {HUMAN} drives")
 
 
 def test_key_and_header_name_one_known_driver():
@@ -130,14 +130,14 @@ def test_key_and_header_name_one_known_driver():
         ("vision", rig.header(source="teleop")),
     ]:
         verdict = rig.gate.offer(source, header, STILL, rig.now_us)
-        assert verdict.reason is Refusal.UNKNOWN_SOURCE and repr(source) in verdict.detail
+        assert verdict.reason is RejectReason.UNKNOWN_SOURCE and repr(source) in verdict.detail
     for source in ("vision", "teleop"):
         verdict = rig.gate.offer(source, None, STILL, rig.now_us)
-        assert verdict.reason is Refusal.MALFORMED and source in verdict.detail
-    assert rig.gate.offer("guest", None, STILL, rig.now_us).reason is Refusal.DISARMED
+        assert verdict.reason is RejectReason.MALFORMED and source in verdict.detail
+    assert rig.gate.offer("guest", None, STILL, rig.now_us).reason is RejectReason.DISARMED
     assert rig.gate.holder(rig.now_us) == GUEST
     off = Rig().gate.offer("guest", None, STILL, 0)
-    assert off.reason is Refusal.UNKNOWN_SOURCE and "safety.guests" in off.detail
+    assert off.reason is RejectReason.UNKNOWN_SOURCE and "safety.guests" in off.detail
 
 
 def test_a_status_is_no_frame_and_a_repeated_number_no_command():
@@ -145,11 +145,11 @@ def test_a_status_is_no_frame_and_a_repeated_number_no_command():
     rig.gate.issued.add("status", 1, rig.now_us)
     status = Echo(channel="status", session=ROBOT, seq=1, t_us=rig.now_us)
     verdict = rig.offer(header=rig.header(status))
-    assert verdict.reason is Refusal.UNKNOWN_FRAME and "status" in verdict.detail
+    assert verdict.reason is RejectReason.UNKNOWN_FRAME and "status" in verdict.detail
     rig.gate.issued.add("beat", 1, rig.now_us)
     beat = rig.header(Echo(channel="beat", session=ROBOT, seq=1, t_us=rig.now_us))
     assert rig.offer(header=beat).accepted
-    assert rig.offer(header=beat).reason is Refusal.OUT_OF_ORDER
+    assert rig.offer(header=beat).reason is RejectReason.OUT_OF_ORDER
 
 
 # --- what is kept of a command -----------------------------------------------------------------------------------

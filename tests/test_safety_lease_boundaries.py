@@ -4,7 +4,7 @@ import pytest
 
 from protocol.errors import WireError
 from protocol.messages import STILL, AnswerHeader, Echo, Holder, Request, RequestHeader, Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from robot_side.limits import SafetyConfig
 from robot_side.safety import Decision, SafetyGate
 from tests.gate_rig import HUMAN_HOLDER, VISION_HOLDER, A, D, H, driving, refused
@@ -25,12 +25,12 @@ def test_acquire_takes_the_lease_ahead_of_the_first_command():
     assert rig.request(Verb.ACQUIRE, source="teleop", session=HUMAN) == "acquired"
     assert rig.gate.holder(rig.now_us) == HUMAN_HOLDER
     assert "0 of 5" in refused(rig, Verb.ARM, source="teleop", session=HUMAN).detail
-    assert rig.offer().reason is Refusal.NOT_HOLDER
+    assert rig.offer().reason is RejectReason.NOT_HOLDER
     for source, session in [("teleop", OTHER), ("vision", VISION), ("operator", OTHER)]:
         error = refused(rig, Verb.ACQUIRE, source=source, session=session)
-        assert (error.reason, error.detail) == (Refusal.NOT_HOLDER, "teleop drives")
+        assert (error.reason, error.detail) == (RejectReason.NOT_HOLDER, "teleop drives")
     error = refused(Rig(), Verb.ACQUIRE, source="operator")
-    assert (error.reason, error.detail) == (Refusal.NOT_HOLDER, "nobody drives")
+    assert (error.reason, error.detail) == (RejectReason.NOT_HOLDER, "nobody drives")
 
 
 def test_acquiring_again_renews_nothing():
@@ -55,7 +55,7 @@ def test_what_was_asked_before_a_stop_or_disarm_does_not_undo_it(verb, denial):
     rig = Rig().armed()
     rig.gate.issued.add("status", 70, rig.now_us)
     getattr(rig.gate, denial)()
-    for seq, reason in ((70, Refusal.STALE), (71, None)):
+    for seq, reason in ((70, RejectReason.STALE), (71, None)):
         rig.gate.issued.add("status", seq, rig.now_us)
         cited = Echo(channel="status", session=ROBOT, seq=seq, t_us=rig.now_us)
         header = RequestHeader(source="teleop", session=HUMAN, seq=seq, echo=cited)
@@ -73,7 +73,7 @@ def test_a_request_cites_a_status_and_no_frame():
     header = RequestHeader(source="operator", session=HUMAN, seq=0, echo=rig.frame())
     with pytest.raises(WireError) as caught:
         rig.gate.request(header, Request(id=1, verb=Verb.RESET), rig.now_us)
-    assert caught.value.reason is Refusal.MALFORMED
+    assert caught.value.reason is RejectReason.MALFORMED
 
 
 def test_a_human_who_acquires_and_then_is_silent_was_lost():
@@ -84,13 +84,13 @@ def test_a_human_who_acquires_and_then_is_silent_was_lost():
     assert rig.step(20) == Decision(STILL, D, "the person driving was lost; arm again")
 
 
-@pytest.mark.parametrize(("silent_us", "reason"), [(999_999, Refusal.NOT_HOLDER), (1_000_000, Refusal.DISARMED)])
+@pytest.mark.parametrize(("silent_us", "reason"), [(999_999, RejectReason.NOT_HOLDER), (1_000_000, RejectReason.DISARMED)])
 def test_a_human_lost_between_two_ticks_is_not_succeeded(silent_us, reason):
     rig = driving(A)
     rig.offer(source="teleop", session=HUMAN)
     rig.now_us += silent_us
     assert rig.offer().reason is reason
-    assert (rig.gate.state is D) == (reason is Refusal.DISARMED)
+    assert (rig.gate.state is D) == (reason is RejectReason.DISARMED)
     rig = driving(A)
     rig.offer(source="teleop", session=HUMAN)
     rig.now_us += 1_000_000
@@ -149,7 +149,7 @@ def test_a_lost_human_is_lost_once():
     assert rig.step().state is H
 
 
-@pytest.mark.parametrize(("guests", "reason"), [(True, Refusal.DISARMED), (False, Refusal.UNKNOWN_SOURCE)])
+@pytest.mark.parametrize(("guests", "reason"), [(True, RejectReason.DISARMED), (False, RejectReason.UNKNOWN_SOURCE)])
 def test_a_guest_with_a_header_is_a_guest(guests, reason):
     gate = SafetyGate(SafetyConfig(guests=guests), ROBOT)
     gate.issued.add("frame", 0, 0)

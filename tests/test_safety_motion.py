@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from protocol.errors import WireError
 from protocol.messages import STILL, State, Twist, Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from robot_side.limits import (
     STOP_DISTANCE_BOUND_M,
     STOP_TIME_BOUND_US,
@@ -17,7 +17,7 @@ from robot_side.limits import (
     clamp_twist,
     stop_bound,
 )
-from robot_side.states import TRANSITIONS, Event, after, is_armed
+from robot_side.states import TRANSITIONS, Event, next_state, is_armed
 from tests.safety_rig import HUMAN, MS, VISION, Rig
 
 
@@ -166,7 +166,7 @@ def test_out_of_range_is_accepted_clamped_and_counted():
 def test_what_is_not_finite_never_reaches_the_ramp(value):
     rig = Rig().armed()
     twist = Twist.model_construct(linear_mps=value, angular_rad_s=0.0)
-    assert rig.gate.offer("vision", rig.header(), twist, rig.now_us).reason is Refusal.NOT_FINITE
+    assert rig.gate.offer("vision", rig.header(), twist, rig.now_us).reason is RejectReason.NOT_FINITE
 
 
 # --- states ------------------------------------------------------------------------------------------------------
@@ -178,7 +178,7 @@ def test_nothing_but_arming_leads_from_off_to_armed():
             assert (state, event) == (State.DISARMED, Event.ARM)
         if state is State.STOPPED:
             assert to in (State.STOPPED, State.DISARMED)
-    assert all(after(state, Event.STOP) is State.STOPPED for state in State)
+    assert all(next_state(state, Event.STOP) is State.STOPPED for state in State)
 
 
 @settings(max_examples=60, deadline=None)

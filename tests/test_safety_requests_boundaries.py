@@ -4,7 +4,7 @@ import pytest
 
 from protocol.errors import WireError
 from protocol.messages import STILL, Echo, Request, RequestHeader, Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from robot_side.limits import SafetyConfig
 from robot_side.safety import SafetyGate
 from tests.gate_rig import A, D, F, H, S, driving, refused
@@ -20,12 +20,12 @@ def test_stop_disarm_and_release_need_no_echo(verb):
         assert rig.request(verb, echo=False)
     else:
         error = refused(rig, verb, echo=False)
-        assert error.reason is Refusal.MALFORMED and error.detail == "what lets a robot move again must cite a status"
+        assert error.reason is RejectReason.MALFORMED and error.detail == "what lets a robot move again must cite a status"
 
 
 @pytest.mark.parametrize("verb", [Verb.ARM, Verb.RESET, Verb.ACQUIRE])
 @pytest.mark.parametrize(
-    ("age_us", "reason"), [(-1, Refusal.FROM_FUTURE), (0, None), (2_000_000, None), (2_000_001, Refusal.STALE)]
+    ("age_us", "reason"), [(-1, RejectReason.FROM_FUTURE), (0, None), (2_000_000, None), (2_000_001, RejectReason.STALE)]
 )
 def test_other_requests_cite_something_young(verb, age_us, reason):
     gate = SafetyGate(SafetyConfig(), ROBOT)
@@ -35,7 +35,7 @@ def test_other_requests_cite_something_young(verb, age_us, reason):
     try:
         gate.request(header, Request(id=1, verb=verb), 10_000_000 + age_us)
     except WireError as error:
-        assert error.reason is (reason or Refusal.NOT_ALLOWED) and (reason or verb is Verb.ARM)
+        assert error.reason is (reason or RejectReason.NOT_ALLOWED) and (reason or verb is Verb.ARM)
     else:
         assert reason is None
 
@@ -49,7 +49,7 @@ def test_each_verb_says_what_it_did():
     assert rig.request(Verb.RESET) == "nothing to reset: DISARMED"
     assert rig.request(Verb.STOP) == "STOPPED" and rig.gate.reason == "STOP by operator"
     error = refused(rig, Verb.ARM)
-    assert (error.reason, error.detail) == (Refusal.STOPPED, "STOP by operator; reset first")
+    assert (error.reason, error.detail) == (RejectReason.STOPPED, "STOP by operator; reset first")
     assert rig.request(Verb.RESET) == "reset; arm to drive" and rig.gate.reason == "reset by operator; not armed"
     assert rig.gate.state is D
     assert rig.gate.stop() == "STOPPED" and rig.gate.reason == "STOP"
@@ -57,7 +57,7 @@ def test_each_verb_says_what_it_did():
     rig.request(Verb.RESET)
     rig.gate.fault("no drive")
     assert (rig.gate.state, rig.gate.reason) == (F, "no drive")
-    assert refused(rig, Verb.ARM).reason is Refusal.FAULT
+    assert refused(rig, Verb.ARM).reason is RejectReason.FAULT
     assert rig.request(Verb.RESET) == "reset; arm to drive"
     rig.armed()
     assert rig.gate.disarm() == "disarmed" and rig.gate.reason == "disarmed"
@@ -69,7 +69,7 @@ def test_reset_waits_for_the_wheels(state):
     rig.gate.stop() if state is S else rig.gate.fault("broken")
     while rig.gate.applied != STILL:
         error = refused(rig, Verb.RESET)
-        assert error.reason is Refusal.NOT_ALLOWED and "not at zero" in error.detail
+        assert error.reason is RejectReason.NOT_ALLOWED and "not at zero" in error.detail
         rig.step()
     assert rig.request(Verb.RESET) and rig.gate.state is D
 
@@ -92,7 +92,7 @@ def test_arm_and_reset_are_not_for_others_beside_a_human(verb):
     rig.offer(source="teleop", session=HUMAN)
     for source, session in [("operator", OTHER), ("teleop", OTHER), ("operator", HUMAN), ("vision", HUMAN)]:
         error = refused(rig, verb, source=source, session=session)
-        assert (error.reason, error.detail) == (Refusal.NOT_ALLOWED, f"teleop {HUMAN} drives")
+        assert (error.reason, error.detail) == (RejectReason.NOT_ALLOWED, f"teleop {HUMAN} drives")
     if verb is Verb.RESET:
         assert rig.request(verb, source="teleop", session=HUMAN).startswith("nothing")
     else:
@@ -123,7 +123,7 @@ def test_arming_needs_five_live_commands(commands, missing):
         assert rig.request(Verb.ARM) == "armed"
     else:
         error = refused(rig, Verb.ARM)
-        assert (error.reason, error.detail) == (Refusal.NOT_ALLOWED, missing)
+        assert (error.reason, error.detail) == (RejectReason.NOT_ALLOWED, missing)
 
 
 def test_the_five_are_of_one_driver_in_a_row():
@@ -161,7 +161,7 @@ def test_arming_waits_for_the_wheels():
         for _ in range(5):
             rig.offer()
         error = refused(rig, Verb.ARM)
-        assert (error.reason, error.detail) == (Refusal.NOT_ALLOWED, "the wheels are not at zero yet; ask again")
+        assert (error.reason, error.detail) == (RejectReason.NOT_ALLOWED, "the wheels are not at zero yet; ask again")
         rig.step()
     for _ in range(5):
         rig.offer()
@@ -259,7 +259,7 @@ def ask(rig, verb=Verb.ARM):
 def stale(rig, asked):
     with pytest.raises(WireError) as caught:
         rig.gate.request(*asked, rig.now_us)
-    return caught.value.reason is Refusal.STALE
+    return caught.value.reason is RejectReason.STALE
 
 
 @pytest.mark.parametrize("how", LEAVING)

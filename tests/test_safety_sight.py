@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from protocol.errors import WireError
 from protocol.messages import STILL, State, Twist, Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from robot_side.guard import GuardConfig, RangeGuard
 from robot_side.ports import Ranges
 from tests.safety_rig import MS, Rig
@@ -36,7 +36,7 @@ def test_a_picture_that_does_not_change_holds_the_robot(unchanged_us, holds):
     assert rig.drive(40).gate.state is State.ACTIVE
 
 
-@pytest.mark.parametrize(("shown_ms", "reason"), [(400, None), (401, Refusal.STALE)])
+@pytest.mark.parametrize(("shown_ms", "reason"), [(400, None), (401, RejectReason.STALE)])
 def test_a_repeated_picture_is_as_old_as_when_it_was_first_shown(shown_ms, reason):
     rig = Rig(silence_ms=300).armed().drive(400)
     rig.gate.pictures.add(rig.now_us, 7)

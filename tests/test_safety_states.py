@@ -6,7 +6,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from protocol.errors import WireError
 from protocol.messages import STILL, State, Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from robot_side import safety
 from robot_side.states import TRANSITIONS
 from tests.safety_rig import HUMAN, MS, OTHER, VISION, Rig
@@ -46,14 +46,14 @@ class Promises:
     def verdict(self, who, age_us):
         """The reason that a command by `who` on a frame of `age_us` is refused for, None if it is obeyed."""
         if age_us < 0:
-            return Refusal.FROM_FUTURE
+            return RejectReason.FROM_FUTURE
         if age_us > 400_000:
-            return Refusal.STALE
+            return RejectReason.STALE
         if self.off in (State.STOPPED, State.FAULT):
-            return Refusal(str(self.off))
+            return RejectReason(str(self.off))
         if self.holder not in (None, who) and RANK[who[0]] <= RANK[self.holder[0]]:
-            return Refusal.NOT_HOLDER
-        return Refusal.DISARMED if self.off else None
+            return RejectReason.NOT_HOLDER
+        return RejectReason.DISARMED if self.off else None
 
     def take(self, who, now_us):
         self.holder, self.until_us = who, now_us + 1_000_000
@@ -98,7 +98,7 @@ class Gate(RuleBasedStateMachine):
         expected = promises.verdict(driver, round(age_ms * MS))
         verdict = self.rig.offer(linear, 1.0, source=driver[0], session=driver[1], age_ms=age_ms)
         assert verdict.reason == expected, verdict.detail
-        if expected in (None, Refusal.DISARMED):
+        if expected in (None, RejectReason.DISARMED):
             promises.live = promises.live + 1 if promises.holder == driver else 1
             promises.take(driver, now_us)
         if expected is None:
@@ -256,13 +256,13 @@ STATES, TAKEN = set(), set()
 
 
 def test_the_gate_keeps_its_promises_and_every_state_and_transition_was_visited(monkeypatch):
-    real = safety.after
+    real = safety.next_state
 
     def recorded(state, event):
         TAKEN.add((state, event))
         return real(state, event)
 
-    monkeypatch.setattr(safety, "after", recorded)
+    monkeypatch.setattr(safety, "next_state", recorded)
     run_state_machine_as_test(
         Gate,
         settings=settings(max_examples=250, stateful_step_count=40, deadline=None, derandomize=True, database=None),

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from protocol.messages import STILL, Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from robot_side.guard import GuardConfig, RangeGuard
 from robot_side.limits import AxisRamp
 from robot_side.ports import Ranges
@@ -82,7 +82,7 @@ def test_a_frozen_picture_holds(unchanged_us, state):
     verdict = rig.offer()
     assert verdict.accepted == (unchanged_us <= 400_000)
     if not verdict.accepted:
-        assert verdict.reason is Refusal.STALE
+        assert verdict.reason is RejectReason.STALE
         assert verdict.detail == "the camera's picture has not changed for 400 ms"
     decision = rig.step(0)
     assert decision.state is state

@@ -11,14 +11,14 @@ from sim.body import outline
 from sim.robot_model import load_robot, robot_names
 from sim.scenario import load_scenario, scenario_names
 from vision_side.config import VisionConfig
-from vision_side.missions.choice import configured
+from vision_side.missions.choice import configured_mission
 
 
 @pytest.mark.parametrize("name", scenario_names())
 def test_every_scenario_configures_a_vision_with_its_mission(name):
     scenario = load_scenario(name)
     config = vision_config(scenario, robot_of(scenario), 3)
-    assert configured(config).name == scenario.mission
+    assert configured_mission(config).name == scenario.mission
     assert config.target.stand_off_m == scenario.stand_off_m
 
 

@@ -11,7 +11,7 @@ pytest.importorskip("pybullet")
 import simplejpeg
 
 from sim import scene_backdrop
-from sim.scene_defects import as_seen, spoiled, streak
+from sim.scene_defects import as_seen, with_defects, streak
 from sim.scene_plan import plan_scene
 from sim.scene_render import SceneRenderer
 from sim.scene_texture_parts import SIDE
@@ -167,16 +167,16 @@ def test_textures_are_tiles_of_their_seed(family):
 def test_light_and_quality_do_what_they_say(renderer):
     scene = renderer.scene(JUDGED_FROM + 2, COLUMNS["nominal"])
     nominal, light = COLUMNS["nominal"], replace(COLUMNS["changed light"], gain=(0.25, 0.25))
-    means = [simplejpeg.decode_jpeg(spoiled(scene.rgb, one, np.random.default_rng(4)), "RGB").mean()
+    means = [simplejpeg.decode_jpeg(with_defects(scene.rgb, one, np.random.default_rng(4)), "RGB").mean()
              for one in (nominal, light)]
     assert 0.15 < means[1] / means[0] < 0.4
-    sizes = [len(spoiled(scene.rgb, COLUMNS[name], np.random.default_rng(4))) for name in ("nominal", "quality 30")]
+    sizes = [len(with_defects(scene.rgb, COLUMNS[name], np.random.default_rng(4))) for name in ("nominal", "quality 30")]
     assert sizes[1] < 0.7 * sizes[0]
 
 
 def test_blur_takes_detail_away_and_keeps_the_light(renderer):
     scene = renderer.scene(JUDGED_FROM + 2, COLUMNS["nominal"])
-    grey = [simplejpeg.decode_jpeg(spoiled(scene.rgb, COLUMNS[name], np.random.default_rng(4)), "GRAY")[..., 0]
+    grey = [simplejpeg.decode_jpeg(with_defects(scene.rgb, COLUMNS[name], np.random.default_rng(4)), "GRAY")[..., 0]
             .astype(float) for name in ("nominal", "blur")]
     detail = [np.abs(np.diff(one, axis=0)).mean() for one in grey]
     assert detail[1] < 0.6 * detail[0] and grey[1].mean() == pytest.approx(grey[0].mean(), rel=0.1)

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from operator_side.score import median_and_worst, score
-from operator_side.score_bounds import judge
+from operator_side.score_bounds import checks_of
 from sim.truth import Truth
 
 
@@ -40,21 +40,21 @@ def test_acquired_means_on_it_in_both_and_in_view(bearing_deg, distance_m, visib
 def test_never_acquired_fails_every_figure_that_is_demanded():
     result = score(samples(bearing_deg=lambda _: 90.0, visible=lambda _: False), 0.8)
     for scenario in ("static", "circle", "eight", "pushed", "walls"):
-        assert not all(check.ok for check in judge(scenario, result))
-    assert not all(check.ok for check in judge("behind", result))
+        assert not all(check.ok for check in checks_of(scenario, result))
+    assert not all(check.ok for check in checks_of("behind", result))
 
 
 def test_time_out_of_view_is_lost_and_contacts_are_never_excused():
     result = score(samples(visible=lambda i: i % 4 != 3, walls=lambda i: i // 50), 0.8)
     assert result.lost_percent == pytest.approx(25.0) and result.wall_contacts == 1
-    names = {check.name for check in judge("pushed", result, factor=100.0) if not check.ok}
+    names = {check.name for check in checks_of("pushed", result, factor=100.0) if not check.ok}
     assert names == {"lost_percent", "wall_contacts"}
 
 
 def test_with_400_ms_the_demand_is_to_stand_still():
     still, moved = score(samples(), 0.8), score(samples(x_m=lambda i: i / 100), 0.8)
-    assert all(check.ok for check in judge("eight", still, latency_ms=400))
-    assert not all(check.ok for check in judge("eight", moved, latency_ms=400))
+    assert all(check.ok for check in checks_of("eight", still, latency_ms=400))
+    assert not all(check.ok for check in checks_of("eight", moved, latency_ms=400))
 
 
 def test_one_run_without_a_figure_makes_the_worst_none():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from operator_side.score import median_and_worst, score
-from operator_side.score_bounds import BOUNDS, UNITS, judge
+from operator_side.score_bounds import BOUNDS, UNITS, checks_of
 from operator_side.score_course import figures_of, goal_figures, legs_figures, light_figures
 from sim.scenario import load_scenario, scenario_names
 from tests.test_score import samples, truth
@@ -22,7 +22,7 @@ def drive(light_of, way_of, speed_of=lambda _s: 0.3, count=600):
 
 def failed(name, run, said=(), called=None):
     scenario = load_scenario(name)
-    checks = judge(called or name, score(run, scenario.stand_off_m, figures_of(scenario, run, said)))
+    checks = checks_of(called or name, score(run, scenario.stand_off_m, figures_of(scenario, run, said)))
     return {check.name for check in checks if not check.ok}
 
 
@@ -148,7 +148,7 @@ def test_a_scenario_of_ones_own_is_judged_by_what_its_kind_demands(mine):
     there = [replace(truth(index / 50, x_m=min(2.0, index / 50)), clearance_m=0.5) for index in range(300)]
     scenario = load_scenario("thymio").model_copy(update={"goals_m": ((1.0, 0.0), (2.0, 0.0))})
     for run, missed in ((there, set()), (there[:70], {"reached_s"})):
-        checks = judge(mine, score(run, scenario.stand_off_m, figures_of(scenario, run)))
+        checks = checks_of(mine, score(run, scenario.stand_off_m, figures_of(scenario, run)))
         assert {one.name for one in checks if not one.ok} == missed
     run = drive(lambda _s: "red", lambda s: -1.5 + 0.3 * s)
     assert "crossed_on_red" in failed("traffic-light", run, called=mine)

@@ -13,7 +13,7 @@ pytest.importorskip("pybullet")
 from operator_side import cli, cli_score_detectors
 from operator_side import score_scenes as score_scenes_file
 from operator_side.score_detectors import Figures
-from operator_side.score_detectors_bounds import LEAST_HITS, judge, judge_all
+from operator_side.score_detectors_bounds import LEAST_HITS, detector_checks, all_detector_checks
 from operator_side.score_detectors_text import check_lines
 from operator_side.score_scenes import LABELLED, Report, close_subjects, score_scenes, subjects
 from protocol.config import Config as Settings
@@ -33,14 +33,14 @@ def report(precision=None, **columns):
 
 
 def failed(one):
-    return [check.name for check in judge(one, "onnx") if not check.ok]
+    return [check.name for check in detector_checks(one, "onnx") if not check.ok]
 
 
 def test_every_column_and_label_is_demanded_and_the_bounds_themselves_are_enough():
     assert set(LEAST_HITS) == set(COLUMNS) and failed(report()) == []
     exact = {name.replace(" ", "_"): replace(GOOD, hits=least) for name, least in LEAST_HITS.items()}
     assert failed(report(**exact)) == []
-    assert len(judge(report(), "onnx")) == 3 * len(COLUMNS) + 1 + 2 * len(LABELLED)
+    assert len(detector_checks(report(), "onnx")) == 3 * len(COLUMNS) + 1 + 2 * len(LABELLED)
 
 
 @pytest.mark.parametrize("column", COLUMNS)
@@ -68,7 +68,7 @@ def test_each_label_is_demanded_of_enough_objects_and_of_who_never_found_one():
 
 
 def test_a_line_for_each_check_names_whose_it_is():
-    lines = check_lines(judge_all(report(nominal=replace(GOOD, centre_p50_px=None, hits=0.84))))
+    lines = check_lines(all_detector_checks(report(nominal=replace(GOOD, centre_p50_px=None, hits=0.84))))
     assert " ".join(lines[0].split()) == "onnx: least hits, nominal 84 % bound 85 % FAIL"
     assert " ".join(lines[3].split()) == "onnx: centre p50, nominal never bound 1 px FAIL"
     assert sum(line.endswith("  ok") for line in lines) == len(lines) - 2
@@ -219,7 +219,7 @@ def test_a_calibrated_range_is_judged(tmp_path, capsys):
 
 def test_options_are_those_of_the_detector_that_is_named(monkeypatch):
     given = {}
-    monkeypatch.setattr(score_scenes_file, "choose_detector", lambda name, options, _: given.update({name: options}))
+    monkeypatch.setattr(score_scenes_file, "build_detector", lambda name, options, _: given.update({name: options}))
     own, named, other = "detector.options.confirm=1", "detector.kind=adaptive", "detector.kind=onnx"
     for names, sets, expected in (
         (("adaptive",), (own,), [{"confirm": 1}]), (("hsv", "adaptive"), (named, own), [{}, {"confirm": 1}]),

@@ -11,17 +11,17 @@ pytest.importorskip("pybullet")
 import cv2
 
 from operator_side import cli, cli_score_detectors
-from operator_side.score_detectors import Found, Judged, figures, judged, precisions
+from operator_side.score_detectors import LabelMatches, FrameResult, figures, frame_result, precisions
 from operator_side.score_detectors_text import markdown, text
 from operator_side.score_scenes import score_scenes, subjects
 from operator_side.score_sheet import Sheet
 from operator_side.train_choice import ball_threshold, label_threshold
 from sim.scene_plan import plan_scene
-from sim.scenes import COLUMNS, JUDGED_FROM, Scene, Truth
+from sim.scenes import COLUMNS, JUDGED_FROM, Scene, LabelledBox
 from vision_side.detect.overlap import overlap
 from vision_side.detect.port import Circle, Detection
 
-BALL = Truth("ball", (100.0, 100.0, 140.0, 140.0), 1.0, (100.0, 100.0, 140.0, 140.0))
+BALL = LabelledBox("ball", (100.0, 100.0, 140.0, 140.0), 1.0, (100.0, 100.0, 140.0, 140.0))
 OTHER = (200.0, 100.0, 240.0, 160.0)
 
 
@@ -52,31 +52,31 @@ def test_overlap_is_intersection_by_union():
     ([found(100, 100, 140, 140, label="target")], "hit"),  # what the colour detectors call it
 ])
 def test_the_first_answer_gives_the_verdict(detections, verdict):
-    assert judged(detections, scene()).verdict == verdict
+    assert frame_result(detections, scene()).verdict == verdict
 
 
 def test_a_half_hidden_ball_is_hit_by_its_visible_part_or_by_its_circle():
     half = replace(BALL, box=(120.0, 100.0, 140.0, 140.0), seen=0.5)
-    assert judged([found(120, 100, 140, 140)], scene([half])).verdict == "hit"
-    assert judged([found(130, 100, 140, 140, circle=Circle(120, 120, 20))], scene([half])).verdict == "hit"
+    assert frame_result([found(120, 100, 140, 140)], scene([half])).verdict == "hit"
+    assert frame_result([found(130, 100, 140, 140, circle=Circle(120, 120, 20))], scene([half])).verdict == "hit"
 
 
 def test_the_centre_counts_only_where_all_of_the_ball_is_in_view():
-    assert judged([found(103, 104, 143, 144)], scene()).off_px == pytest.approx(5.0)
-    assert judged([found(103, 104, 143, 144, circle=Circle(121, 120, 20))], scene()).off_px == pytest.approx(1.0)
-    assert judged([found(100, 100, 140, 140)], scene([replace(BALL, seen=0.9)])).off_px is None
+    assert frame_result([found(103, 104, 143, 144)], scene()).off_px == pytest.approx(5.0)
+    assert frame_result([found(103, 104, 143, 144, circle=Circle(121, 120, 20))], scene()).off_px == pytest.approx(1.0)
+    assert frame_result([found(100, 100, 140, 140)], scene([replace(BALL, seen=0.9)])).off_px is None
 
 
 def test_legs_and_lights_are_wrong_objects_too():
-    legs = Truth("legs", (10.0, 100.0, 60.0, 200.0), 1.0)
-    assert judged([found(20, 110, 40, 150)], scene([BALL, legs])).verdict == "wrong object"
+    legs = LabelledBox("legs", (10.0, 100.0, 60.0, 200.0), 1.0)
+    assert frame_result([found(20, 110, 40, 150)], scene([BALL, legs])).verdict == "wrong object"
 
 
 def test_figures_count_each_frame_where_it_belongs():
     frames = [
-        Judged(True, "hit", 0.9, 1.0, 900), Judged(True, "hit", 0.9, 3.0, 1100), Judged(True, "wrong object", 0.6),
-        Judged(True, "none"), Judged(False, "none"), Judged(False, "nowhere", 0.5), Judged(False, "wrong object", 0.5),
-        Judged(False, "none"),
+        FrameResult(True, "hit", 0.9, 1.0, 900), FrameResult(True, "hit", 0.9, 3.0, 1100), FrameResult(True, "wrong object", 0.6),
+        FrameResult(True, "none"), FrameResult(False, "none"), FrameResult(False, "nowhere", 0.5), FrameResult(False, "wrong object", 0.5),
+        FrameResult(False, "none"),
     ]
     one = figures(frames)
     assert (one.frames, one.balls, one.hits, one.missed) == (8, 4, 0.5, 0.25)
@@ -87,7 +87,7 @@ def test_figures_count_each_frame_where_it_belongs():
 
 def test_average_precision_knows_the_simple_cases():
     def of(objects, marks):
-        return Found(objects, list(marks)).average_precision()
+        return LabelMatches(objects, list(marks)).average_precision()
 
     assert of(2, [(0.9, True), (0.8, True)]) == 1.0
     assert of(2, [(0.9, True)]) == 0.5
@@ -97,8 +97,8 @@ def test_average_precision_knows_the_simple_cases():
 
 
 def test_each_object_is_found_once_and_what_is_unclear_counts_for_nothing():
-    legs = Truth("legs", (10.0, 100.0, 60.0, 200.0), 1.0)
-    one = Found()
+    legs = LabelledBox("legs", (10.0, 100.0, 60.0, 200.0), 1.0)
+    one = LabelMatches()
     detections = [found(10, 100, 60, 200, 0.9, "legs"), found(12, 100, 60, 200, 0.8, "legs"),
                   found(200, 50, 230, 150, 0.7, "legs"), found(*OTHER, label="ball")]
     one.add("legs", detections, scene([legs], unclear=[(195.0, 50.0, 225.0, 120.0)]))
@@ -106,29 +106,29 @@ def test_each_object_is_found_once_and_what_is_unclear_counts_for_nothing():
 
 
 def test_what_is_never_found_is_said_to_be_never_found():
-    legs = Truth("legs", (10.0, 100.0, 60.0, 200.0), 1.0)
+    legs = LabelledBox("legs", (10.0, 100.0, 60.0, 200.0), 1.0)
     seen = [found(10, 100, 60, 200, 0.9, "light-red")]
-    marks = {label: Found() for label in ("legs", "light-red")}
+    marks = {label: LabelMatches() for label in ("legs", "light-red")}
     for label, one in marks.items():
         one.add(label, seen, scene([legs]))
     assert precisions(marks) == {"legs": (1, 0.0), "light-red": (0, None)}
-    assert precisions({"legs": Found(3)}) == {}, "who looks for balls alone is not asked for legs"
+    assert precisions({"legs": LabelMatches(3)}) == {}, "who looks for balls alone is not asked for legs"
 
 
 def test_thresholds_hold_false_alarms_and_wrong_objects_down():
-    alarms = [Judged(False, "nowhere", 0.30)] * 2 + [Judged(False, "none")] * 8
-    wrong = [Judged(True, "wrong object", 0.50)] + [Judged(True, "hit", 0.9)] * 9
+    alarms = [FrameResult(False, "nowhere", 0.30)] * 2 + [FrameResult(False, "none")] * 8
+    wrong = [FrameResult(True, "wrong object", 0.50)] + [FrameResult(True, "hit", 0.9)] * 9
     assert ball_threshold({"one": alarms}) == pytest.approx(0.31)
     assert ball_threshold({"one": alarms, "two": wrong}) == pytest.approx(0.51)
-    assert ball_threshold({"one": [Judged(True, "hit", 0.9)]}) == pytest.approx(0.06)
+    assert ball_threshold({"one": [FrameResult(True, "hit", 0.9)]}) == pytest.approx(0.06)
 
 
 def test_a_labels_threshold_balances_what_is_found_and_what_is_right():
-    assert label_threshold(Found(2, [(0.9, True), (0.4, True), (0.3, False)])) == pytest.approx(0.4)
-    assert label_threshold(Found(2, [(0.9, True), (0.2, False), (0.19, False), (0.1, False)])) == pytest.approx(0.9)
-    overlooked_is_worse = Found(2, [(0.9, True), (0.5, False), (0.4, False), (0.35, False), (0.3, True)])
+    assert label_threshold(LabelMatches(2, [(0.9, True), (0.4, True), (0.3, False)])) == pytest.approx(0.4)
+    assert label_threshold(LabelMatches(2, [(0.9, True), (0.2, False), (0.19, False), (0.1, False)])) == pytest.approx(0.9)
+    overlooked_is_worse = LabelMatches(2, [(0.9, True), (0.5, False), (0.4, False), (0.35, False), (0.3, True)])
     assert label_threshold(overlooked_is_worse) == pytest.approx(0.3)
-    assert label_threshold(Found()) == pytest.approx(0.3)
+    assert label_threshold(LabelMatches()) == pytest.approx(0.3)
 
 
 def test_the_command_line_begins_where_judging_begins():

@@ -8,9 +8,9 @@ import threading
 
 import pytest
 
-from protocol.log_lines import JsonLines
+from protocol.log_lines import JsonLineStream
 from robot_side.latch import StopLatch
-from robot_side.scribe import Scribe
+from robot_side.scribe import BackgroundWriter
 from tests.link_rigs import until
 
 
@@ -50,7 +50,7 @@ def latch(tmp_path):
 def scribe(latch, monkeypatch):
     """With the real one's thread, but whatever stream the test puts in its place."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)
-    scribe = Scribe(latch)
+    scribe = BackgroundWriter(latch)
     yield scribe
     scribe.close()
 
@@ -68,7 +68,7 @@ def test_a_letter_that_the_terminal_has_not_is_shown_as_its_code(latch, scribe):
 
 def test_a_log_of_objects_keeps_every_letter(scribe):
     written = io.StringIO()
-    sys.stdout = JsonLines(written, "robot", "info")
+    sys.stdout = JsonLineStream(written, "robot", "info")
     scribe.say("AnswerHeader is of version 'é'")
     assert until(written.getvalue)
     assert json.loads(written.getvalue())["message"] == "AnswerHeader is of version 'é'"

@@ -21,7 +21,14 @@ from protocol.channels import (
     Direction,
 )
 from protocol.errors import ConfigError, LinkError
-from protocol.transports.secured import ROLES, SOURCES, certificate_role, may_hear, may_publish, secured_for
+from protocol.transports.secured import (
+    ROLES,
+    SOURCES_OF_ROLE,
+    certificate_role,
+    may_subscribe,
+    may_publish,
+    load_role_keys,
+)
 from protocol.transports.websocket_keys import read_tokens
 from protocol.transports.zenoh import open_zenoh
 from protocol.transports.zenoh_around import list_robots
@@ -63,10 +70,10 @@ def test_only_the_listed_may_publish():
 
 
 def test_what_is_said_towards_the_robot_is_heard_by_the_robot_alone():
-    assert all(key.endswith("/*") for key in may_hear("robot"))
-    assert not any("twist" in key for role in SOURCES for key in may_hear(role))
+    assert all(key.endswith("/*") for key in may_subscribe("robot"))
+    assert not any("twist" in key for role in SOURCES_OF_ROLE for key in may_subscribe(role))
     for passed_on in ("detections", "mission", "report", "overlay", "preview"):
-        assert all(f"sightline/*/{passed_on}/*" in may_hear(role) for role in (*SOURCES, "robot"))
+        assert all(f"sightline/*/{passed_on}/*" in may_subscribe(role) for role in (*SOURCES_OF_ROLE, "robot"))
 
 
 def test_a_role_that_is_none_is_a_viewer():
@@ -80,7 +87,7 @@ def test_each_role_says_what_it_may_and_nothing_else(folder, endpoint):
     with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)) as robot:
         for channel in SAID:
             robot.subscribe(channel, lambda message: heard.append((message.channel.name, message.source)))
-        for role in SOURCES:
+        for role in SOURCES_OF_ROLE:
             with open_zenoh("r1", connect=[endpoint], role=role, secure=str(folder)) as peer:
                 frames = peer.latest(FRAME)
                 until(lambda: robot.has_listener(FRAME))
@@ -98,9 +105,9 @@ def test_what_is_over_its_channels_bound_ends_at_who_listens(folder, endpoint):
     """At a router, so that it crosses no robot's radio; what is just within it passes."""
     heard = []
     with (
-        closing(open_session([endpoint], (), 5.0, secured_for(str(folder), "robot"))),
-        open_session((), [endpoint], 5.0, secured_for(str(folder), "robot")) as robot,
-        open_session((), [endpoint], 5.0, secured_for(str(folder), "vision")) as vision,
+        closing(open_session([endpoint], (), 5.0, load_role_keys(str(folder), "robot"))),
+        open_session((), [endpoint], 5.0, load_role_keys(str(folder), "robot")) as robot,
+        open_session((), [endpoint], 5.0, load_role_keys(str(folder), "vision")) as vision,
     ):
         robot.declare_subscriber("sightline/r1/twist/*", lambda sample: heard.append(len(sample.payload)))
         bound = TWIST.max_payload_bytes

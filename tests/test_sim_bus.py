@@ -21,7 +21,7 @@ from robot_side.ports import Camera, Drive, RangeSensor
 from sim.bus import MOTION, MOTION_SET, SimCamera, SimDrive, SimRange, TruthReader
 from sim.robot_model import load_robot
 from sim.service import SimConfig, run
-from sim.sockets import Folder
+from sim.sockets import SocketFolder
 
 pytestmark = pytest.mark.slow
 
@@ -206,10 +206,10 @@ def test_bad_settings_are_one_line(tmp_path):
         run(SimConfig(scenario="cicle", socket_dir=str(tmp_path)))
     with pytest.raises(ConfigError, match="motor_log"):
         run(SimConfig(socket_dir=str(tmp_path), motor_log=str(tmp_path / "no" / "log.csv")))
-    Folder(str(tmp_path)).close()  # the failed run let go of the lock
+    SocketFolder(str(tmp_path)).close()  # the failed run let go of the lock
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="socket_dir"):
-        Folder(str(tmp_path / "file"))
+        SocketFolder(str(tmp_path / "file"))
 
 
 def test_the_robots_plug_ins_import_no_numpy_and_no_pybullet():

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import ConfigError
-from sim.cadence import Cadence
+from sim.cadence import PeriodicTimer
 from sim.look import look_named
 from sim.motors import Motor
 from sim.path import ClosedPath, Leg, Place
@@ -135,7 +135,7 @@ def test_an_encoder_counts_whole_steps_and_is_less_than_one_off(turned_rad):
 
 @pytest.mark.parametrize(("rate_hz", "seconds"), [(30, 10), (10, 10), (100, 3), (7, 10)])
 def test_a_cadence_keeps_its_rate_on_average(rate_hz, seconds):
-    cadence = Cadence(1e6 / rate_hz)
+    cadence = PeriodicTimer(1e6 / rate_hz)
     due = [now_us for now_us in range(4000, seconds * 1_000_000 + 4000, 4000) if cadence.due(now_us)]
     assert abs(len(due) - rate_hz * seconds) <= 1
     gaps_us = [b - a for a, b in pairwise(due)]

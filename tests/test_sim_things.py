@@ -13,7 +13,7 @@ import numpy as np
 import simplejpeg
 
 from protocol.errors import ConfigError
-from sim.light import LIT, Light, Phase, colour_of
+from sim.light import LIT, Light, Phase, color_of
 from sim.robot_model import load_robot
 from sim.scenario import load_scenario
 from sim.start import goals_seen
@@ -101,7 +101,7 @@ def test_the_line_crosses_the_lane_before_the_light(faces_deg, at, past_m):
 def test_only_the_lit_lamp_is_bright():
     lamps = [part for part in Light(at_m=(0.0, 0.0)).parts() if part.state]
     for state in ("red", "yellow", "green"):
-        shine = {part.state: max(colour_of(part, state)) for part in lamps}
+        shine = {part.state: max(color_of(part, state)) for part in lamps}
         assert max(shine, key=shine.get) == state
         assert sorted(shine.values())[-2] < 0.3 * shine[state]
     assert [part.state for part in sorted(lamps, key=lambda part: part.at_m[2], reverse=True)] == [

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import pytest
 
 from protocol.errors import ConfigError
-from sim.body import body_of, outline, urdf
+from sim.body import urdf_body, outline, urdf_from_model
 from sim.robot_model import ROBOTS, load_robot, robot_names
 from sim.urdf import Urdf
 
@@ -39,7 +39,7 @@ def test_range_sensors_face_as_their_links_do():
 
 def test_the_raspberrys_urdf_is_what_its_toml_says():
     drawn = ElementTree.fromstring((ROBOTS / "raspberry.urdf").read_text())
-    said = ElementTree.fromstring(urdf(load_robot("raspberry")))
+    said = ElementTree.fromstring(urdf_from_model(load_robot("raspberry")))
     said.set("name", "raspberry")
     ElementTree.indent(said)
     assert ElementTree.tostring(drawn) == ElementTree.tostring(said)
@@ -68,7 +68,7 @@ def test_a_wheel_that_turns_the_other_way_round_is_driven_the_other_way(axis):
 def test_unequal_wheels_both_touch_the_floor():
     thymio = load_robot("thymio")
     uneven = thymio.model_copy(update={"wheels": thymio.wheels.model_copy(update={"mismatch": 0.02})})
-    text = Urdf(body_of(uneven).text, "uneven")
+    text = Urdf(urdf_body(uneven).text, "uneven")
     heights = [text.place(link, text.foot(*WHEELS, "+x")).at[2] for link in ("left_wheel", "right_wheel")]
     assert heights[0] - heights[1] == pytest.approx(0.022 * 0.02)
 

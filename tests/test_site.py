@@ -16,7 +16,7 @@ from operator_side import keys
 from protocol.channels import ACK, FRAME, REQUEST, STATUS, TWIST
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.zenoh import open_zenoh
-from protocol.transports.zenoh_site import open_site
+from protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, Vision, driving
 
@@ -76,7 +76,7 @@ def test_several_robots_and_visions_at_one_router_never_cross(tmp_path):
     endpoint, robots = free_endpoint(), ("r1", "r2", "r10")
     heard = {robot: [] for robot in robots}
     with ExitStack() as ending:
-        fleet = ending.enter_context(open_site("r*", listen=[endpoint], role="vision"))
+        fleet = ending.enter_context(open_fleet("r*", listen=[endpoint], role="vision"))
         ends = {name: ending.enter_context(open_zenoh(name, connect=[endpoint], role="robot")) for name in robots}
         eyes = {name: ending.enter_context(open_zenoh(name, connect=[endpoint], role="vision")) for name in robots}
         for (name, end), channel in itertools.product(ends.items(), (TWIST, ACK, REQUEST)):

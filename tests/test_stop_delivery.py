@@ -11,9 +11,9 @@ from protocol.codec import encode
 from protocol.messages import Request, RequestHeader, Verb
 from protocol.transports.link import Message
 from protocol.transports.zenoh import open_zenoh
-from robot_side.child import NetworkChild
+from robot_side.child import DriverEnd
 from robot_side.config import RobotConfig
-from robot_side.held import MOST_HELD, HeldRequests
+from robot_side.held import MAX_PENDING, PendingRequests
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess, Vision, driving
 
@@ -37,7 +37,7 @@ class Room:
 
 
 def test_what_waits_is_sent_once_there_is_room_and_stop_first():
-    held = HeldRequests()
+    held = PendingRequests()
     arm, stop = request(Verb.ARM), request(Verb.STOP)
     assert held.hold(arm) and held.hold(stop) and len(held) == 2
     room = Room(1)
@@ -47,7 +47,7 @@ def test_what_waits_is_sent_once_there_is_room_and_stop_first():
 
 
 def test_the_newest_of_one_source_and_verb_waits():
-    held, room = HeldRequests(), Room(9)
+    held, room = PendingRequests(), Room(9)
     old, new = request(Verb.RESET, number=1), request(Verb.RESET, number=2)
     assert held.hold(old) and held.hold(new) and held.flush(room.send)
     assert room.sent == [new]
@@ -55,17 +55,17 @@ def test_the_newest_of_one_source_and_verb_waits():
 
 @pytest.mark.parametrize("first", [Verb.ARM, Verb.STOP])
 def test_it_is_bounded_and_a_stop_still_finds_a_place(first):
-    held, room = HeldRequests(), Room(99)
-    for number in range(MOST_HELD):
+    held, room = PendingRequests(), Room(99)
+    for number in range(MAX_PENDING):
         assert held.hold(request(first, f"source{number}"))
-    assert not held.hold(request(Verb.ARM, "another")) and len(held) == MOST_HELD
-    assert held.hold(request(Verb.STOP, "another")) and len(held) == MOST_HELD
+    assert not held.hold(request(Verb.ARM, "another")) and len(held) == MAX_PENDING
+    assert held.hold(request(Verb.STOP, "another")) and len(held) == MAX_PENDING
     assert held.flush(room.send) and room.sent[0].payload == request(Verb.STOP).payload
     assert request(Verb.STOP, "another") in room.sent
 
 
 def test_what_is_no_request_is_not_kept():
-    held = HeldRequests()
+    held = PendingRequests()
     assert not held.hold(Message(REQUEST, "operator", b"", b"{")) and len(held) == 0
 
 
@@ -74,7 +74,7 @@ def test_what_is_no_request_is_not_kept():
 
 @pytest.fixture
 def child(tmp_path):
-    made = NetworkChild(RobotConfig(state_dir=tmp_path), "0a0a0a0a", lambda line: None)
+    made = DriverEnd(RobotConfig(state_dir=tmp_path), "0a0a0a0a", lambda line: None)
     yield made
     made.close()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from robot_side.config import PluginChoice, RobotConfig
 from robot_side.driver import zero_motors
-from robot_side.supervision import ServiceManager
+from robot_side.supervision import SystemdNotifier
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 
@@ -41,7 +41,7 @@ def test_the_driver_says_ready_and_feeds_the_watchdog_from_its_loop(tmp_path, mo
 
 def test_without_a_manager_nothing_is_told(monkeypatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    manager = ServiceManager()
+    manager = SystemdNotifier()
     manager.tell("READY=1")
     assert not manager.is_there
 

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from protocol.log_lines import RefusalLines
+from protocol.log_lines import RepeatLimiter
 from protocol.transports import tcp_table
 from protocol.transports.denied import Certificates
 from protocol.transports.tcp_table import Visitors
@@ -69,7 +69,7 @@ def test_whatever_else_is_said_is_none_of_it(line):
 
 
 def test_a_cause_is_told_at_once_and_then_ever_more_seldom_with_every_one_counted():
-    lines, told = RefusalLines(), {}
+    lines, told = RepeatLimiter(), {}
     for second in range(200):
         for tenth in range(10):
             now_us = second * SECOND_US + tenth * 100_000
@@ -81,14 +81,14 @@ def test_a_cause_is_told_at_once_and_then_ever_more_seldom_with_every_one_counte
 
 
 def test_two_causes_do_not_hide_one_another_and_an_old_one_is_news_again():
-    lines = RefusalLines()
+    lines = RepeatLimiter()
     assert (lines.is_due("a", 0), lines.is_due("b", 1), lines.is_due("a", 2)) == (1, 1, 0)
     assert lines.is_due("a", 200 * SECOND_US) == 2
     assert lines.is_due("a", 201 * SECOND_US) == 1
 
 
 def test_ever_new_causes_take_no_memory():
-    lines, draw = RefusalLines(), random.Random(3)
+    lines, draw = RepeatLimiter(), random.Random(3)
     for number in range(2_000):
         assert lines.is_due(f"{draw.random()}", number * 1_000) == 1
     assert len(lines._told) + len(lines._untold) <= 33

@@ -12,14 +12,14 @@ import cv2
 
 from operator_side import cli
 from operator_side.train_network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
-from operator_side.train_rounds import Shown
+from operator_side.train_rounds import SceneRange
 from operator_side.train_samples import CUT_PX, WHOLE_PX, sample
 from operator_side.train_scenes import DrawnScenes, drawn_scenes
 from protocol.errors import ConfigError
-from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX, Truth
+from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX, LabelledBox
 from tests.train_rig import weights
 
-BALL = Truth("ball", (100.0, 60.0, 141.0, 99.0), 1.0)
+BALL = LabelledBox("ball", (100.0, 60.0, 141.0, 99.0), 1.0)
 
 
 def one_scene(truths=(BALL,), unclear=(), others=()):
@@ -29,7 +29,7 @@ def one_scene(truths=(BALL,), unclear=(), others=()):
 
 def shown(scenes, seed, step, place, size_px):
     """Any of all scenes."""
-    return sample(scenes, Shown(0, len(scenes.truths)), (seed, step, place), size_px)
+    return sample(scenes, SceneRange(0, len(scenes.truths)), (seed, step, place), size_px)
 
 
 def test_the_table_is_a_network_of_the_agreed_size():
@@ -78,7 +78,7 @@ def test_the_same_numbers_give_the_same_sample():
 def four_scenes():
     """Each of another label, which says which one was shown."""
     pictures = np.full((4, HEIGHT_PX, WIDTH_PX, 3), 120, np.uint8)
-    return DrawnScenes(pictures, tuple((Truth(label, BALL.box, 1.0),) for label in LABELS[:4]), ((),) * 4,
+    return DrawnScenes(pictures, tuple((LabelledBox(label, BALL.box, 1.0),) for label in LABELS[:4]), ((),) * 4,
                        (((4.0, 180.0, 44.0, 220.0),),) * 4)
 
 
@@ -90,12 +90,12 @@ def times_shown(which, count):
 
 def test_only_the_scenes_that_are_known_by_then_are_shown():
     for known in (1, 3, 4):
-        assert {place for place, times in enumerate(times_shown(Shown(0, known), 60)) if times} == {*range(known)}
+        assert {place for place, times in enumerate(times_shown(SceneRange(0, known), 60)) if times} == {*range(known)}
 
 
 def test_a_round_of_harder_pictures_shows_its_own_scenes_more_often():
-    assert min(times_shown(Shown(3, 4), 200)) > 30
-    times = times_shown(Shown(3, 4, harder=True), 200)
+    assert min(times_shown(SceneRange(3, 4), 200)) > 30
+    times = times_shown(SceneRange(3, 4, harder=True), 200)
     assert min(times) > 10 and 95 < times[3] < 155
 
 
@@ -104,7 +104,7 @@ def test_a_round_of_harder_pictures_is_cut_around_other_things_too():
         seen = [sample(four_scenes(), which, (1, 0, place), CUT_PX).heat[-1].max() == 1.0 for place in range(200)]
         return sum(seen)
 
-    assert middle_in_view(Shown(0, 4, harder=True)) > middle_in_view(Shown(0, 4)) + 20
+    assert middle_in_view(SceneRange(0, 4, harder=True)) > middle_in_view(SceneRange(0, 4)) + 20
 
 
 def test_a_round_of_harder_pictures_has_more_clear_ones_and_more_bad_ones():
@@ -119,8 +119,8 @@ def test_a_round_of_harder_pictures_has_more_clear_ones_and_more_bad_ones():
         both = list(zip(sharp, bright, strict=True))
         return both.count((True, True)), both.count((False, False))
 
-    clear, bad = kinds(Shown(0, 1, harder=True))
-    clear_before, bad_before = kinds(Shown(0, 1))
+    clear, bad = kinds(SceneRange(0, 1, harder=True))
+    clear_before, bad_before = kinds(SceneRange(0, 1))
     assert clear > clear_before + 10 and bad > bad_before + 10
 
 
@@ -151,7 +151,7 @@ def test_what_nobody_asks_for_is_taught_on_a_map_of_its_own():
 
 def test_labels_have_maps_of_their_own():
     for number, label in enumerate(LABELS):
-        one = shown(one_scene((Truth(label, (40.0, 60.0, 90.0, 200.0), 1.0),)), 5, 0, 1, WHOLE_PX)
+        one = shown(one_scene((LabelledBox(label, (40.0, 60.0, 90.0, 200.0), 1.0),)), 5, 0, 1, WHOLE_PX)
         assert np.unique(np.argwhere(one.heat > 0)[:, 0]).tolist() == [number]
 
 

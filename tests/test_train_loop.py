@@ -22,7 +22,7 @@ from operator_side.train_rounds import Training
 from operator_side.train_samples import CUT_PX
 from operator_side.train_scenes import DrawnScenes
 from protocol.errors import ConfigError, HardwareError
-from sim.scenes import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED_FROM, WIDTH_PX, Truth
+from sim.scenes import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED_FROM, WIDTH_PX, LabelledBox
 from tests.train_rig import weights
 from vision_side.detect.onnx_detector import SHIPPED
 
@@ -34,7 +34,7 @@ def scenes(count=4):
     for picture in pictures:
         x, y = int(draw.integers(60, 260)), int(draw.integers(60, 180))
         cv2.circle(picture, (x, y), 20, (240, 200, 20), -1)
-        truths.append((Truth("ball", (x - 20.0, y - 20.0, x + 21.0, y + 21.0), 1.0),))
+        truths.append((LabelledBox("ball", (x - 20.0, y - 20.0, x + 21.0, y + 21.0), 1.0),))
     return DrawnScenes(pictures, tuple(truths), ((),) * count, ((),) * count)
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from operator_side.train_rounds import LEAST_SHARE, WHOLE_FROM, Shown, Training
+from operator_side.train_rounds import LEAST_SHARE, WHOLE_FROM, SceneRange, Training
 
 
 @pytest.mark.parametrize("rounds", [(1000,), (1000, 600), (300, 1000, 500), (300, 400, 500, 600, 700)])
@@ -22,10 +22,10 @@ def test_each_round_has_the_rate_up_and_down_again_half_as_high_but_not_below_a_
 def test_each_round_takes_in_more_scenes_and_the_last_all(rounds, known):
     training, begin, before = Training(rounds), 0, 0
     for number, (steps, expected) in enumerate(zip(rounds, known, strict=True)):
-        shown = Shown(before, expected, harder=number >= 2)
+        shown = SceneRange(before, expected, harder=number >= 2)
         assert {training.shown_at(step, 40) for step in range(begin, begin + steps)} == {shown}
         begin, before = begin + steps, expected
-    assert training.steps == sum(rounds) and training.shown_at(0, 1) == Shown(0, 1)
+    assert training.steps == sum(rounds) and training.shown_at(0, 1) == SceneRange(0, 1)
     for step in range(training.steps):
         few = training.shown_at(step, 1)
         assert 0 <= few.newest < few.known == 1, "a single scene is shown in every round"

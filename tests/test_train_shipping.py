@@ -12,11 +12,11 @@ pytest.importorskip("onnx")
 from operator_side.train_card import Card, card_text
 from operator_side.train_export import shifted
 from operator_side.train_rounds import Training
-from operator_side.train_shipping import chosen, judged, written
+from operator_side.train_shipping import chosen_thresholds, final_report, written
 from sim.scenes import COLUMNS, LABELS
 from tests.train_rig import weights
 from vision_side.config import VisionConfig
-from vision_side.detect.choice import choose_detector
+from vision_side.detect.choice import build_detector
 from vision_side.detect.onnx_header import read_onnx_header
 
 
@@ -29,14 +29,14 @@ def told(counts, total, what):
 
 def test_weights_become_a_file_with_thresholds_and_a_card_that_is_true_of_it(tmp_path):
     counts = {}
-    thresholds = chosen(tmp_path / "unchosen.onnx", weights(), 5, 2, partial(told, counts))
+    thresholds = chosen_thresholds(tmp_path / "unchosen.onnx", weights(), 5, 2, partial(told, counts))
     assert len(thresholds) == len(LABELS) and all(0.05 < one < 0.96 for one in thresholds)
     model = tmp_path / "model.onnx"
     written(model, shifted(weights(), thresholds))
     header = read_onnx_header(model.read_bytes())
     assert header.metadata["min_score"] == "0.5" and "golden" in header.metadata
-    choose_detector(f"onnx:{model}", {}, VisionConfig())  # its own answer to the known picture is checked on the way
-    report = judged(model, 5, partial(told, counts))
+    build_detector(f"onnx:{model}", {}, VisionConfig())  # its own answer to the known picture is checked on the way
+    report = final_report(model, 5, partial(told, counts))
     assert len(counts) == 2 and all(total == sum(steps) > 0 for total, *steps in counts.values())
     assert set(report.columns) == set(COLUMNS) and report.columns["blur"]["onnx"].frames == 5
     digest = hashlib.sha256(model.read_bytes()).hexdigest()

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from operator_side.faults.wires import BenchWire
-from sim.wire import Shape, Shapes
+from sim.wire import LinkShape, LinkShapes
 from sim.wire_tun import ADDRESS_A, ADDRESS_B, why_impossible
 from tests.link_rigs import until
 
@@ -92,8 +92,8 @@ class Machines:
 @pytest.fixture(scope="module")
 def wire(tmp_path_factory):
     with BenchWire(tmp_path_factory.mktemp("wire") / "log") as running:
-        both = Shape(delay_ms=2)
-        running.shape(Shapes(ab=both, ba=both))
+        both = LinkShape(delay_ms=2)
+        running.shape(LinkShapes(ab=both, ba=both))
         yield running
 
 

@@ -7,13 +7,22 @@ import pytest
 
 from protocol.channels import CAMERA, FRAME, MISSION, REPORT, SCAN, TWIST
 from protocol.codec import decode, encode, encode_ranges
-from protocol.messages import AnswerHeader, Asked, DetectionsHeader, Echo, FrameHeader, RequestHeader, ScanHeader, Stamp
+from protocol.messages import (
+    AnswerHeader,
+    RequestId,
+    DetectionsHeader,
+    Echo,
+    FrameHeader,
+    RequestHeader,
+    ScanHeader,
+    Stamp,
+)
 from protocol.mission_messages import MissionReport, MissionRequest
 from protocol.transports.memory import MemoryNetwork
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.config import DetectorConfig, VisionConfig
 from vision_side.dry_run import AckingService
-from vision_side.pipeline import Seen
+from vision_side.pipeline import Observation
 from vision_side.reporting import LEAST_GAP_S, PERIOD_S, Reporter
 from vision_side.service import Service
 
@@ -72,10 +81,10 @@ def test_a_mission_that_is_asked_for_is_taken_up_cited_and_reported():
     bench = Bench().frames(5)
     assert bench.answer().mission is None
     bench.ask("band", 7, options={"linear_mps": 0.2})
-    assert bench.frames(6).answer().mission == Asked(session=ASKER, id=7)
+    assert bench.frames(6).answer().mission == RequestId(session=ASKER, id=7)
     report = bench.report()
     assert (report.mission, report.phase, report.refused, report.done) == ("band", "forward", "", False)
-    assert (report.asked, report.detector, report.device) == (Asked(session=ASKER, id=7), "hsv", "cpu")
+    assert (report.asked, report.detector, report.device) == (RequestId(session=ASKER, id=7), "hsv", "cpu")
     header = decode(DetectionsHeader, bench.reports[-1].header)
     assert (header.source, header.echo.channel, header.echo.seq) == ("vision", "frame", bench.seq)
     assert any("mission band, asked for by operator" in line for line in bench.said)
@@ -87,7 +96,7 @@ def test_what_is_said_again_is_taken_up_once():
         bench.ask("band", 1).frames()
         assert decode(MissionReport, bench.reports[-1].payload).phase != "switching"
     bench.ask("band", 2).frames()
-    assert bench.service._pipeline.asked == Asked(session=ASKER, id=2)
+    assert bench.service._pipeline.asked == RequestId(session=ASKER, id=2)
 
 
 @pytest.mark.parametrize(("how", "words"), [
@@ -142,7 +151,7 @@ def test_reports_come_twice_a_second_and_at_once_on_a_change_but_not_with_every_
     reporter, told = Reporter(DetectorConfig()), []
     for at in range(300):
         now_s = at / 100
-        seen = Seen("tracking" if at < 200 or at % 4 < 2 else "coasting", note=f"{at}")
+        seen = Observation("tracking" if at < 200 or at % 4 < 2 else "coasting", note=f"{at}")
         if reporter.due(now_s, "follow", seen, None, "") is not None:
             told.append(now_s)
     assert [one for one in told if one < 2] == [0.0, PERIOD_S, 2 * PERIOD_S, 3 * PERIOD_S]
@@ -151,7 +160,7 @@ def test_reports_come_twice_a_second_and_at_once_on_a_change_but_not_with_every_
 
 
 def test_a_report_says_what_a_mission_says_on_one_line_and_within_bounds():
-    report = Reporter(DetectorConfig()).due(0.0, "m" * 90, Seen("two\nlines" + "x" * 90, note="a\n" * 300), None, "")
+    report = Reporter(DetectorConfig()).due(0.0, "m" * 90, Observation("two\nlines" + "x" * 90, note="a\n" * 300), None, "")
     assert "\n" not in report.phase + report.note and decode(MissionReport, encode(report), 2048) == report
 
 

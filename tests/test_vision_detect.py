@@ -12,11 +12,11 @@ from protocol.messages import CameraModel
 from tests.vision_rig import ball_about_lens, camera, draw_ball, jpeg_of, scene
 from vision_side.config import HsvConfig, HsvRange
 from vision_side.decode import Decoder, Picture
-from vision_side.detect.colour import colour_table
-from vision_side.detect.disc import fit_circle, round_part
+from vision_side.detect.colour import color_table
+from vision_side.detect.disc import fit_circle, fit_round_part
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.port import Detection
-from vision_side.sphere import locate
+from vision_side.sphere import locate_sphere
 
 SIZES = [(320, 240), (640, 480)]
 
@@ -28,7 +28,7 @@ def detect(model: CameraModel, picture: np.ndarray) -> tuple[Detection, ...]:
 
 def errors(model: CameraModel, x_m: float, y_m: float, picture: np.ndarray) -> tuple[float, float]:
     """Bearing error in degrees and distance error as a fraction, about the lens."""
-    seen = locate(detect(model, picture)[0], model, 0.1)
+    seen = locate_sphere(detect(model, picture)[0], model, 0.1)
     assert seen is not None
     true = math.hypot(x_m - model.x_m, y_m)
     bearing = math.atan2(seen.y_m, seen.x_m - model.x_m) - math.atan2(y_m, x_m - model.x_m)
@@ -136,12 +136,12 @@ def test_no_picture_makes_the_detector_raise(seed: int, rows: int, columns: int)
     for one in HsvDetector(HsvConfig()).detect(Picture(np.ascontiguousarray(blocks[:rows, :columns]), 1)):
         assert 0 <= one.x1_px < one.x2_px <= columns
         assert 0 <= one.y1_px < one.y2_px <= rows
-        locate(one, camera(), 0.1)
+        locate_sphere(one, camera(), 0.1)
 
 
 @given(hue=st.integers(0, 359), low=st.integers(0, 360), high=st.integers(0, 360))
 def test_hue_ranges_wrap(hue: int, low: int, high: int) -> None:
-    table = colour_table((HsvRange(hue_low_deg=low, hue_high_deg=high),))
+    table = color_table((HsvRange(hue_low_deg=low, hue_high_deg=high),))
     bgr = (cv2.cvtColor(np.array([[[hue, 0.9, 0.9]]], np.float32), cv2.COLOR_HSV2BGR)[0, 0] * 255).astype(int)
     code = (bgr[0] >> 3) | (bgr[1] >> 2 << 5) | (bgr[2] >> 3 << 11)
     margin = 3  # a BGR565 code stands for colours up to this far apart
@@ -164,7 +164,7 @@ def test_what_cuts_a_disc_off_is_left_out_of_its_circle(cx: float, cy: float, ra
     across = np.minimum(np.cos(turn - start), 0.7)  # a straight cut, at 0.7 radii from the centre
     along = np.sin(turn - start)
     x, y = across * math.cos(start) - along * math.sin(start), across * math.sin(start) + along * math.cos(start)
-    part = round_part(np.column_stack([cx + radius * x, cy + radius * y]), 3.0, 0.07)
+    part = fit_round_part(np.column_stack([cx + radius * x, cy + radius * y]), 3.0, 0.07)
     assert part is not None
     assert part[0] == pytest.approx((cx, cy, radius), abs=0.035 * radius)
     assert 60 <= len(part[1]) <= 120
@@ -199,7 +199,7 @@ def test_a_box_alone_still_locates(x_m: float, share: float) -> None:
     cx, cy = model.cx_px + model.fx_px * right / ahead, model.cy_px + model.fy_px * down / ahead
     half_px = model.fx_px * half
     box = Detection(cx - half_px, cy - half_px, cx + half_px, cy + half_px, 0.9, "ball")
-    seen = locate(box, model, 0.1)
+    seen = locate_sphere(box, model, 0.1)
     if seen is not None:
         assert math.hypot(seen.x_m, seen.y_m) == pytest.approx(math.hypot(x_m, x_m * share), rel=0.25, abs=0.1)
 
@@ -214,7 +214,7 @@ def test_distortion_is_undone() -> None:
     points = np.column_stack([flat, np.ones(len(flat))])
     outline = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(bent.distortion))[0][:, 0]
     moved = Detection(found.x1_px, found.y1_px, found.x2_px, found.y2_px, 1.0, "ball", found.circle, outline)
-    first, second = locate(found, straight, 0.1), locate(moved, bent, 0.1)
+    first, second = locate_sphere(found, straight, 0.1), locate_sphere(moved, bent, 0.1)
     assert first is not None and second is not None
     assert (second.x_m, second.y_m) == pytest.approx((first.x_m, first.y_m), abs=0.002)
 
@@ -222,6 +222,6 @@ def test_distortion_is_undone() -> None:
 def test_detections_reach_a_distorted_camera_as_they_are() -> None:
     bent = camera().model_copy(update={"distortion": (1e-9,)})
     found = detect(bent, scene(bent, 0.7, 0.3))[0]
-    first, second = locate(found, camera(), 0.1), locate(found, bent, 0.1)
+    first, second = locate_sphere(found, camera(), 0.1), locate_sphere(found, bent, 0.1)
     assert first is not None and second is not None
     assert (second.x_m, second.y_m) == pytest.approx((first.x_m, first.y_m), abs=1e-6)

@@ -3,18 +3,18 @@
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.messages import STILL, Asked, FrameHeader, Twist
+from protocol.messages import STILL, RequestId, FrameHeader, Twist
 from tests.mission_contract import CAMERA
 from tests.vision_rig import jpeg_of, scene
 from vision_side.config import MissionConfig, VisionConfig
-from vision_side.missions.choice import choose
-from vision_side.missions.duty import SETTLE_S, Duty
+from vision_side.missions.choice import mission_spec
+from vision_side.missions.duty import SETTLE_S, MissionSwitch
 from vision_side.missions.port import Plan, View
 from vision_side.pipeline import Frame, Pipeline
 
 CONFIG = VisionConfig()
 FRAME_US = 33_333
-ASKED = Asked(session="0000feed", id=1)
+ASKED = RequestId(session="0000feed", id=1)
 
 
 class Scripted:
@@ -43,7 +43,7 @@ class Unbuildable(Scripted):
 
 
 def scripted(name="Scripted", **options):
-    return choose(f"{__name__}:{name}", {"options": options}, CONFIG)
+    return mission_spec(f"{__name__}:{name}", {"options": options}, CONFIG)
 
 
 def view(seq, moving=(0.0, 0.0), applied=(0.0, 0.0), dt_s=0.033):
@@ -52,7 +52,7 @@ def view(seq, moving=(0.0, 0.0), applied=(0.0, 0.0), dt_s=0.033):
 
 
 def test_a_switch_stands_still_until_the_wheels_do_and_the_new_one_begins_afresh():
-    duty = Duty(scripted(), CAMERA)
+    duty = MissionSwitch(scripted(), CAMERA)
     assert duty.step(view(1)).twist.linear_mps == 0.3
     duty.switch(scripted(speed=-0.2))
     assert duty.chosen.config.options == {"speed": -0.2}
@@ -68,14 +68,14 @@ def test_a_switch_stands_still_until_the_wheels_do_and_the_new_one_begins_afresh
 
 def test_a_robot_that_stands_is_waited_for_no_longer_than_a_command_takes():
     """What was told before may still be on its way: standing in one picture is not yet standing."""
-    duty = Duty(scripted(), CAMERA)
+    duty = MissionSwitch(scripted(), CAMERA)
     duty.step(view(1))
     duty.switch(scripted(speed=0.1))
     assert [duty.step(view(seq)).twist.linear_mps for seq in range(2, 5)] == [0.0, 0.1, 0.1]
 
 
 def test_a_robot_that_will_not_stand_is_waited_for_a_second():
-    duty = Duty(scripted(), CAMERA)
+    duty = MissionSwitch(scripted(), CAMERA)
     duty.switch(scripted(speed=0.1))
     waited = [duty.step(view(seq, moving=(0.3, 0.0), dt_s=0.125)).twist.linear_mps for seq in range(1, 11)]
     frames = round(SETTLE_S / 0.125)
@@ -83,7 +83,7 @@ def test_a_robot_that_will_not_stand_is_waited_for_a_second():
 
 
 def test_a_mission_that_is_over_stays_over_and_still():
-    duty = Duty(scripted(done_at=2), CAMERA)
+    duty = MissionSwitch(scripted(done_at=2), CAMERA)
     duty.step(view(1))
     for seq in range(2, 6):
         plan = duty.step(view(seq))
@@ -99,7 +99,7 @@ def test_a_mission_that_is_over_stays_over_and_still():
     ({"speed": float("inf")}, "ValidationError"),
 ])
 def test_a_mission_that_breaks_is_over_and_the_robot_stands(options, words):
-    duty = Duty(scripted(**options), CAMERA)
+    duty = MissionSwitch(scripted(**options), CAMERA)
     plans = [duty.step(view(seq)) for seq in range(1, 5)]
     assert [plan.twist for plan in plans[1:]] == [STILL] * 3
     assert plans[-1].done and plans[-1].phase == "failed"
@@ -107,7 +107,7 @@ def test_a_mission_that_breaks_is_over_and_the_robot_stands(options, words):
 
 
 def test_a_mission_that_cannot_even_begin_is_over():
-    duty = Duty(scripted("Unbuildable"), CAMERA)
+    duty = MissionSwitch(scripted("Unbuildable"), CAMERA)
     assert duty.step(view(1)).note == "ValueError: cannot begin"
     duty.switch(scripted())
     assert [duty.step(view(seq)).twist.linear_mps for seq in range(2, 5)][-1] == 0.3

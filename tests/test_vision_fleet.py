@@ -12,7 +12,7 @@ from protocol.errors import ConfigError
 from protocol.messages import AnswerHeader, FrameHeader, Stamp, State, Status
 from protocol.transports.link import LatestSlot
 from protocol.transports.zenoh import open_zenoh
-from protocol.transports.zenoh_site import open_site
+from protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import JPEG
 from vision_side.config import VisionConfig
@@ -48,7 +48,7 @@ def fleet():
     """A vision for `r*` that listens, its endpoint, and all it said."""
     endpoint, said, ending = free_endpoint(), [], threading.Event()
     config = VisionConfig(robot="r*", listen=(endpoint,), connect=())
-    with open_site("r*", listen=[endpoint], role="vision") as site:
+    with open_fleet("r*", listen=[endpoint], role="vision") as site:
         running = Fleet(config, site, said.append)
         thread = threading.Thread(target=running.serve, args=(ending,), daemon=True)
         thread.start()
@@ -135,4 +135,4 @@ def test_a_robot_may_come_later():
 
 def test_several_robots_need_zenoh():
     with pytest.raises(ConfigError, match="need Zenoh"):
-        open_site("r*", connect=["ws://127.0.0.1:9090"])
+        open_fleet("r*", connect=["ws://127.0.0.1:9090"])

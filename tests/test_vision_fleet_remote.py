@@ -12,14 +12,14 @@ from protocol.config import Config
 from protocol.messages import FrameHeader, Stamp, State, Status
 from protocol.transports.memory import MemoryNetwork
 from protocol.transports.zenoh import open_zenoh
-from protocol.transports.zenoh_site import open_site
+from protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 from tests.remote_rig import BALL_JPEG, MODEL, Server, box, http_reply, said
 from vision_side.config import DetectorConfig, HsvConfig, VisionConfig
 from vision_side.detect.around import close_detector
 from vision_side.detect.choice import configured_detector
 from vision_side.detect.local import Hsv
-from vision_side.detector_service import DetectorService, Serving
+from vision_side.detector_service import DetectorService, ServingOptions
 from vision_side.fleet import Fleet
 from vision_side.service import Service
 
@@ -77,8 +77,8 @@ def _by_http(ending, endpoint):
 
 def _by_zenoh(ending, endpoint):
     """A detector service for the others."""
-    site = ending.enter_context(open_site("ra*", connect=[endpoint], role="detector"))
-    service = DetectorService(site, Hsv(Hsv.Config(hsv=HsvConfig())), Serving("hsv"), lambda line: None)
+    site = ending.enter_context(open_fleet("ra*", connect=[endpoint], role="detector"))
+    service = DetectorService(site, Hsv(Hsv.Config(hsv=HsvConfig())), ServingOptions("hsv"), lambda line: None)
     _served(ending, service)
     return "zenoh"
 
@@ -99,7 +99,7 @@ def shown():
 
         def show(eyes, fallback):
             endpoint = free_endpoint()
-            site = ending.enter_context(open_site("r*", listen=[endpoint], role="vision"))
+            site = ending.enter_context(open_fleet("r*", listen=[endpoint], role="vision"))
             detector = DetectorConfig(kind=eyes(ending, endpoint), fallback=fallback, deadline_s=DEADLINE_S)
             config = VisionConfig(robot="r*", camera=MODEL, detector=detector)
             first = configured_detector(config)

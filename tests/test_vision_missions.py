@@ -16,7 +16,7 @@ from vision_side import plugin_choice
 from vision_side.config import VisionConfig
 from vision_side.detect.port import Circle, Detection
 from vision_side.missions import choice
-from vision_side.missions.choice import BUILT_IN, choose, configured, requested
+from vision_side.missions.choice import BUILT_IN, mission_spec, configured_mission, requested_mission
 from vision_side.missions.port import Plan, View
 
 CONFIG = VisionConfig()
@@ -31,13 +31,13 @@ def options_of(name: str) -> dict:
 @pytest.mark.parametrize("seed", [7, 19])
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_every_mission_keeps_the_contract(name, seed):
-    check_mission(choose(name, options_of(name), CONFIG), frames=120, seed=seed)
+    check_mission(mission_spec(name, options_of(name), CONFIG), frames=120, seed=seed)
 
 
 class Raising:
     """A mission that breaks the contract."""
 
-    Config = BUILT_IN and choose("band", {}, CONFIG).plugin.Config
+    Config = BUILT_IN and mission_spec("band", {}, CONFIG).plugin.Config
 
     def __init__(self, config, camera):
         self.count = 0
@@ -49,7 +49,7 @@ class Raising:
 
 def test_the_contract_finds_what_is_broken():
     with pytest.raises(AssertionError, match="one line"):
-        check_mission(choose(f"{__name__}:Raising", {}, CONFIG))
+        check_mission(mission_spec(f"{__name__}:Raising", {}, CONFIG))
 
 
 # --- choosing --------------------------------------------------------------------------------------------------------
@@ -69,7 +69,7 @@ def test_the_contract_finds_what_is_broken():
 ])
 def test_what_cannot_be_chosen_is_one_line_that_says_why(kind, options, words):
     with pytest.raises(ConfigError) as error:
-        choose(kind, options, CONFIG)
+        mission_spec(kind, options, CONFIG)
     assert words in str(error.value) and len(str(error.value).splitlines()) == 1
 
 
@@ -78,30 +78,30 @@ def test_an_entry_point_gives_a_mission_its_name(monkeypatch):
     broken = EntryPoint("broken", "examples.nothing:There", choice.GROUP)
     monkeypatch.setattr(plugin_choice, "entry_points", lambda group: [shy, broken] if group == choice.GROUP else [])
     monkeypatch.chdir(ROOT)
-    assert requested(MissionRequest(id=1, name="shy", options={"near_px": 12}), CONFIG).config.near_px == 12
+    assert requested_mission(MissionRequest(id=1, name="shy", options={"near_px": 12}), CONFIG).config.near_px == 12
     with pytest.raises(ConfigError, match="'broken' cannot be loaded"):
-        choose("broken", {}, CONFIG)
+        mission_spec("broken", {}, CONFIG)
     with pytest.raises(ConfigError, match="did you mean 'shy'"):
-        choose("shi", {}, CONFIG)
+        mission_spec("shi", {}, CONFIG)
 
 
 def test_a_mission_begins_with_the_sections_of_vision_and_its_options_lie_over_them():
     config = VisionConfig.model_validate({"target": {"stand_off_m": 0.5, "radius_m": 0.07}, "mission": {
         "options": {"target": {"stand_off_m": 1.5}, "steer": {"bearing_kp": 2}}}})
-    made = configured(config).config
+    made = configured_mission(config).config
     assert (made.target.stand_off_m, made.target.radius_m, made.steer.bearing_kp) == (1.5, 0.07, 2.0)
     assert made.track == config.track
 
 
 def test_what_is_asked_for_lies_over_what_is_configured_for_the_same_mission():
     config = VisionConfig.model_validate({"mission": {"kind": "band", "options": {"averaged": 3, "linear_mps": 0.3}}})
-    asked = requested(MissionRequest(id=1, name="band", options={"linear_mps": 0.2}), config)
+    asked = requested_mission(MissionRequest(id=1, name="band", options={"linear_mps": 0.2}), config)
     assert (asked.config.averaged, asked.config.linear_mps) == (3, 0.2)
-    assert requested(MissionRequest(id=1, name="follow", options={"steer.bearing_kp": 3}), config
+    assert requested_mission(MissionRequest(id=1, name="follow", options={"steer.bearing_kp": 3}), config
                      ).config.steer.bearing_kp == 3
     assert config.mission.options == {"averaged": 3, "linear_mps": 0.3}
     others = config.model_copy(update={"missions": {"goto": {"sight_m": 2.0, "waypoints": [[9, 9]]}}})
-    goto = requested(MissionRequest(id=1, name="goto", waypoints=((1.0, 2.0),)), others)
+    goto = requested_mission(MissionRequest(id=1, name="goto", waypoints=((1.0, 2.0),)), others)
     assert goto.config.waypoints == ((1.0, 2.0),) and goto.wants_scan and not goto.needs_camera
     assert goto.config.sight_m == 2.0
 
@@ -125,7 +125,7 @@ def twist_of(mission, *seen: View) -> tuple[float, float]:
 
 
 def mission(name: str, **options):
-    return choose(name, options, CONFIG).build(CAMERA)
+    return mission_spec(name, options, CONFIG).build(CAMERA)
 
 
 @pytest.mark.parametrize(("x_px", "radius_px", "linear_angular"), [
@@ -206,8 +206,8 @@ def test_the_page_names_every_mission_and_shows_its_example_as_it_is(monkeypatch
     shown = re.search(r"```python\n(class Shy:.*?)```", PAGE, re.DOTALL)[1]
     assert shown.strip() in (ROOT / "examples" / "my_mission.py").read_text("utf-8") and shown.count("\n") <= 30
     monkeypatch.chdir(ROOT)
-    check_mission(choose("examples.my_mission:Shy", {"near_px": 30}, CONFIG))
-    law = choose("examples.my_mission:Shy", {}, CONFIG).build(CAMERA)
+    check_mission(mission_spec("examples.my_mission:Shy", {"near_px": 30}, CONFIG))
+    law = mission_spec("examples.my_mission:Shy", {}, CONFIG).build(CAMERA)
     assert twist_of(law, view(ball(200, 50)))[0] == -0.15 and twist_of(law, view(ball(100, 10)))[1] > 0
 
 
@@ -216,5 +216,5 @@ def test_the_sane_numbers_of_the_page_are_options_of_their_missions():
     blocks = [tomllib.loads(text)["mission"] for text in laws]
     assert [one["kind"] for one in blocks] == ["band", "pixel-pi", "pixel-p"]
     for one in blocks:
-        chosen = choose(one["kind"], one["options"], CONFIG)
+        chosen = mission_spec(one["kind"], one["options"], CONFIG)
         assert chosen.config != chosen.plugin.Config()

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 import vision_side
 from protocol.channels import MAX_HEADER_BYTES
 from protocol.codec import decode, encode
-from protocol.messages import STILL, AnswerHeader, Asked, FrameHeader
+from protocol.messages import STILL, AnswerHeader, RequestId, FrameHeader
 from protocol.twist_text import format_twist
 from tests.vision_rig import Rig, camera, eight, jpeg_of, scene
 from vision_side.config import VisionConfig
-from vision_side.pipeline import Answer, Frame, Pipeline, Seen, answer_header, encode_answer
+from vision_side.pipeline import PipelineAnswer, Frame, Pipeline, Observation, answer_header, encode_answer
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -30,7 +30,7 @@ def pipeline() -> Pipeline:
     return Pipeline(VisionConfig(), MODEL)
 
 
-def phases(pictures: list[bytes]) -> list[Answer]:
+def phases(pictures: list[bytes]) -> list[PipelineAnswer]:
     one = pipeline()
     return [one.step(Frame(header(seq), jpeg)) for seq, jpeg in enumerate(pictures, 1)]
 
@@ -95,7 +95,7 @@ def test_the_same_frames_give_the_same_twists_byte_for_byte() -> None:
             super()._set_up()
             step = self.pipeline.step
 
-            def recorded(frame: Frame) -> Answer:
+            def recorded(frame: Frame) -> PipelineAnswer:
                 answer = step(frame)
                 frames.append(frame)
                 twists.append(format_twist(answer.twist) if answer.twist else b"")
@@ -137,8 +137,8 @@ COUNTS = st.integers(0, 2**53 - 1)
 SESSIONS = st.from_regex(r"[0-9a-f]{8}", fullmatch=True)
 
 
-ANSWERS = st.none() | st.builds(Answer, twist=st.none(), seen=st.just(Seen("tracking")), scan=st.none() | COUNTS,
-                                mission=st.none() | st.builds(Asked, session=SESSIONS, id=COUNTS))
+ANSWERS = st.none() | st.builds(PipelineAnswer, twist=st.none(), seen=st.just(Observation("tracking")), scan=st.none() | COUNTS,
+                                mission=st.none() | st.builds(RequestId, session=SESSIONS, id=COUNTS))
 
 
 @given(SESSIONS, SESSIONS, st.tuples(COUNTS, COUNTS, COUNTS, COUNTS), ANSWERS)

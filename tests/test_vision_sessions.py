@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from vision_side.sessions import GOES_ON_US, KEPT, SILENT_US, Sessions
+from vision_side.sessions import GOES_ON_US, KEPT, SILENT_US, SessionSelector
 
 A, B, C = "0000aaaa", "0000bbbb", "0000cccc"
 FRAME_US = 33_333
@@ -14,7 +14,7 @@ class Watch:
     """Plays frames of several robots, each with its own clock, at one `Sessions`."""
 
     def __init__(self):
-        self.sessions = Sessions()
+        self.sessions = SessionSelector()
         self.now_us = 50_000_000
 
     def frame(self, session, late_us=0):

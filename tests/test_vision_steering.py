@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from protocol.messages import Pose, Twist
 from vision_side.config import LatencyConfig, SearchConfig, SteerConfig, TrackConfig
 from vision_side.detect.port import Detection
-from vision_side.foretell import Foretelling
+from vision_side.foretell import MotionPredictor
 from vision_side.search import Search
 from vision_side.sphere import Sighting
 from vision_side.steer import Aim, Steer
@@ -91,7 +91,7 @@ def test_a_pushed_target_stays_in_the_gate(push_mps: float) -> None:
 
 def test_unknown_latency_is_estimated_low_and_a_measured_one_approached_and_bounded() -> None:
     config = LatencyConfig(actuation_s=0.0)
-    one = Foretelling(config)
+    one = MotionPredictor(config)
     one.measure(None, DT_S)
     assert one.latency_s == config.first_guess_s
     for _ in range(300):
@@ -104,7 +104,7 @@ def test_unknown_latency_is_estimated_low_and_a_measured_one_approached_and_boun
 
 def test_commands_under_way_are_foretold() -> None:
     config = LatencyConfig(first_guess_s=0.2, actuation_s=0.0, angular_acceleration_rad_s2=200)
-    one = Foretelling(config)
+    one = MotionPredictor(config)
     for step in range(30):
         one.sent(step * 33_333, Twist(linear_mps=0.0, angular_rad_s=1.0))
     motion = one.motion(30 * 33_333, HERE, (0.0, 1.0), (0.0, 1.0))
@@ -112,7 +112,7 @@ def test_commands_under_way_are_foretold() -> None:
 
 
 def test_a_held_robot_is_foretold_to_stay() -> None:
-    one = Foretelling(LatencyConfig())
+    one = MotionPredictor(LatencyConfig())
     for step in range(30):
         one.sent(step * 33_333, Twist(linear_mps=0.5, angular_rad_s=1.0))
     assert one.motion(1_000_000, (1.0, 2.0, 0.5), (0.0, 0.0), (0.0, 0.0)).pose == (1.0, 2.0, 0.5)

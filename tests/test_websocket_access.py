@@ -15,16 +15,16 @@ from protocol.transports.websocket import open_websocket
 from protocol.transports.websocket_access import (
     NO_TOKEN,
     NOT_LISTED,
-    address_problem,
+    client_address_problem,
     check_listening,
-    grant_of,
-    role_of,
+    grants_of_role,
+    role_of_token,
 )
-from protocol.transports.websocket_doorlog import DoorLog
-from protocol.transports.websocket_endpoints import parse_endpoint, with_allowed
+from protocol.transports.websocket_doorlog import BurstLimiter
+from protocol.transports.websocket_endpoints import parse_websocket_endpoint, with_allowed
 from protocol.transports.websocket_keys import own_token, read_tokens
 from protocol.transports.websocket_peer import NOT_GRANTED
-from protocol.transports.websocket_seat import SEAT_US, Seat
+from protocol.transports.websocket_seat import DRIVER_SLOT_US, DriverSlot
 from robot_side.config import RobotConfig
 from tests.link_rigs import claim, until
 from tests.websocket_rig import V1, free_ws
@@ -53,7 +53,7 @@ BEYOND = ("ws://0.0.0.0:9090", "ws://[::]:9090", "wss://192.168.1.7:9090", "ws:/
 
 @pytest.mark.parametrize("text", LOOPBACK)
 def test_on_loopback_nothing_is_asked_for(text):
-    check_listening(parse_endpoint(text), {})
+    check_listening(parse_websocket_endpoint(text), {})
 
 
 @pytest.mark.parametrize("text", BEYOND)
@@ -62,7 +62,7 @@ def test_beyond_loopback_a_token_is_demanded_in_one_line(text):
         open_websocket("r1", listen=text)
     assert "\n" not in str(why.value)
     assert text in str(why.value)
-    check_listening(parse_endpoint(text), {"a" * 16: "vision"})
+    check_listening(parse_websocket_endpoint(text), {"a" * 16: "vision"})
 
 
 def test_beyond_loopback_the_older_dialect_demands_a_list_in_one_line():
@@ -70,7 +70,7 @@ def test_beyond_loopback_the_older_dialect_demands_a_list_in_one_line():
     with pytest.raises(ConfigError, match="clients that carry no token: list who may come in") as why:
         open_websocket("r1", listen=here)
     assert f'legacy.allow_from = ["192.168.1.7"] or {here}&from=192.168.1.7' in str(why.value)
-    check_listening(parse_endpoint(f"{here}&from=192.168.1.7"), {})
+    check_listening(parse_websocket_endpoint(f"{here}&from=192.168.1.7"), {})
 
 
 # --- the list --------------------------------------------------------------------------------------------------------
@@ -85,11 +85,11 @@ def test_beyond_loopback_the_older_dialect_demands_a_list_in_one_line():
     ],
 )  # fmt: skip
 def test_addresses_and_networks(address, listed, may):
-    assert (address_problem(address, listed) == "") is may
+    assert (client_address_problem(address, listed) == "") is may
 
 
 def test_the_list_stands_in_the_endpoint():
-    end = parse_endpoint("ws-legacy://0.0.0.0:9091?dashed&from=192.168.1.7,10.0.0.1/8")
+    end = parse_websocket_endpoint("ws-legacy://0.0.0.0:9091?dashed&from=192.168.1.7,10.0.0.1/8")
     assert end.allow_from == ("192.168.1.7/32", "10.0.0.0/8")
     assert end.legacy.dashed
     assert with_allowed("ws-legacy://h:1", ["a", "b"]) == "ws-legacy://h:1?from=a,b"
@@ -112,7 +112,7 @@ def test_a_robots_list_is_written_into_its_endpoints():
 )
 def test_a_bad_option_is_refused(text):
     with pytest.raises(ConfigError):
-        parse_endpoint(f"ws-legacy://127.0.0.1:9091?{text}")
+        parse_websocket_endpoint(f"ws-legacy://127.0.0.1:9091?{text}")
 
 
 def test_who_is_not_listed_is_told_why_and_the_log_tells_of_few(capfd):
@@ -144,7 +144,7 @@ def test_who_is_listed_comes_in():
 
 
 def test_the_log_tells_of_ten_a_second_and_counts_the_rest():
-    log = DoorLog()
+    log = BurstLimiter()
     told = [line for now_us in range(0, 2_000_000, 10_000) if (line := log.line("knock", now_us))]
     assert told == ["knock"] * 10 + ["knock (90 more before)"] + ["knock"] * 9
 
@@ -186,7 +186,7 @@ TOKEN = TOKENS["vision"]
     ],
 )  # fmt: skip
 def test_a_token_is_shown_once_in_one_of_two_ways(authorizations, offers, role):
-    assert role_of({token: name for name, token in TOKENS.items()}, authorizations, offers) == role
+    assert role_of_token({token: name for name, token in TOKENS.items()}, authorizations, offers) == role
 
 
 def test_a_token_opens_the_door_and_nothing_else_does(keys, capfd):
@@ -219,12 +219,12 @@ _OF_VISION = ("twist", "ack", "detections", "report", "overlay", "preview")
 
 
 def test_a_role_may_publish_what_the_table_of_channels_gives_it():
-    assert grant_of("vision") == {(name, "vision") for name in _OF_VISION}
+    assert grants_of_role("vision") == {(name, "vision") for name in _OF_VISION}
     said = {("twist", "teleop"), ("request", "operator"), ("request", "teleop"), ("mission", "operator")}
-    assert said < grant_of("operator")
-    assert ("report", "operator") not in grant_of("operator")
-    assert grant_of("viewer") == frozenset()
-    assert {("frame",), ("status",)} < grant_of("robot")
+    assert said < grants_of_role("operator")
+    assert ("report", "operator") not in grants_of_role("operator")
+    assert grants_of_role("viewer") == frozenset()
+    assert {("frame",), ("status",)} < grants_of_role("robot")
 
 
 @pytest.mark.parametrize("role", TOKENS)
@@ -239,12 +239,12 @@ def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role, capfd):
             client.send('{"robot":"r1","session":"0000beef","role":"teleop","wants":["status"]}')
             for channel, source in sent:
                 client.send(claim(f"sightline/r1/{channel}/{source}", b"", b""))
-            allowed = [pair for pair in sent if pair in grant_of(role)]
+            allowed = [pair for pair in sent if pair in grants_of_role(role)]
             assert until(lambda: len(heard) == len(allowed) and robot.refused[NOT_GRANTED] == len(sent) - len(allowed))
             assert heard == allowed
             assert robot.has_listener(STATUS)  # everybody may watch
             # Told once each, at once, ten a second; an acknowledgement that returns no credit is not worth a word.
-            forbidden = {"/".join(pair) for pair in sent if pair not in grant_of(role) and pair[0] != "ack"}
+            forbidden = {"/".join(pair) for pair in sent if pair not in grants_of_role(role) and pair[0] != "ack"}
             told = [line for line in capfd.readouterr().err.splitlines() if line.startswith("refused ")]
             named = [line.split()[1] for line in told]
             assert set(named) <= forbidden and len(set(named)) == len(named) >= min(10, len(forbidden))
@@ -255,15 +255,15 @@ def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role, capfd):
 
 
 def test_the_seat_is_the_first_s_until_it_leaves_or_is_silent_for_a_second():
-    seat = Seat()
-    claims = ("a", 0), ("b", 1), ("a", 900_000), ("b", SEAT_US)
+    seat = DriverSlot()
+    claims = ("a", 0), ("b", 1), ("a", 900_000), ("b", DRIVER_SLOT_US)
     assert [seat.claim(who, now_us) for who, now_us in claims] == ["a"] * 4
-    assert seat.claim("b", 900_000 + SEAT_US - 1) == "a"
-    assert seat.claim("b", 900_000 + SEAT_US) == "b"
+    assert seat.claim("b", 900_000 + DRIVER_SLOT_US - 1) == "a"
+    assert seat.claim("b", 900_000 + DRIVER_SLOT_US) == "b"
     seat.leave("a")
-    assert seat.claim("a", 900_000 + SEAT_US) == "b"
+    assert seat.claim("a", 900_000 + DRIVER_SLOT_US) == "b"
     seat.leave("b")
-    assert seat.claim("a", 900_000 + SEAT_US) == "a"
+    assert seat.claim("a", 900_000 + DRIVER_SLOT_US) == "a"
 
 
 def test_one_client_drives_and_the_rest_only_watch(capfd):

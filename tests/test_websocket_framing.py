@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from protocol.channels import CHANNELS, MAX_HEADER_BYTES, TWIST, key_for
 from protocol.errors import WireError
-from protocol.refusals import Refusal
-from protocol.transports.websocket_framing import MAX_BLOCK_BYTES, Packet, pack, parse_hello, unpack
+from protocol.refusals import RejectReason
+from protocol.transports.websocket_framing import MAX_BLOCK_BYTES, IncomingMessage, pack, parse_hello, unpack
 
 ROLES = st.from_regex(r"[a-z][a-z0-9_]{0,15}", fullmatch=True)
 HEADERS = st.one_of(
@@ -33,7 +33,7 @@ def test_a_message_arrives_as_it_was_sent(channel, role, source, header, payload
         header = b""  # the source in a header is the message's; that has a test of its own
     source = source if channel.has_source else ""
     message = pack(channel, source, role, header, payload)
-    assert unpack(message, "r1", role) == Packet(key_for("r1", channel, source), header, payload)
+    assert unpack(message, "r1", role) == IncomingMessage(key_for("r1", channel, source), header, payload)
     assert len(message) <= 2 + MAX_BLOCK_BYTES + len(payload)
 
 
@@ -45,7 +45,7 @@ def test_a_usual_header_is_one_json_object_with_the_channel_first():
 
 def test_fields_may_come_in_any_order_and_with_blanks():
     block = b'{ "v": 1, "session": "4e5f6071", "source": "teleop", "seq": 7, "channel": "twist" }'
-    assert unpack(framed(block), "r1", "vision") == Packet("sightline/r1/twist/teleop", block, b"0|0")
+    assert unpack(framed(block), "r1", "vision") == IncomingMessage("sightline/r1/twist/teleop", block, b"0|0")
 
 
 def test_the_source_is_that_of_the_header_else_that_of_the_hello():
@@ -60,7 +60,7 @@ def test_a_source_in_the_header_of_what_comes_from_a_robot_means_nothing():
 
 def test_a_header_that_cannot_be_read_is_for_the_receiver_to_refuse():
     packet = unpack(framed(b'{"channel":"twist","v":1,'), "r1", "vision")
-    assert packet == Packet("sightline/r1/twist/vision", b'{"v":1,', b"0|0")
+    assert packet == IncomingMessage("sightline/r1/twist/vision", b'{"v":1,', b"0|0")
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_a_header_that_cannot_be_read_is_for_the_receiver_to_refuse():
 def test_broken_framing_is_refused(message):
     with pytest.raises(WireError) as refusal:
         unpack(message, "r1", "vision")
-    assert refusal.value.reason is Refusal.MALFORMED
+    assert refusal.value.reason is RejectReason.MALFORMED
 
 
 @given(st.binary(max_size=200) | st.binary(max_size=100).map(framed))
@@ -80,7 +80,7 @@ def test_any_bytes_are_a_packet_or_a_wire_error(message):
     try:
         assert unpack(message, "r1", "vision").key.startswith("sightline/r1/")
     except WireError as refusal:
-        assert refusal.reason is Refusal.MALFORMED
+        assert refusal.reason is RejectReason.MALFORMED
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from protocol.channels import STATUS, TWIST
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link_rules import INEXACT_KEY, OVERSIZE
 from protocol.transports.websocket import open_websocket
 from protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 STRANGERS = Path(__file__).parent / "strangers"
 COUNT = 10_000
 DOCUMENTED = {BAD_FRAMING, BAD_HELLO, OTHER_ROBOT, OVERSIZE, INEXACT_KEY, CROSS_SITE, TOO_MANY_CLIENTS}
-DOCUMENTED |= {WRONG_SUBPROTOCOL, SILENT, *Refusal}
+DOCUMENTED |= {WRONG_SUBPROTOCOL, SILENT, *RejectReason}
 
 
 class EchoingRobot:

@@ -13,7 +13,7 @@ from websockets.sync.client import connect
 from protocol.channels import ACK, DETECTIONS, FRAME, STATUS, TWIST
 from protocol.codec import decode, encode
 from protocol.messages import AnswerHeader, Detections, DetectionsHeader, FrameHeader
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link import Message
 from protocol.transports.link_rules import OVERSIZE
 from protocol.transports.websocket import open_websocket
@@ -117,11 +117,11 @@ def test_boxes_come_in_as_a_guests_detections_of_the_picture_it_was_sent_and_go_
             assert (boxes.width_px, boxes.height_px, corners) == (16, 16, [(8, 4, 16, 12), (0, 0, 8, 16)])
             assert decode(AnswerHeader, acks.take(2).header).echo.seq == 8
             client.send("0.1,0,0.2,1")  # an answer to nothing
-            assert until(lambda: robot.refused == {Refusal.UNKNOWN_FRAME: 1})
+            assert until(lambda: robot.refused == {RejectReason.UNKNOWN_FRAME: 1})
             robot.publish(FRAME, encode(header_of(9)), SMALL_JPEG)
             client.recv(2)
             client.send("0.1,0,0.2,7")
-            assert until(lambda: robot.refused[Refusal.MALFORMED] == 1)
+            assert until(lambda: robot.refused[RejectReason.MALFORMED] == 1)
             robot.publish(FRAME, encode(header_of(10)), SMALL_JPEG)
             client.recv(2)
             client.send("")  # looked, and saw nothing

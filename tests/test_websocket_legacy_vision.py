@@ -12,11 +12,11 @@ from websockets.sync.server import serve
 from protocol.channels import ACK, CAMERA, FRAME, TWIST
 from protocol.codec import decode
 from protocol.messages import FrameHeader
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link_rules import OVERSIZE
 from protocol.transports.websocket import open_websocket
 from protocol.transports.websocket_dialects import BAD_FRAMING
-from protocol.transports.websocket_endpoints import parse_endpoint
+from protocol.transports.websocket_endpoints import parse_websocket_endpoint
 from tests.link_rigs import until
 from tests.test_websocket_legacy import JPEG, TEXT, free_legacy
 
@@ -27,7 +27,7 @@ class OldRobot:
     def __init__(self, endpoint: str) -> None:
         self.said: list[str | bytes] = []
         self.clients = []
-        address = parse_endpoint(endpoint)
+        address = parse_websocket_endpoint(endpoint)
         self._server = serve(self._handle, address.host, address.port, compression=None)
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
@@ -109,7 +109,7 @@ def test_a_text_that_is_no_picture_is_counted_and_skipped(text):
         robot.send(TEXT)
         assert frames.take(2).payload == JPEG
         assert frames.dropped == 0
-        assert vision.refused == {Refusal.MALFORMED: 1}
+        assert vision.refused == {RejectReason.MALFORMED: 1}
         assert robot.said == []
 
 

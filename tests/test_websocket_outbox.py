@@ -10,24 +10,24 @@ from protocol.codec import encode
 from protocol.legacy import encode_picture
 from protocol.messages import Request
 from protocol.transports.link import Message
-from protocol.transports.secured import ROLE_SOURCES
+from protocol.transports.secured import KNOWN_SOURCES
 from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_dialects import V1
+from protocol.transports.websocket_dialects import SightlineV1
 from protocol.transports.websocket_endpoints import LegacyOptions
-from protocol.transports.websocket_legacy import Client, LegacyToVision
-from protocol.transports.websocket_outbox import MAX_MADE_UP_SOURCES, Outbox, Post
-from protocol.transports.websocket_seat import Seat
+from protocol.transports.websocket_legacy import LegacyClient, LegacyToVision
+from protocol.transports.websocket_outbox import MAX_UNKNOWN_SOURCES, Outbox, Publication
+from protocol.transports.websocket_seat import DriverSlot
 from tests.link_rigs import until
 from tests.websocket_rig import free_ws
 
 VERBS = ("arm", "disarm", "stop", "reset", "acquire", "release")
 
 
-def request(verb: str, number: int = 1, source: str = "teleop") -> Post:
-    return Post(Message(REQUEST, source, b"", encode(Request(id=number, verb=verb))))
+def request(verb: str, number: int = 1, source: str = "teleop") -> Publication:
+    return Publication(Message(REQUEST, source, b"", encode(Request(id=number, verb=verb))))
 
 
-def taken(outbox: Outbox) -> list[Post | str]:
+def taken(outbox: Outbox) -> list[Publication | str]:
     return list(iter(outbox.take, None))
 
 
@@ -35,7 +35,7 @@ def test_the_newest_and_the_most_urgent_first():
     outbox = Outbox()
     for number in b"123":
         for channel, source in ((SCAN, ""), (FRAME, ""), (REPLY, ""), (TWIST, "teleop"), (TWIST, "console")):
-            outbox.put(Post(Message(channel, source, b"", bytes([number]))))
+            outbox.put(Publication(Message(channel, source, b"", bytes([number]))))
     outbox.put_hello("old hello")
     outbox.put_hello("hello")
     assert outbox.waiting
@@ -51,7 +51,7 @@ def test_the_newest_and_the_most_urgent_first():
 
 def test_a_stop_is_replaced_by_nothing_but_a_stop_and_goes_first():
     outbox = Outbox()
-    outbox.put(Post(Message(TWIST, "teleop", b"", b"1|0")))
+    outbox.put(Publication(Message(TWIST, "teleop", b"", b"1|0")))
     for verb in ("reset", "stop", "arm", "acquire", "release", "disarm", "reset"):
         outbox.put(request(verb))
     outbox.put(request("stop", 2))
@@ -79,7 +79,7 @@ def test_however_requests_come_every_asker_s_stop_is_there(seed):
 def test_requests_that_cannot_be_read_share_one_place():
     outbox = Outbox()
     for payload in (b"", b"{}", b"stop", bytes(REQUEST.max_payload_bytes)):
-        outbox.put(Post(Message(REQUEST, "teleop", b"", payload)))
+        outbox.put(Publication(Message(REQUEST, "teleop", b"", payload)))
     assert [post.message.payload for post in taken(outbox)] == [bytes(REQUEST.max_payload_bytes)]
 
 
@@ -87,32 +87,32 @@ def test_requests_that_cannot_be_read_share_one_place():
 def test_whoever_makes_up_sources_gets_few_places_and_takes_none_of_the_roles(channel):
     outbox = Outbox()
     for number in range(1000):
-        outbox.put(Post(Message(channel, f"s{number}", b"", b"old")))
-    for source in ROLE_SOURCES:
-        outbox.put(Post(Message(channel, source, b"", b"new")))
-    outbox.put(Post(Message(channel, "s0", b"", b"new")))  # it has its place
-    assert +outbox.dropped == {channel.name: 1000 - MAX_MADE_UP_SOURCES + 1}
+        outbox.put(Publication(Message(channel, f"s{number}", b"", b"old")))
+    for source in KNOWN_SOURCES:
+        outbox.put(Publication(Message(channel, source, b"", b"new")))
+    outbox.put(Publication(Message(channel, "s0", b"", b"new")))  # it has its place
+    assert +outbox.dropped == {channel.name: 1000 - MAX_UNKNOWN_SOURCES + 1}
     got = {post.message.source: post.message.payload for post in taken(outbox)}
-    assert set(got) > ROLE_SOURCES
-    assert len(got) == MAX_MADE_UP_SOURCES + len(ROLE_SOURCES)
+    assert set(got) > KNOWN_SOURCES
+    assert len(got) == MAX_UNKNOWN_SOURCES + len(KNOWN_SOURCES)
     assert got["s0"] == b"new"
-    outbox.put(Post(Message(channel, "s999", b"", b"new")))
+    outbox.put(Publication(Message(channel, "s999", b"", b"new")))
     assert outbox.waiting  # places that were left are free again
 
 
 def test_no_number_of_sources_keeps_a_request_back():
     outbox, count = Outbox(), 100
     for number in range(count):
-        outbox.put(Post(Message(DETECTIONS, f"s{number}", b"", b"")))
+        outbox.put(Publication(Message(DETECTIONS, f"s{number}", b"", b"")))
         outbox.put(request("stop", source=f"s{number}"))
     assert [post.message.channel for post in taken(outbox)][:count] == [REQUEST] * count
 
 
 def test_a_publication_is_written_once_for_all_who_are_sent_the_same():
-    post = Post(Message(FRAME, "", b'{"v":1}', b"picture"))
-    modern, other = V1("r1", ""), V1("r1", "")
+    post = Publication(Message(FRAME, "", b'{"v":1}', b"picture"))
+    modern, other = SightlineV1("r1", ""), SightlineV1("r1", "")
     assert post.written(modern) is post.written(other)
-    client = Client("here", Seat(), print)
+    client = LegacyClient("here", DriverSlot(), print)
     lines, line = (LegacyToVision("r1", LegacyOptions(newlines=newlines), int, client) for newlines in (True, False))
     assert post.written(lines) == (encode_picture(b"picture"),)
     assert post.written(line) == (encode_picture(b"picture", False),)

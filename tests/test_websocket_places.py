@@ -16,20 +16,20 @@ from protocol.errors import LinkError
 from protocol.messages import Request
 from protocol.transports.secured import ROLES
 from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_access import grant_of
+from protocol.transports.websocket_access import grants_of_role
 from protocol.transports.websocket_listen import TOO_MANY_CLIENTS
 from protocol.transports.websocket_places import (
-    KEPT_PLACES,
+    RESERVED_SLOTS,
     MAX_CLIENTS,
     MAX_HANDSHAKES,
-    MAX_HANDSHAKES_OF_ONE,
-    Places,
-    may_act,
+    MAX_HANDSHAKES_PER_ADDRESS,
+    ConnectionLimits,
+    may_control,
 )
 from tests.link_rigs import hail, until
 from tests.websocket_rig import HELLO, V1, Robot, closed_with, free_ws
 
-WATCHERS = MAX_CLIENTS - KEPT_PLACES
+WATCHERS = MAX_CLIENTS - RESERVED_SLOTS
 TOKENS = {"operator": "operator_0123456789abc", "viewer": "viewerviewerviewer"}
 
 
@@ -47,7 +47,7 @@ def keys(tmp_path):
     return str(tmp_path)
 
 
-def settled(places: Places, acts: bool) -> str:
+def settled(places: ConnectionLimits, acts: bool) -> str:
     """What becomes of one more client."""
     place = places.knock("10.0.0.1")
     problem = places.settle(place, acts)
@@ -60,28 +60,28 @@ def settled(places: Places, acts: bool) -> str:
 
 
 def test_who_steers_asks_or_is_the_robot_does_more_than_watch():
-    assert {role for role in ROLES if may_act(grant_of(role))} == {"robot", "vision", "operator"}
+    assert {role for role in ROLES if may_control(grants_of_role(role))} == {"robot", "vision", "operator"}
 
 
 def test_the_last_places_are_kept_for_who_may_act():
-    places = Places()
+    places = ConnectionLimits()
     assert [settled(places, False) for _ in range(WATCHERS)] == [""] * WATCHERS
     assert "12 clients watch, which is the limit" in settled(places, False)
-    assert [settled(places, True) for _ in range(KEPT_PLACES)] == [""] * KEPT_PLACES
+    assert [settled(places, True) for _ in range(RESERVED_SLOTS)] == [""] * RESERVED_SLOTS
     for acts in (True, False):
         assert "16 clients are connected, which is the limit" in settled(places, acts)
 
 
 def test_who_may_act_takes_any_place():
-    places = Places()
+    places = ConnectionLimits()
     assert [settled(places, True) for _ in range(MAX_CLIENTS)] == [""] * MAX_CLIENTS
     assert places.problem(True) == places.problem(False) != ""
 
 
 def test_an_address_has_few_strangers_and_all_together_not_many():
-    places, given = Places(), []
-    for number in range(MAX_HANDSHAKES // MAX_HANDSHAKES_OF_ONE):
-        given += [places.knock(f"10.0.0.{number}") for _ in range(MAX_HANDSHAKES_OF_ONE)]
+    places, given = ConnectionLimits(), []
+    for number in range(MAX_HANDSHAKES // MAX_HANDSHAKES_PER_ADDRESS):
+        given += [places.knock(f"10.0.0.{number}") for _ in range(MAX_HANDSHAKES_PER_ADDRESS)]
         assert places.knock(f"10.0.0.{number}") is None
     assert None not in given
     assert places.knock("10.0.0.99") is None
@@ -90,8 +90,8 @@ def test_an_address_has_few_strangers_and_all_together_not_many():
 
 
 def test_a_client_is_no_stranger_any_more():
-    places = Places()
-    assert [settled(places, True) for _ in range(2 * MAX_HANDSHAKES_OF_ONE)] == [""] * 2 * MAX_HANDSHAKES_OF_ONE
+    places = ConnectionLimits()
+    assert [settled(places, True) for _ in range(2 * MAX_HANDSHAKES_PER_ADDRESS)] == [""] * 2 * MAX_HANDSHAKES_PER_ADDRESS
     assert places.knock("10.0.0.1") is not None
 
 
@@ -124,7 +124,7 @@ def test_a_guest_may_steer_and_is_no_viewer(robot):
 def test_who_is_closed_unheard_for_idle_connections_beside_it_tries_again(robot):
     address = ("127.0.0.1", int(robot.endpoint.rpartition(":")[2]))
     with ExitStack() as ending:
-        for _ in range(MAX_HANDSHAKES_OF_ONE):
+        for _ in range(MAX_HANDSHAKES_PER_ADDRESS):
             ending.enter_context(socket.create_connection(address))
         with pytest.raises(LinkError, match="it hangs up without an answer: too many connections at once, or it speaks wss://"):
             open_websocket("r1", connect=robot.endpoint, role="operator", timeout_s=0.5)
@@ -144,7 +144,7 @@ def test_a_log_that_nobody_reads_shuts_nobody_out(robot, monkeypatch):
     os.set_blocking(writer, True)
     with os.fdopen(reader, "rb"), ExitStack() as ending:
         monkeypatch.setattr(sys, "stderr", os.fdopen(writer, "w"))
-        for _ in range(MAX_HANDSHAKES_OF_ONE + 1):
+        for _ in range(MAX_HANDSHAKES_PER_ADDRESS + 1):
             ending.enter_context(socket.create_connection(address))
         assert until(lambda: robot.refused[TOO_MANY_CLIENTS])
         ending.close()
@@ -181,7 +181,7 @@ def test_idle_strangers_take_only_the_places_of_their_own_address(robot):
     with ExitStack() as ending:
         for _ in range(MAX_CLIENTS + MAX_HANDSHAKES):
             ending.enter_context(socket.create_connection(robot.address, source_address=("127.0.0.2", 0)))
-        expected = MAX_CLIENTS + MAX_HANDSHAKES - MAX_HANDSHAKES_OF_ONE
+        expected = MAX_CLIENTS + MAX_HANDSHAKES - MAX_HANDSHAKES_PER_ADDRESS
         assert until(lambda: robot.refused == {TOO_MANY_CLIENTS: expected}, 1)
         hail(robot.endpoint, role="operator").close()
         robot.still_serves()
@@ -191,15 +191,15 @@ def test_a_thread_that_cannot_start_costs_one_client_and_no_place(robot, monkeyp
     start, failed = threading.Thread.start, []
 
     def starts_late(thread) -> None:
-        if thread.name == "websocket-peer" and len(failed) < 2 * MAX_HANDSHAKES_OF_ONE:
+        if thread.name == "websocket-peer" and len(failed) < 2 * MAX_HANDSHAKES_PER_ADDRESS:
             failed.append(thread)
             raise RuntimeError("can't start new thread")
         start(thread)
 
     monkeypatch.setattr(threading.Thread, "start", starts_late)
-    for _ in range(2 * MAX_HANDSHAKES_OF_ONE):
+    for _ in range(2 * MAX_HANDSHAKES_PER_ADDRESS):
         with socket.create_connection(robot.address, 3) as near:
             assert near.recv(1) == b""  # closed, not left to wait
-    assert robot.refused == {TOO_MANY_CLIENTS: 2 * MAX_HANDSHAKES_OF_ONE}
+    assert robot.refused == {TOO_MANY_CLIENTS: 2 * MAX_HANDSHAKES_PER_ADDRESS}
     hail(robot.endpoint).close()
     robot.still_serves()

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 from websockets.protocol import CLIENT, SERVER, Protocol
 
-from protocol.transports.websocket_messages import MAX_FRAGMENTS, Messages, unmasked_head
+from protocol.transports.websocket_messages import MAX_FRAGMENTS, MessageReader, unmasked_head
 
 BOUND = 70_000
 SIZES = (0, 1, 125, 126, 127, 65_535, 65_536, BOUND - 1, BOUND, BOUND + 1)
@@ -22,7 +22,7 @@ def served(opcode: int, data: bytes, fin: bool = True) -> bytes:
 def read(pieces, bound: int = BOUND) -> tuple[list, int | None]:
     """What a client makes of `pieces`, and with which code it hangs up."""
     protocol = Protocol(CLIENT, max_size=bound)
-    messages = Messages(protocol)
+    messages = MessageReader(protocol)
     for piece in pieces:
         messages.feed(piece)
     return list(messages.ready), protocol.close_sent.code if protocol.close_sent else None
@@ -70,7 +70,7 @@ def test_a_masked_frame_from_a_server_and_an_unmasked_one_from_a_client_are_refu
     masked = Frame(Opcode.BINARY, b"data").serialize(mask=True)
     assert read([masked]) == ([], 1002)
     protocol = Protocol(SERVER, max_size=100)
-    messages = Messages(protocol)
+    messages = MessageReader(protocol)
     messages.feed(served(2, b"data"))
     assert (list(messages.ready), protocol.close_sent.code) == ([], 1002)
 

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from operator_side.faults.wires import BenchWire
 from protocol.errors import ConfigError
-from sim.wire import IP_HEADER_BYTES, MAX_WAITING, Leg, Medium, Shape, Shapes, Wire
+from sim.wire import IP_HEADER_BYTES, MAX_WAITING, Leg, Medium, LinkShape, LinkShapes, EmulatedLink
 from sim.wire_tun import ADDRESS_A, _read_shapes, why_impossible
 
 PACKET = bytes(range(100))
 LONG_US = 10**9
 shapes = st.builds(
-    Shape, delay_ms=st.floats(0, 100), jitter_ms=st.floats(0, 50), loss=st.floats(0, 1), burst_start=st.floats(0, 1),
+    LinkShape, delay_ms=st.floats(0, 100), jitter_ms=st.floats(0, 50), loss=st.floats(0, 1), burst_start=st.floats(0, 1),
     burst_end=st.floats(0.01, 1), rate_bit_s=st.sampled_from([0, 1e4, 1e6]), duplicate=st.floats(0, 1),
     reorder=st.floats(0, 1), corrupt=st.floats(0, 1), queue_packets=st.integers(1, MAX_WAITING), cut=st.booleans(),
 )
@@ -25,7 +25,7 @@ shapes = st.builds(
 
 def leg(seed="1", **shape):
     made = Leg(seed)
-    made.shape = Shape(**shape)
+    made.shape = LinkShape(**shape)
     return made
 
 
@@ -103,17 +103,17 @@ def test_a_rate_spaces_packets_by_their_size():
 
 def test_half_duplex_shares_the_time_and_two_directions_do_not():
     for half_duplex, last_us in ((True, 1600), (False, 800)):
-        wire = Wire()
-        shape = Shape(rate_bit_s=1e6)
-        wire.shape(Shapes(ab=shape, ba=shape, half_duplex=half_duplex))
+        wire = EmulatedLink()
+        shape = LinkShape(rate_bit_s=1e6)
+        wire.shape(LinkShapes(ab=shape, ba=shape, half_duplex=half_duplex))
         wire.ab.put(PACKET, 0)
         wire.ba.put(PACKET, 0)
         assert wire.ba.next_us == pytest.approx(last_us)
 
 
 def test_directions_are_shaped_apart():
-    wire = Wire()
-    wire.shape(Shapes(ab=Shape(cut=True)))
+    wire = EmulatedLink()
+    wire.shape(LinkShapes(ab=LinkShape(cut=True)))
     wire.ab.put(PACKET, 0)
     wire.ba.put(PACKET, 0)
     assert list(wire.ab.take_due(LONG_US)) == [] and list(wire.ba.take_due(0)) == [PACKET]
@@ -121,10 +121,10 @@ def test_directions_are_shaped_apart():
 
 
 def test_half_duplex_can_be_left_again():
-    wire = Wire()
-    wire.shape(Shapes(half_duplex=True))
+    wire = EmulatedLink()
+    wire.shape(LinkShapes(half_duplex=True))
     assert wire.ab.medium is wire.ba.medium
-    wire.shape(Shapes())
+    wire.shape(LinkShapes())
     assert wire.ab.medium is not wire.ba.medium and wire.ba.medium == Medium()
 
 
@@ -156,7 +156,7 @@ def test_the_queue_is_bounded():
 def test_a_cut_loses_what_is_under_way():
     wire = leg(delay_ms=100)
     wire.put(PACKET, 0)
-    wire.shape = Shape(cut=True)
+    wire.shape = LinkShape(cut=True)
     assert list(wire.take_due(LONG_US)) == [] and wire.counts.cut == 1
 
 
@@ -193,12 +193,12 @@ def test_real_packets_pass_are_late_and_are_cut_in_one_direction(tmp_path):
     with BenchWire(tmp_path / "wire.log") as wire:
         said, seconds = probe(wire)
         assert said == "refused" and seconds < 0.05
-        wire.shape(Shapes(ab=Shape(delay_ms=150), ba=Shape(delay_ms=100)))
+        wire.shape(LinkShapes(ab=LinkShape(delay_ms=150), ba=LinkShape(delay_ms=100)))
         said, seconds = probe(wire)
         assert said == "refused" and 0.25 <= seconds < 0.4
-        before = wire.shape(Shapes(ab=Shape(cut=True)))
+        before = wire.shape(LinkShapes(ab=LinkShape(cut=True)))
         assert probe(wire, 0.3)[0] == "silence"
-        assert wire.shape(Shapes()) > before
+        assert wire.shape(LinkShapes()) > before
         assert probe(wire)[0] == "refused"
         names = wire.robot_side, wire.far_side
     left = subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout

@@ -5,7 +5,7 @@ import pytest
 from protocol.errors import WireError
 from protocol.jpeg import JpegSize, read_jpeg_size
 from protocol.messages import Twist
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.twist_text import format_twist, parse_twist
 
 
@@ -44,7 +44,7 @@ def test_numbers_of_the_grammar_are_read_on_either_side(text):
 def test_all_other_numbers_are_malformed_on_either_side(text):
     for data in (f"{text}|0", f"0|{text}"):
         error = refusal(parse_twist, data.encode())
-        assert error.reason is Refusal.MALFORMED
+        assert error.reason is RejectReason.MALFORMED
         assert "linear|angular" in error.detail
 
 
@@ -52,7 +52,7 @@ def test_all_other_numbers_are_malformed_on_either_side(text):
     "data", [b"", b"|", b"||", b"1", b"1|2|3", b"1||2", b"|1|2", b"1|2|", b"12", b"1-2", b"nan", b"nan|1|1"]
 )
 def test_other_counts_of_fields_are_malformed(data):
-    assert refusal(parse_twist, data).reason is Refusal.MALFORMED
+    assert refusal(parse_twist, data).reason is RejectReason.MALFORMED
 
 
 @pytest.mark.parametrize(
@@ -60,11 +60,11 @@ def test_other_counts_of_fields_are_malformed(data):
 )
 def test_what_is_not_finite_is_named_so_on_either_side(text):
     for data in (f"{text}|0", f"0|{text}", f"{text}|{text}", f"{text}|nonsense" if "e" not in text else f"{text}|1"):
-        assert refusal(parse_twist, data.encode()).reason is Refusal.NOT_FINITE
+        assert refusal(parse_twist, data.encode()).reason is RejectReason.NOT_FINITE
 
 
 @pytest.mark.parametrize(
-    ("size", "reason"), [(63, None), (64, None), (65, Refusal.MALFORMED), (257, Refusal.MALFORMED)]
+    ("size", "reason"), [(63, None), (64, None), (65, RejectReason.MALFORMED), (257, RejectReason.MALFORMED)]
 )
 def test_the_text_is_at_most_64_bytes(size, reason):
     data = b"1|" + b"0" * (size - 2)
@@ -123,7 +123,7 @@ def test_the_bound_is_exact_in_pixels(width, height, bound, fits):
         assert read_jpeg_size(data, bound) == JpegSize(width, height, 3)
     else:
         error = refusal(read_jpeg_size, data, bound)
-        assert f"{width}x{height}" in error.detail and error.reason is Refusal.MALFORMED
+        assert f"{width}x{height}" in error.detail and error.reason is RejectReason.MALFORMED
 
 
 @pytest.mark.parametrize(

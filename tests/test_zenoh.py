@@ -15,13 +15,13 @@ from protocol.channels import DETECTIONS, FRAME, STATUS, TWIST
 from protocol.codec import encode
 from protocol.errors import ConfigError, LinkError
 from protocol.messages import FrameHeader
-from protocol.transports.endpoints import check_endpoint, with_send_buffer
+from protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
 from protocol.transports.link_rules import NOT_A_PUT
 from protocol.transports.port_owner import port_owner
 from protocol.transports.zenoh import MAX_KEPT_PUBLISHERS, ZenohLink, open_zenoh
 from protocol.transports.zenoh_around import list_robots
 from protocol.transports.zenoh_session import open_session
-from protocol.transports.zenoh_site import open_site
+from protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 
 NO_ENDPOINTS = (
@@ -40,15 +40,15 @@ def test_an_endpoint_that_is_none_is_refused_with_the_right_form(endpoint, end):
 
 
 def test_well_formed_endpoints_and_their_send_buffer():
-    assert check_endpoint("tcp/[::1]:7447") == ("tcp", "::1", 7447)
-    assert check_endpoint("tls/robot.local:1#so_sndbuf=1") == ("tls", "robot.local", 1)
+    assert parse_zenoh_endpoint("tcp/[::1]:7447") == ("tcp", "::1", 7447)
+    assert parse_zenoh_endpoint("tls/robot.local:1#so_sndbuf=1") == ("tls", "robot.local", 1)
     assert with_send_buffer("tcp/h:1") == "tcp/h:1#so_sndbuf=262144"
     assert with_send_buffer("tcp/h:1#iface=wlan0") == "tcp/h:1#iface=wlan0"
     assert with_send_buffer("udp/h:1") == "udp/h:1"
 
 
 def test_the_owner_of_a_free_port_is_nobody():
-    assert port_owner(check_endpoint(free_endpoint())[2]) == ""
+    assert port_owner(parse_zenoh_endpoint(free_endpoint())[2]) == ""
 
 
 def test_nobody_answering_is_said_in_time():
@@ -57,7 +57,7 @@ def test_nobody_answering_is_said_in_time():
     with pytest.raises(LinkError, match=re.escape(said)):
         open_zenoh("r1", connect=[endpoint], timeout_s=0.4)
     assert 0.3 < time.monotonic() - begin_s < 2
-    with socket.create_server(("127.0.0.1", check_endpoint(endpoint)[2])):
+    with socket.create_server(("127.0.0.1", parse_zenoh_endpoint(endpoint)[2])):
         more = f"{said}, and what listens there does not speak Zenoh"
         with pytest.raises(LinkError, match=re.escape(more)):
             open_zenoh("r1", connect=[endpoint], timeout_s=0.4)
@@ -104,7 +104,7 @@ class _Counting:
     """A TCP relay in front of `endpoint` that counts the bytes it passes on towards who connects."""
 
     def __init__(self, endpoint: str) -> None:
-        self.to = check_endpoint(endpoint)[1:]
+        self.to = parse_zenoh_endpoint(endpoint)[1:]
         self.passed = 0
         self._door = socket.create_server(("127.0.0.1", 0))
         self.endpoint = f"tcp/127.0.0.1:{self._door.getsockname()[1]}"
@@ -251,7 +251,7 @@ def _publish_until(link, over):
         link.publish(FRAME, b"{}", bytes(60_000))
 
 
-@pytest.mark.parametrize("opened", [partial(open_zenoh, "r1", role="robot"), partial(open_site, "r*", role="vision")])
+@pytest.mark.parametrize("opened", [partial(open_zenoh, "r1", role="robot"), partial(open_fleet, "r*", role="vision")])
 def test_who_closes_lets_go_of_the_session_at_once(opened):
     """See `GONE` for what happens where the collector frees it instead."""
     end = opened(listen=[free_endpoint()])

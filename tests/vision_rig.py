@@ -14,7 +14,7 @@ import numpy as np
 from protocol.messages import CameraModel, FrameHeader, Twist
 from vision_side.config import VisionConfig
 from vision_side.detect.port import Circle, Detection
-from vision_side.pipeline import Frame, Pipeline, Seen
+from vision_side.pipeline import Frame, Pipeline, Observation
 
 TICK_US = 4_000
 FRAME_US = 33_333
@@ -110,7 +110,7 @@ class Truth:
     distance_m: float
     moving: tuple[float, float]
     robot: tuple[float, float, float]
-    seen: Seen | None
+    seen: Observation | None
 
 
 @dataclass
@@ -146,7 +146,7 @@ class Rig:
         self._up: list[tuple[int, Frame, np.ndarray]] = []
         self._down: list[tuple[int, int, Twist]] = []
         self._command: tuple[int, int, Twist] | None = None
-        self._seen: Seen | None = None
+        self._seen: Observation | None = None
         self._blank = jpeg_of(np.zeros((self._model.height_px, self._model.width_px, 3), np.uint8))
 
     def _tick(self, t_us: int) -> Truth:

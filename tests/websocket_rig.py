@@ -13,7 +13,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from protocol.channels import FRAME, TWIST
 from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_endpoints import parse_endpoint
+from protocol.transports.websocket_endpoints import parse_websocket_endpoint
 from tests.link_rigs import free_endpoint, until
 
 V1 = {"subprotocols": ["sightline.v1"], "compression": None, "legacy": True}
@@ -26,7 +26,7 @@ def free_ws(scheme: str = "ws") -> str:
 
 
 def address_of(endpoint: str) -> tuple[str, int]:
-    return parse_endpoint(endpoint).host, parse_endpoint(endpoint).port
+    return parse_websocket_endpoint(endpoint).host, parse_websocket_endpoint(endpoint).port
 
 
 class Robot:

@@ -14,14 +14,14 @@ from protocol.messages import FrameHeader
 from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.config import VisionConfig
 from vision_side.detect.boxes import REMEMBERED, BoxReader
-from vision_side.pipeline import Answer, Seen
-from vision_side.service import Say, Service
+from vision_side.pipeline import PipelineAnswer, Observation
+from vision_side.service import LogLine, Service
 
 _BOXES_SILENCE_S = 2.0
-_NO_BOXES = Seen("no boxes")
+_NO_BOXES = Observation("no boxes")
 
 
-class Inbox(LatestSlot[Message]):
+class BoxesInbox(LatestSlot[Message]):
     """The newest frame and the newest boxes of one source; also the last frames' headers, which boxes may name."""
 
     def __init__(self, source: str) -> None:
@@ -52,8 +52,8 @@ class Inbox(LatestSlot[Message]):
 class BoxesService(Service):
     """A `Service` whose detector is elsewhere."""
 
-    def __init__(self, config: VisionConfig, link: Link, say: Say) -> None:
-        self._inbox = Inbox(config.boxes.source)
+    def __init__(self, config: VisionConfig, link: Link, say: LogLine) -> None:
+        self._inbox = BoxesInbox(config.boxes.source)
         self._reader = BoxReader(config.boxes)
         self._boxes_heard_s = time.monotonic()
         super().__init__(config, link, say)
@@ -73,7 +73,7 @@ class BoxesService(Service):
             return
         self._heard_s = time.monotonic()
         self._tell("link", f"frames from robot {self._config.robot}, session {header.session}")
-        self._publish(header, Answer(None, Seen("no picture", note="somebody else looks")), 0)
+        self._publish(header, PipelineAnswer(None, Observation("no picture", note="somebody else looks")), 0)
         self._viewing.keep(header, message.payload)
         if self._pipeline is None:
             self._wait_for_camera()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from protocol.errors import WireError
 from protocol.jpeg import MAX_SEGMENTS, read_jpeg_size
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 
 cv2.setNumThreads(1)  # one stream, one thread: pictures this small only lose by being split
 
@@ -108,4 +108,4 @@ def _count_scans(jpeg: bytes) -> int:
 
 
 def _bad(what: str) -> WireError:
-    return WireError(Refusal.MALFORMED, f"picture {what}")
+    return WireError(RejectReason.MALFORMED, f"picture {what}")

@@ -33,11 +33,11 @@ from protocol.messages import (
 )
 from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.config import VisionConfig
-from vision_side.detect.around import maker_of, news_of
-from vision_side.detect.checking import asked
-from vision_side.detect.own_decoders import OwnDecoders
+from vision_side.detect.around import maker_of, notices_of
+from vision_side.detect.checking import checked_results
+from vision_side.detect.own_decoders import DecoderPool
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
-from vision_side.detector_turns import Tally, Turn, Turns
+from vision_side.detector_turns import FrameCounters, QueuedFrame, FairQueue
 from vision_side.service_process import ends_on_signal
 
 ROLE: Final = "detector"
@@ -50,11 +50,11 @@ _MOST_WHYS: Final = 8
 """Reasons that are told: a plug-in's may be another each time."""
 _OVERLOAD: Final = 0.1
 """Share of frames that go unanswered, from which on it is said that there are too many."""
-Say = Callable[[str], None]
+LogLine = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Serving:
+class ServingOptions:
     """How it serves."""
 
     name: str
@@ -64,7 +64,7 @@ class Serving:
     max_pixels: int = 1920 * 1080
 
 
-class Site(Protocol):
+class FleetLink(Protocol):
     """Where robots are met."""
 
     def robots(self) -> list[str]:
@@ -80,14 +80,14 @@ class Site(Protocol):
         ...
 
 
-def run(config: VisionConfig, detector: Detector, serving: Serving) -> int:
+def run(config: VisionConfig, detector: Detector, serving: ServingOptions) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code 0. Raises ConfigError, LinkError as `open_site` does."""
-    from protocol.transports.zenoh_log import refusals_told
-    from protocol.transports.zenoh_site import open_site
+    from protocol.transports.zenoh_log import log_rejected_peers
+    from protocol.transports.zenoh_site import open_fleet
 
     ending, services = threading.Event(), list[DetectorService]()
-    with refusals_told(config.listen, config.secure, lambda line: _say(f"detector: {line}")):
-        opened = open_site(
+    with log_rejected_peers(config.listen, config.secure, lambda line: _say(f"detector: {line}")):
+        opened = open_fleet(
             config.robot, listen=config.listen, connect=config.connect, role=ROLE, secure=config.secure,
             max_frame_bytes=config.max_frame_bytes,
             about=lambda: services[0].about() if services else f"{serving.name}: starts",
@@ -103,13 +103,13 @@ def run(config: VisionConfig, detector: Detector, serving: Serving) -> int:
 class DetectorService:
     """One detector, a place for the newest frame of each robot, and turns. Frames arrive on the site's threads."""
 
-    def __init__(self, site: Site, detector: Detector, serving: Serving, say: Say) -> None:
+    def __init__(self, site: FleetLink, detector: Detector, serving: ServingOptions, say: LogLine) -> None:
         self._site, self._detector, self._serving, self._say = site, detector, serving, say
-        self._turns: Turns[Message] = Turns(serving.max_batch, serving.deadline_us)
+        self._turns: FairQueue[Message] = FairQueue(serving.max_batch, serving.deadline_us)
         self._guard = threading.Lock()
         self._bell: LatestSlot[bool] = LatestSlot()
         self._links: dict[str, Link] = {}
-        self._decoders = OwnDecoders(serving.max_pixels)
+        self._decoders = DecoderPool(serving.max_pixels)
         self._session = secrets.token_hex(4)
         self._said = 0
         self._each_us = 0.0
@@ -132,7 +132,7 @@ class DetectorService:
 
     def turn(self) -> bool:
         """Tell the detector's news, welcome who is new, then look at one batch; False if nothing waited."""
-        for line in news_of(self._detector):
+        for line in notices_of(self._detector):
             self._say(f"detector: {line}")
         for robot in self._site.robots():
             if robot not in self._links:
@@ -143,7 +143,7 @@ class DetectorService:
             self._look(batch)
         return bool(batch)
 
-    def tallies(self) -> dict[str, Tally]:
+    def tallies(self) -> dict[str, FrameCounters]:
         """What became of each robot's frames."""
         with self._guard:
             return dict(self._turns.tallies)
@@ -173,13 +173,13 @@ class DetectorService:
         link.subscribe(FRAME, heard)
         self._say(f"detector: looks at the pictures of {robot}")
 
-    def _look(self, batch: list[Turn[Message]]) -> None:
+    def _look(self, batch: list[QueuedFrame[Message]]) -> None:
         began_us = monotonic_us()
         frames = [(turn, frame) for turn in batch if (frame := self._frame(turn)) is not None]
         if not frames:
             return
         deadline_us = min(turn.arrived_us for turn, _ in frames) + self._serving.deadline_us
-        results = asked(self._detector, [frame for _, frame in frames], deadline_us, monotonic_us)
+        results = checked_results(self._detector, [frame for _, frame in frames], deadline_us, monotonic_us)
         ended_us = monotonic_us()
         each_us = (ended_us - began_us) / len(frames)
         self._each_us += (each_us - self._each_us) * (_SMOOTHING if self._each_us else 1.0)
@@ -189,7 +189,7 @@ class DetectorService:
             else:
                 self._answer(turn, frame, result, ended_us - began_us)
 
-    def _frame(self, turn: Turn[Message]) -> DetectFrame | None:
+    def _frame(self, turn: QueuedFrame[Message]) -> DetectFrame | None:
         """What the detector is given; None, counted, for what is no frame."""
         jpeg = turn.item.payload
         try:
@@ -204,7 +204,7 @@ class DetectorService:
             return None
         return self._decoders.frame(turn.robot, header, jpeg, sides)
 
-    def _refuse(self, turn: Turn[Message], why: str, late: bool = False) -> None:
+    def _refuse(self, turn: QueuedFrame[Message], why: str, late: bool = False) -> None:
         """Count it. Each reason is told once, as far as there are few; the rest is in the tallies."""
         tally = self._tally(turn)
         tally.late, tally.refused = tally.late + late, tally.refused + (not late)
@@ -212,7 +212,7 @@ class DetectorService:
             self._whys.add(why)
             self._say(f"detector: {why}")
 
-    def _answer(self, turn: Turn[Message], frame: DetectFrame, result: DetectionResult, took_us: int) -> None:
+    def _answer(self, turn: QueuedFrame[Message], frame: DetectFrame, result: DetectionResult, took_us: int) -> None:
         tally, age_us = self._tally(turn), monotonic_us() - turn.arrived_us
         if age_us > self._serving.deadline_us:
             tally.late += 1
@@ -229,7 +229,7 @@ class DetectorService:
         self._ages_us.append(age_us)
         self._maker = (result.model_hash[:8], result.device)
 
-    def _tally(self, turn: Turn[Message]) -> Tally:
+    def _tally(self, turn: QueuedFrame[Message]) -> FrameCounters:
         return self._turns.tallies[turn.robot]
 
     def _look_at_load(self, now_s: float) -> None:

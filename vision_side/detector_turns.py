@@ -11,7 +11,7 @@ _BATCH_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Turn(Generic[Item]):
+class QueuedFrame(Generic[Item]):
     """One robot's newest frame, and when it came."""
 
     robot: str
@@ -20,7 +20,7 @@ class Turn(Generic[Item]):
 
 
 @dataclass(slots=True)
-class Tally:
+class FrameCounters:
     """What became of one robot's frames; the numbers only grow."""
 
     offered: int = 0
@@ -45,29 +45,29 @@ class Tally:
         return self.overtaken + self.stale + self.late
 
 
-class Turns(Generic[Item]):
+class FairQueue(Generic[Item]):
     """One place for each robot. Whoever waits for the longest time since its last turn is next."""
 
     def __init__(self, max_batch: int, deadline_us: int) -> None:
         self._max_batch, self._deadline_us = max_batch, deadline_us
-        self._waiting: OrderedDict[str, Turn[Item] | None] = OrderedDict()
-        self.tallies: dict[str, Tally] = {}
+        self._waiting: OrderedDict[str, QueuedFrame[Item] | None] = OrderedDict()
+        self.tallies: dict[str, FrameCounters] = {}
 
     def offer(self, robot: str, item: Item, now_us: int) -> None:
         """The newest frame of `robot`, in place of the one before."""
-        tally = self.tallies.setdefault(robot, Tally())
+        tally = self.tallies.setdefault(robot, FrameCounters())
         tally.offered += 1
         tally.overtaken += self._waiting.get(robot) is not None
-        self._waiting[robot] = Turn(robot, item, now_us)
+        self._waiting[robot] = QueuedFrame(robot, item, now_us)
 
-    def take(self, now_us: int, each_us: int = 0) -> list[Turn[Item]]:
+    def take(self, now_us: int, each_us: int = 0) -> list[QueuedFrame[Item]]:
         """What waits, as one batch that fits in half a deadline if a frame takes `each_us`; empty if nothing waits."""
         most, share_us = self._max_batch, int(self._deadline_us * _BATCH_SHARE)
         if each_us > 0:
             most = max(1, min(most, share_us // each_us))
         # One slow frame (a device that warms up) must not rule out all later ones: nothing would be measured again.
         each_us = min(each_us, share_us)
-        batch: list[Turn[Item]] = []
+        batch: list[QueuedFrame[Item]] = []
         for robot in [name for name, turn in self._waiting.items() if turn is not None]:
             if len(batch) == most:
                 break

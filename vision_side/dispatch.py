@@ -6,24 +6,24 @@ from collections.abc import Callable
 from protocol.channels import MISSION, REPORT, SCAN
 from protocol.codec import encode
 from protocol.errors import WireError
-from protocol.messages import Asked, DetectionsHeader, Echo, FrameHeader
+from protocol.messages import RequestId, DetectionsHeader, Echo, FrameHeader
 from protocol.transports.link import LatestSlot, Link, Message
-from vision_side.asking import Desk, Swap
+from vision_side.asking import MissionRequests, DetectorSwap
 from vision_side.config import VisionConfig
-from vision_side.detect.around import news_of
+from vision_side.detect.around import notices_of
 from vision_side.detect.port import Detector
-from vision_side.detect.shadow import Shadowed
-from vision_side.detect.timing import Clocked
-from vision_side.missions.choice import configured
-from vision_side.pipeline import SOURCE, Pipeline, Seen
+from vision_side.detect.shadow import ShadowDetector
+from vision_side.detect.timing import TimedDetector
+from vision_side.missions.choice import configured_mission
+from vision_side.pipeline import SOURCE, Pipeline, Observation
 from vision_side.reporting import Reporter
-from vision_side.scan import read_scan
+from vision_side.scan import decode_scan
 
-NO_FRAMES = Seen("no frames")
+NO_FRAMES = Observation("no frames")
 _ENDED = "the robot started anew, which ended it: say it again"
 
 
-class Dispatch:
+class MissionChannel:
     """One robot's missions. Scans are subscribed to only once a mission goes by them."""
 
     def __init__(
@@ -34,14 +34,14 @@ class Dispatch:
         Raises ConfigError for a configured mission that there is not.
         """
         self._link, self._tell, self._refuse = link, tell, refuse
-        self._mission = configured(config).name
+        self._mission = configured_mission(config).name
         self._missions: LatestSlot[Message] = link.latest(MISSION)
         self._scans: LatestSlot[Message] | None = None
-        self._desk = Desk(config)
+        self._desk = MissionRequests(config)
         self._reporter = Reporter(config.detector)
         self._session = secrets.token_hex(4)
         self._reports = 0
-        self._swapped: Asked | None = None
+        self._swapped: RequestId | None = None
 
     def before(self, pipeline: Pipeline, frame: FrameHeader) -> None:
         """Give `pipeline` what it has to know before it answers `frame`."""
@@ -51,7 +51,7 @@ class Dispatch:
         if pipeline.mission.wants_scan:
             self._look(pipeline)
 
-    def after(self, now_s: float, pipeline: Pipeline | None, frame: FrameHeader | None, seen: Seen) -> None:
+    def after(self, now_s: float, pipeline: Pipeline | None, frame: FrameHeader | None, seen: Observation) -> None:
         """Say what was done, if it is time; without a frame, that none comes."""
         if pipeline is not None:
             self._mission = pipeline.mission.name
@@ -61,11 +61,11 @@ class Dispatch:
         eyes, looked = (pipeline.eyes, pipeline.looked) if pipeline else (None, None)
         self.tell_news(eyes)
         beside = ""
-        if pipeline is not None and isinstance(eyes, Shadowed):
+        if pipeline is not None and isinstance(eyes, ShadowDetector):
             eyes.go_by(self._link.robot, pipeline.mission.goes_by)
             beside = eyes.shadow_text(self._link.robot)
         plain = pipeline.detector if pipeline else None
-        took_us = plain.took_us if isinstance(plain, Clocked) else None
+        took_us = plain.took_us if isinstance(plain, TimedDetector) else None
         report = self._reporter.due(now_s, self._mission, seen, asked, refused, looked=looked, beside=beside,
                                     took_us=took_us)
         if report is None:
@@ -79,7 +79,7 @@ class Dispatch:
 
     def tell_news(self, eyes: Detector | None) -> None:
         """What the detector has to say."""
-        for line in news_of(eyes):
+        for line in notices_of(eyes):
             self._tell("detector", line)
 
     def _choose(self, message: Message, pipeline: Pipeline, frame: FrameHeader) -> None:
@@ -88,7 +88,7 @@ class Dispatch:
         except WireError as error:
             self._refuse(error)
             return
-        if isinstance(chosen, Swap):
+        if isinstance(chosen, DetectorSwap):
             self._swap(chosen, pipeline.eyes, message.source)
         elif chosen is not None and self._desk.asked is not None:
             pipeline.meet(frame.session)
@@ -97,11 +97,11 @@ class Dispatch:
         elif self._desk.refused:
             self._tell("mission", f"a mission of {message.source} is refused: {self._desk.refused}")
 
-    def _swap(self, swap: Swap, eyes: Detector | None, source: str) -> None:
+    def _swap(self, swap: DetectorSwap, eyes: Detector | None, source: str) -> None:
         """Let the other detector drive."""
         self._swapped = self._desk.asked
         refused = "no detector looks on; start vision with --shadow NAME"
-        if isinstance(eyes, Shadowed):
+        if isinstance(eyes, ShadowDetector):
             refused = eyes.promote(self._link.robot, swap.shadow)
         self._desk.refused = refused
         who = "the shadow drives" if swap.shadow else "the shadow looks on"
@@ -114,7 +114,7 @@ class Dispatch:
         if message is None:
             return
         try:
-            pipeline.see_scan(*read_scan(message.header, message.payload))
+            pipeline.see_scan(*decode_scan(message.header, message.payload))
         except WireError as error:
             self._refuse(error)
             self._tell("scan", f"scans are refused: {error.detail}")

@@ -13,17 +13,17 @@ from protocol.errors import HardwareError
 from protocol.messages import CameraModel, FrameHeader
 from protocol.transports.link import Link
 from vision_side.config import VisionConfig
-from vision_side.detect.around import news_of
+from vision_side.detect.around import notices_of
 from vision_side.detect.choice import configured_detector
-from vision_side.dispatch import Dispatch
-from vision_side.pipeline import SOURCE, Answer, Frame, Pipeline, Seen
+from vision_side.dispatch import MissionChannel
+from vision_side.pipeline import SOURCE, PipelineAnswer, Frame, Pipeline, Observation
 from vision_side.service import Service
 
 _TELL_EVERY_S = 0.5
 _WAIT_S = 0.2
 _RETRY_S = 0.5
 _DEGREES = 57.29577951308232
-Say = Callable[[str], None]
+LogLine = Callable[[str], None]
 
 
 class Capture(Protocol):
@@ -46,7 +46,7 @@ class LocalCamera(Protocol):
         ...
 
 
-def watch_robot(config: VisionConfig, say: Say, seconds: float | None = None) -> int:
+def watch_robot(config: VisionConfig, say: LogLine, seconds: float | None = None) -> int:
     """Tell what is seen in the robot's pictures, until Ctrl-C or for `seconds`; returns the exit code 0.
 
     Raises ConfigError for an endpoint that is none, LinkError if the link cannot be opened.
@@ -61,11 +61,11 @@ def watch_robot(config: VisionConfig, say: Say, seconds: float | None = None) ->
         return _repeat(lambda: service.turn(_WAIT_S), seconds)
 
 
-def watch_camera(config: VisionConfig, camera: LocalCamera, say: Say, seconds: float | None = None) -> int:
+def watch_camera(config: VisionConfig, camera: LocalCamera, say: LogLine, seconds: float | None = None) -> int:
     """Tell what is seen by a camera of this machine, until Ctrl-C or for `seconds`; returns the exit code 0."""
     model = camera.model
     lens = "calibrated" if model.calibrated else "not calibrated, so distances are a guess"
-    watching = Watching(config, camera, say)
+    watching = LocalRun(config, camera, say)
     say(f"vision: dry run, camera {model.width_px}x{model.height_px}, {lens}; nothing is driven")
     return _repeat(watching.turn, seconds)
 
@@ -83,18 +83,18 @@ def _repeat(turn: Callable[[], None], seconds: float | None) -> int:
 class AckingService(Service):
     """The vision service as it is, but every answer goes out as an acknowledgement."""
 
-    def __init__(self, config: VisionConfig, link: Link, say: Say) -> None:
+    def __init__(self, config: VisionConfig, link: Link, say: LogLine) -> None:
         super().__init__(config, link, say)
-        self._dispatch = OnlyScans(config, link, self._tell, self._refuse)
+        self._dispatch = ScansOnly(config, link, self._tell, self._refuse)
         self._dispatch.tell_news(self._eyes)
-        self._telling = Telling(say)
+        self._telling = ProgressPrinter(say)
 
-    def _publish(self, header: FrameHeader, answer: Answer, compute_us: int) -> None:
-        super()._publish(header, Answer(None, answer.seen), compute_us)
+    def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
+        super()._publish(header, PipelineAnswer(None, answer.seen), compute_us)
         self._telling.step(answer, time.monotonic())
 
 
-class OnlyScans(Dispatch):
+class ScansOnly(MissionChannel):
     """Takes no missions and reports nothing: what the robot does is not this one's doing."""
 
     def before(self, pipeline: Pipeline, frame: FrameHeader) -> None:  # noqa: ARG002
@@ -103,21 +103,21 @@ class OnlyScans(Dispatch):
             self._look(pipeline)
 
     def after(
-        self, now_s: float, pipeline: Pipeline | None, frame: FrameHeader | None, seen: Seen  # noqa: ARG002
+        self, now_s: float, pipeline: Pipeline | None, frame: FrameHeader | None, seen: Observation  # noqa: ARG002
     ) -> None:
         """Say only what the detector has to say."""
         if pipeline is not None:
             self.tell_news(pipeline.eyes)
 
 
-class Watching:
+class LocalRun:
     """A local camera straight into the pipeline, as if its robot stood still."""
 
-    def __init__(self, config: VisionConfig, camera: LocalCamera, say: Say) -> None:
+    def __init__(self, config: VisionConfig, camera: LocalCamera, say: LogLine) -> None:
         self._camera, self._say = camera, say
         self._patience_us = round(config.detector.deadline_s * 1e6)
         self._pipeline = Pipeline(config, camera.model, eyes=configured_detector(config))
-        self._telling = Telling(say)
+        self._telling = ProgressPrinter(say)
         self._tell_news()
         self._session = secrets.token_hex(4)
         self._seq = 0
@@ -140,7 +140,7 @@ class Watching:
             self._tell_news()
 
     def _tell_news(self) -> None:
-        for line in news_of(self._pipeline.eyes):
+        for line in notices_of(self._pipeline.eyes):
             self._say(f"vision: {line}")
 
     def _complain(self, fault: str) -> None:
@@ -149,15 +149,15 @@ class Watching:
         self._fault = fault
 
 
-class Telling:
+class ProgressPrinter:
     """One line at most every half second, with the pictures per second since the last."""
 
-    def __init__(self, say: Say) -> None:
+    def __init__(self, say: LogLine) -> None:
         self._say = say
         self._told_s: float | None = None
         self._pictures = 0
 
-    def step(self, answer: Answer, now_s: float) -> None:
+    def step(self, answer: PipelineAnswer, now_s: float) -> None:
         """Count a picture; tell of it if it is time."""
         self._pictures += 1
         if self._told_s is None:
@@ -165,19 +165,19 @@ class Telling:
         elif now_s - self._told_s >= _TELL_EVERY_S:
             self._tell(answer, f" ({self._pictures / (now_s - self._told_s):.0f} pictures/s)", now_s)
 
-    def _tell(self, answer: Answer, rate: str, now_s: float) -> None:
+    def _tell(self, answer: PipelineAnswer, rate: str, now_s: float) -> None:
         self._say(f"{seen_text(answer.seen)}{_would_text(answer)}{rate}")
         self._told_s, self._pictures = now_s, 0
 
 
-def seen_text(seen: Seen) -> str:
+def seen_text(seen: Observation) -> str:
     """One line for a person: phase, bearing (left positive), distance."""
     if seen.bearing_rad is None or seen.distance_m is None:
         return f"{seen.phase}: {seen.note or 'no target in sight'}"
     return f"{seen.phase}: bearing {seen.bearing_rad * _DEGREES:+.1f} degrees, distance {seen.distance_m:.2f} m"
 
 
-def _would_text(answer: Answer) -> str:
+def _would_text(answer: PipelineAnswer) -> str:
     twist = answer.twist
     if twist is None or answer.seen.bearing_rad is None:
         return ""

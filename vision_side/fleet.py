@@ -17,14 +17,14 @@ from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.config import VisionConfig
 from vision_side.counts import Counts
 from vision_side.detect.around import close_detector
-from vision_side.detect.choice import configured_detector, waits
+from vision_side.detect.choice import configured_detector, waits_for_service
 from vision_side.detect.port import Detector
-from vision_side.service import Say, Service, open_service
+from vision_side.service import LogLine, Service, open_service
 
 _LONGEST_WAIT_S = 0.2
 
 
-class Site(Protocol):
+class FleetLink(Protocol):
     """Where robots are met."""
 
     def robots(self) -> list[str]:
@@ -40,7 +40,7 @@ class Site(Protocol):
         ...
 
 
-class _Belled:
+class _NotifyingLink:
     """A link whose slots ring `bell` when something is put into them; all else is the link's own."""
 
     def __init__(self, link: Link, bell: threading.Event) -> None:
@@ -87,10 +87,10 @@ class Fleet:
     waits for keeps no other waiting.
     """
 
-    def __init__(self, config: VisionConfig, site: Site, say: Say, eyes: Detector | None = None) -> None:
+    def __init__(self, config: VisionConfig, site: FleetLink, say: LogLine, eyes: Detector | None = None) -> None:
         """`eyes` look for every robot, or for the first of those with their own; None for those of `config`."""
         self._config, self._site, self._say = config, site, say
-        self._apart = waits(config)
+        self._apart = waits_for_service(config)
         self._eyes = eyes or configured_detector(config)
         self._bell, self._ending = threading.Event(), threading.Event()
         self._threads: list[threading.Thread] = []
@@ -132,7 +132,7 @@ class Fleet:
         config = self._config.model_copy(update={"robot": robot})
         link = self._site.link(robot)
         if not self._apart:
-            self.services[robot] = open_service(config, _Belled(link, self._bell), self._of(robot), self._eyes)
+            self.services[robot] = open_service(config, _NotifyingLink(link, self._bell), self._of(robot), self._eyes)
             return
         own = configured_detector(config) if self.services else None
         service = self.services[robot] = open_service(config, link, self._of(robot), own or self._eyes)
@@ -157,5 +157,5 @@ class Fleet:
         for thread in self._threads:
             thread.join(max(0.0, until_s - time.monotonic()))
 
-    def _of(self, robot: str) -> Say:
+    def _of(self, robot: str) -> LogLine:
         return lambda line: self._say(line.replace("vision: ", f"vision: {robot}: ", 1))

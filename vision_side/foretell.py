@@ -25,7 +25,7 @@ class Motion:
     angular_rad_s: float
 
 
-class Latency:
+class LatencyEstimator:
     """How late a command acts, smoothed."""
 
     def __init__(self, config: LatencyConfig) -> None:
@@ -46,12 +46,12 @@ class Latency:
         self.measured_s += share * (min(latency_us / 1e6, self._config.max_s) - self.measured_s)
 
 
-class Foretelling:
+class MotionPredictor:
     """Keeps the latency and the commands sent."""
 
     def __init__(self, config: LatencyConfig) -> None:
         self._config = config
-        self._latency = Latency(config)
+        self._latency = LatencyEstimator(config)
         self._sent: deque[tuple[int, float, float]] = deque(maxlen=_REMEMBERED)
 
     @property

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from protocol.messages import CameraModel, FrameHeader, Twist
 from vision_side.detect.port import Detection
-from vision_side.pipeline import Seen
+from vision_side.pipeline import Observation
 
 Image = NDArray[np.uint8]
 Point = tuple[float, float]
-Colour = tuple[int, int, int]
+Color = tuple[int, int, int]
 
 AXES: Final = (210, 210, 210)
 OUTLINE: Final = (255, 230, 0)
@@ -23,7 +23,7 @@ TARGET: Final = (80, 235, 80)
 OTHER: Final = (170, 170, 60)
 RAW: Final = (70, 110, 255)
 FILTERED: Final = (255, 120, 255)
-WORDS: Final = (255, 255, 255)
+TEXT_COLOR: Final = (255, 255, 255)
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _FONT_PER_WIDTH: Final = 0.48 / 640  # about sixty letters from edge to edge
 _STRIP_SHADE: Final = 0.35  # what is left of the picture under words, so that they can be read on anything
@@ -33,7 +33,7 @@ _FAR_PX: Final = 9e3  # OpenCV draws in 16 bits
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class OverlayData:
     """What is told of one frame.
 
     `radius_m` is the target's, for where the track says that its middle is; `age_us` is the least that the frame's age
@@ -41,7 +41,7 @@ class Shown:
     """
 
     header: FrameHeader
-    seen: Seen
+    seen: Observation
     twist: Twist | None
     mission: str
     camera: CameraModel
@@ -49,7 +49,7 @@ class Shown:
     age_us: int | None = None
 
 
-def draw_overlay(picture: Image, shown: Shown, width_px: int) -> Image:
+def draw_overlay(picture: Image, shown: OverlayData, width_px: int) -> Image:
     """`picture`, of any size, made `width_px` wide, with everything drawn over it."""
     camera = shown.camera
     height_px = max(1, round(width_px * camera.height_px / camera.width_px))
@@ -94,7 +94,7 @@ def radius_px(target: Detection) -> float:
     return math.sqrt(max(0.0, (target.x2_px - target.x1_px) * (target.y2_px - target.y1_px)) / math.pi)
 
 
-def filtered_px(shown: Shown) -> Point | None:
+def filtered_px(shown: OverlayData) -> Point | None:
     """Where the track says that the target's middle is, in pixels of the encoded picture; None if not in front."""
     seen, camera = shown.seen, shown.camera
     if seen.bearing_rad is None or seen.distance_m is None:
@@ -143,27 +143,27 @@ def _at(point: Point, scale: float) -> tuple[int, int]:
 
 # --- words -------------------------------------------------------------------------------------------------------
 
-Words = Sequence[tuple[str, Colour]]
+StyledText = Sequence[tuple[str, Color]]
 
 
-def _what_it_does(shown: Shown) -> Words:
+def _what_it_does(shown: OverlayData) -> StyledText:
     seen, header = shown.seen, shown.header
     told = [f"{shown.mission}: {seen.phase}" if shown.mission else seen.phase]
     told += [f"{seen.distance_m:.2f} m"] if seen.distance_m is not None else []
     told += [f"{math.degrees(seen.bearing_rad):+.1f} deg"] if seen.bearing_rad is not None else []
     told += [seen.note] if seen.note else []
-    return [(f"frame {header.seq}  age {_age_text(shown)}", WORDS), (_GAP.join(told), WORDS)]
+    return [(f"frame {header.seq}  age {_age_text(shown)}", TEXT_COLOR), (_GAP.join(told), TEXT_COLOR)]
 
 
-def _age_text(shown: Shown) -> str:
+def _age_text(shown: OverlayData) -> str:
     """From capture to accepted command, the robot's own measure; while it obeys nothing, what is known here."""
     if shown.header.latency_us is not None:
         return f"{shown.header.latency_us / 1000:.0f} ms"
     return "?" if shown.age_us is None else f">= {shown.age_us / 1000:.0f} ms"
 
 
-def _where_it_is(target: Detection | None, filtered: Point | None) -> Words:
-    parts: list[tuple[str, Colour]] = []
+def _where_it_is(target: Detection | None, filtered: Point | None) -> StyledText:
+    parts: list[tuple[str, Color]] = []
     if target is not None:
         x, y = raw_px(target)
         parts.append((f"raw {x:.1f}, {y:.1f}", RAW))
@@ -171,20 +171,20 @@ def _where_it_is(target: Detection | None, filtered: Point | None) -> Words:
         parts.append((f"filtered {filtered[0]:.1f}, {filtered[1]:.1f}", FILTERED))
     if target is not None:
         parts.append((f"radius {radius_px(target):.1f} px", TARGET))
-    return parts or [("nothing found", WORDS)]
+    return parts or [("nothing found", TEXT_COLOR)]
 
 
-def _what_it_commands(shown: Shown) -> Words:
+def _what_it_commands(shown: OverlayData) -> StyledText:
     twist, applied = shown.twist, shown.header.applied
     command = "no command" if twist is None else f"twist {_twist_text((twist.linear_mps, twist.angular_rad_s))}"
-    return [(command, WORDS), (f"wheels {_twist_text(applied)}", WORDS)]
+    return [(command, TEXT_COLOR), (f"wheels {_twist_text(applied)}", TEXT_COLOR)]
 
 
 def _twist_text(twist: tuple[float, float]) -> str:
     return f"{twist[0]:+.2f} m/s {twist[1]:+.2f} rad/s"
 
 
-def _write_strip(canvas: Image, lines: Sequence[Words], font: float, *, top: bool) -> None:
+def _write_strip(canvas: Image, lines: Sequence[StyledText], font: float, *, top: bool) -> None:
     height = round(_LINE_PER_FONT * font)
     band = canvas[: height + 6] if top else canvas[-(height * len(lines) + 6) :]
     band[:] = cv2.convertScaleAbs(band, alpha=_STRIP_SHADE)
@@ -193,7 +193,7 @@ def _write_strip(canvas: Image, lines: Sequence[Words], font: float, *, top: boo
         _write_line(canvas, words, start + height * (number + 1) - 2, font)
 
 
-def _write_line(canvas: Image, words: Words, y_px: int, font: float) -> None:
+def _write_line(canvas: Image, words: StyledText, y_px: int, font: float) -> None:
     x_px, end_px = 8, canvas.shape[1] - 8
     for text, colour in words:
         plain = _fitting(_plain(text), end_px - x_px, font)
@@ -220,6 +220,6 @@ def _plain(text: str) -> str:
     return "".join(letter if " " <= letter <= "~" else "?" for letter in text)
 
 
-def _outlined(canvas: Image, text: str, at: tuple[int, int], font: float, colour: Colour) -> None:
+def _outlined(canvas: Image, text: str, at: tuple[int, int], font: float, colour: Color) -> None:
     for shade, thickness in (((0, 0, 0), 3), (colour, 1)):
         cv2.putText(canvas, text, at, _FONT, font, shade, thickness, cv2.LINE_AA)

@@ -6,7 +6,7 @@ _EARLY: Final = 0.25
 """Share of a period that one may come early: else every second of 30 frames a second would often be a third."""
 
 
-class Pace:
+class RateLimiter:
     """At most `rate_hz` in the mean."""
 
     def __init__(self, rate_hz: float) -> None:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 from protocol import VERSION
 from protocol.errors import WireError
-from protocol.messages import AnswerHeader, Asked, CameraModel, Echo, FrameHeader, ScanHeader, Twist
+from protocol.messages import AnswerHeader, RequestId, CameraModel, Echo, FrameHeader, ScanHeader, Twist
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder, Picture
-from vision_side.detect.checking import asked
+from vision_side.detect.checking import checked_results
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.port import (
     NO_DEADLINE,
@@ -18,9 +18,9 @@ from vision_side.detect.port import (
     Detector,
     PictureDetector,
 )
-from vision_side.foretell import Latency
-from vision_side.missions.choice import Chosen, configured
-from vision_side.missions.duty import Duty
+from vision_side.foretell import LatencyEstimator
+from vision_side.missions.choice import MissionSpec, configured_mission
+from vision_side.missions.duty import MissionSwitch
 from vision_side.missions.port import Plan, RangeScan, View
 
 Detections = tuple[Detection, ...]
@@ -40,7 +40,7 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class Observation:
     """What a person may want to see of one step.
 
     `phase` is the mission's own word (of `follow`: tracking, coasting, searching, lost), or no picture; bearing (left
@@ -57,13 +57,13 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class PipelineAnswer:
     """The answer to one frame; without a twist it only acknowledges. `scan` and `mission` tell what else it went by."""
 
     twist: Twist | None
-    seen: Seen
+    seen: Observation
     scan: int | None = None
-    mission: Asked | None = None
+    mission: RequestId | None = None
 
 
 class Pipeline:
@@ -74,7 +74,7 @@ class Pipeline:
         config: VisionConfig,
         camera: CameraModel,
         detector: PictureDetector | None = None,
-        chosen: Chosen | None = None,
+        chosen: MissionSpec | None = None,
         eyes: Detector | None = None,
     ) -> None:
         """`chosen` is the mission to begin with, that of `config` if None; `eyes` look in place of `detector`.
@@ -88,7 +88,7 @@ class Pipeline:
         self._eyes = eyes
         self.looked: DetectionResult | None = None
         self._decoder = Decoder(camera.width_px, camera.height_px, config.max_pixels)
-        self._first = chosen or configured(config)
+        self._first = chosen or configured_mission(config)
         self.skipped: Counter[str] = Counter()
         self._session = ""
         self._scan: tuple[ScanHeader, RangeScan] | None = None
@@ -96,18 +96,18 @@ class Pipeline:
 
     def _forget(self) -> None:
         """Everything that was learned from earlier frames, and what somebody asked for since."""
-        self._duty = Duty(self._first, self._camera)
-        self._latency = Latency(self._config.latency)
-        self._asked: Asked | None = None
+        self._duty = MissionSwitch(self._first, self._camera)
+        self._latency = LatencyEstimator(self._config.latency)
+        self._asked: RequestId | None = None
         self._last_us: int | None = None
 
     @property
-    def mission(self) -> Chosen:
+    def mission(self) -> MissionSpec:
         """The newest chosen."""
         return self._duty.chosen
 
     @property
-    def asked(self) -> Asked | None:
+    def asked(self) -> RequestId | None:
         """Who asked for it; None for the one it began with."""
         return self._asked
 
@@ -121,7 +121,7 @@ class Pipeline:
         """What looks in place of the pipeline's own detector."""
         return self._eyes
 
-    def switch(self, chosen: Chosen, asked: Asked) -> None:
+    def switch(self, chosen: MissionSpec, asked: RequestId) -> None:
         """From the next frame on come to rest, then carry out `chosen`; a new session of the robot ends it."""
         self._asked = asked
         self._duty.switch(chosen)
@@ -143,10 +143,10 @@ class Pipeline:
         after._scan = self._scan
         if self._asked is not None:
             after._session, after._asked = self._session, self._asked
-            after._duty = Duty(self.mission, camera) if self.mission.needs_camera else self._duty
+            after._duty = MissionSwitch(self.mission, camera) if self.mission.needs_camera else self._duty
         return after
 
-    def step(self, frame: Frame) -> Answer:
+    def step(self, frame: Frame) -> PipelineAnswer:
         """Answer `frame`. Never raises for any JPEG bytes; what cannot be used is counted in `skipped`."""
         if not self._is_new(frame.header):
             return self._skip("OUT_OF_ORDER", "frame is not newer than the last")
@@ -157,13 +157,13 @@ class Pipeline:
         if self._eyes is None:
             return self._answer(frame.header, self._detector.detect(picture), picture)
         shown = DetectFrame(self._config.robot, frame.header, frame.jpeg, self._decoder, picture)
-        (result,) = asked(self._eyes, [shown], frame.deadline_us)
+        (result,) = checked_results(self._eyes, [shown], frame.deadline_us)
         if isinstance(result, str):
             return self._skip(NO_ANSWER, result, "no answer")
         self.looked = result
         return self._answer(frame.header, result.detections, picture)
 
-    def follow(self, header: FrameHeader, detections: Detections) -> Answer:
+    def follow(self, header: FrameHeader, detections: Detections) -> PipelineAnswer:
         """Answer the frame of `header`, in which somebody else found `detections`; empty is "saw nothing"."""
         if not self._is_new(header):
             return self._skip("OUT_OF_ORDER", "what was looked at is not newer than the last")
@@ -174,16 +174,16 @@ class Pipeline:
         self.meet(header.session)
         return self._last_us is None or header.t_us > self._last_us
 
-    def _skip(self, reason: str, note: str, phase: str = "no picture") -> Answer:
+    def _skip(self, reason: str, note: str, phase: str = "no picture") -> PipelineAnswer:
         self.skipped[reason] += 1
-        return Answer(None, Seen(phase, note=note))
+        return PipelineAnswer(None, Observation(phase, note=note))
 
-    def _answer(self, header: FrameHeader, detections: Detections, picture: Picture | None) -> Answer:
+    def _answer(self, header: FrameHeader, detections: Detections, picture: Picture | None) -> PipelineAnswer:
         dt_s = self._tick(header)
         stamp, scan = self._newest_scan(header)
         view = View(header, dt_s, self._latency.total_s, self._camera, detections, picture, scan)
         plan = self._duty.step(view)
-        return Answer(plan.twist, _seen(plan, detections), stamp.seq if stamp else None, self._asked)
+        return PipelineAnswer(plan.twist, _seen(plan, detections), stamp.seq if stamp else None, self._asked)
 
     def _tick(self, header: FrameHeader) -> float:
         """Seconds since the last picture; also takes in what the robot measured."""
@@ -199,12 +199,12 @@ class Pipeline:
         return self._scan
 
 
-def _seen(plan: Plan, detections: Detections) -> Seen:
-    return Seen(plan.phase, detections, plan.target, plan.bearing_rad, plan.distance_m, plan.note, plan.done)
+def _seen(plan: Plan, detections: Detections) -> Observation:
+    return Observation(plan.phase, detections, plan.target, plan.bearing_rad, plan.distance_m, plan.note, plan.done)
 
 
 def answer_header(
-    frame: FrameHeader, session: str, seq: int, compute_us: int = 0, answer: Answer | None = None
+    frame: FrameHeader, session: str, seq: int, compute_us: int = 0, answer: PipelineAnswer | None = None
 ) -> AnswerHeader:
     """The header of the answer to `frame`, naming it field for field, and what else `answer` went by."""
     echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
@@ -213,7 +213,7 @@ def answer_header(
                         mission=mission)
 
 
-def encode_answer(frame: FrameHeader, session: str, seq: int, compute_us: int, answer: Answer | None = None) -> bytes:
+def encode_answer(frame: FrameHeader, session: str, seq: int, compute_us: int, answer: PipelineAnswer | None = None) -> bytes:
     """`encode(answer_header(...))` byte for byte, without the models: every part of it was checked when it came in."""
     scan, mission = (answer.scan, answer.mission) if answer else (None, None)
     by_scan = "" if scan is None else f',"scan":{scan}'

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError
 
 from protocol.errors import ConfigError
 from vision_side.config import VisionConfig
-from vision_side.detect.around import PLUGIN_RAISES
+from vision_side.detect.around import PLUGIN_ERRORS
 
 LONGEST_DETAIL: Final = 160
 _CLASS: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
@@ -27,7 +27,7 @@ _CLASS: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
 
 
 @dataclass(frozen=True, slots=True)
-class Family:
+class PluginRegistry:
     """One kind of plug-in: what it is called, what is built in, who else may be installed."""
 
     noun: str
@@ -47,7 +47,7 @@ class Family:
                 return others[kind].load()
             if where is not None or _CLASS.fullmatch(kind):
                 return _imported(where or kind)
-        except PLUGIN_RAISES as error:  # in a plug-in's own import
+        except PLUGIN_ERRORS as error:  # in a plug-in's own import
             hint = "" if where or kind in others else self._hint(kind)
             why = str(error) or type(error).__name__
             raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {why}"[:LONGEST_DETAIL] + hint) from None
@@ -61,7 +61,7 @@ class Family:
 
     def settings(self, kind: str, plugin: Any, options: Mapping[str, Any], config: VisionConfig) -> Any:
         """The checked `Config` of `plugin`. Raises ConfigError, one line, for a wrong option."""
-        settings = settings_model(plugin)
+        settings = config_model(plugin)
         if settings is None:
             raise ConfigError(f"{self.noun} {kind!r}: {plugin!r} has no pydantic model called Config; see "
                               f"docs/{self.noun}s.md")
@@ -71,7 +71,7 @@ class Family:
             raise ConfigError(f"{self.noun} {kind!r}: {_problem(settings, error)}"[:LONGEST_DETAIL]) from None
 
 
-def settings_model(plugin: Any) -> type[BaseModel] | None:
+def config_model(plugin: Any) -> type[BaseModel] | None:
     """The class's own `Config`."""
     settings = getattr(plugin, "Config", None)
     return settings if isinstance(settings, type) and issubclass(settings, BaseModel) else None

@@ -2,11 +2,11 @@
 
 from typing import Any, Final
 
-from protocol.messages import Asked
+from protocol.messages import RequestId
 from protocol.mission_messages import MissionReport
 from vision_side.config import DetectorConfig
 from vision_side.detect.port import DetectionResult
-from vision_side.pipeline import Seen
+from vision_side.pipeline import Observation
 
 PERIOD_S: Final = 0.5
 LEAST_GAP_S: Final = 0.1
@@ -24,7 +24,7 @@ class Reporter:
         self._said_s = 0.0
 
     def due(
-        self, now_s: float, mission: str, seen: Seen, asked: Asked | None, refused: str, *,
+        self, now_s: float, mission: str, seen: Observation, asked: RequestId | None, refused: str, *,
         looked: DetectionResult | None = None, beside: str = "", took_us: int | None = None,
     ) -> MissionReport | None:
         """The report, if it is time for one. `looked` is the detector's newest result, `beside` who else looks.

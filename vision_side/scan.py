@@ -6,11 +6,11 @@ from protocol.channels import SCAN
 from protocol.codec import check_sizes, decode
 from protocol.errors import WireError
 from protocol.messages import ScanHeader
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from vision_side.missions.port import RangeScan
 
 
-def read_scan(header: bytes, payload: bytes) -> tuple[ScanHeader, RangeScan]:
+def decode_scan(header: bytes, payload: bytes) -> tuple[ScanHeader, RangeScan]:
     """The scan and its stamp.
 
     Raises WireError: MALFORMED for broken headers and sizes, NOT_FINITE for a nan or a negative range.
@@ -18,10 +18,10 @@ def read_scan(header: bytes, payload: bytes) -> tuple[ScanHeader, RangeScan]:
     check_sizes(SCAN, header, payload)
     stamp = decode(ScanHeader, header)
     if len(payload) % 4:
-        raise WireError(Refusal.MALFORMED, f"scan payload of {len(payload)} bytes is no whole number of float32")
+        raise WireError(RejectReason.MALFORMED, f"scan payload of {len(payload)} bytes is no whole number of float32")
     ranges_m = np.frombuffer(payload, "<f4").astype(np.float32, copy=False)
     if not (ranges_m >= 0).all():  # false for a nan too
-        raise WireError(Refusal.NOT_FINITE, "scan holds a nan or negative range")
+        raise WireError(RejectReason.NOT_FINITE, "scan holds a nan or negative range")
     scan = RangeScan(stamp.t_us, stamp.angle_min_rad, stamp.angle_increment_rad, stamp.range_min_m, stamp.range_max_m,
                      ranges_m)
     return stamp, scan

@@ -14,7 +14,7 @@ from protocol.clock import monotonic_us
 from protocol.codec import decode
 from protocol.errors import WireError
 from protocol.messages import CameraModel, FrameHeader, Stamp
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link import LatestSlot, Link, Message
 from protocol.twist_text import format_twist
 from vision_side.config import VisionConfig
@@ -23,22 +23,22 @@ from vision_side.detect.around import attach_detector
 from vision_side.detect.choice import configured_detector
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.port import Detector
-from vision_side.detect.timing import Clocked
-from vision_side.dispatch import NO_FRAMES, Dispatch
-from vision_side.pipeline import Answer, Frame, Pipeline, Seen, encode_answer
-from vision_side.sessions import Sessions
-from vision_side.viewing import Viewing
+from vision_side.detect.timing import TimedDetector
+from vision_side.dispatch import NO_FRAMES, MissionChannel
+from vision_side.pipeline import PipelineAnswer, Frame, Pipeline, Observation, encode_answer
+from vision_side.sessions import SessionSelector
+from vision_side.viewing import ViewPublisher
 
 _SILENCE_S = 3.0
 _NO_FRAMES_S = 1.0  # twice what the slowest stream takes between two frames
 _CAMERA_PATIENCE_S = 1.5
 _TOLD_COUNTS = tuple(10**power for power in range(10))  # a camera gone bad is told at 1, 10, 100 ... pictures
 _TOLD_PHASES = {"searching": "target not in sight, searching", "lost": "target lost"}
-Say = Callable[[str], None]
+LogLine = Callable[[str], None]
 Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
 
 
-def open_service(config: VisionConfig, link: Link, say: Say, eyes: Detector | None = None) -> "Service":
+def open_service(config: VisionConfig, link: Link, say: LogLine, eyes: Detector | None = None) -> "Service":
     """The service that fits the configured detector, for one robot. `eyes` are that detector, if it is built."""
     if config.detector.kind == "boxes":
         from vision_side.boxes_service import BoxesService
@@ -50,10 +50,10 @@ def open_service(config: VisionConfig, link: Link, say: Say, eyes: Detector | No
 class Service:
     """What is known of the robot on the other end, and the pipeline that fits it."""
 
-    def __init__(self, config: VisionConfig, link: Link, say: Say, eyes: Detector | None = None) -> None:
+    def __init__(self, config: VisionConfig, link: Link, say: LogLine, eyes: Detector | None = None) -> None:
         self._config, self._link, self._say = config, link, say
         self._eyes = eyes or configured_detector(config)
-        self._plain = Clocked(HsvDetector(config.hsv))
+        self._plain = TimedDetector(HsvDetector(config.hsv))
         attach_detector(self._eyes, link)
         self._cameras: LatestSlot[Message] = link.latest(CAMERA)
         self._frames = self._arrivals(link)
@@ -61,7 +61,7 @@ class Service:
         self._pipeline: Pipeline | None = None
         self._session = secrets.token_hex(4)
         self._robot_session = ""
-        self._sessions = Sessions()
+        self._sessions = SessionSelector()
         self._said: dict[str, str] = {}
         self._counted: Counter[str] = Counter()
         if config.camera is not None:
@@ -71,8 +71,8 @@ class Service:
         self._newest: tuple[int, int | None] = (0, None)
         self.answered = self.steered = 0
         self.skipped: Counter[str] = Counter()
-        self._dispatch = Dispatch(config, link, self._tell, self._refuse)
-        self._viewing = Viewing(config, link, self._tell)
+        self._dispatch = MissionChannel(config, link, self._tell, self._refuse)
+        self._viewing = ViewPublisher(config, link, self._tell)
 
     def _arrivals(self, link: Link) -> LatestSlot[Message]:
         """Where what is to be answered arrives."""
@@ -97,7 +97,7 @@ class Service:
             self._dispatch.after(now_s, self._pipeline, None, NO_FRAMES)
         if now_s - self._heard_s > _SILENCE_S:
             self._robot_session = ""
-            self._tell("link", f"no frames from robot {self._config.robot} at {_endpoints(self._config)}; is "
+            self._tell("link", f"no frames from robot {self._config.robot} at {endpoints_text(self._config)}; is "
                                "`sightline robot` running there, with this robot id?")
 
     def counts(self) -> Counts:
@@ -140,7 +140,7 @@ class Service:
             self._tell("link", f"frames from robot {self._config.robot}, session {header.session}")
         if self._pipeline is None:
             self._wait_for_camera()
-            self._publish(header, Answer(None, Seen("no picture", note="no camera model yet")), 0)
+            self._publish(header, PipelineAnswer(None, Observation("no picture", note="no camera model yet")), 0)
             return
         self._dispatch.before(self._pipeline, header)
         deadline_us = monotonic_us() + round(self._config.detector.deadline_s * 1e6)
@@ -164,7 +164,7 @@ class Service:
         if time.monotonic() - self._blind_since_s > _CAMERA_PATIENCE_S:
             self._tell("camera", "frames come, but no camera model; is the robot of another version?")
 
-    def _publish(self, header: FrameHeader, answer: Answer, compute_us: int) -> None:
+    def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
         self.answered += 1
         self.steered += answer.twist is not None
         self._newest = (compute_us, header.latency_us)
@@ -183,10 +183,10 @@ class Service:
 
     def _refuse(self, error: WireError) -> None:
         self.skipped[error.reason] += 1
-        if error.reason is Refusal.UNSUPPORTED_VERSION:
+        if error.reason is RejectReason.UNSUPPORTED_VERSION:
             self._tell("version", error.detail)
 
-    def _tell_phase(self, answer: Answer) -> None:
+    def _tell_phase(self, answer: PipelineAnswer) -> None:
         seen = answer.seen
         if answer.twist is None:
             count = self.skipped.total()
@@ -206,7 +206,7 @@ class Service:
             self._say(f"vision: {line}")
 
 
-def _endpoints(config: VisionConfig) -> str:
+def endpoints_text(config: VisionConfig) -> str:
     return ", ".join([*config.connect, *(f"{one} (listening)" for one in config.listen)]) or "nowhere"
 
 

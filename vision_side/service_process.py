@@ -12,9 +12,9 @@ from vision_side.counts import Observe
 from vision_side.detect.around import close_detector
 from vision_side.detect.choice import configured_detector
 from vision_side.detect.port import Detector
-from vision_side.missions.choice import configured
+from vision_side.missions.choice import configured_mission
 from vision_side.pipeline import SOURCE
-from vision_side.service import Say, _endpoints, open_service
+from vision_side.service import LogLine, endpoints_text, open_service
 
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 
@@ -43,13 +43,13 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
 
     Raises ConfigError for an endpoint or a mission that is none, LinkError if the link cannot be opened.
     """
-    from protocol.transports.zenoh_log import refusals_told
+    from protocol.transports.zenoh_log import log_rejected_peers
 
-    configured(config)  # a mission that there is not is said before anything is opened
+    configured_mission(config)  # a mission that there is not is said before anything is opened
     ending, eyes = threading.Event(), configured_detector(config)
     run_it = _run_fleet if set("*?") & set(config.robot) else _run_one
     try:
-        with refusals_told(config.listen, config.secure, lambda line: _say(f"vision: {line}")):
+        with log_rejected_peers(config.listen, config.secure, lambda line: _say(f"vision: {line}")):
             return run_it(config, ending, observe, eyes)
     finally:
         close_detector(eyes)
@@ -62,19 +62,19 @@ def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | N
                         max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     # Signals are caught only from here on: until the link is open, they end the process by themselves.
     with opened as link, ends_on_signal(ending):
-        _say(f"vision: looking for robot {config.robot} at {_endpoints(config)}")
+        _say(f"vision: looking for robot {config.robot} at {endpoints_text(config)}")
         serve(config, link, ending, _say, observe, eyes=eyes)
     return 0
 
 
 def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe | None, eyes: Detector | None) -> int:
-    from protocol.transports.zenoh_site import open_site
+    from protocol.transports.zenoh_site import open_fleet
     from vision_side.fleet import Fleet
 
-    opened = open_site(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
+    opened = open_fleet(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                        max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     with opened as site, ends_on_signal(ending):
-        _say(f"vision: looking for robots {config.robot} at {_endpoints(config)}")
+        _say(f"vision: looking for robots {config.robot} at {endpoints_text(config)}")
         fleet = Fleet(config, site, _say, eyes)
         if observe is not None:
             observe(fleet.counts)
@@ -83,7 +83,7 @@ def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe |
 
 
 def serve(
-    config: VisionConfig, link: Link, ending: threading.Event, say: Say, observe: Observe | None = None, *,
+    config: VisionConfig, link: Link, ending: threading.Event, say: LogLine, observe: Observe | None = None, *,
     eyes: Detector | None = None,
 ) -> None:
     """Answer frames that come over `link` until `ending` is set."""

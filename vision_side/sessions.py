@@ -35,7 +35,7 @@ class _Earlier:
         return min(now_us - self.again_us, captured_us - self.captured_us) >= GOES_ON_US
 
 
-class Sessions:
+class SessionSelector:
     """Judges every frame by its session. Times are of this machine's clock, but for `captured_us`, the robot's."""
 
     def __init__(self) -> None:

@@ -34,7 +34,7 @@ class Sighting:
     detection: Detection
 
 
-def locate(detection: Detection, camera: CameraModel, radius_m: float) -> Sighting | None:
+def locate_sphere(detection: Detection, camera: CameraModel, radius_m: float) -> Sighting | None:
     """Where a sphere of `radius_m` is, or None if the outline is no sphere's (too few points, no size, behind)."""
     outline = detection.outline_px if detection.outline_px is not None else _box_outline(detection, camera)
     if len(outline) < _MIN_POINTS:

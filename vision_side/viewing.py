@@ -26,9 +26,9 @@ from protocol.robot_clock import RobotClock
 from protocol.transports.link import LatestSlot, Link
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
-from vision_side.overlay import Shown, draw_overlay, draw_preview
-from vision_side.pace import Pace
-from vision_side.pipeline import SOURCE, Answer
+from vision_side.overlay import OverlayData, draw_overlay, draw_preview
+from vision_side.pace import RateLimiter
+from vision_side.pipeline import SOURCE, PipelineAnswer
 
 IDLE_S: Final = 2.0
 """Without anything to show for this long the thread ends; the next frame that is watched starts another."""
@@ -45,19 +45,19 @@ _QUALITIES_BELOW: Final = (50, 30)
 class _Job:
     """One frame to show, and where."""
 
-    shown: Shown
+    shown: OverlayData
     jpeg: bytes
     channels: tuple[Channel, ...]
     started_ns: int
 
 
-class Viewing:
+class ViewPublisher:
     """What one vision shows of one robot."""
 
     def __init__(self, config: VisionConfig, link: Link, tell: Callable[[str, str], None]) -> None:
         """`tell` prints a line (about what, the line) if it changed."""
         self._config, self._link, self._tell = config, link, tell
-        self._paces = {OVERLAY: Pace(config.viewing.overlay_hz), PREVIEW: Pace(config.viewing.preview_hz)}
+        self._paces = {OVERLAY: RateLimiter(config.viewing.overlay_hz), PREVIEW: RateLimiter(config.viewing.preview_hz)}
         self._kept: deque[tuple[FrameHeader, bytes]] = deque(maxlen=KEPT)
         self._jobs: LatestSlot[_Job] = LatestSlot()
         self._starting = threading.Lock()
@@ -75,7 +75,7 @@ class Viewing:
             self._kept.clear()
 
     def show(
-        self, header: FrameHeader, answer: Answer, mission: str, camera: CameraModel | None, *, started_ns: int,
+        self, header: FrameHeader, answer: PipelineAnswer, mission: str, camera: CameraModel | None, *, started_ns: int,
         jpeg: bytes | None = None,
     ) -> None:
         """Show an answered frame to who watches, if it is time; without `jpeg` one that was kept."""
@@ -89,7 +89,7 @@ class Viewing:
         jpeg = jpeg if jpeg is not None else self._kept_of(header)
         if jpeg is None or camera is None or answer.seen.phase == NO_PICTURE:
             return
-        shown = Shown(header, answer.seen, answer.twist, mission, camera, self._config.target.radius_m,
+        shown = OverlayData(header, answer.seen, answer.twist, mission, camera, self._config.target.radius_m,
                       self._clock.age_us(header.session, header.t_us, now_us))
         self._jobs.put(_Job(shown, jpeg, channels, started_ns))
         self._wake()

@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from benchmarks.loop_tally import Tally
-from benchmarks.peers.eyes import Eyes
+from benchmarks.peers.eyes import Vision
 from benchmarks.peers.film import Film
 
 _RETRY_S: Final = 0.1
@@ -35,22 +35,22 @@ def main(name: str, role: str, settings: dict[str, Any]) -> None:
 def _part(peer: ModuleType, role: str, settings: dict[str, Any]) -> Callable[[], None]:
     if role == "vision":
         signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
-        return partial(peer.vision, _eyes(settings), settings["port"])
+        return partial(peer.vision, _vision(settings), settings["port"])
     tally, film = Tally(Path(settings["tally"])), Film(Path(settings["pictures"]), settings["fps"])
     signal.signal(signal.SIGTERM, lambda *_: _end(tally))
     if role == "alone":
         slow = settings["delay_ms"] or settings["busy_ms"]
-        return partial(peer.alone, film, _eyes(settings), tally, hot=not slow)
+        return partial(peer.alone, film, _vision(settings), tally, hot=not slow)
     return partial(peer.robot, film, tally, settings["port"])
 
 
-def _eyes(settings: dict[str, Any]) -> Eyes:
+def _vision(settings: dict[str, Any]) -> Vision:
     """A robot has no use for any, and they are large; nor has a peer with its own for what ours import and set."""
     if settings["eyes"] == "classic":
-        from benchmarks.peers.classic_eyes import ClassicEyes
+        from benchmarks.peers.classic_eyes import ClassicVision
 
-        return ClassicEyes(settings["delay_ms"], settings["busy_ms"])
-    from benchmarks.loop_eyes import Eyes as OurEyes
+        return ClassicVision(settings["delay_ms"], settings["busy_ms"])
+    from benchmarks.loop_eyes import PipelineVision as OurEyes
 
     return OurEyes(settings["width_px"], settings["height_px"], settings["delay_ms"], settings["busy_ms"])
 

@@ -15,7 +15,7 @@ import zenoh
 
 if TYPE_CHECKING:
     from benchmarks.loop_tally import Tally
-    from benchmarks.peers.eyes import Eyes
+    from benchmarks.peers.eyes import Vision
     from benchmarks.peers.film import Film
 
 STAMP: Final = struct.Struct("<Q")
@@ -53,7 +53,7 @@ def robot(film: Film, tally: Tally, port: int) -> None:
             pictures.put(STAMP.pack(t_us) + jpeg)
 
 
-def vision(eyes: Eyes, port: int) -> None:
+def vision(eyes: Vision, port: int) -> None:
     """Answer the robot at `port`."""
     with _session("connect", port) as session:
         commands = session.declare_publisher("peer/twist")

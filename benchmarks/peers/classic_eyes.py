@@ -22,7 +22,7 @@ _ANGULAR_INTEGRAL: Final = 0.007
 _DEAD_BAND: Final = 0.1
 
 
-class ClassicEyes:
+class ClassicVision:
     """Pictures in, `linear|angular` out; as slow as was asked, by waiting (`delay_ms`) or by work (`busy_ms`)."""
 
     def __init__(self, delay_ms: float, busy_ms: float) -> None:

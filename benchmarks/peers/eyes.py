@@ -3,7 +3,7 @@
 from typing import Protocol
 
 
-class Eyes(Protocol):
+class Vision(Protocol):
     """Pictures in, `linear|angular` out."""
 
     def answer(self, t_us: int, jpeg: bytes, /) -> str:

@@ -10,13 +10,13 @@ from protocol.twist_text import parse_twist
 
 if TYPE_CHECKING:
     from benchmarks.loop_tally import Tally
-    from benchmarks.peers.eyes import Eyes
+    from benchmarks.peers.eyes import Vision
     from benchmarks.peers.film import Film
 
 _HOT_STEPS: Final = 150
 
 
-def alone(film: Film, eyes: Eyes, tally: Tally, *, hot: bool) -> None:
+def alone(film: Film, eyes: Vision, tally: Tally, *, hot: bool) -> None:
     """Answer pictures at their pace for ever; before that, `hot` measures steps without any pause."""
     if hot:
         tally.hot_us = statistics.median(_step_us(film, eyes) for _ in range(_HOT_STEPS))
@@ -28,7 +28,7 @@ def alone(film: Film, eyes: Eyes, tally: Tally, *, hot: bool) -> None:
         tally.judge(t_us)
 
 
-def _step_us(film: Film, eyes: Eyes) -> float:
+def _step_us(film: Film, eyes: Vision) -> float:
     t_us, jpeg = film.shoot()
     began_ns = time.perf_counter_ns()
     eyes.answer(t_us, jpeg)

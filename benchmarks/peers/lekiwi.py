@@ -14,7 +14,7 @@ import zmq
 
 if TYPE_CHECKING:
     from benchmarks.loop_tally import Tally
-    from benchmarks.peers.eyes import Eyes
+    from benchmarks.peers.eyes import Vision
     from benchmarks.peers.film import Film
 
 Socket = zmq.Socket[bytes]
@@ -53,7 +53,7 @@ def _read_command(commands: Socket, tally: Tally) -> None:
     tally.judge(command["t_us"])
 
 
-def vision(eyes: Eyes, port: int) -> None:
+def vision(eyes: Vision, port: int) -> None:
     """Answer the newest picture of the robot at `port`."""
     context = zmq.Context()
     commands, observations = _newest(context, zmq.PUSH), _newest(context, zmq.PULL)

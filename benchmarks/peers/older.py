@@ -17,7 +17,7 @@ from websockets.sync.client import ClientConnection, connect
 
 if TYPE_CHECKING:
     from benchmarks.loop_tally import Tally
-    from benchmarks.peers.eyes import Eyes
+    from benchmarks.peers.eyes import Vision
     from benchmarks.peers.film import Film
 
 COMMAND_PERIOD_S: Final = 0.0551
@@ -82,7 +82,7 @@ class Newest:
             self.text, self.processed = str(message), False
 
 
-def vision(eyes: Eyes, port: int) -> None:
+def vision(eyes: Vision, port: int) -> None:
     """Answer the robot at `port`."""
     connection = connect(f"ws://127.0.0.1:{port}", compression=None)
     newest = Newest(connection)

@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 if TYPE_CHECKING:
     from benchmarks.loop_tally import Tally
-    from benchmarks.peers.eyes import Eyes
+    from benchmarks.peers.eyes import Vision
     from benchmarks.peers.film import Film
 
 STAMP: Final = struct.Struct("<Q")
@@ -35,12 +35,12 @@ def robot(film: Film, tally: Tally, port: int) -> None:
         tally.judge(t_us)
 
 
-def vision(eyes: Eyes, port: int) -> None:
+def vision(eyes: Vision, port: int) -> None:
     """Serve answers at `port`."""
     asyncio.run(_serve(eyes, port))
 
 
-async def _serve(eyes: Eyes, port: int) -> None:
+async def _serve(eyes: Vision, port: int) -> None:
     async def handle(connection: ServerConnection) -> None:
         async for message in connection:
             data = message if isinstance(message, bytes) else message.encode()

@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from benchmarks.loop_tally import Tally
-    from benchmarks.peers.eyes import Eyes
+    from benchmarks.peers.eyes import Vision
     from benchmarks.peers.film import Film
 
 HEAD: Final = struct.Struct("<IQ")
@@ -40,7 +40,7 @@ def _listen(lines: IO[bytes], tally: Tally) -> None:
         tally.judge(int(t_us))
 
 
-def vision(eyes: Eyes, port: int) -> None:
+def vision(eyes: Vision, port: int) -> None:
     """Answer the robot at `port`."""
     connection = socket.create_connection(("127.0.0.1", port))
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

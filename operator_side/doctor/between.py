@@ -20,20 +20,20 @@ from protocol.messages import Status
 from protocol.transports import endpoints, websocket_endpoints
 from protocol.transports.link import Link
 from protocol.transports.opening import open_link
-from protocol.transports.presence import ASKS, Peer, quickest
-from protocol.transports.secured import ROBOT
+from protocol.transports.presence import QUERY_ROUNDS, PeerInfo, best_round_trips
+from protocol.transports.secured import ROBOT_ROLE
 from protocol.transports.zenoh_around import find_listeners
 from protocol.transports.zenoh_discovery import LOOPBACK
-from protocol.transports.zenoh_presence import software
+from protocol.transports.zenoh_presence import software_version
 
 ROLE = "doctor"
 ARP_TABLE = Path("/proc/net/arp")
 _ARP_COMPLETE = 0x2
 _SCOUT_S = 0.5
 _OVER_UDP = ("udp", "quic")
-_KNOCKS = 40
+_PROBES = 40
 _PATIENCE_S = 2.0
-_LOOK_S = 3.0
+_LISTEN_S = 3.0
 _QUICK_MS = 60.0
 """A round trip above this takes speed from a robot: its full limit ends at 150 ms of frame age."""
 _UNREACHED = {
@@ -47,7 +47,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
     """Everything about the way to `endpoint` and, if it is a robot's, its stream."""
     transport, host, port = _address(endpoint)
     if transport not in _OVER_UDP:
-        knocks_ms, why = _knock(host, port)
+        knocks_ms, why = _probe(host, port)
         if why:
             yield Finding("reach", False, f"{host}:{port} does not answer", why)
             return
@@ -58,7 +58,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
         role = viewer_role(secure) if secure else ROLE  # an operator's keys may acknowledge frames
         with open_link(robot, connect=[endpoint], role=role, secure=secure) as link:
             if transport in _OVER_UDP:
-                yield from _round_trip(_asked_ms(link), "questions")
+                yield from _round_trip(_answer_ms(link), "questions")
             yield from _peers(link, robot)
             yield from _robot(link, robot, Viewer(link, role, secure))
     except SightlineError as error:
@@ -81,36 +81,36 @@ def _no_link(error: SightlineError, endpoint: str) -> Finding:
 def _found_by_multicast(host: str) -> Finding:
     """Discovery is a comfort: only said."""
     try:
-        there = socket.gethostbyname(host) in {endpoints.check_endpoint(one)[1] for one in find_listeners(_SCOUT_S)}
+        there = socket.gethostbyname(host) in {endpoints.parse_zenoh_endpoint(one)[1] for one in find_listeners(_SCOUT_S)}
     except OSError:
         there = False
     words = "it answers: `sightline robots` finds it" if there else "no answer, as on many networks"
     return Finding("multicast there", None, words, "" if there else "none needed: name the endpoint with --connect")
 
 
-def _asked_ms(link: Link) -> list[float]:
+def _answer_ms(link: Link) -> list[float]:
     """Round trips of questions on the link itself, for what has no handshake of its own."""
-    rounds = [_peers_of(link) for _ in range(_KNOCKS)]
+    rounds = [_peers_of(link) for _ in range(_PROBES)]
     return [min(one.round_trip_us for one in peers) / 1000 for peers in rounds if peers]
 
 
-def _peers_of(link: Link) -> list[Peer]:
+def _peers_of(link: Link) -> list[PeerInfo]:
     """Who answers on `link`; nobody on one that cannot be asked."""
-    ask: Callable[[], list[Peer]] = getattr(link, "peers", list)
+    ask: Callable[[], list[PeerInfo]] = getattr(link, "peers", list)
     return ask()
 
 
 def _peers(link: Link, robot: str) -> Iterator[Finding]:
     """Versions at both ends, and how far their clocks are apart; a WebSocket does not tell."""
-    ours = software()
-    for peer in quickest([_peers_of(link) for _ in range(ASKS)]):
+    ours = software_version()
+    for peer in best_round_trips([_peers_of(link) for _ in range(QUERY_ROUNDS)]):
         said = peer.presence
-        if said.role == ROBOT and said.robot != robot:
+        if said.role == ROBOT_ROLE and said.robot != robot:
             continue
         same = True if said.software == ours else None
         fix = f"the same version on both machines; this one has {ours}"
         yield Finding(f"version of {said.role}", same, f"{said.software} on {said.host}", fix)
-        if said.role == ROBOT:
+        if said.role == ROBOT_ROLE:
             ahead_ms = peer.ahead_us / 1000
             yield Finding("clock skew", None, f"the robot's clock is {abs(ahead_ms):.0f} ms "
                           f"{'ahead' if ahead_ms > 0 else 'behind'}; only certificates and logs need it, no frame or "
@@ -120,15 +120,15 @@ def _peers(link: Link, robot: str) -> Iterator[Finding]:
 def _address(endpoint: str) -> tuple[str, str, int]:
     """Transport, host and port. Raises ConfigError for an endpoint that is none."""
     if "://" in endpoint:
-        web = websocket_endpoints.parse_endpoint(endpoint)
+        web = websocket_endpoints.parse_websocket_endpoint(endpoint)
         return "ws", web.host, web.port
-    return endpoints.check_endpoint(endpoint)
+    return endpoints.parse_zenoh_endpoint(endpoint)
 
 
-def _knock(host: str, port: int) -> tuple[list[float], str]:
+def _probe(host: str, port: int) -> tuple[list[float], str]:
     """Times of TCP handshakes, one round trip each, in ms; or why there is none."""
     times_ms: list[float] = []
-    for _ in range(_KNOCKS):
+    for _ in range(_PROBES):
         begun_ns = time.monotonic_ns()
         try:
             socket.create_connection((host, port), _PATIENCE_S).close()
@@ -197,10 +197,10 @@ def _watch(link: Link, viewer: Viewer) -> tuple[float, float]:
     """Frames per second and kB a frame over a few seconds; each is acknowledged, as any viewer does."""
     slot, begun_s = link.latest(FRAME), time.monotonic()
     sizes: list[int] = []
-    while time.monotonic() - begun_s < _LOOK_S:
+    while time.monotonic() - begun_s < _LISTEN_S:
         message = slot.take(0.2)
         if message is None:
             continue
         sizes.append(len(message.payload))
         viewer.acknowledge(message)
-    return len(sizes) / _LOOK_S, sum(sizes) / len(sizes) / 1000 if sizes else 0.0
+    return len(sizes) / _LISTEN_S, sum(sizes) / len(sizes) / 1000 if sizes else 0.0

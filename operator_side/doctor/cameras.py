@@ -15,7 +15,7 @@ from operator_side.doctor.finding import Finding, trouble
 from protocol.errors import SightlineError
 
 DEVICES: Final = Path("/dev")
-_LOOK_S: Final = 3.0
+_MEASURED_S: Final = 3.0
 _ENOUGH: Final = 0.9
 _ENUM_FMT: Final = 0xC0405602
 """The kernel's VIDIOC_ENUM_FMT: read and write, 64 bytes, 'V', 2 (linux/videodev2.h)."""
@@ -40,10 +40,10 @@ def modes() -> Iterator[Finding]:
                           f"{fix} {device}" if "fuser" in fix else fix)
             continue
         if offered:
-            yield _judged(device, offered)
+            yield _finding(device, offered)
 
 
-def _judged(device: Path, offered: list[str]) -> Finding:
+def _finding(device: Path, offered: list[str]) -> Finding:
     said, option = ", ".join(offered), f"--set camera.kind=v4l2 --set camera.options.device={device}"
     if "MJPG" in offered or "JPEG" in offered:
         return Finding(f"modes {device.name}", True, f"{said}; its own JPEG is passed through (MJPG, the default)")
@@ -84,7 +84,7 @@ def delivered(kind: str, sets: list[str]) -> Finding:
     try:
         with local_camera(kind, sets) as opened:
             begun_s, stamps_us = time.monotonic(), []
-            while time.monotonic() - begun_s < _LOOK_S:
+            while time.monotonic() - begun_s < _MEASURED_S:
                 picture = opened.read(0.5)
                 stamps_us += [picture.t_us] if picture else []
     except SightlineError as error:

@@ -18,7 +18,7 @@ from operator_side.extras import needs
 from protocol import VERSION
 from protocol.errors import SightlineError
 from protocol.transports.port_owner import port_owner
-from protocol.transports.zenoh_discovery import GROUP
+from protocol.transports.zenoh_discovery import MULTICAST_GROUP
 
 PORTS = {7447: "Zenoh", 9090: "sightline.v1", 9091: "the older dialect"}
 _HOT_C = 80.0
@@ -151,11 +151,11 @@ def _multicast() -> Finding:
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
             heard.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            heard.bind(("", GROUP[1]))
-            group = socket.inet_aton(GROUP[0]) + socket.inet_aton("0.0.0.0")
+            heard.bind(("", MULTICAST_GROUP[1]))
+            group = socket.inet_aton(MULTICAST_GROUP[0]) + socket.inet_aton("0.0.0.0")
             heard.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
             heard.settimeout(0.3)
-            heard.sendto(b"sightline doctor", GROUP)
+            heard.sendto(b"sightline doctor", MULTICAST_GROUP)
             heard.recv(64)
     except OSError as error:
         fix = "nothing: name the endpoint with --connect, which is surer anyway"

@@ -16,8 +16,8 @@ from operator_side.faults.judge import (
     moved_on_old_sight,
     stop_checks,
 )
-from operator_side.faults.rig import Rig
-from operator_side.faults.row import Injected, Outcome, Row
+from operator_side.faults.rig import RobotFixture
+from operator_side.faults.row import Injected, Outcome, Case
 from operator_side.faults.sampler import STALL_US
 from operator_side.score import Check
 from protocol.errors import SightlineError
@@ -29,7 +29,7 @@ _WATCHED_US: Final = 1_000_000
 """After the injection: the time in which a stop is measured, and a stalled sampler spoils it."""
 
 
-def run_row(row: Row, folder: Path, run: int = 1) -> Outcome:
+def run_case(row: Case, folder: Path, run: int = 1) -> Outcome:
     """Run a row, again while its sampler stalled; its files stay in `folder` unless all was well."""
     if row.setup.wired and (why := why_impossible()):
         return Outcome(row, skipped=why)
@@ -50,9 +50,9 @@ def run_row(row: Row, folder: Path, run: int = 1) -> Outcome:
     return outcome
 
 
-def _run_once(row: Row, place: Path) -> tuple[tuple[Check, ...], int]:
+def _run_once(row: Case, place: Path) -> tuple[tuple[Check, ...], int]:
     """The checks, and for how long the sampler stalled."""
-    with Rig(place, row.setup) as rig:
+    with RobotFixture(place, row.setup) as rig:
         injected = row.inject(rig)
         grown_mb = rig.grown_mb()
         checks = (
@@ -72,7 +72,7 @@ def watched_us(checks: Sequence[Check]) -> int:
     return _WATCHED_US if all(check.ok for check in checks) else _TO_THE_END_US
 
 
-def _motion_checks(row: Row, rig: Rig, injected: Injected) -> Iterable[Check]:
+def _motion_checks(row: Case, rig: RobotFixture, injected: Injected) -> Iterable[Check]:
     rows, sent = rig.motors(), rig.sent()
     blind = Blind(injected.at_us, injected.resumed_us, row.by_frame) if row.blind else None
     if row.stops:

@@ -9,13 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from operator_side.faults.ledger import INJECTED, Ledger
+from operator_side.faults.ledger import INJECTED, EventLog
 from protocol.errors import HardwareError
 from robot_side.ports import Picture
 from sim.bus import SimCamera, SimSocketConfig
 
 MODE: Final = "camera.mode"
-LEDGER: Final = "camera.ledger"
+EVENTS: Final = "camera.ledger"
 GIL_HELD_S: Final = 1
 SLOW_S: Final = 0.2
 HEAVY_BYTES: Final = 16_700
@@ -37,7 +37,7 @@ class FaultyCamera:
         self._camera = SimCamera(SimSocketConfig(socket_dir=config.socket_dir))
         self.model, self.live = self._camera.model, self._camera.live
         self._mode = config.folder / MODE
-        self._ledger = Ledger(config.folder / LEDGER)
+        self._ledger = EventLog(config.folder / EVENTS)
         self._spares = {name: (config.folder / f"{name}.jpg").read_bytes() for name in SPARE}
         self._last: Picture | None = None
         self._held = False

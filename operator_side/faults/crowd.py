@@ -16,17 +16,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from operator_side.faults.ledger import INJECTED, Ledger
+from operator_side.faults.ledger import INJECTED, EventLog
 from protocol.channels import FRAME
 from protocol.codec import encode
-from protocol.transports.websocket_dial import Dialer
-from protocol.transports.websocket_endpoints import parse_endpoint
+from protocol.transports.websocket_dial import Client
+from protocol.transports.websocket_endpoints import parse_websocket_endpoint
 from protocol.transports.websocket_framing import MAX_BLOCK_BYTES, Hello
 from protocol.transports.websocket_peer import OPEN_S
-from protocol.transports.websocket_places import KEPT_PLACES
+from protocol.transports.websocket_places import RESERVED_SLOTS
 
 if TYPE_CHECKING:
-    from protocol.transports.websocket_wire import Wire
+    from protocol.transports.websocket_wire import Connection
 
 ADMITTED: Final = "admitted"
 SEEN: Final = "seen"
@@ -42,13 +42,13 @@ _BEGUN: Final = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgr"
 class Viewer:
     """One viewer; `reads` is False for the one that takes nothing but the hello out of its connection."""
 
-    def __init__(self, ledger: Ledger, role: str, *, reads: bool) -> None:
+    def __init__(self, ledger: EventLog, role: str, *, reads: bool) -> None:
         self._ledger, self._reads = ledger, reads
         hello = Hello(robot="r1", role=role, session=secrets.token_hex(4), wants=(FRAME.name,))
         self._hello = encode(hello).decode("ascii")
         self.admitted = False
 
-    def watch(self, wire: "Wire") -> None:
+    def watch(self, wire: "Connection") -> None:
         """Say hello and take pictures, until the robot has had enough."""
         wire.protocol.max_message_size = MAX_BLOCK_BYTES + FRAME.max_payload_bytes
         wire.say(self._hello)
@@ -65,11 +65,11 @@ class Viewer:
             wire.wait(_AGAIN_S)
 
 
-def view(endpoint: str, ledger: Ledger) -> None:
+def view(endpoint: str, ledger: EventLog) -> None:
     """All viewers, for ever."""
-    roles = ["operator"] * KEPT_PLACES + ["viewer"] * (VIEWERS - KEPT_PLACES)
-    viewers = [Viewer(ledger, role, reads=number != KEPT_PLACES) for number, role in enumerate(roles)]
-    dialers = [Dialer(parse_endpoint(endpoint), viewer.watch, lambda _reason: None) for viewer in viewers]
+    roles = ["operator"] * RESERVED_SLOTS + ["viewer"] * (VIEWERS - RESERVED_SLOTS)
+    viewers = [Viewer(ledger, role, reads=number != RESERVED_SLOTS) for number, role in enumerate(roles)]
+    dialers = [Client(parse_websocket_endpoint(endpoint), viewer.watch, lambda _reason: None) for viewer in viewers]
     waiting = list(zip(viewers, dialers, strict=True))
     while waiting:
         knocked = [pair for pair in waiting if pair[0].admitted or pair[1].trouble]
@@ -81,9 +81,9 @@ def view(endpoint: str, ledger: Ledger) -> None:
     threading.Event().wait()
 
 
-def leave_handshakes(endpoint: str, ledger: Ledger) -> None:
+def leave_handshakes(endpoint: str, ledger: EventLog) -> None:
     """Begin them, and begin again what the robot has closed."""
-    end = parse_endpoint(endpoint)
+    end = parse_websocket_endpoint(endpoint)
     begun: list[socket.socket] = []
     told = False
     while True:
@@ -116,13 +116,13 @@ def _is_open(one: socket.socket) -> bool:
     return False
 
 
-_KINDS: Final[dict[str, Callable[[str, Ledger], None]]] = {"viewers": view, "handshakes": leave_handshakes}
+_KINDS: Final[dict[str, Callable[[str, EventLog], None]]] = {"viewers": view, "handshakes": leave_handshakes}
 
 
 def main(kind: str, endpoint: str, ledger: str) -> None:
     """Be a crowd until killed."""
     os.nice(_POLITE)
-    _KINDS[kind](endpoint, Ledger(Path(ledger)))
+    _KINDS[kind](endpoint, EventLog(Path(ledger)))
 
 
 if __name__ == "__main__":

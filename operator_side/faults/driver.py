@@ -6,7 +6,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from operator_side.faults.ledger import GOOD, INJECTED, Ledger
+from operator_side.faults.ledger import GOOD, INJECTED, EventLog
 from protocol.channels import FRAME, TWIST, key_for
 from protocol.codec import decode, encode
 from protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
@@ -24,7 +24,7 @@ WAIT_S: Final = 0.05
 class Script:
     """What an attack works with: the link, the newest frame, everything sent so far."""
 
-    def __init__(self, options: "PeerOptions", link: ZenohLink, ledger: Ledger) -> None:
+    def __init__(self, options: "PeerOptions", link: ZenohLink, ledger: EventLog) -> None:
         self.options, self.link = options, link
         self.session = secrets.token_hex(4)
         self.seq = 0
@@ -72,7 +72,7 @@ class Script:
         return key_for(self.link.robot, TWIST, self.options.source)
 
 
-def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: Ledger) -> int:
+def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
     """Drive, then do what `options.fault` names, for ever or for `options.seconds`."""
     from operator_side.faults.attacks import ATTACKS
 

@@ -29,7 +29,7 @@ _RAMPED_OUT_US: Final = stop_bound(SafetyConfig()).ramped_us + 2 * TICK_US
 
 
 @dataclass(frozen=True, slots=True)
-class Motors:
+class MotorRow:
     """One line of the motors' log: speeds as told, and how far the wheels had really turned."""
 
     t_us: int
@@ -40,7 +40,7 @@ class Motors:
 
 
 @dataclass(frozen=True, slots=True)
-class Sent:
+class SentCommand:
     """One good command, as its sender noted it: when it left and when the frame behind it was captured."""
 
     t_us: int
@@ -58,11 +58,11 @@ class Blind:
     until_us: int | None = None
     by_frame: bool = False
 
-    def is_earlier(self, one: Sent) -> bool:
+    def is_earlier(self, one: SentCommand) -> bool:
         """Whether a command is from before the blindness."""
         return (one.frame_us if self.by_frame else one.t_us) <= self.from_us
 
-    def hides(self, one: Sent, now_us: int) -> bool:
+    def hides(self, one: SentCommand, now_us: int) -> bool:
         """Whether a command must not move the wheels at `now_us`."""
         return not self.is_earlier(one) and (self.until_us is None or now_us < self.until_us)
 
@@ -76,31 +76,31 @@ class Stop:
     distance_m: float
 
 
-def read_motors(text: str) -> list[Motors]:
+def read_motors(text: str) -> list[MotorRow]:
     """Whole lines of `motors.csv`; a line that is still being written is left out."""
     lines = text.split("\n")[1:-1]
     parts = [line.split(",") for line in lines]
-    return [Motors(int(t), float(left), float(right), float(a), float(b)) for t, left, right, a, b in parts]
+    return [MotorRow(int(t), float(left), float(right), float(a), float(b)) for t, left, right, a, b in parts]
 
 
-def wheel_mps(row: Motors) -> float:
+def wheel_mps(row: MotorRow) -> float:
     """Speed that the faster wheel is told, at its rim, m/s."""
     return max(abs(row.left_rad_s), abs(row.right_rad_s)) * DiffDriveConfig().wheel_radius_m
 
 
-def _rim_m(before: Motors, after: Motors) -> float:
+def _rim_m(before: MotorRow, after: MotorRow) -> float:
     """Way of the faster wheel between two rows."""
     turned_rad = max(abs(after.left_rad - before.left_rad), abs(after.right_rad - before.right_rad))
     return turned_rad * DiffDriveConfig().wheel_radius_m
 
 
-def _axle_m(before: Motors, after: Motors) -> float:
+def _axle_m(before: MotorRow, after: MotorRow) -> float:
     """Way of the middle of the axle between two rows."""
     turned_rad = (after.left_rad - before.left_rad + after.right_rad - before.right_rad) / 2
     return abs(turned_rad) * DiffDriveConfig().wheel_radius_m
 
 
-def measure_stop(rows: Sequence[Motors], since_us: int, until_us: int | None = None) -> Stop:
+def measure_stop(rows: Sequence[MotorRow], since_us: int, until_us: int | None = None) -> Stop:
     """The stop after the last valid command at `since_us`, within the log up to `until_us`."""
     before = [row for row in rows if row.t_us <= since_us]
     after = [row for row in rows if row.t_us > since_us and (until_us is None or row.t_us <= until_us)]
@@ -111,7 +111,7 @@ def measure_stop(rows: Sequence[Motors], since_us: int, until_us: int | None = N
     return Stop(_falls_ms(window, since_us), _zero_ms(window, since_us), distance_m)
 
 
-def _falls_ms(window: Sequence[Motors], since_us: int) -> float | None:
+def _falls_ms(window: Sequence[MotorRow], since_us: int) -> float | None:
     highest_mps = max(map(wheel_mps, window))
     if highest_mps == 0:
         return 0.0
@@ -119,7 +119,7 @@ def _falls_ms(window: Sequence[Motors], since_us: int) -> float | None:
     return _ms_after(window, fast[-1] + 1, since_us)
 
 
-def _zero_ms(window: Sequence[Motors], since_us: int) -> float | None:
+def _zero_ms(window: Sequence[MotorRow], since_us: int) -> float | None:
     told = [index for index, row in enumerate(window) if wheel_mps(row) > 0]
     spans = list(itertools.pairwise(_thinned(window)))
     rolling = [b.t_us for a, b in spans if _rim_m(a, b) > _AT_REST_MPS * (b.t_us - a.t_us) / 1e6]
@@ -129,7 +129,7 @@ def _zero_ms(window: Sequence[Motors], since_us: int) -> float | None:
     return None if told_ms is None else max(told_ms, *((end_us - since_us) / 1000 for end_us in rolling[-1:]), 0.0)
 
 
-def _thinned(window: Sequence[Motors]) -> list[Motors]:
+def _thinned(window: Sequence[MotorRow]) -> list[MotorRow]:
     """Rows at least a tick apart: the angles in the log come in physics steps of 4 ms, rows as often as commands."""
     kept = list(window[:1])
     for row in window:
@@ -138,16 +138,16 @@ def _thinned(window: Sequence[Motors]) -> list[Motors]:
     return kept
 
 
-def _ms_after(window: Sequence[Motors], index: int, since_us: int) -> float | None:
+def _ms_after(window: Sequence[MotorRow], index: int, since_us: int) -> float | None:
     return max(0.0, (window[index].t_us - since_us) / 1000) if index < len(window) else None
 
 
-def last_valid_us(sent: Iterable[Sent], blind: Blind) -> int | None:
+def last_valid_us(sent: Iterable[SentCommand], blind: Blind) -> int | None:
     """When the last command left that still counted when the blindness began; None without one."""
     return max((one.t_us for one in sent if blind.is_earlier(one)), default=None)
 
 
-def moved_on_old_sight(rows: Sequence[Motors], sent: Sequence[Sent], blind: Blind | None) -> int:
+def moved_on_old_sight(rows: Sequence[MotorRow], sent: Sequence[SentCommand], blind: Blind | None) -> int:
     """Log lines whose motion no young frame allows.
 
     With the newest frame behind any valid command older than 400 ms (and one tick, for which a decision holds) the
@@ -160,7 +160,7 @@ def moved_on_old_sight(rows: Sequence[Motors], sent: Sequence[Sent], blind: Blin
     )
 
 
-def _ages_us(rows: Iterable[Motors], sent: Sequence[Sent], blind: Blind | None) -> Iterable[float]:
+def _ages_us(rows: Iterable[MotorRow], sent: Sequence[SentCommand], blind: Blind | None) -> Iterable[float]:
     """For each row, the age of the youngest frame that a valid command had brought by then."""
     ordered = sorted(sent, key=lambda one: one.t_us)
     for row in rows:
@@ -171,7 +171,7 @@ def _ages_us(rows: Iterable[Motors], sent: Sequence[Sent], blind: Blind | None) 
         yield row.t_us - max(frames, default=float("-inf"))
 
 
-def most_gain_mps2(rows: Sequence[Motors], since_us: int, over_us: int = 100_000) -> float:
+def most_gain_mps2(rows: Sequence[MotorRow], since_us: int, over_us: int = 100_000) -> float:
     """The hardest change of a wheel's told speed over `over_us`, at its rim, since `since_us`."""
     radius_m = DiffDriveConfig().wheel_radius_m
     late = [row for row in rows if row.t_us >= since_us]

@@ -9,15 +9,15 @@ import os
 from pathlib import Path
 from typing import Final
 
-from operator_side.faults.judge import Sent
+from operator_side.faults.judge import SentCommand
 from protocol.clock import monotonic_us
 
 GOOD: Final = "good"
 INJECTED: Final = "injected"
-TOLD: Final = "told"
+REQUESTED: Final = "told"
 
 
-class Ledger:
+class EventLog:
     """Appends; a line is in the file when `note` returns."""
 
     def __init__(self, path: Path) -> None:
@@ -28,9 +28,9 @@ class Ledger:
         os.write(self._file, f"{kind},{monotonic_us()},{frame_us}\n".encode())
 
 
-def read_ledger(path: Path, kind: str) -> list[Sent]:
+def read_events(path: Path, kind: str) -> list[SentCommand]:
     """The events of `kind`, oldest first; none while there is no file."""
     if not path.exists():
         return []
     rows = [line.split(",") for line in path.read_text("ascii").split("\n")[:-1]]
-    return [Sent(int(t), int(frame)) for what, t, frame in rows if what == kind]
+    return [SentCommand(int(t), int(frame)) for what, t, frame in rows if what == kind]

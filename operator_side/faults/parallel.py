@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from benchmarks.interrupted import terminated_like_interrupted
-from operator_side.faults.bench import run_row
-from operator_side.faults.row import Outcome, Row
+from operator_side.faults.bench import run_case
+from operator_side.faults.row import Outcome, Case
 
 _FORK: Final = multiprocessing.get_context("fork")  # nothing is open here that a copy could spoil: no link, no thread
 _END_S: Final = 30.0
@@ -32,7 +32,7 @@ class _Turn:
     """One run of one row; `index` is the row's place in the report."""
 
     index: int
-    row: Row
+    row: Case
     number: int
 
 
@@ -43,8 +43,8 @@ class _Running:
     answer: connection.Connection
 
 
-def run_rows(
-    rows: Sequence[Row], repeat: int, folder: Path, jobs: int, say: Callable[[Outcome, Progress], None]
+def run_cases(
+    rows: Sequence[Case], repeat: int, folder: Path, jobs: int, say: Callable[[Outcome, Progress], None]
 ) -> list[list[Outcome]]:
     """Every row `repeat` times, `jobs` at once, those that want it alone last. What is skipped is not repeated."""
     results: list[list[Outcome]] = [[] for _ in rows]
@@ -84,7 +84,7 @@ def _outcomes(
             one.process.join(_END_S)
 
 
-def _may_start(row: Row, running: Sequence[_Running], jobs: int) -> bool:
+def _may_start(row: Case, running: Sequence[_Running], jobs: int) -> bool:
     if not running:
         return True
     return len(running) < jobs and not row.alone and not running[0].turn.row.alone
@@ -101,7 +101,7 @@ def _start(turn: _Turn, folder: Path) -> _Running:
 def _run(turn: _Turn, folder: Path, answer: connection.Connection) -> None:
     """In the process of its own; whoever waits is told what became of the row, whatever did."""
     with suppress(KeyboardInterrupt), terminated_like_interrupted():
-        outcome = run_row(turn.row, folder, turn.number)
+        outcome = run_case(turn.row, folder, turn.number)
         answer.send((outcome.checks, outcome.skipped, outcome.trouble))
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Literal
 
-from operator_side.faults.ledger import Ledger
+from operator_side.faults.ledger import EventLog
 from protocol.config import Config
 
 Role = Literal["vision", "driver", "operator"]
@@ -53,11 +53,11 @@ class Trigger:
 def main() -> int:
     """Run one peer; returns its exit code."""
     options = PeerOptions.model_validate_json(sys.argv[1])
-    trigger, ledger = Trigger(), Ledger(options.ledger)
+    trigger, ledger = Trigger(), EventLog(options.ledger)
     return _entry(options.role)(options, trigger.pulled, ledger)
 
 
-def _entry(role: Role) -> Callable[[PeerOptions, threading.Event, Ledger], int]:
+def _entry(role: Role) -> Callable[[PeerOptions, threading.Event, EventLog], int]:
     """Imported late: only vision needs OpenCV."""
     if role == "vision":
         from operator_side.faults.vision import run_vision
@@ -67,9 +67,9 @@ def _entry(role: Role) -> Callable[[PeerOptions, threading.Event, Ledger], int]:
         from operator_side.faults.driver import run_driver
 
         return run_driver
-    from operator_side.faults.person import run_person
+    from operator_side.faults.person import run_operator
 
-    return run_person
+    return run_operator
 
 
 if __name__ == "__main__":

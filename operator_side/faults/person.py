@@ -3,8 +3,8 @@
 import threading
 from typing import TYPE_CHECKING
 
-from operator_side.faults.ledger import INJECTED, TOLD, Ledger
-from operator_side.requests import SOURCE, Operator
+from operator_side.faults.ledger import INJECTED, REQUESTED, EventLog
+from operator_side.requests import SOURCE as OPERATOR_SOURCE, Operator
 from protocol.messages import Verb
 from protocol.transports.zenoh import open_zenoh
 
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from operator_side.faults.peer import PeerOptions
 
 
-def run_person(options: "PeerOptions", pulled: threading.Event, ledger: Ledger) -> int:
+def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
     """Wait for the trigger, ask, and say what was answered."""
-    with open_zenoh(options.robot, connect=[options.endpoint], role=SOURCE, timeout_s=15) as link:
+    with open_zenoh(options.robot, connect=[options.endpoint], role=OPERATOR_SOURCE, timeout_s=15) as link:
         operator = Operator(link)
         operator.wait_report(10.0)
         print("person ready", flush=True)
@@ -22,7 +22,7 @@ def run_person(options: "PeerOptions", pulled: threading.Event, ledger: Ledger) 
         if options.fault == "lateness":
             print(f"late by {operator.wait_report(10.0).status.tick_late_max_us} us", flush=True)
             return 0
-        ledger.note(TOLD)
+        ledger.note(REQUESTED)
         ledger.note(INJECTED)
         print(f"state {operator.stop(lambda: None).state}", flush=True)
         if options.fault == "reset":

@@ -12,7 +12,7 @@ from operator_side.score import Check
 Results = Sequence[Sequence[Outcome]]
 _LOWEST_IS_WORST: Final = ("injected", "drives again", "sent", "speed kept", "commands after it", "reset refused",
                            "next driver after", "came", "admitted", "pictures seen", "ticks")
-_TOLD_IF_WRONG: Final = ("on old sight", "drives again", "reset refused", "exit code", "last speed told")
+_SHOWN_IF_WRONG: Final = ("on old sight", "drives again", "reset refused", "exit code", "last speed told")
 """Yes or no: in the table they are in what was demanded."""
 _COUNTED_FROM: Final = 1000
 
@@ -102,7 +102,7 @@ def markdown(results: Results, machine: Sequence[str], command: str, repeat: int
 
 def with_rows_of(report: str, newer: str) -> str:
     """`report` with the rows that `newer` ran in place of its own, and said to be; what only `newer` has is added."""
-    rows, again = _rows(report), _rows(newer)
+    rows, again = _table_rows(report), _table_rows(newer)
     rows.update(again)
     head, _, _ = report.partition("|---|---|---|---|\n")
     passed_rows = sum(line.endswith("| yes |") for line in rows.values())
@@ -116,7 +116,7 @@ def with_rows_of(report: str, newer: str) -> str:
 _COMMAND: Final = re.compile(r"^Written by `([^`]+)`", re.MULTILINE)
 
 
-def _rows(report: str) -> dict[str, str]:
+def _table_rows(report: str) -> dict[str, str]:
     """Lines of the table by their fault."""
     lines = report.partition("|---|---|---|---|\n")[2].splitlines()
     return {line.split(" | ")[0].removeprefix("| "): line for line in lines if line.startswith("| ")}
@@ -137,6 +137,6 @@ def _table_row(outcomes: Sequence[Outcome]) -> str:
     if first.skipped:
         return f"| {row.what} | {row.demanded} | {first.skipped} | not run |"
     trouble = [one.trouble for one in outcomes if one.trouble][:1]
-    told = [check for check in worst_checks(outcomes) if not check.ok or check.name not in _TOLD_IF_WRONG]
+    told = [check for check in worst_checks(outcomes) if not check.ok or check.name not in _SHOWN_IF_WRONG]
     good = all(one.ok for one in outcomes)
     return f"| {row.what} | {row.demanded} | {', '.join([*trouble, *_figures(told)])} | {'yes' if good else '**no**'} |"

@@ -15,8 +15,8 @@ from typing import Any, Final, Self
 from operator_side.faults import camera, judge
 from operator_side.faults.clock import write_wrong_clock
 from operator_side.faults.fleet import COMMAND_LINE, Fleet, raise_priority
-from operator_side.faults.judge import Motors, Sent, wheel_mps
-from operator_side.faults.ledger import GOOD, INJECTED, read_ledger
+from operator_side.faults.judge import MotorRow, SentCommand, wheel_mps
+from operator_side.faults.ledger import GOOD, INJECTED, read_events
 from operator_side.faults.peer import PeerOptions, Role
 from operator_side.faults.sampler import Hole, read_holes, stalled_us
 from operator_side.faults.wires import BenchWire
@@ -67,7 +67,7 @@ class Setup:
         return 0.3 if self.driver == "vision" else 0.48
 
 
-class Rig:
+class RobotFixture:
     """Use it in a `with`: everything runs, and the wheels are at speed, once inside."""
 
     def __init__(self, folder: Path, setup: Setup) -> None:
@@ -212,12 +212,12 @@ class Rig:
 
     # --- evidence ------------------------------------------------------------------------------------------------
 
-    def motors(self) -> list[Motors]:
+    def motors(self) -> list[MotorRow]:
         """The motors' log so far."""
         path = self.folder / "motors.csv"
         return judge.read_motors(path.read_text("ascii")) if path.exists() else []
 
-    def _latest_motors(self) -> list[Motors]:
+    def _latest_motors(self) -> list[MotorRow]:
         """The end of the motors' log: who waits looks often, and the log grows."""
         path = self.folder / "motors.csv"
         if not path.exists():
@@ -226,14 +226,14 @@ class Rig:
             log.seek(max(0, path.stat().st_size - _TAIL_BYTES))
             return judge.read_motors(log.read().decode("ascii"))  # its first line, cut or a heading, is left out
 
-    def sent(self, name: str | None = None) -> list[Sent]:
+    def sent(self, name: str | None = None) -> list[SentCommand]:
         """Good commands by one peer, or by all, oldest first."""
         names = self._peers if name is None else [name]
         return sorted((one for peer in names for one in self.noted(peer, GOOD)), key=lambda one: one.t_us)
 
-    def noted(self, name: str, kind: str) -> list[Sent]:
+    def noted(self, name: str, kind: str) -> list[SentCommand]:
         """What a peer, `camera` or `clock` noted of one kind."""
-        return read_ledger(self.folder / f"{name}.ledger", kind)
+        return read_events(self.folder / f"{name}.ledger", kind)
 
     def injected(self, name: str = "peer") -> int:
         """How often the fault was done."""

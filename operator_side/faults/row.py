@@ -8,7 +8,7 @@ from operator_side.faults.judge import DISTANCE_M, FALLS_MS, OLD_US, ZERO_MS
 from operator_side.score import Check
 
 if TYPE_CHECKING:
-    from operator_side.faults.rig import Rig, Setup
+    from operator_side.faults.rig import RobotFixture, Setup
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,12 +25,12 @@ class Injected:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class Case:
     """One fault. `inject` is given a robot at speed and returns when there is nothing more to see."""
 
     id: str
     what: str
-    inject: "Callable[[Rig], Injected]"
+    inject: "Callable[[RobotFixture], Injected]"
     setup: "Setup"
     blind: bool = False
     """Commands go on while they must not be obeyed any more: from the injection on, none counts as good."""
@@ -64,7 +64,7 @@ class Row:
 class Outcome:
     """What became of one run of a row. `skipped` says why it could not run."""
 
-    row: Row
+    row: Case
     checks: tuple[Check, ...] = ()
     skipped: str = ""
     trouble: str = ""

@@ -4,8 +4,8 @@ from functools import partial
 from typing import Final
 
 from operator_side.faults.judge import at_least, at_most, most_gain_mps2, wheel_mps
-from operator_side.faults.rig import Rig, Setup
-from operator_side.faults.row import Injected, Row
+from operator_side.faults.rig import RobotFixture, Setup
+from operator_side.faults.row import Injected, Case
 from operator_side.faults.rows_processes import SETTLED_S
 from protocol.clock import monotonic_us
 from robot_side.limits import SafetyConfig
@@ -18,7 +18,7 @@ ENOUGH: Final = 30
 FLOOD_AT_LEAST: Final = 20_000
 
 
-def _attack(rig: Rig, at_least_times: int = ENOUGH) -> Injected:
+def _attack(rig: RobotFixture, at_least_times: int = ENOUGH) -> Injected:
     """From the trigger on, only what must be refused is sent."""
     at_us = rig.trigger()
     rig.watch(ATTACKED_S)
@@ -26,14 +26,14 @@ def _attack(rig: Rig, at_least_times: int = ENOUGH) -> Injected:
     return Injected(times, at_us, checks=(at_least("sent", times, "times", at_least_times),))
 
 
-def _reverse(rig: Rig) -> Injected:
+def _reverse(rig: RobotFixture) -> Injected:
     at_us = rig.trigger()
     rig.watch(2.0 + SETTLED_S)
     gain = at_most("hardest change", most_gain_mps2(rig.motors(), at_us), "m/s2", GAIN_MPS2)
     return Injected(rig.injected(), at_us, checks=(gain,))
 
 
-def _replay_earlier(rig: Rig) -> Injected:
+def _replay_earlier(rig: RobotFixture) -> Injected:
     """Record a session, start the robot anew, drive, and then play the recording to it."""
     recording = rig.folder / "earlier.txt"
     rig.start_peer("recorder", "driver", source="teleop", recording=recording, seconds=3.0)
@@ -49,7 +49,7 @@ def _replay_earlier(rig: Rig) -> Injected:
     return Injected(rig.injected("replayer"), at_us)
 
 
-def _two_visions(rig: Rig) -> Injected:
+def _two_visions(rig: RobotFixture) -> Injected:
     """A second vision asks for the opposite all the time; then both die."""
     rig.start_peer("second", "driver", linear_mps=-0.5, angular_rad_s=0.0)
     rig.until(lambda: len(rig.sent("second")) > 30, 15.0, "a second vision")
@@ -67,7 +67,7 @@ def _two_visions(rig: Rig) -> Injected:
     return Injected(len(rig.sent("second")), at_us, checks=checks)
 
 
-def _take_over(rig: Rig) -> Injected:
+def _take_over(rig: RobotFixture) -> Injected:
     """A person takes over at full speed and drives back, then is lost: a stop that vision does not end."""
     rig.start_peer("person", "driver", source="teleop", linear_mps=-0.4, angular_rad_s=0.0)
     rig.until(lambda: _goes_back(rig), 15.0, "a takeover")
@@ -79,12 +79,12 @@ def _take_over(rig: Rig) -> Injected:
     return Injected(1, at_us, checks=(at_most("person obeyed after", took_ms, "ms", 1000.0),))
 
 
-def _goes_back(rig: Rig) -> bool:
+def _goes_back(rig: RobotFixture) -> bool:
     last = rig.motors()[-1]
     return last.left_rad_s < 0 and last.right_rad_s < 0 and wheel_mps(last) > 0.39
 
 
-def _holder_dies(rig: Rig) -> Injected:
+def _holder_dies(rig: RobotFixture) -> Injected:
     """The driver dies while another waits: a stop first, the other only when the lease is over."""
     rig.start_peer("second", "driver", linear_mps=0.3)
     rig.until(lambda: len(rig.sent("second")) > 10, 15.0, "a second driver")
@@ -98,26 +98,26 @@ def _holder_dies(rig: Rig) -> Injected:
     return Injected(1, at_us, last_us + LEASE_US - 20_000, bool(moving), checks)
 
 
-def _row(name: str, what: str, *, short: bool = False) -> Row:
-    return Row(f"command.{name}", f"commands: {what}", _attack, Setup(fault=name), short=short)
+def _command_case(name: str, what: str, *, short: bool = False) -> Case:
+    return Case(f"command.{name}", f"commands: {what}", _attack, Setup(fault=name), short=short)
 
 
-ROWS: Final = (
-    _row("late", "each 500 ms after its frame"),
-    _row("replay", "this session's, replayed", short=True),
-    Row("command.earlier", "commands: an earlier session's, replayed", _replay_earlier, Setup()),
-    _row("never_issued", "citing frames never issued"),
-    _row("from_future", "citing frames from the future"),
-    _row("wrapped", "their numbers wrap"),
-    _row("malformed", "nan, inf, 1e400, underscores, full-width, empty, 3 fields, 257 bytes, 10 MB, binary ..."),
-    Row("command.flood", "commands: an old one at 10 kHz", partial(_attack, at_least_times=FLOOD_AT_LEAST),
+COMMAND_CASES: Final = (
+    _command_case("late", "each 500 ms after its frame"),
+    _command_case("replay", "this session's, replayed", short=True),
+    Case("command.earlier", "commands: an earlier session's, replayed", _replay_earlier, Setup()),
+    _command_case("never_issued", "citing frames never issued"),
+    _command_case("from_future", "citing frames from the future"),
+    _command_case("wrapped", "their numbers wrap"),
+    _command_case("malformed", "nan, inf, 1e400, underscores, full-width, empty, 3 fields, 257 bytes, 10 MB, binary ..."),
+    Case("command.flood", "commands: an old one at 10 kHz", partial(_attack, at_least_times=FLOOD_AT_LEAST),
         Setup(fault="flood"), also=f">= {FLOOD_AT_LEAST} sent", short=True, alone=True),
-    Row("command.reversal", "commands: full speed ahead and back at 50 Hz", _reverse, Setup(fault="reversal"),
+    Case("command.reversal", "commands: full speed ahead and back at 50 Hz", _reverse, Setup(fault="reversal"),
         also=f"speed changes by <= {GAIN_MPS2:g} m/s2"),
-    _row("heartbeat", "none, but frames are acknowledged and the link is alive", short=True),
-    Row("driver.two", "drivers: two visions, then none", _two_visions, Setup(), also="the second is not obeyed"),
-    Row("driver.person", "drivers: a person takes over at full speed, and is lost", _take_over, Setup(), blind=True,
+    _command_case("heartbeat", "none, but frames are acknowledged and the link is alive", short=True),
+    Case("driver.two", "drivers: two visions, then none", _two_visions, Setup(), also="the second is not obeyed"),
+    Case("driver.person", "drivers: a person takes over at full speed, and is lost", _take_over, Setup(), blind=True,
         also="obeyed <= 1000 ms; vision does not resume by itself"),
-    Row("driver.dies", "drivers: the holder dies while another waits", _holder_dies, Setup(), blind=True, again=True,
+    Case("driver.dies", "drivers: the holder dies while another waits", _holder_dies, Setup(), blind=True, again=True,
         also="the other drives only after the lease"),
 )

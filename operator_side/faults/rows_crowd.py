@@ -6,10 +6,10 @@ from functools import partial
 from typing import Final
 
 from operator_side.faults.crowd import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
-from operator_side.faults.judge import Motors, at_least, at_most, wheel_mps
+from operator_side.faults.judge import MotorRow, at_least, at_most, wheel_mps
 from operator_side.faults.ledger import INJECTED
-from operator_side.faults.rig import READY_S, Rig, Setup
-from operator_side.faults.row import Injected, Row
+from operator_side.faults.rig import READY_S, RobotFixture, Setup
+from operator_side.faults.row import Injected, Case
 from operator_side.faults.rows_processes import AGAIN_S, BUSY, SETTLED_S, busy_processes
 from operator_side.faults.sampler import Hole
 from operator_side.score import Check
@@ -17,7 +17,7 @@ from protocol.clock import monotonic_us
 from protocol.transports.websocket_places import MAX_CLIENTS
 from robot_side.limits import TICK_US
 
-CROWDED_S: Final = 6.0
+LOADED_S: Final = 6.0
 KEPT_MPS: Final = 0.4
 TICK_MS: Final = 40.0
 STARVED_S: Final = 24.0
@@ -27,12 +27,12 @@ HONEST_MS: Final = 10.0
 """The simulation stamps what it receives up to so much late while its own physics holds the interpreter."""
 
 
-def _crowd(rig: Rig, kind: str, at_least_times: int) -> Injected:
+def _load(rig: RobotFixture, kind: str, at_least_times: int) -> Injected:
     """They come while the robot is driven and stay; then whoever drives dies."""
     came_us = monotonic_us()
     rig.start_crowd(kind)
     rig.fleet.wait_line("crowd", READY, READY_S)
-    rig.watch(CROWDED_S)
+    rig.watch(LOADED_S)
     slowest_mps = min(wheel_mps(row) for row in rig.motors() if row.t_us > came_us)
     times = len(rig.noted("crowd", INJECTED))
     at_us = monotonic_us()
@@ -48,7 +48,7 @@ def _crowd(rig: Rig, kind: str, at_least_times: int) -> Injected:
 # --- punctuality -------------------------------------------------------------------------------------------------
 
 
-def _keep_time(rig: Rig) -> Injected:
+def _keep_time(rig: RobotFixture) -> Injected:
     """Drive beside busy processes for long enough to tell a 99.9th percentile; then the driving peer dies."""
     rig.start_peer("person", "operator", fault="lateness")
     rig.fleet.wait_line("person", "person ready", AGAIN_S)
@@ -65,7 +65,7 @@ def _keep_time(rig: Rig) -> Injected:
     return Injected(BUSY, at_us, checks=tuple(_tick_checks(rows, rig.holes(), int(said.split()[0]))))
 
 
-def _tick_checks(rows: Sequence[Motors], holes: Sequence[Hole], published_us: int) -> list[Check]:
+def _tick_checks(rows: Sequence[MotorRow], holes: Sequence[Hole], published_us: int) -> list[Check]:
     gaps_us = undisturbed_gaps_us(rows, holes)
     ticks = sum(gaps_us) // TICK_US
     worst_ms = max(gaps_us, default=0) / 1000
@@ -78,7 +78,7 @@ def _tick_checks(rows: Sequence[Motors], holes: Sequence[Hole], published_us: in
     ]
 
 
-def undisturbed_gaps_us(rows: Sequence[Motors], holes: Sequence[Hole]) -> list[int]:
+def undisturbed_gaps_us(rows: Sequence[MotorRow], holes: Sequence[Hole]) -> list[int]:
     """Times between two motor commands, without those in which this machine itself stood still."""
     pairs = itertools.pairwise(row.t_us for row in rows)
     return [b - a for a, b in pairs if not any(hole.from_us < b and hole.to_us > a for hole in holes)]
@@ -92,11 +92,11 @@ def permille_us(gaps_us: Sequence[int], ticks: int) -> int:
 _WEB: Final = Setup(web=True)
 _DRIVEN: Final = f"speed stays >= {KEPT_MPS:g} m/s while they are there"
 
-ROWS: Final = (
-    Row("crowd.viewers", f"drivers: {VIEWERS} WebSocket viewers, one never reading; then the driver dies",
-        partial(_crowd, kind="viewers", at_least_times=VIEWERS), _WEB, also=_DRIVEN, alone=True),
-    Row("crowd.handshakes", f"drivers: {HANDSHAKES} half-open handshakes; then the driver dies",
-        partial(_crowd, kind="handshakes", at_least_times=HANDSHAKES), _WEB, also=_DRIVEN, alone=True),
-    Row("driver.tick", "robot: four busy processes beside it for 24 s; then the driver dies", _keep_time, Setup(),
+CLIENT_CASES: Final = (
+    Case("crowd.viewers", f"drivers: {VIEWERS} WebSocket viewers, one never reading; then the driver dies",
+        partial(_load, kind="viewers", at_least_times=VIEWERS), _WEB, also=_DRIVEN, alone=True),
+    Case("crowd.handshakes", f"drivers: {HANDSHAKES} half-open handshakes; then the driver dies",
+        partial(_load, kind="handshakes", at_least_times=HANDSHAKES), _WEB, also=_DRIVEN, alone=True),
+    Case("driver.tick", "robot: four busy processes beside it for 24 s; then the driver dies", _keep_time, Setup(),
         also=f"p99.9 of ticks <= {TICK_MS:g} ms, lateness published", alone=True),
 )

@@ -4,15 +4,15 @@ import signal
 from functools import partial
 from typing import Final
 
-from operator_side.faults.judge import Motors, at_least, at_most, wheel_mps
-from operator_side.faults.ledger import TOLD
-from operator_side.faults.rig import Rig, Setup
-from operator_side.faults.row import Injected, Row
+from operator_side.faults.judge import MotorRow, at_least, at_most, wheel_mps
+from operator_side.faults.ledger import REQUESTED
+from operator_side.faults.rig import RobotFixture, Setup
+from operator_side.faults.row import Injected, Case
 from operator_side.faults.rows_network import LOSSY, shape
 from operator_side.faults.rows_processes import AGAIN_S, SETTLED_S, drives_again
 from protocol.clock import monotonic_us
 from robot_side.kinematics import DiffDriveConfig
-from sim.wire import Shapes
+from sim.wire import LinkShapes
 from vision_side.config import TrackConfig
 
 BAD_S: Final = 3.0
@@ -26,14 +26,14 @@ DAY_S: Final = 86_400
 # --- the camera --------------------------------------------------------------------------------------------------
 
 
-def _spoil_camera(rig: Rig, mode: str) -> Injected:
+def _spoil_camera(rig: RobotFixture, mode: str) -> Injected:
     at_us = rig.camera_mode(mode)
     rig.watch(BAD_S)
     times, resumed_us = rig.injected("camera"), rig.camera_mode("")
     return Injected(times, at_us, resumed_us, drives_again(rig))
 
 
-def _blacken(rig: Rig) -> Injected:
+def _blacken(rig: RobotFixture) -> Injected:
     """Nothing is seen, on young frames: vision may coast and then turn to search, but not drive on."""
     at_us = rig.camera_mode("black")
     rig.watch(BAD_S)
@@ -44,41 +44,41 @@ def _blacken(rig: Rig) -> Injected:
     return Injected(times, at_us, again=drives_again(rig), checks=(coasted,))
 
 
-def _forward_mps(row: Motors) -> float:
+def _forward_mps(row: MotorRow) -> float:
     return (row.left_rad_s + row.right_rad_s) / 2 * DiffDriveConfig().wheel_radius_m
 
 
 # --- STOP --------------------------------------------------------------------------------------------------------
 
 
-def _say_stop(rig: Rig, fault: str = "") -> int:
+def _send_stop(rig: RobotFixture, fault: str = "") -> int:
     """A person says STOP; returns when it was first sent."""
     rig.start_peer("person", "operator", fault=fault)
     rig.fleet.wait_line("person", "person ready", AGAIN_S)
     rig.trigger("person")
     rig.until(lambda: rig.injected("person") > 0, 5.0, "a STOP")
-    return rig.noted("person", TOLD)[0].t_us
+    return rig.noted("person", REQUESTED)[0].t_us
 
 
-def _stop(rig: Rig, fault: str = "") -> Injected:
-    at_us = _say_stop(rig, fault)
+def _stop(rig: RobotFixture, fault: str = "") -> Injected:
+    at_us = _send_stop(rig, fault)
     rig.watch(BAD_S)
     return Injected(rig.injected("person"), at_us)
 
 
-def _stop_lossy(rig: Rig) -> Injected:
-    before = shape(rig, Shapes())
+def _stop_lossy(rig: RobotFixture) -> Injected:
+    before = shape(rig, LinkShapes())
     rig.start_peer("person", "operator")
     rig.fleet.wait_line("person", "person ready", AGAIN_S)
-    shape(rig, Shapes(ab=LOSSY, ba=LOSSY))
+    shape(rig, LinkShapes(ab=LOSSY, ba=LOSSY))
     rig.trigger("person")
     rig.until(lambda: rig.injected("person") > 0, 5.0, "a STOP")
     rig.watch(2 * BAD_S)
-    return Injected(shape(rig, Shapes()) - before, rig.noted("person", TOLD)[0].t_us)
+    return Injected(shape(rig, LinkShapes()) - before, rig.noted("person", REQUESTED)[0].t_us)
 
 
-def _stop_then_commands(rig: Rig) -> Injected:
-    at_us = _say_stop(rig)
+def _stop_then_commands(rig: RobotFixture) -> Injected:
+    at_us = _send_stop(rig)
     rig.watch(SETTLED_S)
     rig.trigger()
     rig.watch(BAD_S)
@@ -86,8 +86,8 @@ def _stop_then_commands(rig: Rig) -> Injected:
     return Injected(times, at_us, checks=(at_least("commands after it", times, "times", 1000),))
 
 
-def _stop_then_restart(rig: Rig) -> Injected:
-    at_us = _say_stop(rig)
+def _stop_then_restart(rig: RobotFixture) -> Injected:
+    at_us = _send_stop(rig)
     rig.watch(SETTLED_S)
     before = rig.fleet.child("robot")
     rig.signal_network(signal.SIGKILL)
@@ -98,7 +98,7 @@ def _stop_then_restart(rig: Rig) -> Injected:
     return Injected(1, at_us)
 
 
-def _reset_moving(rig: Rig) -> Injected:
+def _reset_moving(rig: RobotFixture) -> Injected:
     """Reset while the wheels still turn; the wheels must come to zero and vision must not take it up again."""
     injected = _stop(rig, "reset")
     refused = "reset False" in rig.fleet.log("person").read_text("utf-8")
@@ -108,7 +108,7 @@ def _reset_moving(rig: Rig) -> Injected:
 # --- clocks ------------------------------------------------------------------------------------------------------
 
 
-def _drive_on(rig: Rig) -> Injected:
+def _drive_on(rig: RobotFixture) -> Injected:
     """Drive with the wrong clock for a while, then let vision die."""
     rig.watch(BAD_S)
     slowest_mps = min((wheel_mps(row) for row in rig.motors() if row.t_us > monotonic_us() - BAD_S * 1e6), default=0.0)
@@ -123,27 +123,27 @@ _VISION: Final = Setup(driver="vision")
 _SCRIPT: Final = Setup()
 _STAYS: Final = "and stays at zero"
 
-ROWS: Final = (
-    Row("camera.unplugged", "camera: unplugged 3 s", partial(_spoil_camera, mode="unplugged"), _VISION, again=True),
-    Row("camera.frozen", "camera: frozen 3 s, with new stamps", partial(_spoil_camera, mode="frozen"), _SCRIPT,
+OPERATOR_CASES: Final = (
+    Case("camera.unplugged", "camera: unplugged 3 s", partial(_spoil_camera, mode="unplugged"), _VISION, again=True),
+    Case("camera.frozen", "camera: frozen 3 s, with new stamps", partial(_spoil_camera, mode="frozen"), _SCRIPT,
         blind=True, again=True, short=True),
-    Row("camera.black", "camera: black 3 s", _blacken, _VISION, stops=False, again=True,
+    Case("camera.black", "camera: black 3 s", _blacken, _VISION, stops=False, again=True,
         also=f"forward speed zero <= {COASTED_MS:g} ms"),
-    Row("camera.slow", "camera: 5 fps for 3 s", partial(_spoil_camera, mode="slow"), _SCRIPT, stops=False, again=True),
-    Row("camera.bomb", "camera: a JPEG that claims 65500 x 65500, 3 s", partial(_spoil_camera, mode="bomb"), _VISION,
+    Case("camera.slow", "camera: 5 fps for 3 s", partial(_spoil_camera, mode="slow"), _SCRIPT, stops=False, again=True),
+    Case("camera.bomb", "camera: a JPEG that claims 65500 x 65500, 3 s", partial(_spoil_camera, mode="bomb"), _VISION,
         blind=True, again=True),
-    Row("camera.resized", "camera: the picture changes size, 3 s", partial(_spoil_camera, mode="resized"), _VISION,
+    Case("camera.resized", "camera: the picture changes size, 3 s", partial(_spoil_camera, mode="resized"), _VISION,
         blind=True, again=True),
-    Row("stop.driving", "STOP: while driving", _stop, _SCRIPT, blind=True, also=_STAYS, short=True),
-    Row("stop.lossy", "STOP: while 20 % of packets are lost", _stop_lossy, Setup(wired=True), blind=True,
+    Case("stop.driving", "STOP: while driving", _stop, _SCRIPT, blind=True, also=_STAYS, short=True),
+    Case("stop.lossy", "STOP: while 20 % of packets are lost", _stop_lossy, Setup(wired=True), blind=True,
         zero_ms=LOSSY_STOP_ZERO_MS, distance_m=1.0, also=_STAYS),
-    Row("stop.commands", "STOP: then 1000 commands", _stop_then_commands, Setup(fault="thousand"), blind=True,
+    Case("stop.commands", "STOP: then 1000 commands", _stop_then_commands, Setup(fault="thousand"), blind=True,
         also=_STAYS),
-    Row("stop.restart", "STOP: then the network process is killed", _stop_then_restart, _SCRIPT, blind=True,
+    Case("stop.restart", "STOP: then the network process is killed", _stop_then_restart, _SCRIPT, blind=True,
         also=_STAYS),
-    Row("stop.reset", "STOP: then reset while moving", _reset_moving, _SCRIPT, blind=True, also="refused; " + _STAYS),
-    Row("clock.ahead", "clocks: a day ahead, then vision: SIGKILL", _drive_on, Setup(clock=f"{DAY_S}")),
-    Row("clock.behind", "clocks: a day behind, then vision: SIGKILL", _drive_on, Setup(clock=f"-{DAY_S}")),
-    Row("clock.steps", "clocks: an hour forth and back every 0.5 s", _drive_on,
+    Case("stop.reset", "STOP: then reset while moving", _reset_moving, _SCRIPT, blind=True, also="refused; " + _STAYS),
+    Case("clock.ahead", "clocks: a day ahead, then vision: SIGKILL", _drive_on, Setup(clock=f"{DAY_S}")),
+    Case("clock.behind", "clocks: a day behind, then vision: SIGKILL", _drive_on, Setup(clock=f"-{DAY_S}")),
+    Case("clock.steps", "clocks: an hour forth and back every 0.5 s", _drive_on,
         Setup(clock="3600 * (int(2 * right()) % 3 - 1)")),
 )

@@ -11,8 +11,8 @@ from functools import partial
 from typing import Final
 
 from operator_side.faults.judge import at_most
-from operator_side.faults.rig import Rig, Setup
-from operator_side.faults.row import Injected, Row
+from operator_side.faults.rig import RobotFixture, Setup
+from operator_side.faults.row import Injected, Case
 from protocol.clock import monotonic_us
 
 STOPPED_S: Final = 3.0
@@ -26,21 +26,21 @@ FREE_MS: Final = 2000.0
 _BUSY_LOOP: Final = "while True: pass"
 
 
-def drives_again(rig: Rig) -> bool:
+def drives_again(rig: RobotFixture) -> bool:
     """Wait until the robot drives again, and a little longer."""
     rig.wait_speed(AGAIN_MPS, AGAIN_S)
     rig.watch(0.5)
     return True
 
 
-def _kill_vision(rig: Rig) -> Injected:
+def _kill_vision(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
     rig.fleet.kill("peer")
     rig.watch(SETTLED_S)
     return Injected(1, at_us)
 
 
-def _pause_vision(rig: Rig) -> Injected:
+def _pause_vision(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
     rig.fleet.signal("peer", signal.SIGSTOP)
     rig.watch(STOPPED_S)
@@ -49,19 +49,19 @@ def _pause_vision(rig: Rig) -> Injected:
     return Injected(1, at_us, resumed_us, drives_again(rig))
 
 
-def _fail_detector(rig: Rig) -> Injected:
+def _fail_detector(rig: RobotFixture) -> Injected:
     at_us = rig.trigger()
     rig.watch(SETTLED_S)
     return Injected(rig.injected(), at_us)
 
 
-def _slow_detector(rig: Rig) -> Injected:
+def _slow_detector(rig: RobotFixture) -> Injected:
     at_us = rig.trigger()
     rig.watch(2 * STOPPED_S)
     return Injected(rig.injected(), at_us)
 
 
-def _restart_vision(rig: Rig) -> Injected:
+def _restart_vision(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
     rig.fleet.kill("peer")
     rig.watch(SETTLED_S)
@@ -70,7 +70,7 @@ def _restart_vision(rig: Rig) -> Injected:
     return Injected(1, at_us, resumed_us, drives_again(rig))
 
 
-def _kill_network(rig: Rig) -> Injected:
+def _kill_network(rig: RobotFixture) -> Injected:
     before = rig.fleet.child("robot")
     at_us = rig.signal_network(signal.SIGKILL)
     rig.until(lambda: rig.fleet.child("robot") not in (0, before), AGAIN_S, "a new network process")
@@ -80,14 +80,14 @@ def _kill_network(rig: Rig) -> Injected:
     return Injected(1, at_us, first_us, again)
 
 
-def _pause_network(rig: Rig) -> Injected:
+def _pause_network(rig: RobotFixture) -> Injected:
     at_us = rig.signal_network(signal.SIGSTOP)
     rig.watch(STOPPED_S)
     resumed_us = rig.signal_network(signal.SIGCONT)
     return Injected(1, at_us, resumed_us, drives_again(rig))
 
 
-def _hold_gil(rig: Rig) -> Injected:
+def _hold_gil(rig: RobotFixture) -> Injected:
     rig.camera_mode("gil")
     rig.until(lambda: rig.injected("camera") > 0, 5.0, "the interpreter's lock being held")
     at_us = rig.noted("camera", "injected")[0].t_us
@@ -109,14 +109,14 @@ def busy_processes() -> Iterator[None]:
             process.wait()
 
 
-def _starve(rig: Rig) -> Injected:
+def _starve(rig: RobotFixture) -> Injected:
     with busy_processes():
         rig.watch(SETTLED_S)
         injected = _kill_vision(rig)
     return Injected(BUSY, injected.at_us)
 
 
-def _end_robot(rig: Rig, number: signal.Signals) -> Injected:
+def _end_robot(rig: RobotFixture, number: signal.Signals) -> Injected:
     started_s, at_us = time.monotonic(), monotonic_us()
     rig.fleet.signal("robot", number)
     code = rig.fleet.exit_code("robot", FREE_MS / 1000)
@@ -144,20 +144,20 @@ _VISION: Final = Setup(driver="vision")
 _SCRIPT: Final = Setup()
 _ENDED: Final = "zero is the last speed told, exit code 0, port free <= 2 s"
 
-ROWS: Final = (
-    Row("vision.kill", "vision: SIGKILL", _kill_vision, _VISION, short=True),
-    Row("vision.pause", "vision: SIGSTOP 3 s, then SIGCONT", _pause_vision, _VISION, again=True),
-    Row("vision.raises", "vision: the detector raises", _fail_detector, Setup("vision", "raises")),
-    Row("vision.hangs", "vision: the detector hangs", _fail_detector, Setup("vision", "hangs"), short=True),
-    Row("vision.slow", "vision: the detector takes 330 ms", _slow_detector, Setup("vision", "slow"), stops=False),
-    Row("vision.restart", "vision: killed and started again", _restart_vision, _VISION, again=True),
-    Row("network.kill", "network process: SIGKILL", _kill_network, _SCRIPT, blind=True, again=True, short=True),
-    Row("network.pause", "network process: SIGSTOP 3 s", _pause_network, _SCRIPT, blind=True, again=True),
-    Row("network.gil", "network process: C code holds the interpreter 1 s", _hold_gil, _SCRIPT, blind=True, again=True,
+PROCESS_CASES: Final = (
+    Case("vision.kill", "vision: SIGKILL", _kill_vision, _VISION, short=True),
+    Case("vision.pause", "vision: SIGSTOP 3 s, then SIGCONT", _pause_vision, _VISION, again=True),
+    Case("vision.raises", "vision: the detector raises", _fail_detector, Setup("vision", "raises")),
+    Case("vision.hangs", "vision: the detector hangs", _fail_detector, Setup("vision", "hangs"), short=True),
+    Case("vision.slow", "vision: the detector takes 330 ms", _slow_detector, Setup("vision", "slow"), stops=False),
+    Case("vision.restart", "vision: killed and started again", _restart_vision, _VISION, again=True),
+    Case("network.kill", "network process: SIGKILL", _kill_network, _SCRIPT, blind=True, again=True, short=True),
+    Case("network.pause", "network process: SIGSTOP 3 s", _pause_network, _SCRIPT, blind=True, again=True),
+    Case("network.gil", "network process: C code holds the interpreter 1 s", _hold_gil, _SCRIPT, blind=True, again=True,
         short=True),
-    Row("driver.starved", "robot: four busy processes beside it; then vision: SIGKILL", _starve, _SCRIPT, alone=True),
+    Case("driver.starved", "robot: four busy processes beside it; then vision: SIGKILL", _starve, _SCRIPT, alone=True),
     *(
-        Row(f"end.{number.name.lower()}", f"robot: {number.name} while moving", partial(_end_robot, number=number),
+        Case(f"end.{number.name.lower()}", f"robot: {number.name} while moving", partial(_end_robot, number=number),
             _SCRIPT, blind=True, also=_ENDED, short=number is signal.SIGTERM)
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     ),

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from operator_side.faults.ledger import GOOD, INJECTED, Ledger
+from operator_side.faults.ledger import GOOD, INJECTED, EventLog
 from operator_side.service_settings import load_service
 from protocol.channels import TWIST, Channel
 from protocol.codec import decode
@@ -16,7 +16,7 @@ from protocol.transports.link import LatestSlot, Link, Message
 from protocol.transports.zenoh import open_zenoh
 from vision_side.config import VisionConfig
 from vision_side.detect.hsv import HsvDetector
-from vision_side.pipeline import SOURCE
+from vision_side.pipeline import SOURCE as VISION_SOURCE
 from vision_side.service_process import serve
 
 if TYPE_CHECKING:
@@ -26,10 +26,10 @@ SLOW_S: Final = 0.33
 """Ten frame intervals at 30 fps."""
 
 
-class LedgerLink:
+class LoggingLink:
     """A link that notes every twist before it leaves; a `Link` itself."""
 
-    def __init__(self, link: Link, ledger: Ledger) -> None:
+    def __init__(self, link: Link, ledger: EventLog) -> None:
         self.robot = link.robot
         self._link, self._ledger = link, ledger
 
@@ -77,7 +77,7 @@ FAULTS: Final[dict[str, Callable[[], None]]] = {
 }
 
 
-def _spoil_detector(fault: str, pulled: threading.Event, ledger: Ledger) -> None:
+def _spoil_detector(fault: str, pulled: threading.Event, ledger: EventLog) -> None:
     """Every detector built from now on does `fault` before it detects, once the trigger is pulled."""
     detect = HsvDetector.detect
 
@@ -90,7 +90,7 @@ def _spoil_detector(fault: str, pulled: threading.Event, ledger: Ledger) -> None
     HsvDetector.detect = spoiled  # type: ignore[method-assign]
 
 
-def run_vision(options: "PeerOptions", pulled: threading.Event, ledger: Ledger) -> int:
+def run_vision(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
     """Serve for ever."""
     if options.fault:
         _spoil_detector(options.fault, pulled, ledger)
@@ -98,6 +98,6 @@ def run_vision(options: "PeerOptions", pulled: threading.Event, ledger: Ledger) 
                           options={"connect": (options.endpoint,)}, environ=os.environ)
     config = loaded.config
     assert isinstance(config, VisionConfig)
-    with LedgerLink(open_zenoh(config.robot, connect=config.connect, role=SOURCE, timeout_s=15), ledger) as link:
+    with LoggingLink(open_zenoh(config.robot, connect=config.connect, role=VISION_SOURCE, timeout_s=15), ledger) as link:
         serve(config, link, threading.Event(), lambda line: print(line, flush=True))
     return 0

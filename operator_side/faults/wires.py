@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import IO, Final, Self
 
 from protocol.errors import HardwareError
-from sim.wire import Shapes
+from sim.wire import LinkShapes
 from sim.wire_tun import namespaces
 
 _END_S: Final = 2.0
@@ -47,7 +47,7 @@ class BenchWire:
     ) -> None:
         self._ending.close()
 
-    def shape(self, shapes: Shapes) -> int:
+    def shape(self, shapes: LinkShapes) -> int:
         """Put `shapes` in force; returns how many packets the wire has harmed so far."""
         assert self._process is not None
         stdin = _file(self._process.stdin)

@@ -29,7 +29,7 @@ class _Line:
     passed: bool
 
 
-def page_with_worst(page: str, report: str) -> str:
+def page_with_summary(page: str, report: str) -> str:
     """`page` with the block between its marks made of `report`; as it was if it has no marks."""
     return _MARKS.sub(lambda marks: marks[1] + _block(report) + marks[2], page)
 
@@ -37,14 +37,14 @@ def page_with_worst(page: str, report: str) -> str:
 def _block(report: str) -> str:
     lines = list(_lines(report))
     groups = dict.fromkeys((line.group, line.bound) for line in lines)
-    rows = [_row(group, bound, [one for one in lines if (one.group, one.bound) == (group, bound)])
+    rows = [_summary_row(group, bound, [one for one in lines if (one.group, one.bound) == (group, bound)])
             for group, bound in groups]
     written = _WRITTEN_BY.search(report)
     source = f"The worst of every run of {written[1] if written else 'the bench'}, of what broke in the same way."
     return "\n".join([source, "", _HEAD, "|---" * (_HEAD.count("|") - 1) + "|", *rows, ""])
 
 
-def _row(group: str, bound: str, lines: list[_Line]) -> str:
+def _summary_row(group: str, bound: str, lines: list[_Line]) -> str:
     worst = [max((line.figures[name] for line in lines if name in line.figures), default=None) for name in _FIGURES]
     cells = ["-" if one is None else "never" if one == _NEVER else f"{one:g}" for one in worst]
     passed = sum(line.passed for line in lines)
@@ -57,10 +57,10 @@ def _lines(report: str) -> Iterator[_Line]:
         cells = [cell.strip() for cell in text.strip("|").split("|")]
         if text.startswith("| ") and len(cells) == 4 and cells[3] in ("yes", "**no**"):
             bound = _STOP_BOUND.search(cells[1])
-            yield _Line(cells[0].partition(":")[0], bound[0] if bound else "", _figures(cells[2]), cells[3] == "yes")
+            yield _Line(cells[0].partition(":")[0], bound[0] if bound else "", _figures_in(cells[2]), cells[3] == "yes")
 
 
-def _figures(cell: str) -> dict[str, float]:
+def _figures_in(cell: str) -> dict[str, float]:
     found = {}
     for name, unit in _FIGURES.items():
         match = re.search(rf"\b{name} (never|[0-9.]+) {unit}\b", cell)

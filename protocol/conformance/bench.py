@@ -16,14 +16,14 @@ from protocol.channels import Channel
 from protocol.codec import decode, encode
 from protocol.conformance.case import ConformanceError, NotApplicableError
 from protocol.errors import WireError
-from protocol.messages import Wire
+from protocol.messages import WireModel
 from protocol.transports.link import Message
-from protocol.transports.secured import SOURCES, certificate_role
+from protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
 
 KEPT_MESSAGES: Final = 600
 """Per channel; 20 s of frames at 30 fps, longer than any case lasts."""
 
-Model = TypeVar("Model", bound=Wire)
+Model = TypeVar("Model", bound=WireModel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Access:
 
     def may_ask(self, source: str) -> bool:
         """Whether requests of `source` get through."""
-        return not self.is_guarded or source in SOURCES["operator"]
+        return not self.is_guarded or source in SOURCES_OF_ROLE["operator"]
 
     def token_of(self, source: str) -> str:
         """What `source` shows; "" where nothing is asked for."""
@@ -125,7 +125,7 @@ class Bench(ABC):
 
     # --- messages ------------------------------------------------------------------------------------------------
 
-    def publish(self, channel: Channel, header: Wire | bytes, payload: Wire | bytes = b"", source: str = "") -> None:
+    def publish(self, channel: Channel, header: WireModel | bytes, payload: WireModel | bytes = b"", source: str = "") -> None:
         """Send a message; `source` is the role in the key, for channels towards the robot."""
         self.send(channel, _bytes(header), _bytes(payload), source)
 
@@ -212,5 +212,5 @@ class Bench(ABC):
             raise NotApplicableError(reason)
 
 
-def _bytes(part: Wire | bytes) -> bytes:
+def _bytes(part: WireModel | bytes) -> bytes:
     return part if isinstance(part, bytes) else encode(part)

@@ -31,8 +31,8 @@ def _cases(asked: Sequence[CodecCase]) -> tuple[Case, ...]:
     return tuple(suite.cases)
 
 
-_ASKED: Final = {f"C-CODEC-{one.number}": one for one in codec_cases()}
-CASES: Final[tuple[Case, ...]] = _cases(tuple(_ASKED.values()))
+_SENT: Final = {f"C-CODEC-{one.number}": one for one in codec_cases()}
+CASES: Final[tuple[Case, ...]] = _cases(tuple(_SENT.values()))
 
 
 def run_codec(
@@ -51,7 +51,7 @@ def run_codec(
             outcome, reason = (Outcome.SKIPPED, "the program is gone") if gone else (Outcome.PASSED, "")
             try:
                 if not gone:
-                    outcome, reason = _judge(program, case)
+                    outcome, reason = _result(program, case)
             except ProgramError as fault:
                 gone = reason = str(fault)
                 outcome = Outcome.FAILED
@@ -60,13 +60,13 @@ def run_codec(
     return results
 
 
-def _judge(program: CodecProgram, case: Case) -> tuple[Outcome, str]:
+def _result(program: CodecProgram, case: Case) -> tuple[Outcome, str]:
     """Ask one case's questions. Raises ProgramError."""
     if case.id == END:
         program.finish()
         return Outcome.PASSED, ""
     wrong, unsupported = "", ""
-    for question, answer in program.ask(_ASKED[case.id].questions()):
+    for question, answer in program.ask(_SENT[case.id].questions()):
         if "unsupported" in answer:
             unsupported = f"the program does not know questions of kind {question.kind}"
         wrong = wrong or ("" if unsupported else same(dict(question.expected), answer))

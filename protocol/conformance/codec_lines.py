@@ -16,7 +16,7 @@ from typing import Any, Final
 
 MAX_ANSWER_BYTES: Final = 1_048_576
 """Security limit: a longer line is no answer."""
-_SHOWN: Final = 120
+_PRINTED: Final = 120
 Fields = Mapping[str, Any]
 
 
@@ -64,8 +64,8 @@ def read_answer(line: bytes) -> tuple[int, dict[str, Any]]:
 
 def shown(line: bytes) -> str:
     """The line's beginning, without anything that could confuse a terminal."""
-    text = line[:_SHOWN].decode("utf-8", "replace")
-    return ascii(text) + ("..." if len(line) > _SHOWN else "")
+    text = line[:_PRINTED].decode("utf-8", "replace")
+    return ascii(text) + ("..." if len(line) > _PRINTED else "")
 
 
 def same(expected: Any, got: Any, where: str = "") -> str:
@@ -89,4 +89,4 @@ def _differ(expected: Any, got: Any, where: str) -> str:
 
 def _short(value: Any) -> str:
     text = ascii(value)
-    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
+    return text if len(text) <= _PRINTED else text[:_PRINTED] + "..."

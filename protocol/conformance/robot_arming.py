@@ -21,7 +21,7 @@ def _driven(bench: Bench, twists: int = 8) -> Sender:
     return driver
 
 
-def refused_to_arm(bench: Bench, sender: Sender, reason: str, what: str, **changes: object) -> None:
+def expect_arm_rejected(bench: Bench, sender: Sender, reason: str, what: str, **changes: object) -> None:
     """Fail the case unless `arm` is refused, and that counted under `reason`."""
     before = sender.robot.next_status().refused.get(reason, 0)
     reply = sender.ask("arm", **changes)  # type: ignore[arg-type]
@@ -40,7 +40,7 @@ def is_soon(robot: Robot, state: State, within_us: int = 500_000) -> bool:
 @SUITE.must("R-ARM-01", "8.2 Requests and replies")
 def nobody_drives(bench: Bench) -> None:
     """`arm` is refused as NOT_ALLOWED while nobody sends good twists."""
-    refused_to_arm(bench, Sender(Robot(bench), "operator"), "NOT_ALLOWED", "a request without any twist")
+    expect_arm_rejected(bench, Sender(Robot(bench), "operator"), "NOT_ALLOWED", "a request without any twist")
 
 
 @SUITE.must("R-ARM-02", "6.4 Arming")
@@ -49,7 +49,7 @@ def too_few(bench: Bench) -> None:
     driver = Sender(Robot(bench))
     driver.need_good()
     driver.need_good()
-    refused_to_arm(bench, Sender(driver.robot, "operator"), "NOT_ALLOWED", "two twists")
+    expect_arm_rejected(bench, Sender(driver.robot, "operator"), "NOT_ALLOWED", "two twists")
 
 
 @SUITE.must("R-ARM-03", "6.4 Arming")
@@ -88,7 +88,7 @@ def disarms(bench: Bench) -> None:
 def arming_needs_echo(bench: Bench) -> None:
     """`arm` without `echo` is refused as MALFORMED."""
     driver = _driven(bench)
-    refused_to_arm(bench, driver, "MALFORMED", "a request without echo", cite=False)
+    expect_arm_rejected(bench, driver, "MALFORMED", "a request without echo", cite=False)
 
 
 @SUITE.must("R-ARM-07", "8.3 Freshness")
@@ -97,7 +97,7 @@ def arming_needs_news(bench: Bench) -> None:
     robot = Robot(bench)
     old = robot.stamp()
     bench.rest(2_300_000)
-    refused_to_arm(bench, _driven(bench), "STALE", "a request 2.5 s late", cite=old)
+    expect_arm_rejected(bench, _driven(bench), "STALE", "a request 2.5 s late", cite=old)
 
 
 @SUITE.must("R-ARM-08", "8.3 Freshness")
@@ -106,7 +106,7 @@ def arming_after_disarm(bench: Bench) -> None:
     driver = _driven(bench)
     before = driver.robot.stamp()
     bench.need(driver.granted("disarm"), "disarm is not granted (R-ARM-05)")
-    refused_to_arm(bench, driver, "STALE", "a request from before the disarm", cite=before)
+    expect_arm_rejected(bench, driver, "STALE", "a request from before the disarm", cite=before)
 
 
 @SUITE.must("R-ARM-09", "8.2 Requests and replies")
@@ -116,7 +116,7 @@ def human_beside(bench: Bench) -> None:
     human.need_good()
     human.drive()
     bench.need(bench.wait(lambda: human.seq >= 9, 3_000_000), "too few frames")
-    refused_to_arm(bench, Sender(human.robot, "operator"), "NOT_ALLOWED", "somebody beside the human")
+    expect_arm_rejected(bench, Sender(human.robot, "operator"), "NOT_ALLOWED", "somebody beside the human")
 
 
 @SUITE.must("R-ARM-10", "8.2 Requests and replies")
@@ -137,7 +137,7 @@ def counts_one_driver(bench: Bench) -> None:
     bench.rest(1_500_000)
     second = Sender(driver.robot)
     second.need_good()
-    refused_to_arm(bench, second, "NOT_ALLOWED", "one twist after another driver's twelve")
+    expect_arm_rejected(bench, second, "NOT_ALLOWED", "one twist after another driver's twelve")
 
 
 @SUITE.must("R-ARM-12", "6.4 Arming")
@@ -174,4 +174,4 @@ def row_ends_with_the_lease(bench: Bench) -> None:
     bench.rest(1_500_000)
     bench.need(driver.robot.next_status().holder is None, "the lease does not end by silence (R-LEASE-04, R-LEASE-07)")
     driver.need_good()
-    refused_to_arm(bench, driver, "NOT_ALLOWED", "one twist, 1.5 s after twelve")
+    expect_arm_rejected(bench, driver, "NOT_ALLOWED", "one twist, 1.5 s after twelve")

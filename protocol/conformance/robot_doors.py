@@ -13,21 +13,21 @@ from protocol.conformance.robot_sockets import (
     SESSION,
     SWITCHED,
     block,
-    door,
+    endpoint_of,
     ends_with,
     hello,
     offered,
     packets_of,
     spoken,
 )
-from protocol.transports.websocket_framing import MAX_HELLO_BYTES, Packet
+from protocol.transports.websocket_framing import MAX_HELLO_BYTES, IncomingMessage
 
 SUITE: Final = Suite("R")
 _HANDSHAKE_S: Final = 4.0
 """Two seconds by the specification, and room for a slow machine."""
 
 
-def _told(bench: Bench, send: Callable[[], None]) -> tuple[str, str]:
+def _reason_given(bench: Bench, send: Callable[[], None]) -> tuple[str, str]:
     """What became of what `send` sends, and whom the robot took for its sender."""
     watcher = Sender(Robot(bench), bench.access.watcher, acks=False)
     verdict = watcher.verdict(send)
@@ -60,14 +60,14 @@ def _passed_on(bench: Bench, channel: str, role: str, payload: bytes) -> None:
         bench.expect(not _said_on(channel, speaker, bench, 0.3), f"who said `{channel}` gets it back")
 
 
-def _said_on(channel: str, raw: RawWebSocket, bench: Bench, for_s: float) -> list[Packet]:
+def _said_on(channel: str, raw: RawWebSocket, bench: Bench, for_s: float) -> list[IncomingMessage]:
     return [one for one in packets_of(raw, bench, for_s) if f"/{channel}/" in one.key]
 
 
 @SUITE.must("R-SOCK-42", "14.4 Limits", real=True)
 def late_handshake(bench: Bench) -> None:
     """Who connects and asks for nothing is dropped after two seconds."""
-    _tls, address, port = split_url(door(bench))
+    _tls, address, port = split_url(endpoint_of(bench))
     with socket.create_connection((address, port), _HANDSHAKE_S) as near:
         began_s = time.monotonic()
         near.settimeout(_HANDSHAKE_S)
@@ -86,7 +86,7 @@ def late_handshake(bench: Bench) -> None:
 @SUITE.must("R-SOCK-43", "14.5 Hello", real=True)
 def long_hello(bench: Bench) -> None:
     """A hello of more than 1024 bytes ends with 1009 or 1008."""
-    with RawWebSocket(door(bench), offered(bench)) as raw:
+    with RawWebSocket(endpoint_of(bench), offered(bench)) as raw:
         bench.need(raw.status == SWITCHED, f"the handshake fails with {raw.status} (R-SOCK-01)")
         raw.send(TEXT, hello(bench, "status", note="x" * MAX_HELLO_BYTES))
         ends_with(raw, bench, (1008, 1009), "a hello of 1.1 kB")
@@ -99,7 +99,7 @@ def hello_again_with_another_role(bench: Bench) -> None:
         raw.send(TEXT, hello(bench, "reply", role="operator"))
         packets_of(raw, bench, 0.3)
         fields = {"channel": "request", "v": 1, "session": SESSION, "seq": 1}
-        told = _told(bench, lambda: raw.send(BINARY, block(as_json(fields), b'{"id":1,"verb":"disarm"}')))
+        told = _reason_given(bench, lambda: raw.send(BINARY, block(as_json(fields), b'{"id":1,"verb":"disarm"}')))
         bench.need(told[0] == "MALFORMED", f"a header without source is {told[0] or 'not counted'} (R-SOCK-33)")
         bench.expect(told[1] == "operator", f"after a hello as operator it is taken for {told[1]}'s")
 
@@ -109,7 +109,7 @@ def block_without_header(bench: Bench) -> None:
     """A block of channel and source alone is a message without header: a guest's twist, or UNKNOWN_SOURCE."""
     bench.need(not bench.access.is_guarded, "where keys are asked for no guest gets in")
     with spoken(bench, role="guest") as raw:
-        verdict = _told(bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","source":"guest"}', b"0.1|0")))[0]
+        verdict = _reason_given(bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","source":"guest"}', b"0.1|0")))[0]
         bench.expect(verdict in (GOOD, "UNKNOWN_SOURCE"), f"it was {verdict or 'not counted'}")
 
 
@@ -117,6 +117,6 @@ def block_without_header(bench: Bench) -> None:
 def header_that_is_no_json(bench: Bench) -> None:
     """A block that begins with its channel is of it, whatever follows: what is no JSON is counted as MALFORMED."""
     with spoken(bench, "reply", role="teleop") as raw:
-        verdict, _source = _told(bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","v":1,,}', b"1|1")))
+        verdict, _source = _reason_given(bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","v":1,,}', b"1|1")))
         bench.expect(verdict == "MALFORMED", f"it was {verdict or 'not counted'}")
         bench.expect(raw.end(0.3) is None, "the connection ended")

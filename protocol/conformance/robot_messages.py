@@ -17,7 +17,7 @@ from protocol.conformance.robot_sockets import (
     SWITCHED,
     block,
     disarm_request,
-    door,
+    endpoint_of,
     ends_with,
     hello,
     is_answered,
@@ -132,7 +132,7 @@ def pings_every_second(bench: Bench) -> None:
 @SUITE.must("R-SOCK-30", "14.8 Liveness", real=True)
 def the_deaf_are_dropped(bench: Bench) -> None:
     """A peer that leaves pings unanswered is dropped within about two seconds."""
-    with RawWebSocket(door(bench), offered(bench), answers_pings=False) as raw:
+    with RawWebSocket(endpoint_of(bench), offered(bench), answers_pings=False) as raw:
         raw.send(TEXT, hello(bench))
         began_s = time.monotonic()
         end = raw.end(5.0)
@@ -143,7 +143,7 @@ def the_deaf_are_dropped(bench: Bench) -> None:
 @SUITE.must("R-SOCK-31", "13.2 Bounds", real=True)
 def abrupt_ends(bench: Bench) -> None:
     """Connections that break off anywhere disturb nobody else."""
-    door(bench)
+    endpoint_of(bench)
     for opening in (b"", b"GET / HTTP/1.1\r\nHost: x", b"\x16\x03\x01\x02\0\x01\0" * 9):
         with RawWebSocket(bench.endpoint, offered(bench)) as raw:
             raw.write(opening)
@@ -161,7 +161,7 @@ def sixteen_clients(bench: Bench) -> None:
     with ExitStack() as ending:
         statuses, opened = [], list[RawWebSocket]()
         for _ in range(17):
-            raw = ending.enter_context(RawWebSocket(door(bench), offered(bench)))
+            raw = ending.enter_context(RawWebSocket(endpoint_of(bench), offered(bench)))
             statuses.append(raw.status)
             raw.send(TEXT, hello(bench, role="operator"))  # of those who only watch, fewer may come in
             opened.append(raw)

@@ -12,7 +12,7 @@ from typing import Any, Final
 from protocol.channels import ACK, CAMERA, FRAME, REPLY, REQUEST, STATUS, TWIST
 from protocol.conformance.bench import Bench, Heard
 from protocol.messages import CameraModel, FrameHeader, Reply, Stamp, State, Status
-from protocol.refusals import CLAMPED, Refusal
+from protocol.refusals import CLAMPED, RejectReason
 
 GOOD: Final = "GOOD"
 """The verdict on a command that the robot judged good: obeyed, or counted as DISARMED."""
@@ -174,7 +174,7 @@ class Sender:
         after = self.robot.status()
         news = _counts(after) - _counts(before)
         del news[CLAMPED]
-        names = [GOOD if name in (Refusal.DISARMED, GOOD) else name for name in news]
+        names = [GOOD if name in (RejectReason.DISARMED, GOOD) else name for name in news]
         return "+".join(sorted(names))
 
     def judged(self, text: bytes = CRAWL, **changes: Any) -> str:

@@ -10,7 +10,7 @@ from protocol.conformance.case import NotApplicableError, Suite
 from protocol.conformance.raw_websocket import BINARY, CONTINUED, TEXT, RawWebSocket, split_url
 from protocol.conformance.robot_rig import as_json
 from protocol.errors import WireError
-from protocol.transports.websocket_framing import SUBPROTOCOL, Packet, parse_hello, unpack
+from protocol.transports.websocket_framing import SUBPROTOCOL, IncomingMessage, parse_hello, unpack
 
 SUITE: Final = Suite("R")
 SWITCHED: Final = 101
@@ -20,7 +20,7 @@ PASSING_S: Final = 1.2
 SESSION: Final = "5eed5eed"
 
 
-def door(bench: Bench) -> str:
+def endpoint_of(bench: Bench) -> str:
     bench.need(bench.endpoint.startswith(("ws://", "wss://")), "the peer is not tested over WebSocket")
     return bench.endpoint
 
@@ -34,7 +34,7 @@ def hello(bench: Bench, *wants: str, **changes: Any) -> bytes:
 @contextmanager
 def spoken(bench: Bench, *wants: str, **changes: Any) -> Iterator[RawWebSocket]:
     """A connection on which both have said hello."""
-    with RawWebSocket(door(bench), offered(bench, source=changes.get("role", ""))) as raw:
+    with RawWebSocket(endpoint_of(bench), offered(bench, source=changes.get("role", ""))) as raw:
         bench.need(raw.status == SWITCHED, f"the handshake fails with {raw.status} (R-SOCK-01)")
         raw.send(TEXT, hello(bench, *wants, **changes))
         answer = raw.frame(SOON_S)
@@ -73,7 +73,7 @@ def disarm_request(bench: Bench) -> bytes:
     return block(as_json(header), as_json({"id": 4711, "verb": "disarm"}))
 
 
-def packets_of(raw: RawWebSocket, bench: Bench, for_s: float) -> list[Packet]:
+def packets_of(raw: RawWebSocket, bench: Bench, for_s: float) -> list[IncomingMessage]:
     """What comes in whole messages, taken apart; what cannot be taken apart has an empty key."""
     until_s, whole, packets = time.monotonic() + for_s, b"", []
     while (left_s := until_s - time.monotonic()) > 0:
@@ -86,14 +86,14 @@ def packets_of(raw: RawWebSocket, bench: Bench, for_s: float) -> list[Packet]:
     return packets
 
 
-def _packet(message: bytes, bench: Bench) -> Packet:
+def _packet(message: bytes, bench: Bench) -> IncomingMessage:
     try:
         return unpack(message, bench.robot, "")
     except WireError:
-        return Packet("", b"", message)
+        return IncomingMessage("", b"", message)
 
 
-def names_of(packets: list[Packet]) -> set[str]:
+def names_of(packets: list[IncomingMessage]) -> set[str]:
     return {packet.key.split("/")[2] for packet in packets if packet.key}
 
 
@@ -110,7 +110,7 @@ def ends_with(raw: RawWebSocket, bench: Bench, codes: tuple[int, ...], what: str
 
 
 def _refused(bench: Bench, status: int, what: str, **options: Any) -> None:
-    with RawWebSocket(door(bench), **{"protocols": offered(bench), **options}) as raw:
+    with RawWebSocket(endpoint_of(bench), **{"protocols": offered(bench), **options}) as raw:
         bench.expect(raw.status == status, f"{what}: HTTP {raw.status or 'nothing'}, expected {status}")
 
 
@@ -120,7 +120,7 @@ def _refused(bench: Bench, status: int, what: str, **options: Any) -> None:
 @SUITE.must("R-SOCK-01", "14.1 Opening", real=True)
 def selects_the_sub_protocol(bench: Bench) -> None:
     """The handshake selects `sightline.v1` among what is offered."""
-    with RawWebSocket(door(bench), offered(bench, "chat")) as raw:
+    with RawWebSocket(endpoint_of(bench), offered(bench, "chat")) as raw:
         bench.expect(raw.status == SWITCHED, f"HTTP {raw.status}")
         selected = raw.headers.get("sec-websocket-protocol")
         bench.expect(selected == SUBPROTOCOL, f"it selects {selected!r}")
@@ -139,7 +139,7 @@ def demands_the_sub_protocol(bench: Bench) -> None:
 def no_compression(bench: Bench) -> None:
     """No extension is negotiated, though compression is offered."""
     offer = (("Sec-WebSocket-Extensions", "permessage-deflate; client_max_window_bits"),)
-    with RawWebSocket(door(bench), offered(bench), offer) as raw:
+    with RawWebSocket(endpoint_of(bench), offered(bench), offer) as raw:
         agreed = raw.headers.get("sec-websocket-extensions", "")
         bench.expect(raw.status == SWITCHED and not agreed, f"HTTP {raw.status}, extensions {agreed!r}")
 
@@ -147,7 +147,7 @@ def no_compression(bench: Bench) -> None:
 @SUITE.must("R-SOCK-04", "14.2 Host and Origin", real=True)
 def foreign_host(bench: Bench) -> None:
     """A Host that a foreign site could own fails with 403."""
-    port = split_url(door(bench))[2]
+    port = split_url(endpoint_of(bench))[2]
     _refused(bench, 403, "Host: evil.example.com", host=f"evil.example.com:{port}")
 
 
@@ -161,7 +161,7 @@ def foreign_origin(bench: Bench) -> None:
 @SUITE.must("R-SOCK-06", "14.2 Host and Origin", real=True)
 def own_origin(bench: Bench) -> None:
     """An Origin that is the Host itself is let in."""
-    tls, address, port = split_url(door(bench))
+    tls, address, port = split_url(endpoint_of(bench))
     origin = f"http{'s' if tls else ''}://{address}:{port}"
     _refused(bench, SWITCHED, "Origin as the Host", headers=(("Origin", origin),))
 
@@ -172,7 +172,7 @@ def own_origin(bench: Bench) -> None:
 @SUITE.must("R-SOCK-07", "14.5 Hello", real=True)
 def answers_hello(bench: Bench) -> None:
     """A hello is answered with the robot's own, as text, that names the robot."""
-    with RawWebSocket(door(bench), offered(bench)) as raw:
+    with RawWebSocket(endpoint_of(bench), offered(bench)) as raw:
         raw.send(TEXT, hello(bench, "status"))
         frame = raw.frame(SOON_S)
         bench.expect(frame is not None and frame.opcode == TEXT, f"the answer is {frame}")
@@ -186,7 +186,7 @@ def answers_hello(bench: Bench) -> None:
 
 def _no_hello(number: str, title: str, codes: tuple[int, ...], send: Callable[[RawWebSocket, Bench], None]) -> None:
     def run(bench: Bench) -> None:
-        with RawWebSocket(door(bench), offered(bench)) as raw:
+        with RawWebSocket(endpoint_of(bench), offered(bench)) as raw:
             bench.need(raw.status == SWITCHED, f"the handshake fails with {raw.status} (R-SOCK-01)")
             send(raw, bench)
             reason = ends_with(raw, bench, codes, title, 4.0)

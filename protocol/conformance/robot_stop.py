@@ -4,7 +4,7 @@ from typing import Final
 
 from protocol.conformance.bench import Bench
 from protocol.conformance.case import Suite
-from protocol.conformance.robot_arming import is_soon, refused_to_arm
+from protocol.conformance.robot_arming import is_soon, expect_arm_rejected
 from protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, arm, armed
 from protocol.messages import State, Status
 
@@ -75,7 +75,7 @@ def no_arming(bench: Bench) -> None:
     operator = _stopped(bench)
     Sender(operator.robot).drive()
     bench.rest(500_000)
-    refused_to_arm(bench, operator, "STOPPED", "a request")
+    expect_arm_rejected(bench, operator, "STOPPED", "a request")
     _state(operator.robot, State.STOPPED, "after arm")
 
 

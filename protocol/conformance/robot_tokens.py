@@ -10,7 +10,7 @@ from protocol.conformance.robot_sockets import (
     SWITCHED,
     block,
     disarm_request,
-    door,
+    endpoint_of,
     entry_of,
     hello,
     is_answered,
@@ -20,12 +20,12 @@ from protocol.transports.websocket_framing import SUBPROTOCOL
 
 SUITE: Final = Suite("R")
 _CLAUSE: Final = "14.3 Token"
-_STRANGE: Final = "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"
+_WRONG_TOKENS: Final = "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"
 """A token by its form, and nobody's."""
 
 
 def _token(bench: Bench) -> str:
-    door(bench)
+    endpoint_of(bench)
     token = bench.access.token_of(bench.access.watcher)
     bench.need(token, "no token was named (--token, or --secure): a robot on loopback need not ask for one")
     return token
@@ -33,7 +33,7 @@ def _token(bench: Bench) -> str:
 
 def _answers(bench: Bench, status: int, what: str, **options: Any) -> None:
     """Fail the case unless a client who comes so gets `status`."""
-    with RawWebSocket(door(bench), **{"protocols": (SUBPROTOCOL,), **options}) as raw:
+    with RawWebSocket(endpoint_of(bench), **{"protocols": (SUBPROTOCOL,), **options}) as raw:
         bench.expect(raw.status == status, f"{what}: HTTP {raw.status or 'nothing'}, expected {status}")
 
 
@@ -48,7 +48,7 @@ def no_token(bench: Bench) -> None:
 def wrong_token(bench: Bench) -> None:
     """A token that is nobody's, or a part of the right one, is refused with 401."""
     token = _token(bench)
-    for what, wrong in (("nobody's token", _STRANGE), ("all but its last letter", token[:-1]), ("an empty one", "")):
+    for what, wrong in (("nobody's token", _WRONG_TOKENS), ("all but its last letter", token[:-1]), ("an empty one", "")):
         _answers(bench, 401, what, protocols=(SUBPROTOCOL, entry_of(wrong)))
 
 
@@ -56,8 +56,8 @@ def wrong_token(bench: Bench) -> None:
 def two_tokens(bench: Bench) -> None:
     """Two tokens, though one of them be right, are refused with 401."""
     token = _token(bench)
-    _answers(bench, 401, "a second entry", protocols=(SUBPROTOCOL, entry_of(token), entry_of(_STRANGE)))
-    shown = (("Authorization", f"Bearer {_STRANGE}"),)
+    _answers(bench, 401, "a second entry", protocols=(SUBPROTOCOL, entry_of(token), entry_of(_WRONG_TOKENS)))
+    shown = (("Authorization", f"Bearer {_WRONG_TOKENS}"),)
     _answers(bench, 401, "a second one as bearer", protocols=(SUBPROTOCOL, entry_of(token)), headers=shown)
 
 
@@ -81,7 +81,7 @@ def token_is_not_repeated(bench: Bench) -> None:
     """Beside a token `sightline.v1` is selected, wherever it stands, and the token is never repeated."""
     token = _token(bench)
     for protocols in ((entry_of(token), SUBPROTOCOL), (SUBPROTOCOL, entry_of(token))):
-        with RawWebSocket(door(bench), protocols) as raw:
+        with RawWebSocket(endpoint_of(bench), protocols) as raw:
             bench.expect(raw.status == SWITCHED, f"offered {len(protocols)} entries: HTTP {raw.status}")
             selected = raw.headers.get("sec-websocket-protocol")
             bench.expect(selected == SUBPROTOCOL, "it selects the token" if token in str(selected) else f"{selected!r}")
@@ -93,7 +93,7 @@ def roles_are_kept_apart(bench: Bench) -> None:
     """What the token's role may not publish is dropped, and the connection stays: a vision asks for nothing."""
     _token(bench)
     bench.need(len(set(bench.access.tokens.values())) > 1, "one token stands for every role here")
-    with RawWebSocket(door(bench), offered(bench, source="vision")) as raw:
+    with RawWebSocket(endpoint_of(bench), offered(bench, source="vision")) as raw:
         raw.send(TEXT, hello(bench, "reply"))
         bench.need(raw.frame(SOON_S), "hello is not answered (R-SOCK-07)")
         raw.send(BINARY, disarm_request(bench))

@@ -5,13 +5,13 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Final, Self
 
-from protocol.transports.secured import secured_for
+from protocol.transports.secured import load_role_keys
 from protocol.transports.zenoh_session import open_session
 
 _OPEN_S: Final = 5.0
 
 
-class ZenohStranger:
+class RawZenoh:
     """A session of its own at `endpoint`, opened when it is first needed; use it in a `with`."""
 
     def __init__(self, endpoint: str, folder: str = "", source: str = "vision") -> None:
@@ -23,7 +23,7 @@ class ZenohStranger:
     def put(self, key: str, header: bytes, payload: bytes) -> None:
         """Send it. Raises LinkError where nobody answers."""
         if self._put is None:
-            secured = secured_for(self._folder, self._source)
+            secured = load_role_keys(self._folder, self._source)
             session = open_session((), [self._endpoint], _OPEN_S, secured)
             self._ending.callback(session.close)
             self._put = session.put

@@ -14,7 +14,7 @@ from protocol.conformance.vision_robot import Answer, RobotPlayed
 from protocol.errors import WireError
 from protocol.golden_case import packed
 from protocol.messages import MAX_INTEGER
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link_rules import INEXACT_KEY, OVERSIZE
 from protocol.twist_text import parse_twist
 
@@ -246,7 +246,7 @@ def grammar(bench: Bench) -> None:
         try:
             parse_twist(twist.text)
         except WireError as error:
-            bench.expect(error.reason is not Refusal.MALFORMED, error.detail)
+            bench.expect(error.reason is not RejectReason.MALFORMED, error.detail)
 
 
 @SUITE.must("V-GRAM-02", "4.1 Grammar")

@@ -10,7 +10,7 @@ from protocol.conformance.vision_pictures import CAMERA as LENS
 from protocol.conformance.vision_pictures import HALF_CAMERA
 from protocol.conformance.vision_robot import ANSWER_US, FRAME_US, RobotPlayed
 from protocol.golden_case import packed
-from protocol.messages import Holder, LastRefusal, State, Status
+from protocol.messages import Holder, LastRejection, State, Status
 
 SUITE = Suite("V")
 _BURST: Final = 20
@@ -172,7 +172,7 @@ def stopped(bench: Bench) -> None:
 @SUITE.must("V-STAT-03", "7.1 Answers")
 def refused(bench: Bench) -> None:
     """A robot that refuses every twist is answered on."""
-    last = LastRefusal(source="vision", reason="STALE", detail="frame is 900 ms old")
+    last = LastRejection(source="vision", reason="STALE", detail="frame is 900 ms old")
     _goes_on(bench, Status(state=State.HOLD, reason="no command", refused={"STALE": 99}, last_refusal=last),
              "while refused")
 

@@ -47,7 +47,7 @@ DOUBTED: Final[dict[str, tuple[str, Callable[[], bytes]]]] = {
 """The same, where a decoder may see it otherwise."""
 
 
-def _refused(jpeg: Callable[[], bytes], title: str) -> Callable[[Bench], None]:
+def _picture_rejected(jpeg: Callable[[], bytes], title: str) -> Callable[[Bench], None]:
     def run(bench: Bench) -> None:
         robot = RobotPlayed(bench).met()
         for _ in range(2):
@@ -59,8 +59,8 @@ def _refused(jpeg: Callable[[], bytes], title: str) -> Callable[[Bench], None]:
 
 
 for _level, _table in ((Level.MUST, REFUSED), (Level.SHOULD, DOUBTED)):
-    for _id, (_title, _jpeg) in _table.items():
-        SUITE.add(Case(_id, _level, _CHECK, f"{_title} drives nothing.", _refused(_jpeg, _title)))
+    for _case_id, (_case_title, _jpeg) in _table.items():
+        SUITE.add(Case(_case_id, _level, _CHECK, f"{_case_title} drives nothing.", _picture_rejected(_jpeg, _case_title)))
 
 
 @SUITE.must("V-LIM-31", "13.2 Bounds")
@@ -102,5 +102,5 @@ def _read(jpeg: Callable[[], bytes]) -> Callable[[Bench], None]:
     return run
 
 
-for _id, (_clause, _title, _level, _jpeg) in READ.items():
-    SUITE.add(Case(_id, _level, _clause, _title, _read(_jpeg)))
+for _case_id, (_case_clause, _case_title, _level, _jpeg) in READ.items():
+    SUITE.add(Case(_case_id, _level, _case_clause, _case_title, _read(_jpeg)))

@@ -15,9 +15,9 @@ from protocol.conformance.vision_pictures import picture
 from protocol.conformance.vision_socket_server import BINARY, PING, PONG, TEXT, GoneError, RawClient, RawServer
 from protocol.errors import WireError
 from protocol.messages import FrameHeader, Stamp
-from protocol.transports.websocket_endpoints import parse_endpoint
+from protocol.transports.websocket_endpoints import parse_websocket_endpoint
 from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL, pack, parse_hello
-from protocol.transports.websocket_tls import listening_context
+from protocol.transports.websocket_tls import server_tls_context
 
 SUITE = Suite("V")
 BACK_S: Final = 5.0
@@ -39,10 +39,10 @@ def server_of(bench: Bench) -> Iterator[RawServer]:
     """A server of our own in the place of the kit's."""
     need_websocket(bench)
     secure = bench.endpoint.startswith("wss://")
-    end = parse_endpoint(bench.endpoint)
+    end = parse_websocket_endpoint(bench.endpoint)
     bench.leave()
     try:
-        tls = listening_context(bench.access.folder, "robot") if secure else None
+        tls = server_tls_context(bench.access.folder, "robot") if secure else None
         with RawServer(end.host, end.port, tls) as server:
             yield server
     finally:

@@ -10,7 +10,7 @@ import re
 from collections.abc import Collection
 from typing import Final
 
-LOG_FILTER: Final = (
+ACCESS_LOG_FILTER: Final = (
     "zenoh_link_tls::unicast=debug,zenoh_link_quic::unicast=debug,"
     "zenoh::net::routing::interceptor=trace,zenoh::net::routing::interceptor::access_control=off"
 )
@@ -20,7 +20,7 @@ WHY: Final = "a certificate's role may not say or hear that, or it is too large 
 DENIED: Final = b"Msg intercepted!"
 """How the line about a message that was turned away ends."""
 
-_COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
+_ANSI_ESCAPES: Final = re.compile(r"\x1b\[[0-9;]*m")
 _OURS: Final = re.compile(r"\S+Z +(?:DEBUG|TRACE) .*?(?:zenoh_link_(?:tls|quic)::|zenoh::net::routing::interceptor)")
 _ACCEPTED: Final = re.compile(r"Accepted \S+ connection on \S+: (\S+):(\d+)\. Common Name: (.*)\.$")
 _MOST_ENDS: Final = 256
@@ -36,7 +36,7 @@ class Certificates:
 
     def note(self, line: str) -> bool:
         """Take a line of the log; False for one that `LOG_FILTER` did not ask for."""
-        text = _COLOURS.sub("", line).rstrip()
+        text = _ANSI_ESCAPES.sub("", line).rstrip()
         if _OURS.match(text) is None:
             return False
         accepted = _ACCEPTED.search(text)

@@ -20,9 +20,9 @@ from protocol.transports.link import LatestSlot, Link, Message
 def check_endpoint(endpoint: str) -> None:
     """Raise ConfigError, with the right form, unless `endpoint` is one of some transport."""
     if "://" in endpoint:
-        websocket_endpoints.parse_endpoint(endpoint)
+        websocket_endpoints.parse_websocket_endpoint(endpoint)
     else:
-        endpoints.check_endpoint(endpoint)
+        endpoints.parse_zenoh_endpoint(endpoint)
 
 
 def open_link(
@@ -56,14 +56,14 @@ def open_link(
             of_web = open_websocket(robot, listen=web[0], connect=web[1], secure=secure, **options)
             links.append(undo.enter_context(of_web))
         undo.pop_all()
-    return links[0] if len(links) == 1 else ManyLinks(links)
+    return links[0] if len(links) == 1 else LinkGroup(links)
 
 
 def _of_kind(ends: Sequence[str], is_web: bool) -> list[str]:
     return [endpoint for endpoint in ends if ("://" in endpoint) == is_web]
 
 
-class ManyLinks:
+class LinkGroup:
     """Several links of one robot as one. They do not hear one another."""
 
     def __init__(self, links: Sequence[Link]) -> None:

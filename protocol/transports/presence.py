@@ -14,29 +14,29 @@ from pydantic import Field
 
 from protocol.codec import decode
 from protocol.errors import WireError
-from protocol.messages import Microseconds, SessionId, Source, Wire
-from protocol.transports.secured import PRESENCE, ROBOT, certificate_role
+from protocol.messages import Microseconds, SessionId, Source, WireModel
+from protocol.transports.secured import PRESENCE_PREFIX, ROBOT_ROLE, certificate_role
 
-EVERYBODY: Final = f"{PRESENCE}/**"
+PRESENCE_PATTERN: Final = f"{PRESENCE_PREFIX}/**"
 MAX_BYTES: Final = 512
 MAX_PEERS: Final = 256
 """Security limit: no more answers than this are kept, whatever a network claims."""
-ASKS: Final = 3
+QUERY_ROUNDS: Final = 3
 """A first answer also pays for routes that nobody used before; the best of a few is the way itself."""
 
 _PRINTED: Final = r"^[^\x00-\x1f\x7f-\x9f]*$"
-_Words = Annotated[str, Field(max_length=64, pattern=_PRINTED)]
+_Line = Annotated[str, Field(max_length=64, pattern=_PRINTED)]
 MAX_ABOUT: Final = 160
 
 
-class Presence(Wire):
+class Presence(WireModel):
     """What a peer says of itself. `clock_us` is its wall clock, to be shown and never to be judged by."""
 
     role: Source
     robot: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.*?-]{1,32}$")]
     session: SessionId
-    software: _Words = ""
-    host: _Words = ""
+    software: _Line = ""
+    host: _Line = ""
     about: Annotated[str | None, Field(max_length=MAX_ABOUT, pattern=_PRINTED)] = None
     """One line of those who serve others: what they run, on what, and how they fare."""
     up_us: Microseconds = 0
@@ -44,7 +44,7 @@ class Presence(Wire):
 
 
 @dataclass(frozen=True, slots=True)
-class Peer:
+class PeerInfo:
     """Somebody who answered, how long that took, and how far its wall clock is ahead of ours."""
 
     presence: Presence
@@ -52,12 +52,12 @@ class Peer:
     ahead_us: int
 
 
-def key_of(role: str, session: str) -> str:
+def presence_key(role: str, session: str) -> str:
     """Where a peer of `role` answers: under the role of its certificate, so that access rules can hold it to that."""
-    return f"{PRESENCE}/{certificate_role(role)}/{session}"
+    return f"{PRESENCE_PREFIX}/{certificate_role(role)}/{session}"
 
 
-def read_answer(key: str, payload: bytes, asked_us: int, answered_us: int, clock_us: int) -> Peer | None:
+def parse_presence_reply(key: str, payload: bytes, asked_us: int, answered_us: int, clock_us: int) -> PeerInfo | None:
     """The peer behind an answer; None for one that is no presence, or claims a role that its key is not of.
 
     Times are ours: monotonic when asked and answered, `clock_us` the wall clock of the answer's arrival.
@@ -66,15 +66,15 @@ def read_answer(key: str, payload: bytes, asked_us: int, answered_us: int, clock
         presence = decode(Presence, payload, MAX_BYTES)
     except WireError:
         return None
-    if key != key_of(presence.role, presence.session):
+    if key != presence_key(presence.role, presence.session):
         return None
     round_trip_us = max(0, answered_us - asked_us)
-    return Peer(presence, round_trip_us, presence.clock_us + round_trip_us // 2 - clock_us)
+    return PeerInfo(presence, round_trip_us, presence.clock_us + round_trip_us // 2 - clock_us)
 
 
-def quickest(rounds: Iterable[Iterable[Peer]]) -> list[Peer]:
+def best_round_trips(rounds: Iterable[Iterable[PeerInfo]]) -> list[PeerInfo]:
     """Each peer once, as it answered quickest, in the order in which people look for them."""
-    best: dict[tuple[str, str], Peer] = {}
+    best: dict[tuple[str, str], PeerInfo] = {}
     for peer in (peer for answers in rounds for peer in answers):
         name = (peer.presence.role, peer.presence.session)
         known = best.get(name)
@@ -85,20 +85,20 @@ def quickest(rounds: Iterable[Iterable[Peer]]) -> list[Peer]:
     return sorted(best.values(), key=_order)
 
 
-def _order(peer: Peer) -> tuple[int, str, str, str]:
+def _order(peer: PeerInfo) -> tuple[int, str, str, str]:
     role = peer.presence.role
-    known = (ROBOT, "vision")
+    known = (ROBOT_ROLE, "vision")
     return known.index(role) if role in known else len(known), role, peer.presence.robot, peer.presence.session
 
 
-def namesake(own: Presence, answers: Iterable[Peer]) -> Presence | None:
+def robot_with_same_id(own: Presence, answers: Iterable[PeerInfo]) -> Presence | None:
     """The robot that had the id of `own` before it; None if nobody else has it.
 
     Of two that start at once the one that is up for longer stays. Its own session is a robot's earlier self.
     """
     for peer in answers:
         other = peer.presence
-        if other.role == ROBOT and other.robot == own.robot and other.session != own.session \
+        if other.role == ROBOT_ROLE and other.robot == own.robot and other.session != own.session \
                 and other.up_us > own.up_us:
             return other
     return None

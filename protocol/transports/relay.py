@@ -9,7 +9,7 @@ from functools import partial
 
 from protocol.channels import CHANNELS, Channel
 from protocol.transports.link import Link, Message
-from protocol.transports.opening import ManyLinks
+from protocol.transports.opening import LinkGroup
 
 
 class Relay:
@@ -17,7 +17,7 @@ class Relay:
 
     def __init__(self, link: Link) -> None:
         """Begin with what is always passed on."""
-        self._links: tuple[Link, ...] = link.links if isinstance(link, ManyLinks) else (link,)
+        self._links: tuple[Link, ...] = link.links if isinstance(link, LinkGroup) else (link,)
         self._watched = [one for one in CHANNELS.values() if one.while_watched]
         self._open: set[tuple[str, int]] = set()
         for channel in CHANNELS.values():
@@ -38,12 +38,12 @@ class Relay:
                     near.ignore(channel)
 
     def _begin(self, channel: Channel, near: Link) -> None:
-        near.subscribe(channel, partial(_say, self._others(near)))
+        near.subscribe(channel, partial(_republish, self._others(near)))
 
     def _others(self, near: Link) -> list[Link]:
         return [other for other in self._links if other is not near]
 
 
-def _say(links: Sequence[Link], message: Message) -> None:
+def _republish(links: Sequence[Link], message: Message) -> None:
     for link in links:
         link.publish(message.channel, message.header, message.payload, message.source)

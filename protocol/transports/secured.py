@@ -13,10 +13,10 @@ from typing import Any, Final
 
 from protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REQUEST, Channel, Direction
 from protocol.errors import ConfigError
-from protocol.transports.endpoints import check_endpoint
+from protocol.transports.endpoints import parse_zenoh_endpoint
 
-ROBOT: Final = "robot"
-SOURCES: Final[dict[str, tuple[str, ...]]] = {
+ROBOT_ROLE: Final = "robot"
+SOURCES_OF_ROLE: Final[dict[str, tuple[str, ...]]] = {
     "vision": ("vision",),
     "operator": ("operator", "teleop"),
     "detector": ("detector",),
@@ -24,23 +24,23 @@ SOURCES: Final[dict[str, tuple[str, ...]]] = {
 }
 """Role of a certificate -> the sources it may speak as towards a robot. A detector says what it sees and no more, a
 viewer nothing, not even `ack`."""
-ROLE_SOURCES: Final = frozenset(source for sources in SOURCES.values() for source in sources)
+KNOWN_SOURCES: Final = frozenset(source for sources in SOURCES_OF_ROLE.values() for source in sources)
 """The sources that a role speaks as; any other is made up by its peer, and possible only on a link without keys."""
-ROLES: Final = (ROBOT, *SOURCES)
-PRESENCE: Final = "sightline-presence"
+ROLES: Final = (ROBOT_ROLE, *SOURCES_OF_ROLE)
+PRESENCE_PREFIX: Final = "sightline-presence"
 """Where peers say that they are there (`protocol.transports.presence`): beside `sightline/`, the keys of channels."""
 _TLS: Final = ("tls", "quic")
 
 
 def certificate_role(source: str) -> str:
     """The certificate that a link of role `source` shows; who is none of these is a viewer."""
-    if source == ROBOT:
-        return ROBOT
-    return next((role for role, sources in SOURCES.items() if source in sources), "viewer")
+    if source == ROBOT_ROLE:
+        return ROBOT_ROLE
+    return next((role for role, sources in SOURCES_OF_ROLE.items() if source in sources), "viewer")
 
 
 @dataclass(frozen=True)
-class Secured:
+class RoleKeys:
     """Keys of one role in a folder that `sightline keys` made."""
 
     folder: str
@@ -49,7 +49,7 @@ class Secured:
     def check(self, endpoints: Sequence[str]) -> None:
         """Raise ConfigError if an endpoint is not of TLS: there is no silent way back to a plain link."""
         for endpoint in endpoints:
-            if check_endpoint(endpoint)[0] not in _TLS:
+            if parse_zenoh_endpoint(endpoint)[0] not in _TLS:
                 raise ConfigError(f"{endpoint} is not secured: with --secure write tls/<host>:<port> or quic/...")
 
     def tls_section(self) -> dict[str, Any]:
@@ -77,7 +77,7 @@ class Secured:
         }
 
 
-def size_section() -> list[dict[str, Any]]:
+def size_limit_section() -> list[dict[str, Any]]:
     """Zenoh's `low_pass_filter`: what is over its channel's bound ends at whoever listens, and crosses no radio."""
     return [
         {"id": f"size of {channel.name}", "flows": ["ingress"], "messages": ["put"], "key_exprs": [_pattern(channel)],
@@ -86,7 +86,7 @@ def size_section() -> list[dict[str, Any]]:
     ]
 
 
-def secured_for(folder: str, source: str) -> Secured | None:
+def load_role_keys(folder: str, source: str) -> RoleKeys | None:
     """What a link of role `source` shows and checks; None for no folder. Raises ConfigError for a missing file."""
     if not folder:
         return None
@@ -95,7 +95,7 @@ def secured_for(folder: str, source: str) -> Secured | None:
     if missing:
         raise ConfigError(f"{missing[0]} is missing in {folder}: make keys with `sightline keys init`, and copy "
                           f"ca.pem, {role}.pem and {role}.key to this machine")
-    return Secured(folder, role)
+    return RoleKeys(folder, role)
 
 
 def may_publish(role: str) -> list[str]:
@@ -103,19 +103,19 @@ def may_publish(role: str) -> list[str]:
     return [key for channel in CHANNELS.values() for key in _published(role, channel)]
 
 
-def may_hear(role: str) -> list[str]:
+def may_subscribe(role: str) -> list[str]:
     """Key expressions, for any robot, that a certificate of `role` may subscribe to."""
-    own = Direction.TO_ROBOT if role == ROBOT else Direction.FROM_ROBOT
-    heard = [one for one in CHANNELS.values() if one.direction is own or (one.passed_on and role != ROBOT)]
+    own = Direction.TO_ROBOT if role == ROBOT_ROLE else Direction.FROM_ROBOT
+    heard = [one for one in CHANNELS.values() if one.direction is own or (one.passed_on and role != ROBOT_ROLE)]
     return [_pattern(channel) for channel in heard]
 
 
 def _published(role: str, channel: Channel) -> list[str]:
-    if role == ROBOT:
+    if role == ROBOT_ROLE:
         return [_pattern(channel)] if channel.direction is Direction.FROM_ROBOT else []
     if channel.direction is Direction.FROM_ROBOT or (channel is REQUEST and role != "operator"):
         return []
-    sources = [source for source in SOURCES[role] if not channel.said_by or source in channel.said_by]
+    sources = [source for source in SOURCES_OF_ROLE[role] if not channel.said_by or source in channel.said_by]
     return [f"{KEY_PREFIX}/*/{channel.name}/{source}" for source in sources]
 
 
@@ -125,7 +125,7 @@ def _pattern(channel: Channel) -> str:
 
 def _rules(role: str) -> list[dict[str, Any]]:
     """What comes in from a peer of `role` and goes out to it; subscriptions go out so that it knows who listens."""
-    said, heard = may_publish(role), may_hear(role)
+    said, heard = may_publish(role), may_subscribe(role)
     listeners = sorted({_pattern(CHANNELS[key.split("/")[2]]) for key in said})
     rows = [
         ("says", "ingress", ["put"], said),
@@ -143,7 +143,7 @@ def _rules(role: str) -> list[dict[str, Any]]:
 
 def _presence_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
     """Everybody may ask who is there; each answers as its own role only."""
-    own, all_of_it = [f"{PRESENCE}/{role}/*"], [f"{PRESENCE}/**"]
+    own, all_of_it = [f"{PRESENCE_PREFIX}/{role}/*"], [f"{PRESENCE_PREFIX}/**"]
     return [
         ("answers", "ingress", ["declare_queryable", "reply"], own),
         ("is asked", "egress", ["query"], all_of_it),

@@ -8,10 +8,10 @@ from __future__ import annotations
 import re
 from typing import Final
 
-LOG_FILTER: Final = "off,zenoh_link_tls=warn,zenoh_link_quic=warn,zenoh_link_commons::quic=warn"
+TLS_LOG_FILTER: Final = "off,zenoh_link_tls=warn,zenoh_link_quic=warn,zenoh_link_commons::quic=warn"
 """What is asked of Zenoh's log about handshakes: nothing of it is written per message."""
 
-_COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
+_ANSI_COLORS: Final = re.compile(r"\x1b\[[0-9;]*m")
 _LINE: Final = re.compile(r"\S+Z +(?:WARN|ERROR) .*?(?:zenoh_link_tls|zenoh_link_quic|zenoh_link_commons)\S*: (.*)")
 _SAME_KEYS: Final = "use keys of one `sightline keys init` on both"
 _OTHER: Final = f"its certificate is of another authority: {_SAME_KEYS}"
@@ -49,7 +49,7 @@ _HINT: Final = ". Hint: increase the system open file limit."
 _LONGEST_WORDS: Final = 120
 def refusal_cause(line: str) -> str | None:
     """Why somebody was turned away; "" for what is not worth a word; None for a line that says nothing of it."""
-    said = _LINE.match(_COLOURS.sub("", line))
+    said = _LINE.match(_ANSI_COLORS.sub("", line))
     if said is None:
         return None
     text = said[1].removesuffix(_HINT)

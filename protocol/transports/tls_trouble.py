@@ -5,10 +5,10 @@ from __future__ import annotations
 import socket
 import ssl
 
-from protocol.transports.endpoints import check_endpoint
-from protocol.transports.secured import Secured
+from protocol.transports.endpoints import parse_zenoh_endpoint
+from protocol.transports.secured import RoleKeys
 
-_PATIENCE_S = 1.0
+_TLS_TIMEOUT_S = 1.0
 _PLAIN = "it is a plain link, not TLS; give --secure there too, or on neither end"
 _CAUSES = (
     ("certificate has expired", "its certificate has expired; make new keys there"),
@@ -24,9 +24,9 @@ _CAUSES = (
 )
 
 
-def tls_trouble(endpoint: str, secured: Secured | None) -> str:
+def diagnose_tls(endpoint: str, secured: RoleKeys | None) -> str:
     """What is wrong between this end and `endpoint`; "" if TLS is not what is wrong."""
-    transport, host, port = check_endpoint(endpoint)
+    transport, host, port = parse_zenoh_endpoint(endpoint)
     if transport == "quic" or (transport != "tls" and secured is None and not _speaks_tls(host, port)):
         return ""
     if transport != "tls":
@@ -35,7 +35,7 @@ def tls_trouble(endpoint: str, secured: Secured | None) -> str:
         return "a tls/ endpoint needs keys; give --secure DIR"
     context = ssl.create_default_context(cafile=f"{secured.folder}/ca.pem")
     context.load_cert_chain(f"{secured.folder}/{secured.role}.pem", f"{secured.folder}/{secured.role}.key")
-    return _shake_hands(host, port, context)
+    return _try_handshake(host, port, context)
 
 
 def _speaks_tls(host: str, port: int) -> bool:
@@ -43,7 +43,7 @@ def _speaks_tls(host: str, port: int) -> bool:
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:
         with (
-            socket.create_connection((host, port), _PATIENCE_S) as plain,
+            socket.create_connection((host, port), _TLS_TIMEOUT_S) as plain,
             context.wrap_socket(plain, server_hostname=host),
         ):
             return True
@@ -51,10 +51,10 @@ def _speaks_tls(host: str, port: int) -> bool:
         return False
 
 
-def _shake_hands(host: str, port: int, context: ssl.SSLContext) -> str:
+def _try_handshake(host: str, port: int, context: ssl.SSLContext) -> str:
     """Shake hands as Zenoh would, and wait a moment for the other end's verdict on our certificate."""
     try:
-        with socket.create_connection((host, port), _PATIENCE_S) as plain:
+        with socket.create_connection((host, port), _TLS_TIMEOUT_S) as plain:
             try:
                 secure = context.wrap_socket(plain, server_hostname=host)
             except TimeoutError:

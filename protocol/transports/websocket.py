@@ -21,21 +21,21 @@ from typing import Final, Self
 from protocol.channels import FRAME, TWIST, Channel, parse_key
 from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, LinkError
-from protocol.log_lines import tell
+from protocol.log_lines import log_line
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.link_rules import INEXACT_KEY, LinkRules
-from protocol.transports.websocket_dial import Dialer
-from protocol.transports.websocket_dialects import V1, Dialect
-from protocol.transports.websocket_doorlog import DoorLog
-from protocol.transports.websocket_endpoints import Endpoint, parse_endpoint
-from protocol.transports.websocket_framing import Packet
-from protocol.transports.websocket_legacy import Client, LegacyToRobot, LegacyToVision
-from protocol.transports.websocket_listen import Keys, Listener
-from protocol.transports.websocket_outbox import Post
-from protocol.transports.websocket_peer import Peer, Settle, greet
-from protocol.transports.websocket_seat import Seat
-from protocol.transports.websocket_wants import Wants
-from protocol.transports.websocket_wire import Wire
+from protocol.transports.websocket_dial import Client as Dialer
+from protocol.transports.websocket_dialects import SightlineV1, PeerCodec
+from protocol.transports.websocket_doorlog import BurstLimiter
+from protocol.transports.websocket_endpoints import WebSocketEndpoint, parse_websocket_endpoint
+from protocol.transports.websocket_framing import IncomingMessage
+from protocol.transports.websocket_legacy import LegacyClient, LegacyToRobot, LegacyToVision
+from protocol.transports.websocket_listen import KeyFolder, Server
+from protocol.transports.websocket_outbox import Publication
+from protocol.transports.websocket_peer import Peer, Promote, exchange_hellos
+from protocol.transports.websocket_seat import DriverSlot
+from protocol.transports.websocket_wants import Subscriptions
+from protocol.transports.websocket_wire import Connection
 
 CLOSE_S: Final = 1.5
 """A close that takes longer is left to daemon threads, so that no process hangs on a dead peer."""
@@ -61,7 +61,7 @@ def open_websocket(
     not speak.
     """
     rules = LinkRules(robot, role, max_frame_bytes)
-    doors, far = [[parse_endpoint(text) for text in _listed(ends)] for ends in (listen, connect)]
+    doors, far = [[parse_websocket_endpoint(text) for text in _listed(ends)] for ends in (listen, connect)]
     if not doors and not far:
         raise ConfigError("no endpoint: give one to listen on (--listen) or to connect to (--connect)")
     try:
@@ -90,18 +90,18 @@ class WebSocketLink:
         """Made by `open_websocket`."""
         self.robot = rules.robot
         self._rules = rules
-        self._wants = Wants(rules, secrets.token_hex(4))
+        self._wants = Subscriptions(rules, secrets.token_hex(4))
         # Who drives comes first. Replaced, never changed, so that publishing needs no lock.
         self._peers: tuple[Peer, ...] = ()
         self._joining = threading.Lock()
         self._joined = threading.Event()
-        self._listeners: list[Listener] = []
+        self._listeners: list[Server] = []
         self._dialers: list[Dialer] = []
         self._closed = False
         self._in_callback = threading.local()
         self._dropped: Counter[str] = Counter()
-        self._seat = Seat()
-        self._log = DoorLog()
+        self._seat = DriverSlot()
+        self._log = BurstLimiter()
 
     @property
     def refused(self) -> Counter[str]:
@@ -129,7 +129,7 @@ class WebSocketLink:
         key = self._rules.key(channel, source)
         if not self.connected:
             return False
-        post = Post(Message(channel, key.rpartition("/")[2] if channel.has_source else "", header, payload))
+        post = Publication(Message(channel, key.rpartition("/")[2] if channel.has_source else "", header, payload))
         for peer in self._peers:
             peer.offer(post)
         return True
@@ -183,11 +183,11 @@ class WebSocketLink:
 
     # --- opening -------------------------------------------------------------------------------------------------
 
-    def open(self, doors: Sequence[Endpoint], far: Sequence[Endpoint], secure: str) -> None:
+    def open(self, doors: Sequence[WebSocketEndpoint], far: Sequence[WebSocketEndpoint], secure: str) -> None:
         """Listen on `doors` and begin to connect to `far`. Raises what `open_websocket` does."""
-        refuse, keys = self._rules.refuse, Keys(secure, self._rules.role)
+        refuse, keys = self._rules.refuse, KeyFolder(secure, self._rules.role)
         for end in doors:
-            self._listeners.append(Listener(end, partial(self._serve, end), refuse, self._tell, keys))
+            self._listeners.append(Server(end, partial(self._serve, end), refuse, self._tell, keys))
         for end in far:
             self._dialers.append(Dialer(end, partial(self._serve, end), refuse, keys))
 
@@ -205,7 +205,7 @@ class WebSocketLink:
 
     # --- peers, on threads of their own ------------------------------------------------------------------------------
 
-    def _serve(self, end: Endpoint, wire: Wire, settle: Settle | None = None) -> None:
+    def _serve(self, end: WebSocketEndpoint, wire: Connection, settle: Promote | None = None) -> None:
         """Speak with one peer until it is gone; `settle` gives it a place where this end listens.
 
         Raises PeerError or ConnectionClosed if it says no proper hello.
@@ -215,8 +215,8 @@ class WebSocketLink:
             told, hello, wanted_bytes = self._wants.told, self._wants.hello(), self._wants.bound()
         peer = Peer(wire, dialect, self._heed)
         peer.limit(wanted_bytes)
-        if isinstance(dialect, V1):
-            greet(wire, dialect, hello, settle)
+        if isinstance(dialect, SightlineV1):
+            exchange_hellos(wire, dialect, hello, settle)
         elif settle is not None:
             settle("")
         if self._join(peer, told):
@@ -259,16 +259,16 @@ class WebSocketLink:
 
     def _pass_on(self, sender: Peer, message: Message) -> None:
         """Where all connect, what one has found is for the others too."""
-        post = Post(message)
+        post = Publication(message)
         for peer in self._peers:
             if peer is not sender:
                 peer.offer(post)
 
-    def _dialect(self, end: Endpoint, listening: bool, who: str) -> Dialect:
+    def _dialect(self, end: WebSocketEndpoint, listening: bool, who: str) -> PeerCodec:
         if end.legacy is None:
-            return V1(self.robot, self._rules.role)
+            return SightlineV1(self.robot, self._rules.role)
         if listening:
-            return LegacyToVision(self.robot, end.legacy, monotonic_us, Client(who, self._seat, self._tell))
+            return LegacyToVision(self.robot, end.legacy, monotonic_us, LegacyClient(who, self._seat, self._tell))
         bound = self._rules.payload_bound(FRAME)
         return LegacyToRobot(self.robot, end.legacy, monotonic_us, secrets.token_hex(4), bound)
 
@@ -277,9 +277,9 @@ class WebSocketLink:
         with self._joining:
             line = self._log.line(text, monotonic_us())
         if line:
-            tell(line)
+            log_line(line)
 
-    def _deliver(self, peer: Peer, packet: Packet) -> None:
+    def _deliver(self, peer: Peer, packet: IncomingMessage) -> None:
         parsed = parse_key(packet.key)
         if parsed is None:
             self._rules.refuse(INEXACT_KEY)

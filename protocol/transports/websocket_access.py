@@ -7,7 +7,7 @@ from typing import Final
 
 from protocol.errors import ConfigError
 from protocol.transports.secured import may_publish
-from protocol.transports.websocket_endpoints import Endpoint, with_allowed
+from protocol.transports.websocket_endpoints import WebSocketEndpoint, with_allowed
 
 NOT_LISTED: Final = "NOT_LISTED"
 """Counted for a client of the older dialect from an address that its owner did not list."""
@@ -18,7 +18,7 @@ _BEARER: Final = "bearer "
 _ENTRY: Final = "sightline.token."
 
 
-def check_listening(endpoint: Endpoint, tokens: Mapping[str, str]) -> None:
+def check_listening(endpoint: WebSocketEndpoint, tokens: Mapping[str, str]) -> None:
     """Raise ConfigError for an endpoint that would let anybody in from beyond this machine."""
     if endpoint.is_loopback:
         return
@@ -35,7 +35,7 @@ def check_listening(endpoint: Endpoint, tokens: Mapping[str, str]) -> None:
         )
 
 
-def address_problem(address: str, allow_from: Sequence[str]) -> str:
+def client_address_problem(address: str, allow_from: Sequence[str]) -> str:
     """Why a client at `address` may not come in; "" if it may. An empty list allows every address that gets here."""
     here = ipaddress.ip_address(address.partition("%")[0])
     here = getattr(here, "ipv4_mapped", None) or here
@@ -44,7 +44,7 @@ def address_problem(address: str, allow_from: Sequence[str]) -> str:
     return f"{address} is not listed in legacy.allow_from: the robot's owner lists who may come in here"
 
 
-def role_of(tokens: Mapping[str, str], authorizations: Sequence[str], offers: Sequence[str]) -> str | None:
+def role_of_token(tokens: Mapping[str, str], authorizations: Sequence[str], offers: Sequence[str]) -> str | None:
     """The role of who sent these `Authorization` and `Sec-WebSocket-Protocol` headers; None without a token of ours.
 
     Every token is compared, and in constant time, so that no clock tells how much of a guess was right.
@@ -58,11 +58,11 @@ def role_of(tokens: Mapping[str, str], authorizations: Sequence[str], offers: Se
     return matches[0] if matches else None
 
 
-def bearer(token: str) -> str:
+def bearer_header(token: str) -> str:
     """The `Authorization` header that shows `token`."""
     return f"Bearer {token}"
 
 
-def grant_of(role: str) -> frozenset[tuple[str, ...]]:
+def grants_of_role(role: str) -> frozenset[tuple[str, ...]]:
     """(channel, source) of all that `role` may publish; from a robot just (channel,)."""
     return frozenset(tuple(key.replace("/*/", "/", 1).split("/")[1:]) for key in may_publish(role))

@@ -10,14 +10,14 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 from protocol.transports.endpoints import SEND_BUFFER_BYTES
-from protocol.transports.websocket_access import bearer
+from protocol.transports.websocket_access import bearer_header
 from protocol.transports.websocket_dialects import PeerError
-from protocol.transports.websocket_endpoints import Endpoint
+from protocol.transports.websocket_endpoints import WebSocketEndpoint
 from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
 from protocol.transports.websocket_keys import own_token
 from protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS
-from protocol.transports.websocket_tls import connecting_context, shake_hands
-from protocol.transports.websocket_wire import Wire
+from protocol.transports.websocket_tls import client_tls_context, tls_handshake
+from protocol.transports.websocket_wire import Connection
 
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed
@@ -28,13 +28,13 @@ LONGEST_PAUSE_S: Final = 1.0
 PAUSE_GROWTH: Final = 1.5
 
 
-class Dialer:
+class Client:
     """Keeps one connection to `endpoint` until closed."""
 
     def __init__(
         self,
-        endpoint: Endpoint,
-        serve: Callable[[Wire], None],
+        endpoint: WebSocketEndpoint,
+        serve: Callable[[Connection], None],
         refuse: Callable[[str], None],
         keys: tuple[str, str] = ("", ""),
     ) -> None:
@@ -45,7 +45,7 @@ class Dialer:
         """
         self.endpoint = endpoint
         self._token = "" if endpoint.legacy else own_token(*keys)
-        self._context = connecting_context(keys[0]) if endpoint.secure else None
+        self._context = client_tls_context(keys[0]) if endpoint.secure else None
         self._serve, self._refuse = serve, refuse
         self._closing = threading.Event()
         self.trouble = ""
@@ -101,7 +101,7 @@ class Dialer:
         other = "ws://" if self.endpoint.secure else "wss://"
         return f"it hangs up without an answer: too many connections at once, or it speaks {other}, or is no Sightline"
 
-    def _open(self) -> Wire:
+    def _open(self) -> Connection:
         from websockets.client import ClientProtocol
         from websockets.uri import parse_uri
 
@@ -109,7 +109,7 @@ class Dialer:
         near = socket.create_connection((end.host, end.port), OPEN_S)
         near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         if self._context is not None:
-            near = shake_hands(near, self._context, end.host, time.monotonic() + OPEN_S)
+            near = tls_handshake(near, self._context, end.host, time.monotonic() + OPEN_S)
         name = f"[{end.host}]" if ":" in end.host else end.host
         subprotocol: Subprotocol = SUBPROTOCOL  # type: ignore[assignment]
         protocol = ClientProtocol(
@@ -120,11 +120,11 @@ class Dialer:
         )
         request = protocol.connect()
         if self._token:
-            request.headers["Authorization"] = bearer(self._token)
+            request.headers["Authorization"] = bearer_header(self._token)
         protocol.send_request(request)
-        return Wire(near, protocol)
+        return Connection(near, protocol)
 
-    def _speak(self, wire: Wire) -> None:
+    def _speak(self, wire: Connection) -> None:
         """Shake hands, and serve until it is over."""
         try:
             wire.flush()

@@ -12,7 +12,7 @@ from protocol.transports.link import Message
 from protocol.transports.websocket_framing import (
     MAX_BLOCK_BYTES,
     MAX_HELLO_BYTES,
-    Packet,
+    IncomingMessage,
     pack_pieces,
     parse_hello,
     unpack,
@@ -35,7 +35,7 @@ class PeerError(Exception):
         self.code = code
 
 
-class Dialect(Protocol):
+class PeerCodec(Protocol):
     """One peer's way of speaking."""
 
     text: bool
@@ -67,7 +67,7 @@ class Dialect(Protocol):
         """Take note that the connection has ended."""
         ...
 
-    def read(self, message: str | bytes) -> list[Packet]:
+    def read(self, message: str | bytes) -> list[IncomingMessage]:
         """What a message says, oldest first. Raises PeerError to drop the peer, WireError to drop just the message."""
         ...
 
@@ -76,7 +76,7 @@ class Dialect(Protocol):
         ...
 
 
-class V1:
+class SightlineV1:
     """`sightline.v1` with a peer of `robot`; `role` is this end's own. Until it says hello, the peer wants nothing."""
 
     text = False
@@ -89,7 +89,7 @@ class V1:
 
     @property
     def form(self) -> Hashable:
-        return V1
+        return SightlineV1
 
     def hears(self, channel: Channel) -> bool:
         return channel.name in self.wants
@@ -103,7 +103,7 @@ class V1:
     def note_gone(self) -> None:
         pass
 
-    def read(self, message: str | bytes) -> list[Packet]:
+    def read(self, message: str | bytes) -> list[IncomingMessage]:
         if isinstance(message, str):
             self.accept(message)
             return []

@@ -7,10 +7,10 @@ import socket
 from protocol.errors import LinkError
 from protocol.transports.endpoints import SEND_BUFFER_BYTES
 from protocol.transports.port_owner import port_owner
-from protocol.transports.websocket_endpoints import Endpoint
+from protocol.transports.websocket_endpoints import WebSocketEndpoint
 
 
-def listening_socket(endpoint: Endpoint) -> socket.socket:
+def listening_socket(endpoint: WebSocketEndpoint) -> socket.socket:
     """Listen at `endpoint`. Raises LinkError, with the cause and the way out, if that is not possible."""
     family = socket.AF_INET6 if ":" in endpoint.host else socket.AF_INET
     try:
@@ -21,7 +21,7 @@ def listening_socket(endpoint: Endpoint) -> socket.socket:
     return listening
 
 
-def _cannot_listen(endpoint: Endpoint, error: OSError) -> LinkError:
+def _cannot_listen(endpoint: WebSocketEndpoint, error: OSError) -> LinkError:
     if error.errno == errno.EADDRINUSE:
         owner = port_owner(endpoint.port) or "another process"
         fix = f"port {endpoint.port} is in use by {owner}; end it or choose another port"

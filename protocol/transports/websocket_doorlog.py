@@ -2,11 +2,11 @@
 
 from typing import Final
 
-LINES_PER_S: Final = 10
+MAX_LINES_PER_S: Final = 10
 _SECOND_US: Final = 1_000_000
 
 
-class DoorLog:
+class BurstLimiter:
     """At most ten lines a second; what is left out is counted in the next."""
 
     def __init__(self) -> None:
@@ -17,7 +17,7 @@ class DoorLog:
         """What to print for `text`; "" for nothing."""
         if now_us - self._begin_us >= _SECOND_US:
             self._begin_us, self._lines = now_us, 0
-        if self._lines >= LINES_PER_S:
+        if self._lines >= MAX_LINES_PER_S:
             self._left_out += 1
             return ""
         self._lines += 1

@@ -15,7 +15,7 @@ from typing import Final
 
 from protocol.errors import ConfigError
 
-_ENDPOINT: Final = re.compile(
+_WEBSOCKET_ENDPOINT: Final = re.compile(
     r"(ws|wss|ws-legacy)://(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]@]+):([0-9]{1,5})/?(?:\?([^\s?#]*))?", re.ASCII
 )
 _WORDS: Final = ("dashed", "swapped", "oneline", "boxes")
@@ -37,7 +37,7 @@ class LegacyOptions:
     boxes: bool = False
     """Towards the robot: boxes are taken too, as detections of a guest."""
 @dataclass(frozen=True, slots=True)
-class Endpoint:
+class WebSocketEndpoint:
     """A checked endpoint; `text` is as it was written."""
 
     text: str
@@ -56,9 +56,9 @@ class Endpoint:
         return self.host == "localhost" or (_is_address(self.host) and ipaddress.ip_address(self.host).is_loopback)
 
 
-def parse_endpoint(text: str) -> Endpoint:
+def parse_websocket_endpoint(text: str) -> WebSocketEndpoint:
     """Check an endpoint; raise ConfigError with the right form otherwise."""
-    match = _ENDPOINT.fullmatch(text)
+    match = _WEBSOCKET_ENDPOINT.fullmatch(text)
     port = int(match[3]) if match else 0
     if match is None or not 1 <= port <= 65_535 or (match[4] is not None and match[1] != "ws-legacy"):
         raise ConfigError(
@@ -67,8 +67,8 @@ def parse_endpoint(text: str) -> Endpoint:
         )
     host = match[2].strip("[]")
     if match[1] != "ws-legacy":
-        return Endpoint(text, host, port, None, match[1] == "wss")
-    return Endpoint(text, host, port, *_legacy(text, [word for word in (match[4] or "").split("&") if word]))
+        return WebSocketEndpoint(text, host, port, None, match[1] == "wss")
+    return WebSocketEndpoint(text, host, port, *_legacy(text, [word for word in (match[4] or "").split("&") if word]))
 
 
 def _legacy(text: str, words: Sequence[str]) -> tuple[LegacyOptions, bool, tuple[str, ...]]:

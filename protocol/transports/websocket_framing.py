@@ -16,8 +16,8 @@ from protocol import VERSION
 from protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, Channel
 from protocol.codec import decode
 from protocol.errors import WireError
-from protocol.messages import RobotId, SessionId, Version, Wire
-from protocol.refusals import Refusal
+from protocol.messages import RobotId, SessionId, Version, WireModel
+from protocol.refusals import RejectReason
 
 SUBPROTOCOL: Final = "sightline.v1"
 MAX_BLOCK_BYTES: Final = MAX_HEADER_BYTES + 64
@@ -31,7 +31,7 @@ _FIRST: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})",(?=")')
 _ALONE: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{0,64})")?\}')
 
 
-class Hello(Wire):
+class Hello(WireModel):
     """Who a peer is and what it wants; the first message each way, as JSON text, sent again when `wants` changes."""
 
     v: Version = VERSION
@@ -43,7 +43,7 @@ class Hello(Wire):
     """Names of channels; unknown ones are ignored."""
 
 
-class Packet(NamedTuple):
+class IncomingMessage(NamedTuple):
     """What came off the wire; the key is made of what the peer claimed and is still to be checked."""
 
     key: str
@@ -71,29 +71,29 @@ def pack_pieces(channel: Channel, source: str, role: str, header: bytes, payload
     return len(block).to_bytes(_LENGTH_BYTES) + block, payload
 
 
-def unpack(message: bytes, robot: str, role: str) -> Packet:
+def unpack(message: bytes, robot: str, role: str) -> IncomingMessage:
     """Take a binary message of a peer apart; `robot` and `role` are those of its hello.
 
     The source of a message is its header's, else that of the hello. Raises WireError MALFORMED for broken framing.
     """
     size = int.from_bytes(message[:_LENGTH_BYTES])
     if len(message) < _LENGTH_BYTES + size or size > MAX_BLOCK_BYTES:
-        raise WireError(Refusal.MALFORMED, f"header block of {size} bytes in a message of {len(message)}")
+        raise WireError(RejectReason.MALFORMED, f"header block of {size} bytes in a message of {len(message)}")
     block, payload = message[_LENGTH_BYTES : _LENGTH_BYTES + size], message[_LENGTH_BYTES + size :]
     alone = _ALONE.match(block)
     if alone is not None:
         source = role if alone[2] is None else alone[2].decode("utf-8", "replace")
-        return Packet(_key(robot, alone[1].decode("utf-8", "replace"), source), block[alone.end() :], payload)
+        return IncomingMessage(_key(robot, alone[1].decode("utf-8", "replace"), source), block[alone.end() :], payload)
     first = _FIRST.match(block)
     if first is not None and first[1] in _WITHOUT_SOURCE:  # most bytes of a link: no need to look any further
-        return Packet(_key(robot, first[1].decode("ascii"), ""), b"{" + block[first.end() :], payload)
+        return IncomingMessage(_key(robot, first[1].decode("ascii"), ""), b"{" + block[first.end() :], payload)
     fields = _fields(block)
     name = fields.get("channel") if first is None else first[1].decode("utf-8", "replace")
     if not isinstance(name, str):
-        raise WireError(Refusal.MALFORMED, "the header block is no JSON object that names its channel")
+        raise WireError(RejectReason.MALFORMED, "the header block is no JSON object that names its channel")
     source = fields.get("source", role)
     header = block if first is None else b"{" + block[first.end() :]
-    return Packet(_key(robot, name, source if isinstance(source, str) else ""), header, payload)
+    return IncomingMessage(_key(robot, name, source if isinstance(source, str) else ""), header, payload)
 
 
 def _fields(block: bytes) -> dict[str, Any]:

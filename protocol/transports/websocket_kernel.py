@@ -6,7 +6,7 @@ import socket
 import struct
 from typing import Final, NamedTuple
 
-from protocol.transports.websocket_life import SILENCE_US, WayOut
+from protocol.transports.websocket_life import SILENCE_US, SendPath
 
 
 class _Fields(NamedTuple):
@@ -23,15 +23,15 @@ _LAYOUT: Final = struct.Struct("=3xB20xI28xI60xQ16xI")
 _OPTION: Final = getattr(socket, "TCP_INFO", None)
 
 
-def way_out(near: socket.socket, full: bool) -> WayOut:
+def send_path(near: socket.socket, full: bool) -> SendPath:
     """The way out of `near`; `full` is what this end can tell of it by itself."""
     if _OPTION is None:
-        return WayOut(full, 0, False)
+        return SendPath(full, 0, False)
     try:
         fields = _Fields(*_LAYOUT.unpack(near.getsockopt(socket.IPPROTO_TCP, _OPTION, _LAYOUT.size)))
     except (OSError, struct.error):  # closed, or a kernel that knows less
-        return WayOut(full, 0, False)
+        return SendPath(full, 0, False)
     # A machine whose reader is slow still answers a probe of its full window: two unanswered are many.
     is_asked = fields.unacked_packets > 0 or fields.probes >= 2
     lost = is_asked and fields.last_ack_ms * 1000 >= SILENCE_US
-    return WayOut(full or fields.unsent_bytes > 0, fields.acked_bytes, lost)
+    return SendPath(full or fields.unsent_bytes > 0, fields.acked_bytes, lost)

@@ -10,19 +10,19 @@ from protocol.jpeg import read_jpeg_size
 from protocol.legacy import (
     MAX_BOXES_BYTES,
     decode_picture,
-    detections_of,
+    detections_from_boxes,
     encode_picture,
     parse_boxes,
     parse_dashed,
     text_bound,
 )
 from protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link import Message
 from protocol.transports.websocket_dialects import BAD_FRAMING, PeerError
 from protocol.transports.websocket_endpoints import LegacyOptions
-from protocol.transports.websocket_framing import Packet
-from protocol.transports.websocket_seat import Seat
+from protocol.transports.websocket_framing import IncomingMessage
+from protocol.transports.websocket_seat import DriverSlot
 from protocol.twist_text import format_twist, parse_twist
 
 GUEST: Final = "guest"
@@ -32,11 +32,11 @@ MAX_COMMAND_TEXT_BYTES: Final = 256
 """Security limit: a text towards a robot; a twist over its own 64 bytes is still counted, not a reason to hang up."""
 
 
-class Client(NamedTuple):
+class LegacyClient(NamedTuple):
     """Who speaks the older dialect with a robot, the seat it shares with others, and where lines for the log go."""
 
     who: str
-    seat: Seat
+    seat: DriverSlot
     tell: Callable[[str], None]
 
 
@@ -50,7 +50,7 @@ class LegacyToVision:
     text = True
     wants: tuple[str, ...] = ()
 
-    def __init__(self, robot: str, options: LegacyOptions, now_us: Callable[[], int], client: Client) -> None:
+    def __init__(self, robot: str, options: LegacyOptions, now_us: Callable[[], int], client: LegacyClient) -> None:
         """`now_us` reads a monotonic clock."""
         self._robot, self._options, self._now_us = robot, options, now_us
         self._who, self._seat, self._tell = client
@@ -74,7 +74,7 @@ class LegacyToVision:
         if self._looked_at is None:  # of several it may have looked at, the oldest: never younger than the truth
             self._looked_at = message.header, message.payload
 
-    def read(self, message: str | bytes) -> list[Packet]:
+    def read(self, message: str | bytes) -> list[IncomingMessage]:
         if isinstance(message, bytes):
             raise PeerError(BAD_FRAMING, 1003, "binary message; this port speaks text: linear|angular")
         text = message.encode("utf-8", "surrogatepass")
@@ -89,15 +89,15 @@ class LegacyToVision:
         """The client is gone: another may drive."""
         self._seat.leave(self._who)
 
-    def _twist(self, text: bytes) -> Packet:
+    def _twist(self, text: bytes) -> IncomingMessage:
         """What is no twist stays as it is: the robot refuses it, and says why in `status`."""
         try:
             twist = parse_dashed(text, self._options.swapped) if self._options.dashed else parse_twist(text)
         except WireError:
-            return Packet(key_for(self._robot, TWIST, GUEST), b"", text)
+            return IncomingMessage(key_for(self._robot, TWIST, GUEST), b"", text)
         self._take_seat()
         barred = format_twist(twist) if self._options.dashed else text
-        return Packet(key_for(self._robot, TWIST, GUEST), b"", barred)
+        return IncomingMessage(key_for(self._robot, TWIST, GUEST), b"", barred)
 
     def _take_seat(self) -> None:
         """Raise WireError, told once for each driver, if another client drives."""
@@ -106,19 +106,19 @@ class LegacyToVision:
             self._told = driver
             self._tell(f"{self._who} drives" if driver == self._who else f"{self._who} only watches: {driver} drives")
         if driver != self._who:
-            raise WireError(Refusal.NOT_HOLDER, f"{driver} drives")
+            raise WireError(RejectReason.NOT_HOLDER, f"{driver} drives")
 
-    def _detections(self, text: bytes) -> Packet:
+    def _detections(self, text: bytes) -> IncomingMessage:
         looked_at, self._looked_at = self._looked_at, None
         if looked_at is None:
-            raise WireError(Refusal.UNKNOWN_FRAME, "boxes without a picture to look at")
-        found = detections_of(parse_boxes(text), read_jpeg_size(looked_at[1]))
+            raise WireError(RejectReason.UNKNOWN_FRAME, "boxes without a picture to look at")
+        found = detections_from_boxes(parse_boxes(text), read_jpeg_size(looked_at[1]))
         self._answers += 1
         echo = _echo(looked_at[0])
         header = DetectionsHeader(source=GUEST, session=GUEST_SESSION, seq=self._answers, echo=echo)
-        return Packet(key_for(self._robot, DETECTIONS, GUEST), encode(header), encode(found))
+        return IncomingMessage(key_for(self._robot, DETECTIONS, GUEST), encode(header), encode(found))
 
-    def _acknowledgement(self) -> list[Packet]:
+    def _acknowledgement(self) -> list[IncomingMessage]:
         sent, self._sent, self._looked_at = self._sent, None, None
         echo = _echo(sent[0]) if sent else None
         if sent is None or echo is None:  # there is no credit to return
@@ -127,7 +127,7 @@ class LegacyToVision:
         # How much of the time was computing is unknown; called computing, none of it widens the window.
         spent_us = max(0, self._now_us() - sent[1])
         answer = AnswerHeader(source=GUEST, session=GUEST_SESSION, seq=self._answers, echo=echo, compute_us=spent_us)
-        return [Packet(key_for(self._robot, ACK, GUEST), encode(answer), b"")]
+        return [IncomingMessage(key_for(self._robot, ACK, GUEST), encode(answer), b"")]
 
 
 def _echo(header: bytes) -> Echo | None:
@@ -177,14 +177,14 @@ class LegacyToRobot:
     def note_gone(self) -> None:
         pass
 
-    def read(self, message: str | bytes) -> list[Packet]:
+    def read(self, message: str | bytes) -> list[IncomingMessage]:
         if isinstance(message, bytes):
             raise PeerError(BAD_FRAMING, 1003, "binary message; the older dialect is text: base64 pictures")
         jpeg = decode_picture(message.encode("utf-8", "surrogatepass"), self._max_frame_bytes)
         self._seq += 1
         self._last_us = max(self._now_us(), self._last_us + 1)
         header = FrameHeader(session=self._session, seq=self._seq, t_us=self._last_us)
-        return [Packet(f"{KEY_PREFIX}/{self._robot}/{FRAME.name}", encode(header), jpeg)]
+        return [IncomingMessage(f"{KEY_PREFIX}/{self._robot}/{FRAME.name}", encode(header), jpeg)]
 
     def bound(self, _wanted_bytes: int, /) -> int:
         return text_bound(self._max_frame_bytes)

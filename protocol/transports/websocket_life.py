@@ -12,7 +12,7 @@ PING_EVERY_US: Final = 1_000_000
 """A peer that says nothing of its own is asked so often."""
 SILENCE_US: Final = 2_000_000
 """A ping, and a second to answer it."""
-PATIENCE_US: Final = 30_000_000
+STALLED_LIMIT_US: Final = 30_000_000
 """A full way out that nobody takes anything from, e.g. a stopped process: it costs one socket buffer and a place."""
 _LOOK_AFTER_US: Final = 500_000
 """Silent for so long, the way out is watched."""
@@ -20,7 +20,7 @@ _LONG_AGO_US: Final = -(10**12)
 
 
 @dataclass(frozen=True, slots=True)
-class WayOut:
+class SendPath:
     """What is known of the way to the other end."""
 
     full: bool
@@ -31,7 +31,7 @@ class WayOut:
     """Something is under way, and that machine has acknowledged nothing for `SILENCE_US`."""
 
 
-class Life:
+class Keepalive:
     """One connection's. `look` tells of the way out, and is asked only of who is silent."""
 
     def __init__(self, now_us: int) -> None:
@@ -50,7 +50,7 @@ class Life:
             self._pinged_us = now_us
         return due
 
-    def is_over(self, now_us: int, look: Callable[[], WayOut]) -> bool:
+    def is_over(self, now_us: int, look: Callable[[], SendPath]) -> bool:
         """Whether to give the other end up."""
         if now_us - self._heard_us < _LOOK_AFTER_US:
             return False
@@ -62,4 +62,4 @@ class Life:
         if now_us - self._heard_us < SILENCE_US:
             return False
         is_slow = now_us - self._full_us < SILENCE_US
-        return way.lost or not is_slow or now_us - max(self._heard_us, self._taken_us) >= PATIENCE_US
+        return way.lost or not is_slow or now_us - max(self._heard_us, self._taken_us) >= STALLED_LIMIT_US

@@ -15,20 +15,20 @@ from protocol.transports.secured import certificate_role
 from protocol.transports.websocket_access import (
     NO_TOKEN,
     NOT_LISTED,
-    address_problem,
+    client_address_problem,
     check_listening,
-    grant_of,
-    role_of,
+    grants_of_role,
+    role_of_token,
 )
 from protocol.transports.websocket_dialects import BAD_FRAMING, PeerError
 from protocol.transports.websocket_door import listening_socket
-from protocol.transports.websocket_endpoints import Endpoint, host_problem, origin_problem
+from protocol.transports.websocket_endpoints import WebSocketEndpoint, host_problem, origin_problem
 from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
 from protocol.transports.websocket_keys import read_tokens
-from protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS, Settle, count_end
-from protocol.transports.websocket_places import Place, Places, may_act
-from protocol.transports.websocket_tls import listening_context, shake_hands
-from protocol.transports.websocket_wire import CLOSE_S, Wire
+from protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS, Promote, count_close
+from protocol.transports.websocket_places import Slot, ConnectionLimits, may_control
+from protocol.transports.websocket_tls import server_tls_context, tls_handshake
+from protocol.transports.websocket_wire import CLOSE_S, Connection
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
@@ -48,23 +48,23 @@ _GUEST: Final = "guest"  # shows a viewer's certificate, and may steer where no 
 _PAUSE_S: Final = 0.1  # after an accept that failed, e.g. without descriptors left
 
 
-class Keys(NamedTuple):
+class KeyFolder(NamedTuple):
     """A folder of keys and tokens, "" for none, and the role of the link that uses it."""
 
     folder: str
     source: str
 
 
-class Listener:
+class Server:
     """Accepts clients at `endpoint`, each on a thread of its own, until closed."""
 
     def __init__(
         self,
-        endpoint: Endpoint,
-        serve: Callable[[Wire, Settle], None],
+        endpoint: WebSocketEndpoint,
+        serve: Callable[[Connection, Promote], None],
         refuse: Callable[[str], None],
         tell: Callable[[str], None],
-        keys: Keys,
+        keys: KeyFolder,
     ) -> None:
         """`serve` is called for each client and returns when it is gone; it may raise PeerError to drop it.
 
@@ -75,12 +75,12 @@ class Listener:
         self._endpoint, self._serve, self._refuse, self._tell = endpoint, serve, refuse, tell
         self._tokens = {} if endpoint.legacy else read_tokens(keys.folder)
         check_listening(endpoint, self._tokens)
-        self._context = listening_context(keys.folder, keys.source) if endpoint.secure else None
+        self._context = server_tls_context(keys.folder, keys.source) if endpoint.secure else None
         self._door = listening_socket(endpoint)
         self._alarm, self._bell = socket.socketpair()
         self._counting = threading.Lock()
-        self._places = Places()
-        self._wires: set[Wire] = set()
+        self._places = ConnectionLimits()
+        self._wires: set[Connection] = set()
         # Daemons: no client keeps a finished process alive.
         self._acceptor = threading.Thread(target=self._accept_all, name="websocket-listen", daemon=True)
         self._acceptor.start()
@@ -115,7 +115,7 @@ class Listener:
         self._turn_away(TOO_MANY_CLIENTS, address, "too many connections at once")
         near.close()
 
-    def _is_begun(self, near: socket.socket, place: Place) -> bool:
+    def _is_begun(self, near: socket.socket, place: Slot) -> bool:
         """Whether a thread of its own has taken over; a machine may have none left."""
         thread = threading.Thread(target=self._handle, args=(near, place), name="websocket-peer", daemon=True)
         try:
@@ -129,7 +129,7 @@ class Listener:
         self._refuse(counted)
         self._tell(f"{self._endpoint.text}: turned {address or 'a client'} away: {why}")
 
-    def _handle(self, near: socket.socket, place: Place) -> None:
+    def _handle(self, near: socket.socket, place: Slot) -> None:
         try:
             secured = self._secured(near)
             if secured is not None:
@@ -144,19 +144,19 @@ class Listener:
         address = ""
         try:
             address = near.getpeername()[0]
-            return shake_hands(near, self._context, "", time.monotonic() + OPEN_S)
+            return tls_handshake(near, self._context, "", time.monotonic() + OPEN_S)
         except OSError as error:  # SSLError and TimeoutError among them
             self._turn_away(NO_TLS, address, f"no TLS: {getattr(error, 'reason', '') or type(error).__name__}")
             near.close()
             return None
 
-    def _welcome_on(self, near: socket.socket, place: Place) -> None:
+    def _welcome_on(self, near: socket.socket, place: Slot) -> None:
         from websockets.server import ServerProtocol
 
         protocol = ServerProtocol(max_size=MAX_HELLO_BYTES, **PROTOCOL_OPTIONS)
         if self._endpoint.legacy is None:
             protocol.select_subprotocol = self._select  # type: ignore[method-assign,assignment]
-        wire = Wire(near, protocol)
+        wire = Connection(near, protocol)
         with self._counting:
             self._wires.add(wire)
         try:
@@ -166,7 +166,7 @@ class Listener:
             with self._counting:
                 self._wires.discard(wire)
 
-    def _speak(self, wire: Wire, protocol: ServerProtocol, place: Place) -> None:
+    def _speak(self, wire: Connection, protocol: ServerProtocol, place: Slot) -> None:
         from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
         try:
@@ -177,19 +177,19 @@ class Listener:
             wire.close(error.code, str(error))
             wire.linger()
         except ConnectionClosed as closed:  # before it said who it is
-            count_end(closed, self._refuse)
+            count_close(closed, self._refuse)
         except (InvalidHandshake, TimeoutError):
             pass
 
-    def _settle(self, wire: Wire, place: Place, role: str) -> None:
+    def _settle(self, wire: Connection, place: Slot, role: str) -> None:
         """Give it a client's place. Where no token says what it may do, its hello does. Raises PeerError for none."""
-        granted = grant_of(certificate_role(role)) if wire.granted is None else wire.granted
+        granted = grants_of_role(certificate_role(role)) if wire.granted is None else wire.granted
         claims = wire.granted is None and role == _GUEST
-        problem = self._places.settle(place, self._endpoint.legacy is not None or claims or may_act(granted))
+        problem = self._places.settle(place, self._endpoint.legacy is not None or claims or may_control(granted))
         if problem:
             raise PeerError(TOO_MANY_CLIENTS, 1013, problem)
 
-    def _shake_hands(self, wire: Wire, protocol: ServerProtocol) -> bool:
+    def _shake_hands(self, wire: Connection, protocol: ServerProtocol) -> bool:
         """Whether the client came in; else it has been told why not."""
         request: Request = cast(Any, wire.receive_one(time.monotonic() + OPEN_S))
         if protocol.close_expected():  # what came with it is so broken that the protocol has hung up
@@ -203,7 +203,7 @@ class Listener:
             wire.linger()
         return response.status_code == 101
 
-    def _answer(self, wire: Wire, protocol: ServerProtocol, request: Request) -> Response:
+    def _answer(self, wire: Connection, protocol: ServerProtocol, request: Request) -> Response:
         address = wire.address[0]
         refusal = self._refusal(wire, address, request) or self._crowding(wire)
         if refusal is None:
@@ -211,7 +211,7 @@ class Listener:
         self._turn_away(refusal[0], address, refusal[2])
         return protocol.reject(refusal[1], refusal[2] + "\n")
 
-    def _refusal(self, wire: Wire, address: str, request: Request) -> tuple[str, int, str] | None:
+    def _refusal(self, wire: Connection, address: str, request: Request) -> tuple[str, int, str] | None:
         """What it counts as, HTTP status, and why; None for a client that may come in."""
         headers = request.headers
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
@@ -219,19 +219,19 @@ class Listener:
         if problem:
             return CROSS_SITE, 403, problem
         if self._endpoint.legacy is not None:
-            problem = address_problem(address, self._endpoint.allow_from) if address else "gone already"
+            problem = client_address_problem(address, self._endpoint.allow_from) if address else "gone already"
             return (NOT_LISTED, 403, problem) if problem else None
         if self._tokens:
             offers = headers.get_all("Sec-WebSocket-Protocol")
-            role = role_of(self._tokens, headers.get_all("Authorization"), offers)
+            role = role_of_token(self._tokens, headers.get_all("Authorization"), offers)
             if role is None:
                 return NO_TOKEN, 401, "show the token of your role: Authorization: Bearer TOKEN, or --secure DIR"
-            wire.granted = grant_of(role)
+            wire.granted = grants_of_role(role)
         return None
 
-    def _crowding(self, wire: Wire) -> tuple[str, int, str] | None:
+    def _crowding(self, wire: Connection) -> tuple[str, int, str] | None:
         """The same, for want of a place: told by HTTP where that is known before the hello."""
-        problem = self._places.problem(wire.granted is None or may_act(wire.granted))
+        problem = self._places.problem(wire.granted is None or may_control(wire.granted))
         return (TOO_MANY_CLIENTS, 503, problem) if problem else None
 
     def _select(self, offered: Sequence[Subprotocol]) -> Subprotocol:

@@ -25,7 +25,7 @@ _TEXT, _BINARY, _FIN, _MASK = 0x01, 0x02, 0x80, 0x80  # RFC 6455, 5.2
 _SHORT, _LONG = 126, 127
 
 
-class Messages:
+class MessageReader:
     """What arrived on one connection and was not taken yet."""
 
     def __init__(self, protocol: Protocol) -> None:

@@ -12,9 +12,9 @@ from protocol.codec import decode
 from protocol.errors import WireError
 from protocol.messages import Request
 from protocol.transports.link import Message
-from protocol.transports.secured import ROLE_SOURCES
+from protocol.transports.secured import KNOWN_SOURCES
 
-MAX_MADE_UP_SOURCES: Final = 16
+MAX_UNKNOWN_SOURCES: Final = 16
 """Security limit: places of one channel for sources that are no role's."""
 
 _RANKS: Final = {priority: rank for rank, priority in enumerate(Priority, start=2)}
@@ -23,7 +23,7 @@ _STOP_RANK: Final = 1
 _STOP: Final = "stop"
 
 
-class Form(Protocol):
+class WireFormat(Protocol):
     """How a message is written for one kind of peer."""
 
     @property
@@ -36,7 +36,7 @@ class Form(Protocol):
         ...
 
 
-class Post:
+class Publication:
     """One publication, written at most once for all peers that are sent the same bytes."""
 
     __slots__ = ("_written", "message")
@@ -45,7 +45,7 @@ class Post:
         self.message = message
         self._written: dict[Hashable, tuple[bytes, ...]] = {}
 
-    def written(self, dialect: Form) -> tuple[bytes, ...]:
+    def written(self, dialect: WireFormat) -> tuple[bytes, ...]:
         """The bytes for a peer of `dialect`. Two threads may both write; they write the same."""
         data = self._written.get(dialect.form)
         if data is None:
@@ -65,11 +65,11 @@ class Outbox:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._places: dict[tuple[str, str, str], Post | str] = {}
+        self._places: dict[tuple[str, str, str], Publication | str] = {}
         self.dropped = Counter(dict.fromkeys(CHANNELS, 0))  # never grows, so that others may read it meanwhile
         """Publications replaced by a newer one before they were sent, or left out, by channel."""
 
-    def put(self, post: Post) -> None:
+    def put(self, post: Publication) -> None:
         """Replace what is in the message's place, if it has one; never blocks."""
         message = post.message
         place = (message.channel.name, message.source, _verb(message) if message.channel is REQUEST else "")
@@ -80,10 +80,10 @@ class Outbox:
                 self._places[place] = post
 
     def _has_place(self, place: tuple[str, str, str], channel: Channel) -> bool:
-        if not channel.passed_on or place[1] in ROLE_SOURCES or place in self._places:
+        if not channel.passed_on or place[1] in KNOWN_SOURCES or place in self._places:
             return True
-        made_up = (name == channel.name and source not in ROLE_SOURCES for name, source, _ in self._places)
-        return sum(made_up) < MAX_MADE_UP_SOURCES
+        made_up = (name == channel.name and source not in KNOWN_SOURCES for name, source, _ in self._places)
+        return sum(made_up) < MAX_UNKNOWN_SOURCES
 
     def put_hello(self, text: str) -> None:
         """A hello goes before everything else."""
@@ -95,7 +95,7 @@ class Outbox:
         """Whether something is there."""
         return bool(self._places)
 
-    def take(self) -> Post | str | None:
+    def take(self) -> Publication | str | None:
         """Remove and return the most urgent; None if there is nothing."""
         with self._lock:
             if len(self._places) < 2:  # the usual: nothing to choose from

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, Final
 from protocol.channels import ACK, Channel
 from protocol.clock import monotonic_us
 from protocol.errors import WireError
-from protocol.log_lines import RefusalLines
+from protocol.log_lines import RepeatLimiter
 from protocol.transports.link_rules import OVERSIZE
-from protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, V1, Dialect, PeerError
-from protocol.transports.websocket_framing import Packet
-from protocol.transports.websocket_life import Life
-from protocol.transports.websocket_outbox import Outbox, Post
-from protocol.transports.websocket_wire import CLOSE_S, Wire
+from protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, SightlineV1, PeerCodec, PeerError
+from protocol.transports.websocket_framing import IncomingMessage
+from protocol.transports.websocket_life import Keepalive
+from protocol.transports.websocket_outbox import Outbox, Publication
+from protocol.transports.websocket_wire import CLOSE_S, Connection
 
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed
@@ -32,7 +32,7 @@ SILENT: Final = "SILENT"
 NOT_GRANTED: Final = "NOT_GRANTED"
 """Counted for a message that the role of the sender's token may not publish."""
 
-Settle = Callable[[str], None]
+Promote = Callable[[str], None]
 """Gives a client of that role a place; raises PeerError if there is none."""
 
 logging.getLogger("sightline.websocket").addHandler(logging.NullHandler())  # else Python prints to the terminal
@@ -44,14 +44,14 @@ _COUNTED_FOR_CODE: Final = {1002: BAD_FRAMING, 1007: BAD_FRAMING, 1009: OVERSIZE
 class Peer:
     """An open connection whose other end is known, and the dialect that it speaks."""
 
-    def __init__(self, wire: Wire, dialect: Dialect, heed: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, wire: Connection, dialect: PeerCodec, heed: Callable[[], None] = lambda: None) -> None:
         """`heed` is called on the reading thread when the peer says that it wants something else."""
         self.outbox = Outbox()
         self._heed = heed
         self._wire, self._dialect = wire, dialect
         self._reader = threading.current_thread()
         self._gone = threading.Event()
-        self._forbidden = RefusalLines()
+        self._forbidden = RepeatLimiter()
         self._look_us = 0
 
     def hears(self, channel: Channel) -> bool:
@@ -72,7 +72,7 @@ class Peer:
             tell(f"refused {what} from {who}{often}: the role of its token may not say that (docs/security.md)")
         return False
 
-    def offer(self, post: Post) -> None:
+    def offer(self, post: Publication) -> None:
         """Send it if the peer wants it, now or when there is room and nothing newer; never blocks."""
         if self._dialect.hears(post.message.channel):
             self.outbox.put(post)
@@ -80,7 +80,7 @@ class Peer:
 
     def tell(self, hello: str) -> None:
         """Say who this end is and what it wants now, in a dialect that has words for it."""
-        if isinstance(self._dialect, V1):
+        if isinstance(self._dialect, SightlineV1):
             self.outbox.put_hello(hello)
             self._send()
 
@@ -90,11 +90,11 @@ class Peer:
             self._wire.protocol.max_message_size = self._dialect.bound(wanted_bytes)
         self._send()  # whoever found the lock taken left it to this thread
 
-    def run(self, deliver: Callable[[Peer, Packet], None], refuse: Callable[[str], None]) -> None:
+    def run(self, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]) -> None:
         """Read until the connection ends; a peer that breaks the rules is dropped and told why."""
         from websockets.exceptions import ConnectionClosed
 
-        life = Life(monotonic_us())
+        life = Keepalive(monotonic_us())
         try:
             while self._turn(life, deliver, refuse):
                 self._wire.wait(_TICK_US / 1e6)
@@ -105,12 +105,12 @@ class Peer:
             self._wire.close(refusal.code, str(refusal))
             self._wire.linger()
         except ConnectionClosed as closed:
-            count_end(closed, refuse)
+            count_close(closed, refuse)
         finally:
             self._wire.shut()
             self._gone.set()
 
-    def _turn(self, life: Life, deliver: Callable[[Peer, Packet], None], refuse: Callable[[str], None]) -> bool:
+    def _turn(self, life: Keepalive, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]) -> bool:
         """Read what there is, and send; False if the other end is to be given up."""
         now_us = monotonic_us()  # before reading: however long this end stood still, what came meanwhile counts
         for message in self._wire.receive():
@@ -125,7 +125,7 @@ class Peer:
         self._send()
         return not life.is_over(now_us, self._wire.way_out)
 
-    def _read(self, message: Any, deliver: Callable[[Peer, Packet], None], refuse: Callable[[str], None]) -> None:
+    def _read(self, message: Any, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]) -> None:
         before = self._dialect.wants
         try:
             packets = self._dialect.read(message)
@@ -168,7 +168,7 @@ class Peer:
         return pieces, self._dialect.text
 
 
-def greet(wire: Wire, dialect: V1, hello: str, settle: Settle | None) -> None:
+def exchange_hellos(wire: Connection, dialect: SightlineV1, hello: str, settle: Promote | None) -> None:
     """Exchange hellos; who connects, and so gives no place, speaks first."""
     if settle is None:
         wire.say(hello)
@@ -184,7 +184,7 @@ def greet(wire: Wire, dialect: V1, hello: str, settle: Settle | None) -> None:
         wire.say(hello)
 
 
-def count_end(closed: ConnectionClosed, refuse: Callable[[str], None]) -> None:
+def count_close(closed: ConnectionClosed, refuse: Callable[[str], None]) -> None:
     """Count a connection that this end closed because the peer broke a rule; one that the peer ended is no fault."""
     counted = _COUNTED_FOR_CODE.get(closed.sent.code) if closed.sent and not closed.rcvd_then_sent else None
     if counted is not None:

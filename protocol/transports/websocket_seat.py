@@ -5,11 +5,11 @@ They all are the same `guest` to the robot, which so cannot tell two that contra
 
 from typing import Final
 
-SEAT_US: Final = 1_000_000
+DRIVER_SLOT_US: Final = 1_000_000
 """A driver that has said nothing valid for so long has left its seat; as long as the robot's own lease."""
 
 
-class Seat:
+class DriverSlot:
     """The one seat of a link."""
 
     def __init__(self) -> None:
@@ -19,7 +19,7 @@ class Seat:
     def claim(self, who: str, now_us: int) -> str:
         """Who drives after `who` said something valid: `who` itself if the seat was its own, or free."""
         if who == self._driver or now_us >= self._until_us:
-            self._driver, self._until_us = who, now_us + SEAT_US
+            self._driver, self._until_us = who, now_us + DRIVER_SLOT_US
         return self._driver
 
     def leave(self, who: str) -> None:

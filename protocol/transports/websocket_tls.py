@@ -16,7 +16,7 @@ from protocol.errors import ConfigError
 from protocol.transports.secured import certificate_role
 
 
-def listening_context(folder: str, source: str) -> ssl.SSLContext:
+def server_tls_context(folder: str, source: str) -> ssl.SSLContext:
     """TLS for who listens. Raises ConfigError for a certificate or key that is missing or does not fit."""
     role = certificate_role(source)
     certificate, key = (Path(folder).expanduser() / f"{role}.{kind}" for kind in ("pem", "key"))
@@ -30,7 +30,7 @@ def listening_context(folder: str, source: str) -> ssl.SSLContext:
     return context
 
 
-def connecting_context(folder: str) -> ssl.SSLContext:
+def client_tls_context(folder: str) -> ssl.SSLContext:
     """TLS for who connects: trusts the folder's `ca.pem`, or without a folder what this machine trusts."""
     authority = Path(folder).expanduser() / "ca.pem"
     try:
@@ -39,7 +39,7 @@ def connecting_context(folder: str) -> ssl.SSLContext:
         raise ConfigError(f"{authority} holds no certificate of an authority: {error}") from None
 
 
-def shake_hands(near: socket.socket, context: ssl.SSLContext, host: str, deadline_s: float) -> ssl.SSLSocket:
+def tls_handshake(near: socket.socket, context: ssl.SSLContext, host: str, deadline_s: float) -> ssl.SSLSocket:
     """`near` with TLS agreed on; `host` is whom this end connects to, "" for who listens.
 
     Raises TimeoutError at `deadline_s` however slowly the other end goes on, and SSLError for one that does not agree.
@@ -49,14 +49,14 @@ def shake_hands(near: socket.socket, context: ssl.SSLContext, host: str, deadlin
         near, server_side=not host, server_hostname=host or None, do_handshake_on_connect=False
     )
     try:
-        _agree(wrapped, deadline_s)
+        _finish_handshake(wrapped, deadline_s)
     except BaseException:
         wrapped.close()
         raise
     return wrapped
 
 
-def _agree(wrapped: ssl.SSLSocket, deadline_s: float) -> None:
+def _finish_handshake(wrapped: ssl.SSLSocket, deadline_s: float) -> None:
     waiting = select.poll()
     while (left_s := deadline_s - time.monotonic()) > 0:
         try:

@@ -16,7 +16,7 @@ Callback = Callable[[Message], None]
 _WATCHED = tuple(one for one in CHANNELS.values() if one.while_watched)
 
 
-class Hearer(Protocol):
+class Subscriber(Protocol):
     """Another end."""
 
     def hears(self, channel: Channel) -> bool:
@@ -32,7 +32,7 @@ class Hearer(Protocol):
         ...
 
 
-class Wants:
+class Subscriptions:
     """The wants of one link. `told` is what its peers know of them."""
 
     def __init__(self, rules: LinkRules, session: str) -> None:
@@ -61,12 +61,12 @@ class Wants:
         """The largest payload of what was told last, in bytes."""
         return max((self._rules.payload_bound(CHANNELS[name]) for name in self.told), default=0)
 
-    def tell(self, peer: Hearer) -> None:
+    def tell(self, peer: Subscriber) -> None:
         """Tell one peer what the others were told."""
         peer.limit(self.bound())
         peer.tell(self.hello())
 
-    def retell(self, peers: Sequence[Hearer], passing_on: bool) -> None:
+    def retell(self, peers: Sequence[Subscriber], passing_on: bool) -> None:
         """Tell all `peers` what is wanted now, if it changed. `passing_on`: what one says is for the others too."""
         watched = (one.name for one in _WATCHED if passing_on and any(peer.hears(one) for peer in peers))
         names = tuple(dict.fromkeys((*self._callbacks, *watched)))

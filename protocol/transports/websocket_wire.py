@@ -18,9 +18,9 @@ from itertools import takewhile
 from typing import TYPE_CHECKING, Final
 
 from protocol.clock import monotonic_us
-from protocol.transports.websocket_kernel import way_out
-from protocol.transports.websocket_life import WayOut
-from protocol.transports.websocket_messages import Messages, unmasked_head
+from protocol.transports.websocket_kernel import send_path
+from protocol.transports.websocket_life import SendPath
+from protocol.transports.websocket_messages import MessageReader, unmasked_head
 
 if TYPE_CHECKING:
     from websockets.protocol import Protocol
@@ -37,7 +37,7 @@ _MAX_REASON_BYTES: Final = 123  # RFC 6455, 5.5
 _NOT_NOW: Final = (BlockingIOError, InterruptedError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
 
-class Wire:
+class Connection:
     """The connection. `lock` guards the protocol and what the socket has not taken yet."""
 
     def __init__(self, near: socket.socket, protocol: Protocol) -> None:
@@ -55,7 +55,7 @@ class Wire:
         self._near = near
         self._unsent: deque[bytes | memoryview] = deque()
         self._wants_room = False
-        self._messages = Messages(protocol)
+        self._messages = MessageReader(protocol)
         self._cut_off_s: float | None = None
         self._over = self._is_shut = False
         self._alarm, self._bell = socket.socketpair()
@@ -187,10 +187,10 @@ class Wire:
         with self.lock:
             self._flush()
 
-    def way_out(self) -> WayOut:
+    def way_out(self) -> SendPath:
         """What is known of the way to the other end."""
         holds = bool(self._unsent) or self._wants_room
-        return way_out(self._near, holds or self._unheard_bytes >= _MUCH_BYTES)
+        return send_path(self._near, holds or self._unheard_bytes >= _MUCH_BYTES)
 
     def linger(self) -> None:
         """Discard what still comes until the connection has ended, so that the other end reads the reason."""

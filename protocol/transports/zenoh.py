@@ -17,13 +17,13 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from protocol.channels import FRAME, Channel, pattern_for
-from protocol.transports.endpoints import check_endpoints
+from protocol.transports.endpoints import check_zenoh_endpoints
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.link_rules import NOT_A_PUT, LinkRules
-from protocol.transports.presence import Peer
-from protocol.transports.secured import ROBOT, ROLE_SOURCES, secured_for
-from protocol.transports.zenoh_presence import Here, ask
-from protocol.transports.zenoh_session import GONE, open_session
+from protocol.transports.presence import PeerInfo
+from protocol.transports.secured import ROBOT_ROLE, KNOWN_SOURCES, load_role_keys
+from protocol.transports.zenoh_presence import PresenceAnnouncer, query_presence
+from protocol.transports.zenoh_session import CLOSED_SESSION, open_session
 
 if TYPE_CHECKING:
     import zenoh
@@ -57,12 +57,12 @@ def open_zenoh(
     robot whose id another has there.
     """
     rules = LinkRules(robot, role, max_frame_bytes)
-    check_endpoints(listen, connect)
-    opened = open_session(listen, connect, timeout_s, secured_for(secure, role))
+    check_zenoh_endpoints(listen, connect)
+    opened = open_session(listen, connect, timeout_s, load_role_keys(secure, role))
     with ExitStack() as undo:
         link = undo.enter_context(ZenohLink(opened, rules))
         if role:
-            link.announce(Here(role, robot, session or secrets.token_hex(4)))
+            link.announce(PresenceAnnouncer(role, robot, session or secrets.token_hex(4)))
         undo.pop_all()
     return link
 
@@ -80,7 +80,7 @@ class ZenohLink:
         self.robot = rules.robot
         self._session = session
         self._rules = rules
-        self._outlets: dict[str, _Outlet] = {}
+        self._outlets: dict[str, _MatchedPublisher] = {}
         self._subscribers: defaultdict[str, list[zenoh.Subscriber[None]]] = defaultdict(list)
         self._ending = ExitStack()
         if not shared:
@@ -89,7 +89,7 @@ class ZenohLink:
         self._declaring = threading.Lock()
         self._closed = False
         self._in_callback = threading.local()
-        self._peers = _Peers(session, self._ending)
+        self._peers = _ConnectedPeers(session, self._ending)
 
     @property
     def refused(self) -> Counter[str]:
@@ -161,19 +161,19 @@ class ZenohLink:
         except zenoh.ZError:
             return False
 
-    def announce(self, here: Here) -> None:
+    def announce(self, here: PresenceAnnouncer) -> None:
         """Answer whoever asks who is there. Raises LinkError for a robot whose id another has."""
         with self._declaring:
             self._ending.callback(here.answer_in(self._session))
-        if here.role == ROBOT:
+        if here.role == ROBOT_ROLE:
             here.claim(self._session)
 
-    def peers(self) -> list[Peer]:
+    def peers(self) -> list[PeerInfo]:
         """Everybody else who can be reached, with round trips; waits up to half a second. For display only."""
         import zenoh
 
         try:
-            return [] if self._closed else ask(self._session)
+            return [] if self._closed else query_presence(self._session)
         except zenoh.ZError:  # closed meanwhile
             return []
 
@@ -207,17 +207,17 @@ class ZenohLink:
 
     def _is_kept(self, key: str, source: str) -> bool:
         """Whether the publisher on `key` stays: a relay is given sources without number by who makes them up."""
-        is_ours = source in ("", self._rules.role) or source in ROLE_SOURCES
+        is_ours = source in ("", self._rules.role) or source in KNOWN_SOURCES
         return is_ours or key in self._outlets or len(self._outlets) < MAX_KEPT_PUBLISHERS
 
-    def _outlet(self, key: str, channel: Channel) -> _Outlet:
+    def _outlet(self, key: str, channel: Channel) -> _MatchedPublisher:
         """The publisher on `key`, declared at its first use and kept."""
         outlet = self._outlets.get(key)
         if outlet is not None:
             return outlet
         with self._declaring:
             if key not in self._outlets:
-                self._outlets[key] = _Outlet(self._session, key, channel, self._ending)
+                self._outlets[key] = _MatchedPublisher(self._session, key, channel, self._ending)
             return self._outlets[key]
 
     @staticmethod
@@ -235,7 +235,7 @@ class ZenohLink:
         # borrowed", a RuntimeError); the session's close, which runs last in any case, ends it.
         with suppress(zenoh.ZError, RuntimeError):
             self._ending.close()
-        self._session = GONE
+        self._session = CLOSED_SESSION
 
 
 def _options(channel: Channel) -> dict[str, Any]:
@@ -251,7 +251,7 @@ def _options(channel: Channel) -> dict[str, Any]:
     }
 
 
-class _Outlet:
+class _MatchedPublisher:
     """A publisher and whether anybody matches it, kept up to date by Zenoh's thread."""
 
     def __init__(self, session: zenoh.Session, key: str, channel: Channel, ending: ExitStack) -> None:
@@ -274,7 +274,7 @@ class _Outlet:
         self._changed = status.matching
 
 
-class _Peers:
+class _ConnectedPeers:
     """Who is connected, kept up to date by Zenoh's thread."""
 
     def __init__(self, session: zenoh.Session, ending: ExitStack) -> None:

@@ -13,80 +13,80 @@ from typing import TYPE_CHECKING, Final
 
 from protocol.channels import KEY_PREFIX, STATUS, parse_key
 from protocol.errors import ConfigError
-from protocol.transports.endpoints import check_endpoint, check_endpoints
+from protocol.transports.endpoints import parse_zenoh_endpoint, check_zenoh_endpoints
 from protocol.transports.link import Message
 from protocol.transports.link_rules import LinkRules
-from protocol.transports.presence import ASKS, MAX_PEERS, Peer, quickest
-from protocol.transports.secured import Secured, secured_for
-from protocol.transports.zenoh_discovery import _address
-from protocol.transports.zenoh_presence import ANSWER_S, ask
+from protocol.transports.presence import QUERY_ROUNDS, MAX_PEERS, PeerInfo, best_round_trips
+from protocol.transports.secured import RoleKeys, load_role_keys
+from protocol.transports.zenoh_discovery import multicast_address
+from protocol.transports.zenoh_presence import REPLY_TIMEOUT_S, query_presence
 from protocol.transports.zenoh_session import open_session
 
 if TYPE_CHECKING:
     import zenoh
 
-ROLE: Final = "operator"
-VIEWER: Final = "viewer"
-_BETWEEN_ASKS_S: Final = 0.05
+OPERATOR_ROLE: Final = "operator"
+VIEWER_ROLE: Final = "viewer"
+_BETWEEN_QUERIES_S: Final = 0.05
 
 MAX_LISTENERS: Final = 64
 """Security limit: no more answers than this are kept."""
 
 
 @dataclass(frozen=True, slots=True)
-class Around:
+class Discovered:
     """The newest status of each robot, and everybody who answered."""
 
     statuses: dict[str, Message]
-    peers: list[Peer]
+    peers: list[PeerInfo]
 
 
-def look_around(connect: Sequence[str], seconds: float, secure: str = "") -> Around:
+def discover(connect: Sequence[str], seconds: float, secure: str = "") -> Discovered:
     """Everybody heard at `connect` within `seconds`. Raises as `open_zenoh` does."""
-    check_endpoints((), connect)
+    check_zenoh_endpoints((), connect)
     with ExitStack() as ending:
         session = open_session((), connect, seconds, _own_keys(secure))
         ending.callback(session.close)
-        return Around(_statuses(session, ending), _listen(session, seconds))
+        return Discovered(_statuses(session, ending), _listen(session, seconds))
 
 
 def list_robots(connect: Sequence[str], seconds: float, secure: str = "") -> dict[str, Message]:
     """The newest `status` of every robot heard within `seconds` at `connect`. Raises as `open_zenoh` does."""
-    return look_around(connect, seconds, secure).statuses
+    return discover(connect, seconds, secure).statuses
 
 
-def peers_at(connect: Sequence[str], seconds: float, secure: str = "") -> list[Peer]:
+def peers_at(connect: Sequence[str], seconds: float, secure: str = "") -> list[PeerInfo]:
     """Everybody who answers at `connect`, with the quickest of a few round trips. Raises as `open_zenoh` does."""
-    check_endpoints((), connect)
+    check_zenoh_endpoints((), connect)
     with ExitStack() as ending:
         session = open_session((), connect, seconds, _own_keys(secure))
         ending.callback(session.close)
-        return _asked(session, time.monotonic() + seconds)
+        return _query_rounds(session, time.monotonic() + seconds)
 
 
-def _own_keys(folder: str) -> Secured | None:
+def _own_keys(folder: str) -> RoleKeys | None:
     """An operator's, or a viewer's where there are only those: to look takes no more."""
-    only_viewer = folder and not _has(folder, ROLE) and _has(folder, VIEWER)
-    return secured_for(folder, VIEWER if only_viewer else ROLE)
+    only_viewer = folder and not _has(folder, OPERATOR_ROLE) and _has(folder, VIEWER_ROLE)
+    return load_role_keys(folder, VIEWER_ROLE if only_viewer else OPERATOR_ROLE)
 
 
 def _has(folder: str, role: str) -> bool:
     return (Path(folder).expanduser() / f"{role}.key").is_file()
 
 
-def _listen(session: zenoh.Session, seconds: float) -> list[Peer]:
+def _listen(session: zenoh.Session, seconds: float) -> list[PeerInfo]:
     ends_s = time.monotonic() + seconds
-    peers = _asked(session, ends_s)
+    peers = _query_rounds(session, ends_s)
     time.sleep(max(0.0, ends_s - time.monotonic()))
     return peers
 
 
-def _asked(session: zenoh.Session, ends_s: float) -> list[Peer]:
+def _query_rounds(session: zenoh.Session, ends_s: float) -> list[PeerInfo]:
     rounds = []
-    for _ in range(ASKS):
-        rounds.append(ask(session, max(0.1, min(ANSWER_S, ends_s - time.monotonic()))))
-        time.sleep(_BETWEEN_ASKS_S)
-    return quickest(rounds)
+    for _ in range(QUERY_ROUNDS):
+        rounds.append(query_presence(session, max(0.1, min(REPLY_TIMEOUT_S, ends_s - time.monotonic()))))
+        time.sleep(_BETWEEN_QUERIES_S)
+    return best_round_trips(rounds)
 
 
 def _statuses(session: zenoh.Session, ending: ExitStack) -> dict[str, Message]:
@@ -112,7 +112,7 @@ def _statuses(session: zenoh.Session, ending: ExitStack) -> dict[str, Message]:
 def _usable(locator: str) -> str:
     text = str(locator).partition("?")[0].partition("#")[0]
     try:
-        check_endpoint(text)
+        parse_zenoh_endpoint(text)
     except ConfigError:
         return ""
     return text
@@ -129,7 +129,7 @@ def find_listeners(seconds: float) -> list[str]:
         raise ConfigError("Zenoh is not installed: pip install 'sightline[zenoh]'") from None
     logging.getLogger("zenoh").addHandler(logging.NullHandler())
     answers: zenoh.handlers.RingChannel[zenoh.Hello] = zenoh.handlers.RingChannel(MAX_LISTENERS)
-    config = {"scouting": {"multicast": {"enabled": True, "address": _address()}}}
+    config = {"scouting": {"multicast": {"enabled": True, "address": multicast_address()}}}
     try:
         with zenoh.scout(answers, zenoh.WhatAmIMatcher("router"), zenoh.Config.from_json5(json.dumps(config))) as scout:
             time.sleep(seconds)

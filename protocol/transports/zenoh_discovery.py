@@ -9,21 +9,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from protocol.transports.endpoints import check_endpoint
+from protocol.transports.endpoints import parse_zenoh_endpoint
 
-GROUP: Final = ("224.0.0.224", 7449)
+MULTICAST_GROUP: Final = ("224.0.0.224", 7449)
 """Zenoh's own group, three ports above Zenoh's own port."""
-NO_MULTICAST: Final = {"enabled": False}
+MULTICAST_OFF: Final = {"enabled": False}
 LOOPBACK: Final = ("localhost", "127.", "::1")
 
 
 def multicast_section(listen: Sequence[str]) -> dict[str, Any]:
     """Zenoh's `scouting/multicast`: on for who listens beyond loopback, which is an owner's decision."""
-    if all(check_endpoint(endpoint)[1].startswith(LOOPBACK) for endpoint in listen):
-        return NO_MULTICAST
+    if all(parse_zenoh_endpoint(endpoint)[1].startswith(LOOPBACK) for endpoint in listen):
+        return MULTICAST_OFF
     nobody: dict[str, list[str]] = {"router": [], "peer": [], "client": []}
-    return {"enabled": True, "listen": True, "address": _address(), "autoconnect": nobody}
+    return {"enabled": True, "listen": True, "address": multicast_address(), "autoconnect": nobody}
 
 
-def _address() -> str:
-    return f"{GROUP[0]}:{GROUP[1]}"
+def multicast_address() -> str:
+    return f"{MULTICAST_GROUP[0]}:{MULTICAST_GROUP[1]}"

@@ -15,11 +15,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from protocol.clock import monotonic_us
-from protocol.log_lines import JsonLines, RefusalLines
+from protocol.log_lines import JsonLineStream, RepeatLimiter
 from protocol.transports import denied
-from protocol.transports.endpoints import check_endpoint
+from protocol.transports.endpoints import parse_zenoh_endpoint
 from protocol.transports.tcp_table import Visitors
-from protocol.transports.tls_refusals import LOG_FILTER, refusal_cause
+from protocol.transports.tls_refusals import TLS_LOG_FILTER, refusal_cause
 
 _STDOUT = 1
 _GULP_BYTES = 1_048_576  # what an unprivileged pipe can hold; one that is full costs lines
@@ -28,7 +28,7 @@ _LOOKS_S = 0.6  # Zenoh does not say who it was; who is refused tries again with
 
 
 @contextmanager
-def refusals_told(listen: Sequence[str], secure: str, say: Callable[[str], None]) -> Iterator[None]:
+def log_rejected_peers(listen: Sequence[str], secure: str, say: Callable[[str], None]) -> Iterator[None]:
     """While inside, `say` who is turned away at the secured ones of `listen`, and why. Enter it before the link opens.
 
     For a process of its own: its standard output is redirected.
@@ -43,19 +43,19 @@ def refusals_told(listen: Sequence[str], secure: str, say: Callable[[str], None]
         yield
         return
     with _own_stdout() as read_end:
-        zenoh.init_log_from_env_or(f"{LOG_FILTER},{denied.LOG_FILTER}")
-        told = _Told(doors, say)
+        zenoh.init_log_from_env_or(f"{TLS_LOG_FILTER},{denied.ACCESS_LOG_FILTER}")
+        told = _LogReader(doors, say)
         threading.Thread(target=told.read, args=(read_end,), name="zenoh-log", daemon=True).start()
         yield
 
 
-class _Told:
+class _LogReader:
     """Reads the log line by line."""
 
     def __init__(self, doors: Sequence[str], say: Callable[[str], None]) -> None:
         self._doors, self._say = doors, say
-        self._visitors = Visitors({check_endpoint(door)[2] for door in doors})
-        self._lines = RefusalLines()
+        self._visitors = Visitors({parse_zenoh_endpoint(door)[2] for door in doors})
+        self._lines = RepeatLimiter()
         self._certificates = denied.Certificates()
 
     def read(self, read_end: int) -> None:
@@ -112,7 +112,7 @@ def _own_stdout() -> Iterator[int]:
     os.dup2(write_end, _STDOUT)
     os.close(write_end)
     ours = open(kept, "w", buffering=1, encoding="utf-8", errors="replace", closefd=False)  # noqa: SIM115
-    sys.stdout = before.over(ours) if isinstance(before, JsonLines) else ours
+    sys.stdout = before.over(ours) if isinstance(before, JsonLineStream) else ours
     try:
         yield read_end
     finally:

@@ -19,27 +19,27 @@ from protocol.clock import monotonic_us
 from protocol.codec import encode
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.presence import (
-    EVERYBODY,
+    PRESENCE_PATTERN,
     MAX_ABOUT,
     MAX_PEERS,
-    Peer,
+    PeerInfo,
     Presence,
-    key_of,
-    namesake,
-    read_answer,
+    presence_key,
+    robot_with_same_id,
+    parse_presence_reply,
 )
 
 if TYPE_CHECKING:
     import zenoh
 
-ANSWER_S: Final = 0.5
+REPLY_TIMEOUT_S: Final = 0.5
 """Who has not answered by then is not there."""
 _SECOND_LOOK_S: Final = 1.0
 """What is left of a robot that has just ended is gone by then: it leaves when its socket closes."""
 _HOST_CHARACTERS: Final = 64
 
 
-class Here:
+class PresenceAnnouncer:
     """This end of a session: what it answers when it is asked. Raises ConfigError for a role that is none."""
 
     def __init__(self, role: str, robot: str, session: str, about: Callable[[], str] | None = None) -> None:
@@ -48,7 +48,7 @@ class Here:
         self._about = about
         self._began_ns = time.monotonic_ns()
         try:
-            self._fixed = Presence(role=role, robot=robot, session=session, software=software(), host=_host())
+            self._fixed = Presence(role=role, robot=robot, session=session, software=software_version(), host=_host())
         except ValidationError:
             raise ConfigError(f"role {role!r} of robot {robot!r} cannot be announced: a role is 1 to 16 lower-case "
                               "letters, digits or '_', e.g. vision") from None
@@ -63,7 +63,7 @@ class Here:
         """Answer whoever asks, until what this returns is called."""
         import zenoh
 
-        key = key_of(self._fixed.role, self._fixed.session)
+        key = presence_key(self._fixed.role, self._fixed.session)
 
         def answer(query: zenoh.Query) -> None:
             with suppress(zenoh.ZError):  # it went away, or waits no longer
@@ -74,10 +74,10 @@ class Here:
 
     def claim(self, session: zenoh.Session) -> None:
         """Raise LinkError if another robot that is reached here has this id; look twice before saying so."""
-        other = namesake(self.now(), ask(session))
+        other = robot_with_same_id(self.now(), query_presence(session))
         if other is not None:
             time.sleep(_SECOND_LOOK_S)
-            other = namesake(self.now(), ask(session))
+            other = robot_with_same_id(self.now(), query_presence(session))
         if other is None:
             return
         raise LinkError(
@@ -86,28 +86,28 @@ class Here:
         )
 
 
-def ask(session: zenoh.Session, timeout_s: float = ANSWER_S) -> list[Peer]:
+def query_presence(session: zenoh.Session, timeout_s: float = REPLY_TIMEOUT_S) -> list[PeerInfo]:
     """Everybody else who can be reached, each once; over as soon as all have answered."""
     import zenoh
 
-    answers: list[Peer] = []
+    answers: list[PeerInfo] = []
     asked_us = monotonic_us()
     replies = session.get(
-        EVERYBODY, zenoh.handlers.FifoChannel(MAX_PEERS), target=zenoh.QueryTarget.ALL,
+        PRESENCE_PATTERN, zenoh.handlers.FifoChannel(MAX_PEERS), target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s,
     )
     for reply in replies:
         sample = reply.ok
         if sample is None or len(answers) >= MAX_PEERS:
             continue
-        peer = read_answer(str(sample.key_expr), sample.payload.to_bytes(), asked_us, monotonic_us(),
+        peer = parse_presence_reply(str(sample.key_expr), sample.payload.to_bytes(), asked_us, monotonic_us(),
                            time.time_ns() // 1000)
         if peer is not None:
             answers.append(peer)
     return answers
 
 
-def software() -> str:
+def software_version() -> str:
     """This program's name and version."""
     try:
         return f"sightline {metadata.version('sightline')}"

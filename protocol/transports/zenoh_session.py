@@ -15,11 +15,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from protocol.errors import ConfigError, LinkError, SightlineError
-from protocol.transports.endpoints import check_endpoint, with_send_buffer
+from protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
 from protocol.transports.port_owner import port_owner
-from protocol.transports.secured import Secured, size_section
-from protocol.transports.tls_trouble import tls_trouble
-from protocol.transports.zenoh_discovery import NO_MULTICAST, multicast_section
+from protocol.transports.secured import RoleKeys, size_limit_section
+from protocol.transports.tls_trouble import diagnose_tls
+from protocol.transports.zenoh_discovery import MULTICAST_OFF, multicast_section
 
 if TYPE_CHECKING:
     import zenoh
@@ -33,11 +33,11 @@ HANDSHAKE_MS: Final = 3000
 MAX_SESSIONS: Final = 64
 """At one who listens: a fleet of twenty robots, its visions, and the people who watch."""
 _OVER_UDP: Final = ("udp", "quic")
-_KNOCK_S: Final = 0.3
+_PROBE_TIMEOUT_S: Final = 0.3
 RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
 
-class _Gone:
+class _ClosedSession:
     """In place of a session that is closed; asked for anything, it raises ZError as that one would."""
 
     def __getattr__(self, name: str) -> Any:
@@ -46,14 +46,14 @@ class _Gone:
         raise zenoh.ZError("the session is closed")
 
 
-GONE: Final[Any] = _Gone()
+CLOSED_SESSION: Final[Any] = _ClosedSession()
 """Who closes a session lets go of it at once. To free a router's stops every Python thread for up to 10 s where another
 session of the process hears something meanwhile (eclipse-zenoh 1.10.2 waits for a task with the interpreter's lock in
 hand), and if it is part of a cycle, the collector does that at any later time."""
 
 
 def open_session(
-    listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: Secured | None = None
+    listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: RoleKeys | None = None
 ) -> zenoh.Session:
     """Open a session on checked endpoints; with `secured`, by mutual TLS, and whoever listens checks who may what.
 
@@ -72,7 +72,7 @@ def open_session(
     try:
         return _open(session_config(listen, connect, timeout_s, secured))
     except zenoh.ZError as error:
-        raise _explain(str(error), listen, connect, timeout_s, secured) from None
+        raise _error_of(str(error), listen, connect, timeout_s, secured) from None
 
 
 def _open(config: dict[str, Any]) -> zenoh.Session:
@@ -82,14 +82,14 @@ def _open(config: dict[str, Any]) -> zenoh.Session:
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except zenoh.ZError:
-        if config["scouting"]["multicast"] == NO_MULTICAST:
+        if config["scouting"]["multicast"] == MULTICAST_OFF:
             raise
-    config["scouting"]["multicast"] = NO_MULTICAST
+    config["scouting"]["multicast"] = MULTICAST_OFF
     return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
 
 
 def session_config(
-    listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: Secured | None = None
+    listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: RoleKeys | None = None
 ) -> dict[str, Any]:
     """The Zenoh configuration. Who listens is a router and reaches `connect` in the background, else a client."""
     config = _session_config(listen, connect, timeout_s)
@@ -97,7 +97,7 @@ def session_config(
         config["transport"]["link"]["tls"] = secured.tls_section()
         if listen:  # a client has one peer, whoever listens, and that one judges
             config["access_control"] = secured.access_section()
-            config["low_pass_filter"] = size_section()
+            config["low_pass_filter"] = size_limit_section()
     return config
 
 
@@ -134,13 +134,13 @@ def _transport_config() -> dict[str, Any]:
     }
 
 
-def _explain(
-    text: str, listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: Secured | None
+def _error_of(
+    text: str, listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: RoleKeys | None
 ) -> SightlineError:
     """Zenoh's error as one line that names the endpoint and the fix; its source paths are left out."""
     if not listen:
         where = " or ".join(connect)
-        trouble = next((found for endpoint in connect if (found := tls_trouble(endpoint, secured))), "")
+        trouble = next((found for endpoint in connect if (found := diagnose_tls(endpoint, secured))), "")
         if trouble:
             return LinkError(f"refused at {where}: {trouble}")
         more = "" if "quic/" not in where else ", or one end refuses the other's keys: the robot's log says which"
@@ -154,17 +154,17 @@ def _explain(
 
 
 def _is_open(endpoint: str) -> bool:
-    transport, host, port = check_endpoint(endpoint)
+    transport, host, port = parse_zenoh_endpoint(endpoint)
     try:
         if transport not in _OVER_UDP:
-            socket.create_connection((host, port), _KNOCK_S).close()
+            socket.create_connection((host, port), _PROBE_TIMEOUT_S).close()
     except OSError:
         return False
     return transport not in _OVER_UDP
 
 
 def _port_in_use(endpoint: str) -> LinkError:
-    port = check_endpoint(endpoint)[2]
+    port = parse_zenoh_endpoint(endpoint)[2]
     owner = port_owner(port)
     by = f" by {owner}" if owner else " by another process"
     return LinkError(f"cannot listen on {endpoint}: port {port} is in use{by}; end it or choose another port")

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Final, Self
 
 from protocol.channels import FRAME, KEY_PREFIX, STATUS, parse_key
 from protocol.errors import ConfigError
-from protocol.transports.endpoints import check_endpoints
+from protocol.transports.endpoints import check_zenoh_endpoints
 from protocol.transports.link import Link
 from protocol.transports.link_rules import LinkRules
-from protocol.transports.secured import secured_for
+from protocol.transports.secured import load_role_keys
 from protocol.transports.zenoh import ZenohLink
-from protocol.transports.zenoh_presence import Here
-from protocol.transports.zenoh_session import GONE, open_session
+from protocol.transports.zenoh_presence import PresenceAnnouncer
+from protocol.transports.zenoh_session import CLOSED_SESSION, open_session
 
 if TYPE_CHECKING:
     import zenoh
@@ -30,7 +30,7 @@ MAX_ROBOTS: Final = 256
 """Security limit: no more robots than this, whatever a network claims."""
 
 
-def open_site(
+def open_fleet(
     pattern: str,
     *,
     listen: Sequence[str] = (),
@@ -40,7 +40,7 @@ def open_site(
     max_frame_bytes: int = FRAME.max_payload_bytes,
     secure: str = "",
     about: Callable[[], str] | None = None,
-) -> ZenohSite:
+) -> ZenohFleet:
     """Open a session for every robot whose id fits `pattern` (`*` any text, `?` any letter); use it in a `with`.
 
     `about` gives the line that who asks who is there is told of this end, besides its role.
@@ -49,16 +49,16 @@ def open_site(
     for endpoint in (*listen, *connect):
         if "://" in endpoint:
             raise ConfigError(f"{endpoint}: several robots (--robot {pattern!r}) need Zenoh; write tcp/<host>:<port>")
-    check_endpoints(listen, connect)
-    here = Here(role, pattern, secrets.token_hex(4), about) if role else None
-    session = open_session(listen, connect, timeout_s, secured_for(secure, role))
-    site = ZenohSite(session, pattern, role, max_frame_bytes)
+    check_zenoh_endpoints(listen, connect)
+    here = PresenceAnnouncer(role, pattern, secrets.token_hex(4), about) if role else None
+    session = open_session(listen, connect, timeout_s, load_role_keys(secure, role))
+    site = ZenohFleet(session, pattern, role, max_frame_bytes)
     if here is not None:
         site.announce(here)
     return site
 
 
-class ZenohSite:
+class ZenohFleet:
     """One session. Robots are noticed by their status; a link to one shares the session."""
 
     def __init__(self, session: zenoh.Session, pattern: str, role: str, max_frame_bytes: int) -> None:
@@ -70,7 +70,7 @@ class ZenohSite:
         self._news: Callable[[], None] = lambda: None
         self._listen()
 
-    def announce(self, here: Here) -> None:
+    def announce(self, here: PresenceAnnouncer) -> None:
         """Answer whoever asks who is there."""
         self._ending.callback(here.answer_in(self._session))
 
@@ -90,7 +90,7 @@ class ZenohSite:
     def close(self) -> None:
         """Close all links and the session."""
         self._ending.close()
-        self._session = GONE
+        self._session = CLOSED_SESSION
 
     def __enter__(self) -> Self:
         return self

@@ -18,7 +18,7 @@ class Clocks:
     day_us: int
 
 
-class StampClock:
+class CaptureClock:
     """Which clock a device stamps with. One for each opening of a device: another may be plugged in."""
 
     def __init__(self, delay_us: int) -> None:

@@ -9,7 +9,7 @@ from protocol.clock import monotonic_us
 from protocol.errors import HardwareError, WireError
 from protocol.jpeg import JpegSize, read_jpeg_size
 from robot_side.hardware.lens import LensConfig, camera_model
-from robot_side.hardware.pace import Pace
+from robot_side.hardware.pace import FrameTimer
 from robot_side.ports import Picture
 
 
@@ -34,7 +34,7 @@ class FolderCamera:
         if len({(size.width_px, size.height_px) for size in sizes}) > 1:
             raise HardwareError(f"the pictures in {config.path} differ in size; one camera has one size")
         self.model = camera_model(config, sizes.pop())
-        self._pace = Pace(config.fps)
+        self._pace = FrameTimer(config.fps)
         self._count = 0
 
     def read(self, timeout_s: float) -> Picture | None:

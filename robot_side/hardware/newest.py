@@ -10,7 +10,7 @@ _JUST_NOW_S = 0.008
 stored picture is old sight. Shorter, and a reader late by a hair would get every second picture only."""
 
 
-class Newest:
+class LatestPicture:
     """One place: the reader thread puts, `take` waits."""
 
     def __init__(self) -> None:

@@ -6,7 +6,7 @@ from protocol.clock import monotonic_us
 from robot_side.hardware.buffer_time import Clocks
 
 
-class Pace:
+class FrameTimer:
     """Ticks `fps` times a second. Ticks that nobody waited for are not made up for, and who is late shifts none."""
 
     def __init__(self, fps: float) -> None:

@@ -10,9 +10,9 @@ from pydantic import Field
 
 from protocol.errors import ConfigError, HardwareError
 from protocol.jpeg import JpegSize
-from robot_side.hardware.buffer_time import StampClock
+from robot_side.hardware.buffer_time import CaptureClock
 from robot_side.hardware.lens import LensConfig, camera_model
-from robot_side.hardware.newest import Newest
+from robot_side.hardware.newest import LatestPicture
 from robot_side.hardware.pace import read_clocks
 from robot_side.ports import Picture
 
@@ -42,8 +42,8 @@ class PiCamera:
 
     def __init__(self, config: PiCameraConfig) -> None:
         self._config = config
-        self._newest = Newest()
-        self._stamps = StampClock(round(config.delay_ms * 1000))
+        self._newest = LatestPicture()
+        self._stamps = CaptureClock(round(config.delay_ms * 1000))
         self._heard_s = time.monotonic()
         self.model = camera_model(config, JpegSize(config.width_px, config.height_px, 3))
         self._camera = _opened(config)

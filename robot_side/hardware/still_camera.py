@@ -9,7 +9,7 @@ from protocol.clock import monotonic_us
 from protocol.errors import HardwareError
 from robot_side.hardware.folder_camera import jpeg_size
 from robot_side.hardware.lens import LensConfig, camera_model
-from robot_side.hardware.pace import Pace
+from robot_side.hardware.pace import FrameTimer
 from robot_side.ports import Picture
 
 
@@ -34,7 +34,7 @@ class StillCamera:
                 f"picture {config.path} cannot be read: {error.strerror}; set camera.options.path to a .jpg"
             ) from None
         self.model = camera_model(config, jpeg_size(config.path, self._jpeg))
-        self._pace = Pace(config.fps)
+        self._pace = FrameTimer(config.fps)
 
     def read(self, timeout_s: float) -> Picture | None:
         """The picture, at the next tick."""

@@ -11,8 +11,8 @@ from pathlib import Path
 from protocol.errors import HardwareError
 from protocol.messages import CameraModel
 from robot_side.hardware.lens import camera_model
-from robot_side.hardware.newest import Newest
-from robot_side.hardware.v4l2_device import Capture, Device, V4l2CameraConfig, open_capture
+from robot_side.hardware.newest import LatestPicture
+from robot_side.hardware.v4l2_device import Capture, V4l2Device, V4l2CameraConfig, open_capture
 from robot_side.ports import Picture
 
 _RETRY_S = 0.5
@@ -31,18 +31,18 @@ class V4l2Camera:
         self, config: V4l2CameraConfig, opening: Callable[[Path], Capture] = open_capture
     ) -> None:
         self._config, self._opening = config, opening
-        self._newest = Newest()
+        self._newest = LatestPicture()
         self._wish = (100, 100)
         self._fault: HardwareError | None = None
         self._ending = threading.Event()
         self._asked_s = self._heard_s = time.monotonic()
-        self._device: Device | None = Device(config, opening)
+        self._device: V4l2Device | None = V4l2Device(config, opening)
         self.model: CameraModel = self._model(self._device)
         self._thread = threading.Thread(target=self._run, name="v4l2 camera", daemon=True)
         self._thread.start()
         self._await_first()
 
-    def _model(self, device: Device) -> CameraModel:
+    def _model(self, device: V4l2Device) -> CameraModel:
         try:
             return camera_model(self._config, device.size)
         except Exception:
@@ -101,7 +101,7 @@ class V4l2Camera:
 
     def _capture_one(self) -> None:
         if self._device is None:
-            self._device = Device(self._config, self._opening)
+            self._device = V4l2Device(self._config, self._opening)
         self._device.wish = self._wish
         self._device.wait()
         asked = time.monotonic() - self._asked_s < _INTEREST_S

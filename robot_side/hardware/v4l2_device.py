@@ -14,11 +14,11 @@ from pydantic import Field
 
 from protocol.errors import ConfigError, HardwareError
 from protocol.jpeg import JpegSize
-from robot_side.hardware.buffer_time import StampClock
+from robot_side.hardware.buffer_time import CaptureClock
 from robot_side.hardware.lens import LensConfig
 from robot_side.hardware.pace import read_clocks
-from robot_side.hardware.v4l2_trouble import check_device, not_opened
-from robot_side.ports import Picture, scaled_size, share_of
+from robot_side.hardware.v4l2_trouble import check_device, open_error
+from robot_side.ports import Picture, scaled_size, scaled_quality
 
 _SELECT_TIMEOUT_S = 2  # OpenCV waits this long for a picture; its own default of 10 would hide a frozen camera
 _SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
@@ -55,7 +55,7 @@ def open_capture(path: Path) -> Capture:
     cv2 = _opencv()
     capture = cv2.VideoCapture(str(path), cv2.CAP_V4L2)
     if not capture.isOpened():
-        raise not_opened(path)
+        raise open_error(path)
     return capture
 
 
@@ -67,14 +67,14 @@ def _opencv() -> Any:
     return cv2
 
 
-class Device:
+class V4l2Device:
     """One opening of a device; raises HardwareError when it does not give what was asked for, or is gone."""
 
     def __init__(self, config: V4l2CameraConfig, opening: Callable[[Path], Capture]) -> None:
         self._config = config
         self.wish = (100, 100)
         """Shares of the configured quality and side lengths; for YUYV, whose pictures are encoded here."""
-        self._stamps = StampClock(round(config.delay_ms * 1000))
+        self._stamps = CaptureClock(round(config.delay_ms * 1000))
         self._capture = opening(config.device)
         try:
             self._pin_format()
@@ -141,7 +141,7 @@ class Device:
             size = scaled_size(full.width_px, full.height_px, scale_percent)
             bgr = cv2.resize(bgr, (size.width_px, size.height_px), interpolation=cv2.INTER_AREA)
         jpeg: bytes = simplejpeg.encode_jpeg(
-            bgr, quality=share_of(self._config.quality, quality_percent), colorspace="BGR", colorsubsampling="422",
+            bgr, quality=scaled_quality(self._config.quality, quality_percent), colorspace="BGR", colorsubsampling="422",
             fastdct=True,
         )
         return Picture(jpeg, t_us, scale_percent)

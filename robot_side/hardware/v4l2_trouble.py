@@ -22,7 +22,7 @@ def check_device(path: Path) -> None:
         os.close(descriptor)
 
 
-def not_opened(path: Path) -> HardwareError:
+def open_error(path: Path) -> HardwareError:
     """The error for a device that is there and permitted, but did not open as a camera."""
     owner = device_owner(path)
     if owner:
@@ -51,7 +51,7 @@ def _trouble(path: Path, error: OSError) -> HardwareError:
             f"sudo usermod -aG {_group(path)} $USER, then log in anew"
         )
     if error.errno == errno.EBUSY:
-        return not_opened(path)
+        return open_error(path)
     return HardwareError(f"camera {path} cannot be opened: {error.strerror}; set camera.options.device")
 
 

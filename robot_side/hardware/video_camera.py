@@ -14,8 +14,8 @@ from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, HardwareError
 from protocol.jpeg import JpegSize
 from robot_side.hardware.lens import LensConfig, camera_model
-from robot_side.hardware.pace import Pace
-from robot_side.ports import Picture, scaled_size, share_of
+from robot_side.hardware.pace import FrameTimer
+from robot_side.ports import Picture, scaled_size, scaled_quality
 
 _USUAL_FPS = 30.0
 _CATCH_UP_S = 1.0  # after a longer pause the video goes on where it was, as if paused
@@ -44,7 +44,7 @@ class VideoCamera:
         self._open()
         self.model = camera_model(config, self._size())
         fps = config.fps or self._own_fps()
-        self._pace = Pace(fps)
+        self._pace = FrameTimer(fps)
         self._fps = fps
         self._started_s = time.monotonic()
         self._shown = 0
@@ -68,7 +68,7 @@ class VideoCamera:
 
     def adjust(self, quality_percent: int, scale_percent: int) -> bool:
         """As `Adjustable` says."""
-        self._quality = share_of(self._config.quality, quality_percent)
+        self._quality = scaled_quality(self._config.quality, quality_percent)
         self._scale_percent = scale_percent
         return True
 

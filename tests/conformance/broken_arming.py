@@ -2,8 +2,8 @@
 
 from protocol.errors import WireError
 from protocol.messages import State, Twist, Verb
-from protocol.refusals import Refusal
-from robot_side.judge import Accepted, Verdict
+from protocol.refusals import RejectReason
+from robot_side.judge import AcceptedCommand, CommandResult
 from robot_side.lease import RANKS
 from tests.conformance.breaking import breaks, wrap
 
@@ -76,7 +76,7 @@ def accepts_unarmed(robot):
         if error.reason != "DISARMED":
             return inner(source, error)
         gate.accepted += 1
-        return Verdict(None, age_us=0)
+        return CommandResult(None, age_us=0)
 
     wrap(gate, "refuse", around)
 
@@ -120,7 +120,7 @@ def arms_only_once(robot):
     def around(inner, who, now_us):
         detail = inner(who, now_us)
         if detail == "already armed":
-            raise WireError(Refusal.NOT_ALLOWED, detail)
+            raise WireError(RejectReason.NOT_ALLOWED, detail)
         return detail
 
     wrap(gate, "arm", around)
@@ -148,7 +148,7 @@ def obeys_what_came_before(robot):
 
     def around(inner, reason, now_us):
         inner(reason, now_us)
-        gate._command = Accepted(Twist(linear_mps=0.2, angular_rad_s=0.0), now_us, now_us, 300_000)
+        gate._command = AcceptedCommand(Twist(linear_mps=0.2, angular_rad_s=0.0), now_us, now_us, 300_000)
 
     wrap(gate, "_begin", around)
 
@@ -167,7 +167,7 @@ def stop_while_driving_only_disarms(robot):
 def viewers_may_not_stop(robot):
     def around(inner, header, request, now_us):
         if header.source == "viewer":
-            raise WireError(Refusal.NOT_ALLOWED, "viewers only view")
+            raise WireError(RejectReason.NOT_ALLOWED, "viewers only view")
         return inner(header, request, now_us)
 
     on_verb(robot, Verb.STOP, around)
@@ -176,7 +176,7 @@ def viewers_may_not_stop(robot):
 def _needs(condition, reason):
     def around(inner, header, request, now_us):
         if not condition(header.echo, now_us):
-            raise WireError(Refusal(reason), "not so")
+            raise WireError(RejectReason(reason), "not so")
         return inner(header, request, now_us)
 
     return around
@@ -192,7 +192,7 @@ def judges_on_in_stopped(robot):
     gate = robot.driving.gate
 
     def around(inner, source, error):
-        reason = Refusal.DISARMED if error.reason == "STOPPED" and source in RANKS else error.reason
+        reason = RejectReason.DISARMED if error.reason == "STOPPED" and source in RANKS else error.reason
         return inner(source, WireError(reason, error.detail))
 
     wrap(gate, "refuse", around)
@@ -262,7 +262,7 @@ def second_stop_is_refused(robot):
 
     def around(inner, header, request, now_us):
         if gate.state is State.STOPPED:
-            raise WireError(Refusal.NOT_ALLOWED, "stopped already")
+            raise WireError(RejectReason.NOT_ALLOWED, "stopped already")
         return inner(header, request, now_us)
 
     on_verb(robot, Verb.STOP, around)

@@ -5,7 +5,7 @@ import re
 
 from protocol.errors import WireError
 from protocol.messages import MAX_INTEGER
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link import Message
 from tests.conformance.breaking import as_json, bend_twists, breaks, fields_of, wrap
 
@@ -14,7 +14,7 @@ HEX = re.compile(r"[0-9a-f]{8}")
 
 def refuse(robot, message, reason="MALFORMED"):
     """Count a refusal that the reference would not make."""
-    robot.driving.gate.refuse(message.source, WireError(Refusal(reason), "broken on purpose"))
+    robot.driving.gate.refuse(message.source, WireError(RejectReason(reason), "broken on purpose"))
 
 
 def refuses(robot, wrong, reason="MALFORMED"):
@@ -410,7 +410,7 @@ def only_the_same_is_a_replay(robot):
 def no_jumps(robot):
     def check(inner, header, last):
         if 0 <= last < header.seq - 500:
-            raise WireError(Refusal.OUT_OF_ORDER, "too far ahead")
+            raise WireError(RejectReason.OUT_OF_ORDER, "too far ahead")
         inner(header)
 
     check_seq(robot, check)
@@ -422,7 +422,7 @@ def one_count_per_role(robot):
 
     def check(inner, header, _last):
         if highest.get(header.source, 0) > 4096 and header.seq < highest[header.source]:
-            raise WireError(Refusal.OUT_OF_ORDER, "below what another session of this role has had")
+            raise WireError(RejectReason.OUT_OF_ORDER, "below what another session of this role has had")
         inner(header)
         highest[header.source] = max(highest.get(header.source, 0), header.seq)
 

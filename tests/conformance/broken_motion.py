@@ -2,8 +2,8 @@
 
 from protocol.errors import WireError
 from protocol.messages import State, Twist
-from protocol.refusals import CLAMPED, Refusal
-from robot_side.judge import Accepted
+from protocol.refusals import CLAMPED, RejectReason
+from robot_side.judge import AcceptedCommand
 from tests.conformance.breaking import bend_out, breaks, fields_of, wrap
 from tests.conformance.broken_lease import who_sends
 
@@ -99,7 +99,7 @@ def revive(robot):
     """The command in force begins anew."""
     gate = robot.driving.gate
     if gate._command is not None:
-        gate._command = Accepted(gate._command.twist, robot.now(), robot.now(), gate._command.life_us)
+        gate._command = AcceptedCommand(gate._command.twist, robot.now(), robot.now(), gate._command.life_us)
 
 
 def revived_by(robot, reason):
@@ -165,7 +165,7 @@ def hold_is_the_end(robot):
 
     def around(inner, source, header, twist, now_us):
         if gate.state is State.HOLD and now_us - gate._hold_since_us > 300_000 and source == "vision":
-            return gate.refuse(source, WireError(Refusal.NOT_ALLOWED, "arm again"))
+            return gate.refuse(source, WireError(RejectReason.NOT_ALLOWED, "arm again"))
         return inner(source, header, twist, now_us)
 
     wrap(gate, "offer", around)

@@ -5,7 +5,7 @@ import re
 from protocol.channels import ACK, REPLY
 from protocol.errors import WireError
 from protocol.messages import MAX_INTEGER, Reply, State, Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link import Message
 from tests.conformance.breaking import bend_out, bend_twists, breaks, fields_of, wrap
 from tests.conformance.broken_arming import absent, forgives
@@ -136,7 +136,7 @@ def refused_for_the_lease_uses_nothing_up(robot):
         sender = (source, header.session) if header is not None else None
         before = last.get(sender, -1)
         verdict = inner(source, header, *arguments)
-        if verdict.reason is Refusal.NOT_HOLDER:
+        if verdict.reason is RejectReason.NOT_HOLDER:
             last[sender] = before
         return verdict
 
@@ -165,7 +165,7 @@ def a_refusal_breaks_the_row(robot):
 
 
 def _begin_row(gate, error):
-    if error.reason is Refusal.MALFORMED:
+    if error.reason is RejectReason.MALFORMED:
         gate._live_commands = 0
 
 
@@ -189,7 +189,7 @@ def release_needs_the_lease(robot):
     def around(inner, who, now_us):
         detail = inner(who, now_us)
         if detail == "not held":
-            raise WireError(Refusal.NOT_HOLDER, detail)
+            raise WireError(RejectReason.NOT_HOLDER, detail)
         return detail
 
     wrap(robot.driving.gate, "release", around)

@@ -2,7 +2,7 @@
 
 from protocol.errors import WireError
 from protocol.messages import Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link import Message
 from tests.conformance.breaking import as_json, bend_out, bend_requests, breaks, fields_of, wrap
 
@@ -81,7 +81,7 @@ def nameless_requests(robot):
 def requests_of_known_fields_only(robot):
     def around(inner, message):
         if b'"colour"' in message.payload or b'"mood"' in message.header:
-            robot.driving.gate.refuse(message.source, WireError(Refusal.MALFORMED, "unknown field"))
+            robot.driving.gate.refuse(message.source, WireError(RejectReason.MALFORMED, "unknown field"))
         else:
             inner(message)
 

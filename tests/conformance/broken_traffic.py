@@ -3,9 +3,9 @@
 from protocol.channels import CHANNELS
 from protocol.errors import WireError
 from protocol.messages import Twist
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.link import Message
-from robot_side.judge import Accepted
+from robot_side.judge import AcceptedCommand
 from robot_side.lease import Lease
 from robot_side.ports import Picture
 from tests.conformance.breaking import as_json, bend_acks, bend_out, breaks, fields_of, wrap
@@ -133,7 +133,7 @@ def on_bare(robot, change):
 @breaks("R-DIAL-01")
 def a_guest_needs_a_header(robot):
     gate = robot.driving.gate
-    on_bare(robot, lambda _inner, message: gate.refuse("guest", WireError(Refusal.MALFORMED, "no header")))
+    on_bare(robot, lambda _inner, message: gate.refuse("guest", WireError(RejectReason.MALFORMED, "no header")))
 
 
 @breaks("R-DIAL-02")
@@ -168,7 +168,7 @@ def guests_live_long(robot):
     def around(inner, source, twist, now_us, age_us):
         inner(source, twist, now_us, age_us)
         if source == "guest":
-            gate._command = Accepted(gate._command.twist, now_us + 60_000_000, now_us, 60_000_000)
+            gate._command = AcceptedCommand(gate._command.twist, now_us + 60_000_000, now_us, 60_000_000)
 
     wrap(gate, "_keep", around)
 
@@ -322,7 +322,7 @@ def goes_on_where_it_was(robot):
 
     def resume():
         now_us = robot.now()
-        gate._command = Accepted(Twist(linear_mps=0.2, angular_rad_s=0.0), now_us + 300_000, now_us + 300_000, 500_000)
+        gate._command = AcceptedCommand(Twist(linear_mps=0.2, angular_rad_s=0.0), now_us + 300_000, now_us + 300_000, 500_000)
 
     on_return(robot, resume)
 

@@ -11,10 +11,10 @@ from protocol.messages import CameraModel
 from protocol.transports import link_rules, memory
 from protocol.transports.memory import MemoryNetwork
 from robot_side.config import RobotConfig
-from robot_side.driving import Driving
+from robot_side.driving import DriverCore
 from robot_side.limits import TICK_US, SafetyConfig
 from robot_side.ports import Picture, Ranges, WheelAngles
-from robot_side.sending import Sending
+from robot_side.sending import NetworkCore
 from tests.robot_process import JPEG
 
 MODEL = CameraModel(width_px=16, height_px=16, fx_px=20.0, fy_px=20.0, cx_px=8.0, cy_px=8.0)
@@ -44,8 +44,8 @@ class ReferenceRobot:
         self.network = network
         self.now_us = network.now_us
         self.config = RobotConfig(safety=SafetyConfig(**{"guests": True, **safety}))
-        self.driving = Driving(self.config, session)
-        self.sending = Sending(self.config.stream, session, 0, self.config.max_frame_bytes)
+        self.driving = DriverCore(self.config, session)
+        self.sending = NetworkCore(self.config.stream, session, 0, self.config.max_frame_bytes)
         self.link = network.link("r1")
         self.hook()
         self._ticked_us = self._scanned_us = self._reported_us = -1_000_000

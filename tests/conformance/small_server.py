@@ -18,7 +18,7 @@ import time
 from protocol.channels import CHANNELS, Direction, key_for
 from protocol.conformance.raw_websocket import xor
 from protocol.errors import WireError
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from protocol.transports.memory import MemoryNetwork
 from tests.conformance.reference import ReferenceRobot
 
@@ -458,7 +458,7 @@ class OlderClient(Client):
         if message.count(b"|") != 1:
             return True
         if other and not self.has("any client drives"):
-            server.robot.driving.gate.refuse("guest", WireError(Refusal.NOT_HOLDER, "another client drives"))
+            server.robot.driving.gate.refuse("guest", WireError(RejectReason.NOT_HOLDER, "another client drives"))
             return False
         server.driver, server.driven_s = self, now_s
         return True

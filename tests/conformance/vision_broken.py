@@ -11,10 +11,10 @@ from protocol.messages import STILL, FrameHeader
 from protocol.transports.link import Message
 from protocol.twist_text import format_twist
 from tests.conformance.vision_rig import COMPUTE_US, VirtualVision
-from vision_side.pipeline import Answer, Seen, answer_header
+from vision_side.pipeline import PipelineAnswer, Observation, answer_header
 
 BROKEN = {}
-STANDING = Answer(STILL, Seen("broken"))
+STANDING = PipelineAnswer(STILL, Observation("broken"))
 """A twist where there should be none."""
 
 

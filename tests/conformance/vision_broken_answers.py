@@ -5,7 +5,7 @@ from protocol.conformance.vision_pictures import picture
 from protocol.golden_case import packed
 from protocol.messages import Stamp
 from tests.conformance.vision_broken import STANDING, BrokenVision, breaks, frame_header
-from vision_side.pipeline import Answer, Seen
+from vision_side.pipeline import PipelineAnswer, Observation
 
 
 def rewriting(case, wrong, change=lambda fields: {}, text=lambda text: text, **how):
@@ -211,7 +211,7 @@ class KeepsCount(BrokenVision):
 
     def decides(self, header, answer):
         if header.seq < 100 and self.last[1] > 1_000 and header.session != self.last[0]:
-            return Answer(None, Seen("old"))
+            return PipelineAnswer(None, Observation("old"))
         self.last = (header.session, header.seq)
         return answer
 

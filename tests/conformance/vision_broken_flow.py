@@ -7,7 +7,7 @@ from protocol.channels import FRAME
 from protocol.conformance.vision_flow import BROKEN_STATUS
 from tests.conformance.vision_broken import STANDING, BrokenVision, breaks
 from tests.conformance.vision_broken_answers import PerSession
-from vision_side.pipeline import Answer, Seen
+from vision_side.pipeline import PipelineAnswer, Observation
 
 
 class Queueing(BrokenVision):
@@ -186,7 +186,7 @@ class Waiting(Stately):
         return status.get("state") == "DISARMED"
 
     def decides(self, header, answer):
-        return Answer(None, Seen("waiting")) if self.quiet else answer
+        return PipelineAnswer(None, Observation("waiting")) if self.quiet else answer
 
 
 @breaks("V-STAT-06", "needs a status every 300 ms")

@@ -3,7 +3,7 @@
 from protocol.messages import Twist
 from tests.conformance.vision_broken import breaks
 from tests.conformance.vision_broken_answers import PerSession
-from vision_side.pipeline import Answer
+from vision_side.pipeline import PipelineAnswer
 
 
 class Steering(PerSession):
@@ -20,7 +20,7 @@ class Steering(PerSession):
         beside = bearing is not None and abs(bearing) > 0.1
         self.saw.add("nothing" if bearing is None else "ahead" if not beside else "left" if bearing > 0 else "right")
         linear, angular = self.steers(answer.twist.linear_mps, answer.twist.angular_rad_s, bearing)
-        return Answer(Twist(linear_mps=linear, angular_rad_s=angular), answer.seen)
+        return PipelineAnswer(Twist(linear_mps=linear, angular_rad_s=angular), answer.seen)
 
 
 def steering(case, wrong):

@@ -13,7 +13,7 @@ from protocol.transports.memory import MemoryLink, MemoryNetwork
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
 from vision_side.detect.hsv import HsvDetector
-from vision_side.pipeline import Answer, Pipeline
+from vision_side.pipeline import PipelineAnswer, Pipeline
 from vision_side.service import Service
 
 COMPUTE_US = 2_000
@@ -72,7 +72,7 @@ class VirtualVision(Service):
         made._decoder = RememberingDecoder(camera)
         return made
 
-    def _publish(self, header: FrameHeader, answer: Answer, compute_us: int) -> None:
+    def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
         super()._publish(header, answer, COMPUTE_US)
 
 

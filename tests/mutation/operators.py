@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator
 
 from protocol.messages import State, Verb
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 
 _COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),
@@ -38,7 +38,7 @@ _EVENTS = ("ARM", "DISARM", "STOP", "RESET", "FAULT", "FRESH", "AGEING", "OLD", 
 _ENUMS = {
     "State": tuple(State.__members__),
     "Verb": tuple(Verb.__members__),
-    "Refusal": tuple(Refusal.__members__),
+    "Refusal": tuple(RejectReason.__members__),
     "Event": _EVENTS,  # spelt out: its file is judged too, and may not be imported before its mutants
 }
 _WORD = re.compile(r"[a-z0-9]{0,16}")

@@ -15,7 +15,7 @@ from pydantic import Field
 from protocol.config import Config as Settings
 from vision_side.config import HsvConfig
 from vision_side.decode import Picture
-from vision_side.detect.chroma import Chroma
+from vision_side.detect.chroma import ColorModel
 from vision_side.detect.colour import Region
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.labels import Label
@@ -44,7 +44,7 @@ class AdaptiveConfig(Settings):
     """How slowly the colour goes along with the light. A lamp that turns from warm to cold in 3 s is not lost yet."""
 
 
-class AdaptiveEye:
+class AdaptiveTracker:
     """Follows one thing in one robot's pictures."""
 
     def __init__(self, config: AdaptiveConfig) -> None:
@@ -52,7 +52,7 @@ class AdaptiveEye:
         self._everywhere = HsvDetector(config.hsv, config.label)
         self._track: PixelTrack | None = None
         self._candidate: tuple[PixelTrack, int] | None = None
-        self._chroma: Chroma | None = None
+        self._chroma: ColorModel | None = None
         self._seen_us = 0
         self._last_us: int | None = None
 
@@ -112,7 +112,7 @@ class AdaptiveEye:
         self._track, self._candidate, self._chroma = track, None, known
         return found
 
-    def _is_it(self, picture: Picture, found: Detection, known: Chroma | None) -> bool:
+    def _is_it(self, picture: Picture, found: Detection, known: ColorModel | None) -> bool:
         pixels = _pixels(picture, _circle(found))
         return len(pixels) > 0 and (known is None or known.distance(pixels) <= self._config.colour_sigmas)
 
@@ -121,7 +121,7 @@ class AdaptiveEye:
         if not len(pixels):
             return
         if self._chroma is None:
-            self._chroma = Chroma(pixels)
+            self._chroma = ColorModel(pixels)
         elif found.score >= _CLEAR:
             self._chroma.learn(pixels, 1 - math.exp(-dt_s / self._config.adapt_s))
 

@@ -13,11 +13,11 @@ from vision_side.detect.port import Detection, DetectionResult
 
 WINDOW: Final = 300
 """Frames: ten seconds at 30 a second."""
-TELL_US: Final = 5_000_000
+REPORT_EVERY_US: Final = 5_000_000
 """Between two lines, however much the two disagree."""
 LEAST_OVERLAP: Final = 0.3
 """Boxes of one thing by two detectors: one draws the ball, the other its shadow too."""
-GoesBy = Callable[[str], bool]
+LabelTest = Callable[[str], bool]
 """Whether a mission may go by what has this label."""
 
 
@@ -34,20 +34,20 @@ class Agreement:
         """Of the newest frames, those in which both saw the same; 1 before there are any."""
         return sum(self._window) / len(self._window) if self._window else 1.0
 
-    def add(self, driving: DetectionResult, shadow: DetectionResult, goes_by: GoesBy) -> str:
+    def add(self, driving: DetectionResult, shadow: DetectionResult, goes_by: LabelTest) -> str:
         """One frame. Returns the line that tells how they differ, where it is time for one."""
-        what = differs(driving, shadow, goes_by)
+        what = disagreement(driving, shadow, goes_by)
         self.compared += 1
         self.differed += bool(what)
         self._window.append(not what)
-        if not what or (self._told_us is not None and 0 <= driving.t_us - self._told_us < TELL_US):
+        if not what or (self._told_us is not None and 0 <= driving.t_us - self._told_us < REPORT_EVERY_US):
             return ""
         self._told_us = driving.t_us
         return (f"{what}; {shadow.detector} agreed with {driving.detector} in {self.share:.0%} of the last "
                 f"{len(self._window)} frames")
 
 
-def differs(driving: DetectionResult, shadow: DetectionResult, goes_by: GoesBy) -> str:
+def disagreement(driving: DetectionResult, shadow: DetectionResult, goes_by: LabelTest) -> str:
     """What the surest detections of two results of one frame disagree on, of those that a mission may go by; empty if
     on nothing. What else they are called does not count."""
     mine, other = _surest(driving, goes_by), _surest(shadow, goes_by)
@@ -62,7 +62,7 @@ def differs(driving: DetectionResult, shadow: DetectionResult, goes_by: GoesBy) 
     return f"{driving.detector} sees {_where(mine)}, {shadow.detector} {_where(other)}"
 
 
-def _surest(result: DetectionResult, goes_by: GoesBy) -> Detection | None:
+def _surest(result: DetectionResult, goes_by: LabelTest) -> Detection | None:
     return next((one for one in result.detections if goes_by(one.label)), None)
 
 

@@ -8,12 +8,12 @@ from protocol.errors import ConfigError, SightlineError
 from protocol.transports.link import Link
 from vision_side.detect.port import Detector, Maker
 
-PLUGIN_RAISES: Final = (Exception, SystemExit)
+PLUGIN_ERRORS: Final = (Exception, SystemExit)
 """What a plug-in's own code may raise: `sys.exit` in it is to end itself, not the service around it."""
 _LONGEST: Final = 160
 
 
-class Around:
+class DetectorWrapper:
     """The base of combinators: one detector inside."""
 
     def __init__(self, inner: Detector) -> None:
@@ -25,7 +25,7 @@ class Around:
 
     def news(self) -> list[str]:
         """What the one inside has to say."""
-        return news_of(self.inner)
+        return notices_of(self.inner)
 
     @property
     def maker(self) -> Maker | None:
@@ -41,18 +41,18 @@ def attach_detector(detector: Any, link: Link) -> None:
     """Give a detector that hears something else of a robot than frames its link, before the first frame."""
     attach: Callable[[Link], None] | None = getattr(detector, "attach", None)
     if attach is not None:
-        with plugin_does("the detector's attach()"):
+        with plugin_guard("the detector's attach()"):
             attach(link)
 
 
-def news_of(detector: Any) -> list[str]:
+def notices_of(detector: Any) -> list[str]:
     """Lines for a person since the last time; none from a detector that has no `news`. One that raises is told of."""
     news: Callable[[], list[str]] | None = getattr(detector, "news", None)
     if news is None:
         return []
     try:
         return [" ".join(str(line).split()) for line in news()]
-    except PLUGIN_RAISES as error:  # who only talks badly may still see well
+    except PLUGIN_ERRORS as error:  # who only talks badly may still see well
         return [_raises("the detector's news()", error)]
 
 
@@ -66,18 +66,18 @@ def close_detector(detector: Any) -> None:
     """Let go of what a detector holds; nothing to do for one that has no `close`."""
     close: Callable[[], None] | None = getattr(detector, "close", None)
     if close is not None:
-        with plugin_does("the detector's close()"):
+        with plugin_guard("the detector's close()"):
             close()
 
 
 @contextmanager
-def plugin_does(what: str) -> Iterator[None]:
+def plugin_guard(what: str) -> Iterator[None]:
     """Whatever a plug-in's own code raises becomes a ConfigError that says whose fault it is."""
     try:
         yield
     except SightlineError:
         raise
-    except PLUGIN_RAISES as error:
+    except PLUGIN_ERRORS as error:
         raise ConfigError(f"{_raises(what, error)}; it has to be mended") from error
 
 

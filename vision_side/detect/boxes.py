@@ -13,7 +13,7 @@ from protocol.channels import DETECTIONS
 from protocol.codec import decode
 from protocol.errors import WireError
 from protocol.messages import CameraModel, DetectedBox, Detections, DetectionsHeader, FrameHeader
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from vision_side.config import BoxesConfig
 from vision_side.detect.port import Circle, Detection
 from vision_side.sphere import Sighting, points_ahead
@@ -46,7 +46,7 @@ class BoxReader:
         found = decode(Detections, payload, DETECTIONS.max_payload_bytes)
         if (found.width_px, found.height_px) != (camera.width_px, camera.height_px):
             size, own = f"{found.width_px}x{found.height_px}", f"{camera.width_px}x{camera.height_px}"
-            raise WireError(Refusal.MALFORMED, f"boxes of a {size} picture, the camera's is {own}")
+            raise WireError(RejectReason.MALFORMED, f"boxes of a {size} picture, the camera's is {own}")
         frame = self._frame_of(stamp)
         meant = [_detection(box) for box in found.boxes if self._means(box)]
         return frame, tuple(sorted(meant, key=lambda one: one.score, reverse=True))
@@ -56,7 +56,7 @@ class BoxReader:
         frame = self._frames.get((echo.session, echo.seq)) if echo and echo.channel == "frame" else None
         if frame is None or echo is None or frame.t_us != echo.t_us:
             which = f"frame {echo.seq} of session {echo.session}" if echo else "no frame"
-            raise WireError(Refusal.UNKNOWN_FRAME, f"boxes answer {which}, which did not come here")
+            raise WireError(RejectReason.UNKNOWN_FRAME, f"boxes answer {which}, which did not come here")
         return frame
 
     def _means(self, box: DetectedBox) -> bool:

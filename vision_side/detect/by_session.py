@@ -11,7 +11,7 @@ MAX_ROBOTS: Final = 256
 just before theirs. The robot that was not seen for the longest is forgotten first."""
 
 
-class BySession(Generic[Memory]):
+class PerSession(Generic[Memory]):
     """One memory for each robot."""
 
     def __init__(self, begin: Callable[[], Memory]) -> None:

@@ -10,17 +10,17 @@ from numbers import Real
 from typing import Any, Final
 
 from protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER
-from vision_side.detect.around import PLUGIN_RAISES
+from vision_side.detect.around import PLUGIN_ERRORS
 from vision_side.detect.labels import LONGEST_LABEL, is_label
 from vision_side.detect.port import Circle, DetectFrame, Detection, DetectionResult, Detector, clipped
 
 _LONGEST_WHY: Final = 160
-SILENT: Final = "the detector gave no answer in time"
+NO_ANSWER_IN_TIME: Final = "the detector gave no answer in time"
 _FURTHEST_PX: Final = 1e6
 """As for any number on the wire."""
 
 
-def asked(
+def checked_results(
     detector: Detector, frames: Sequence[DetectFrame], deadline_us: int, clock: Callable[[], int] = lambda: 0
 ) -> list[DetectionResult | str]:
     """What `detector` sees in each frame, or why that is no answer; whatever a plug-in does ends here.
@@ -31,17 +31,17 @@ def asked(
         results = detector.detect(frames, deadline_us)
         if len(results) != len(frames):
             raise ValueError(f"{len(results)} results for {len(frames)} frames")
-    except PLUGIN_RAISES as error:
+    except PLUGIN_ERRORS as error:
         if len(frames) > 1:  # whose frame it failed for is not known, and should cost no other robot its answer
             why = _why(error)
-            return [why if clock() > deadline_us else asked(detector, [one], deadline_us)[0] for one in frames]
+            return [why if clock() > deadline_us else checked_results(detector, [one], deadline_us)[0] for one in frames]
         return [_why(error)] * len(frames)
     return [_answer(frame, result) for frame, result in zip(frames, results, strict=True)]
 
 
 def _answer(frame: DetectFrame, result: DetectionResult | None) -> DetectionResult | str:
     try:
-        return checked(frame, result) if result is not None else SILENT
+        return validated(frame, result) if result is not None else NO_ANSWER_IN_TIME
     except Exception as error:  # of what may be no result at all
         return _why(error)
 
@@ -51,7 +51,7 @@ def _why(error: BaseException) -> str:
     return _printable(why[:_LONGEST_WHY])
 
 
-def checked(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
+def validated(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
     """`result` with its boxes clipped to the picture, those outside of it left out, its time in whole microseconds.
 
     Raises ValueError, with the reason, for what is no answer to `frame`.
@@ -64,15 +64,15 @@ def checked(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
     found = result.detections
     if len(found) > MAX_DETECTED_BOXES:  # the wire's own bound: which of more are the best is for the detector to say
         raise ValueError(f"{len(found)} boxes; {MAX_DETECTED_BOXES} is the most")
-    mended = _mended_maker(result)
-    inside = tuple(part for one in found if (part := _checked(one, frame.width_px, frame.height_px)))
+    mended = _repaired_maker(result)
+    inside = tuple(part for one in found if (part := _validated(one, frame.width_px, frame.height_px)))
     unchanged = len(found) == len(inside) and all(one is part for one, part in zip(found, inside, strict=True))
     if unchanged and not mended:
         return result
     return replace(result, detections=inside, **mended)
 
 
-def _mended_maker(result: DetectionResult) -> dict[str, Any]:
+def _repaired_maker(result: DetectionResult) -> dict[str, Any]:
     """What is to be said otherwise of who looked, and for how long: printable, and in whole microseconds. A plug-in may
     be called after any file, and count in any kind of number."""
     mended: dict[str, Any] = {}
@@ -94,18 +94,18 @@ def _printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
-def _checked(one: Detection, width_px: int, height_px: int) -> Detection | None:
+def _validated(one: Detection, width_px: int, height_px: int) -> Detection | None:
     if not all(map(math.isfinite, (one.x1_px, one.y1_px, one.x2_px, one.y2_px, one.score))):
         raise ValueError("a box with a number that is none")
     if not 0 <= one.score <= 1:
         raise ValueError(f"a score of {one.score:g}; it is between 0 and 1")
-    wrong = beside_the_box(one)
+    wrong = annotation_problem(one)
     if wrong:
         raise ValueError(wrong)
     return clipped(one, width_px, height_px)
 
 
-def beside_the_box(one: Detection) -> str:
+def annotation_problem(one: Detection) -> str:
     """What is wrong with its label, circle or track, which nobody could be told of; empty if nothing is."""
     if not is_label(one.label):
         return f"a label {one.label[:20]!r} of {len(one.label)} characters; it is 1 to {LONGEST_LABEL} printable ones"

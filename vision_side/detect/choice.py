@@ -11,14 +11,14 @@ from typing import Any, Final
 
 from protocol.errors import ConfigError
 from vision_side.config import VisionConfig
-from vision_side.detect.around import plugin_does
-from vision_side.detect.colour_filter import ColourFilter
+from vision_side.detect.around import plugin_guard
+from vision_side.detect.colour_filter import ColorFilter
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.port import Detector
 from vision_side.detect.remote.address import EXAMPLES
-from vision_side.detect.tracked import Tracked
-from vision_side.missions.choice import check_choices, configured
-from vision_side.plugin_choice import Family, settings_model
+from vision_side.detect.tracked import TrackIds
+from vision_side.missions.choice import check_missions, configured_mission
+from vision_side.plugin_choice import PluginRegistry, config_model
 
 BUILT_IN: Final = {
     "hsv": "vision_side.detect.local:Hsv",
@@ -33,7 +33,7 @@ BUILT_IN: Final = {
 GROUP: Final = "sightline.detectors"
 BOXES: Final = "boxes"
 """No detector here: boxes that somebody else publishes, see vision_side/boxes_service.py."""
-FAMILY: Final = Family("detector", BUILT_IN, GROUP)
+REGISTRY: Final = PluginRegistry("detector", BUILT_IN, GROUP)
 _FILLED: Final = ("robot", "connect", "listen", "secure", "max_frame_bytes", "max_pixels")
 _MOST_NAMED: Final = 12
 _OF_DETECTOR: Final = ("device", "deadline_s")
@@ -53,27 +53,27 @@ def configured_detector(config: VisionConfig) -> Detector | None:
     """
     one = config.detector
     if one.kind == BOXES:
-        _check_no_eyes(config)
+        _check_no_detector(config)
         return None
     check_device(config)
     _check_fallback(config)
     if is_plain(config):
         return None
-    detector = choose_detector(one.kind, one.options, config)
+    detector = build_detector(one.kind, one.options, config)
     if one.fallback:
         from vision_side.detect.remote.fallback import Fallback
 
-        detector = Fallback(detector, choose_detector(one.fallback, {}, config), max_pixels=config.max_pixels)
+        detector = Fallback(detector, build_detector(one.fallback, {}, config), max_pixels=config.max_pixels)
     detector = _narrowed(detector, config)
     if one.shadow:
-        from vision_side.detect.shadow import Shadowed
+        from vision_side.detect.shadow import ShadowDetector
 
-        second = _narrowed(choose_detector(one.shadow, one.shadow_options, config), config)
-        detector = Shadowed(detector, second, one.shadow, config.max_pixels, configured(config).goes_by)
+        second = _narrowed(build_detector(one.shadow, one.shadow_options, config), config)
+        detector = ShadowDetector(detector, second, one.shadow, config.max_pixels, configured_mission(config).goes_by)
     return detector
 
 
-def _check_no_eyes(config: VisionConfig) -> None:
+def _check_no_detector(config: VisionConfig) -> None:
     """Raise ConfigError for what only a detector of one's own can have."""
     one = config.detector
     given = ["device"] if one.device != "auto" else []
@@ -89,8 +89,8 @@ def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
         _check_labels(one.kind, one.labels, getattr(detector, "labels", ()))
         detector = LabelFilter(detector, one.labels)
     if one.only_colour:
-        detector = ColourFilter(detector, config.hsv.ranges)
-    return Tracked(detector) if one.tracked else detector
+        detector = ColorFilter(detector, config.hsv.ranges)
+    return TrackIds(detector) if one.tracked else detector
 
 
 def _check_labels(kind: str, wanted: Sequence[str], known: Sequence[str]) -> None:
@@ -102,23 +102,23 @@ def _check_labels(kind: str, wanted: Sequence[str], known: Sequence[str]) -> Non
             raise ConfigError(f"detector.labels: {kind} knows no {label!r}{hint}")
 
 
-def waits(config: VisionConfig) -> bool:
+def waits_for_service(config: VisionConfig) -> bool:
     """Whether one of the configured detectors waits for somebody else, so that others should not wait for it."""
     one = config.detector
     kinds = [kind for kind in (one.kind, one.fallback, one.shadow) if kind and kind != BOXES]
-    return any(getattr(FAMILY.load(split(kind)[0]), "waits", False) for kind in kinds)
+    return any(getattr(REGISTRY.load(split_kind(kind)[0]), "waits", False) for kind in kinds)
 
 
 def _check_fallback(config: VisionConfig) -> None:
     """Raise ConfigError for a fallback that may itself be late or gone."""
     kind = config.detector.fallback
-    if kind and getattr(FAMILY.load(split(kind)[0]), "waits", False):
+    if kind and getattr(REGISTRY.load(split_kind(kind)[0]), "waits", False):
         raise ConfigError(f"detector.fallback {kind!r} waits for somebody else, too; it has to look here, e.g. hsv")
 
 
-def check_looks(kind: str) -> None:
+def check_takes_pictures(kind: str) -> None:
     """Raise ConfigError for a detector that does not look at what it is given, where there is no robot to hear of."""
-    if kind != BOXES and getattr(FAMILY.load(split(kind)[0]), "only_hears", False):
+    if kind != BOXES and getattr(REGISTRY.load(split_kind(kind)[0]), "only_hears", False):
         raise ConfigError(f"detector {kind!r} hears what a service says of a robot's own frames, of which there are "
                           "none here; name what that service serves")
 
@@ -135,36 +135,36 @@ def check_device(config: VisionConfig) -> None:
 
 
 def _has_field(kind: str, field: str) -> bool:
-    settings = settings_model(FAMILY.load(split(kind)[0]))
+    settings = config_model(REGISTRY.load(split_kind(kind)[0]))
     return settings is not None and field in settings.model_fields
 
 
-def split(kind: str) -> tuple[str, str]:
+def split_kind(kind: str) -> tuple[str, str]:
     """A detector's name and its address; the name is all of it for `package.module:Name`."""
     name, _, rest = kind.partition(":")
-    if name not in FAMILY.names():
+    if name not in REGISTRY.names():
         return kind, ""
     return name, kind if rest.startswith("//") else rest
 
 
-def choose_detector(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Detector:
+def build_detector(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Detector:
     """The detector called `kind`, by itself.
 
     Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option, and
     HardwareError for a device that is not there.
     """
     plugin, settings = _checked(kind, options, config)
-    with plugin_does(f"{kind}, when it is made,"):
+    with plugin_guard(f"{kind}, when it is made,"):
         detector: Detector = plugin(settings)
     return detector
 
 
 def check_vision(config: VisionConfig) -> None:
     """Raise ConfigError for what can be known to be wrong with all that `config` names, before any of it is built."""
-    check_choices(config)
+    check_missions(config)
     one = config.detector
     if one.kind == BOXES:
-        _check_no_eyes(config)
+        _check_no_detector(config)
         return
     check_device(config)
     _check_fallback(config)
@@ -176,10 +176,10 @@ def check_vision(config: VisionConfig) -> None:
 def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) -> None:
     """Raise ConfigError for what can be known to be wrong before the detector is built: its name, options, model."""
     _, settings = _checked(kind, options, config)
-    if split(kind)[0] == "onnx":
-        from vision_side.detect.onnx_detector import read_model
+    if split_kind(kind)[0] == "onnx":
+        from vision_side.detect.onnx_detector import read_onnx_model
 
-        read_model(settings)
+        read_onnx_model(settings)
 
 
 def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tuple[Any, Any]:
@@ -187,9 +187,9 @@ def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tup
     if kind == BOXES:
         raise ConfigError(f"{BOXES!r} are what somebody else finds; here a detector is needed that looks itself, "
                           "e.g. hsv")
-    name, address = split(kind)
-    plugin = FAMILY.load(name)
-    settings = settings_model(plugin)
+    name, address = split_kind(kind)
+    plugin = REGISTRY.load(name)
+    settings = config_model(plugin)
     fields = settings.model_fields if settings else {}
     if address and "address" not in fields:
         raise ConfigError(f"detector {name!r} takes nothing after its name, not {address!r}")
@@ -198,7 +198,7 @@ def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tup
     given |= {"address": address} if address else {}
     if name in EXAMPLES and "address" not in {**given, **options}:
         raise ConfigError(f"detector {name!r}: say where and what, e.g. {EXAMPLES[name]}")
-    own = FAMILY.settings(name, plugin, given | dict(options), config)
+    own = REGISTRY.settings(name, plugin, given | dict(options), config)
     if not callable(getattr(plugin, "detect", None)):
         raise ConfigError(f"detector {kind!r}: the class has no method detect; see docs/detectors.md")
     return plugin, own

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision_side.detect.colour import codes_565, colours_565
+from vision_side.detect.colour import codes_565, colors_565
 
 Shares = NDArray[np.float32]
 """(..., 2): red and green shares."""
@@ -25,7 +25,7 @@ _MOVED: Final = 0.25  # of a sigma: as long as the cloud moved no further, its t
 _KERNEL: Final = np.ones((3, 3), np.uint8)
 
 
-class Chroma:
+class ColorModel:
     """The colour of one thing."""
 
     def __init__(self, bgr: NDArray[np.uint8]) -> None:
@@ -75,7 +75,7 @@ def _shares(bgr: NDArray[Any]) -> tuple[Shares, NDArray[np.bool_]]:
 @lru_cache(maxsize=1)
 def _code_shares() -> tuple[Shares, NDArray[np.bool_]]:
     """Those of every BGR565 code."""
-    return _shares(colours_565())
+    return _shares(colors_565())
 
 
 def _cloud(shares: Shares) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -28,11 +28,11 @@ class Region:
     origin_px: tuple[int, int]
 
 
-class ColourMask:
+class ColorMask:
     """Marks the configured colours."""
 
     def __init__(self, ranges: tuple[HsvRange, ...]) -> None:
-        self._table = colour_table(ranges)
+        self._table = color_table(ranges)
 
     def region(self, bgr: NDArray[np.uint8]) -> Region | None:
         """Where the colour is, speckle removed; None if nowhere."""
@@ -52,16 +52,16 @@ def codes_565(bgr: NDArray[np.uint8]) -> NDArray[np.uint16]:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
 
 
-def colours_565() -> NDArray[np.float64]:
+def colors_565() -> NDArray[np.float64]:
     """The colour (65536, 3) in the middle of each BGR565 code: blue, green, red, 0..255."""
     codes = np.arange(65536, dtype=np.uint32)
     blue, green, red = (codes & 31) * 8 + 3.5, (codes >> 5 & 63) * 4 + 1.5, (codes >> 11) * 8 + 3.5
     return np.stack([blue, green, red], axis=-1)
 
 
-def colour_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
+def color_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
     """255 for every BGR565 code whose colour is within one of `ranges`, 0 elsewhere; 65536 entries."""
-    bgr = (colours_565() / 255).astype(np.float32)[None]
+    bgr = (colors_565() / 255).astype(np.float32)[None]
     hue, saturation, value = cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV)[0].T
     inside = np.zeros(65536, bool)
     for one in ranges:

@@ -10,8 +10,8 @@ import numpy as np
 from protocol.errors import WireError
 from vision_side.config import HsvRange
 from vision_side.decode import Picture
-from vision_side.detect.around import Around
-from vision_side.detect.colour import colour_table
+from vision_side.detect.around import DetectorWrapper
+from vision_side.detect.colour import color_table
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
 
 LEAST_SHARE: Final = 0.3
@@ -20,12 +20,12 @@ _MIDDLE: Final = 0.6
 """The middle part of a box lies wholly on a ball, whose disc leaves the box's corners out."""
 
 
-class ColourFilter(Around):
+class ColorFilter(DetectorWrapper):
     """A detector that leaves out what another one finds in other colours."""
 
     def __init__(self, detector: Detector, ranges: tuple[HsvRange, ...]) -> None:
         super().__init__(detector)
-        self._table = colour_table(ranges)
+        self._table = color_table(ranges)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """What the other finds, less what has another colour; no answer where there is no picture to tell by."""

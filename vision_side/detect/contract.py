@@ -17,8 +17,8 @@ import numpy as np
 
 from protocol.messages import MAX_DETECTED_BOXES, FrameHeader
 from vision_side.decode import Decoder
-from vision_side.detect.around import PLUGIN_RAISES, close_detector
-from vision_side.detect.checking import beside_the_box
+from vision_side.detect.around import PLUGIN_ERRORS, close_detector
+from vision_side.detect.checking import annotation_problem
 from vision_side.detect.golden import difference
 from vision_side.detect.port import NO_DEADLINE, DetectFrame, DetectionResult, Detector
 
@@ -35,7 +35,7 @@ Make = Callable[[], Detector]
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class PromiseResult:
     """One promise: what it is called, what it says, and what is wrong; empty if it is kept."""
 
     name: str
@@ -53,7 +53,7 @@ class Times:
     p95_ms: float
 
 
-def check_detector(make: Make, seed: int = 1) -> list[Verdict]:
+def check_detector(make: Make, seed: int = 1) -> list[PromiseResult]:
     """Every promise in turn; `make` builds a detector that has seen nothing yet."""
     verdicts = []
     for check in _CHECKS:
@@ -61,11 +61,11 @@ def check_detector(make: Make, seed: int = 1) -> list[Verdict]:
         detector = make()
         try:
             wrong = check(detector, make, seed)
-        except PLUGIN_RAISES as error:  # it promised not to
+        except PLUGIN_ERRORS as error:  # it promised not to
             wrong = f"it raises {type(error).__name__}: {' '.join(str(error).split())}"[:160]
         finally:
             close_detector(detector)
-        verdicts.append(Verdict(check.__name__.removeprefix("_keeps_"), promise, wrong))
+        verdicts.append(PromiseResult(check.__name__.removeprefix("_keeps_"), promise, wrong))
     return verdicts
 
 
@@ -208,7 +208,7 @@ def _out_of_bounds(result: DetectionResult) -> str:
             return f"a box {one.x1_px:g}, {one.y1_px:g}, {one.x2_px:g}, {one.y2_px:g}"
         if not 0 <= one.score <= 1:
             return f"a score of {one.score:g}"
-        if wrong := beside_the_box(one):
+        if wrong := annotation_problem(one):
             return wrong
     return ""
 

@@ -25,7 +25,7 @@ def fit_circle(points: Outline) -> Fit:
     return _fit(_terms(points))[0]
 
 
-def round_part(outline: NDArray[Any], min_radius_px: float, max_roughness: float) -> tuple[Fit, Outline] | None:
+def fit_round_part(outline: NDArray[Any], min_radius_px: float, max_roughness: float) -> tuple[Fit, Outline] | None:
     """The circle of `outline` and the points on it, less what something in front cut off; None if it is not round.
 
     `max_roughness` bounds the RMS distance from the circle, in radii.

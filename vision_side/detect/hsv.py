@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from vision_side.config import HsvConfig
 from vision_side.decode import Picture
-from vision_side.detect.colour import ColourMask, Region
-from vision_side.detect.disc import Fit, Outline, round_part
+from vision_side.detect.colour import ColorMask, Region
+from vision_side.detect.disc import Fit, Outline, fit_round_part
 from vision_side.detect.edge import Box, sharp_outline
 from vision_side.detect.port import Circle, Detection
 
@@ -24,7 +24,7 @@ class HsvDetector:
     def __init__(self, config: HsvConfig, label: str = "target") -> None:
         self._config = config
         self._label = label
-        self._mask = ColourMask(config.ranges)
+        self._mask = ColorMask(config.ranges)
 
     def detect(self, picture: Picture) -> tuple[Detection, ...]:
         """What has the colour, and the shape if one is asked for, largest first."""
@@ -59,7 +59,7 @@ class HsvDetector:
         if sharp is not None:
             outline, box = sharp, cv2.boundingRect(sharp)
         edge = own_edge(outline, box, region.origin_px, picture.bgr.shape)
-        fit = round_part(edge, self._config.min_radius_px, self._config.max_roughness)
+        fit = fit_round_part(edge, self._config.min_radius_px, self._config.max_roughness)
         if fit is None or len(fit[1]) < self._config.min_outline_kept * len(edge):
             return None
         whose = (len(fit[1]) / len(outline), self._label)

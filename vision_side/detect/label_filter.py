@@ -3,17 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from vision_side.detect.around import Around
-from vision_side.detect.labels import COLOURED
+from vision_side.detect.around import DetectorWrapper
+from vision_side.detect.labels import COLOR_LABEL
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
 
 
-class LabelFilter(Around):
+class LabelFilter(DetectorWrapper):
     """A detector that leaves out what another one finds under other labels."""
 
     def __init__(self, detector: Detector, labels: tuple[str, ...]) -> None:
         super().__init__(detector)
-        self._labels = frozenset((*labels, COLOURED))
+        self._labels = frozenset((*labels, COLOR_LABEL))
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """What the other finds, less what is not meant."""

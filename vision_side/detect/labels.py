@@ -10,16 +10,16 @@ Label = Annotated[str, Field(min_length=1, max_length=LONGEST_LABEL)]
 """One that is configured."""
 
 
-COLOURED: Final = "target"
+COLOR_LABEL: Final = "target"
 """What the colour detectors call what they find, whatever it is. It always counts: one of them may be the fallback."""
 _NO_TARGETS: Final = ("legs", "light")
 """What other missions are for; a model that knows balls may know these too."""
 
 
-def may_be_followed(label: str, wanted: str) -> bool:
+def is_followable(label: str, wanted: str) -> bool:
     """Whether what is called `label` is followed: what is `wanted`, if anything is, and what has the target's colour;
     else all but lights and legs."""
-    return label in (wanted, COLOURED) if wanted else not label.startswith(_NO_TARGETS)
+    return label in (wanted, COLOR_LABEL) if wanted else not label.startswith(_NO_TARGETS)
 
 
 def is_label(text: str) -> bool:

@@ -7,8 +7,8 @@ from protocol.config import Config as Settings
 from protocol.messages import MAX_DETECTED_BOXES
 from vision_side.config import HsvConfig
 from vision_side.decode import Picture
-from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveEye
-from vision_side.detect.by_session import BySession
+from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveTracker
+from vision_side.detect.by_session import PerSession
 from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.labels import Label
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
@@ -46,7 +46,7 @@ class Adaptive:
     maker = Maker("adaptive", device=_CPU)
 
     def __init__(self, config: AdaptiveConfig) -> None:
-        self._eyes = BySession(lambda: AdaptiveEye(config))
+        self._eyes = PerSession(lambda: AdaptiveTracker(config))
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
         """A result for each; one takes two or three times as long as by plain colour, whatever the deadline."""

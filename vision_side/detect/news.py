@@ -3,15 +3,15 @@
 from collections import deque
 from typing import Final
 
-MAX_NEWS: Final = 16
+MAX_NOTICES: Final = 16
 """Lines kept for who asks for them seldom; the oldest go first."""
 
 
-class News:
+class Notices:
     """Lines for a person, until somebody takes them; may be added to on another thread."""
 
     def __init__(self) -> None:
-        self._lines: deque[str] = deque(maxlen=MAX_NEWS)
+        self._lines: deque[str] = deque(maxlen=MAX_NOTICES)
 
     def add(self, line: str) -> None:
         """One line."""

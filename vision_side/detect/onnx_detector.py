@@ -21,7 +21,14 @@ from vision_side.decode import Picture
 from vision_side.detect.golden import KEY, difference, golden_picture, read_golden
 from vision_side.detect.onnx_engine import Engine, open_engine
 from vision_side.detect.onnx_header import OnnxHeader, read_onnx_header
-from vision_side.detect.onnx_reading import Form, apart, fit_picture, form_of, own_labels, read_outputs
+from vision_side.detect.onnx_reading import (
+    ModelFormat,
+    split_batch,
+    fit_picture,
+    model_format,
+    own_labels,
+    read_outputs,
+)
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
 from vision_side.detect.refine import refined
 from vision_side.detect.timing import timed_together
@@ -59,7 +66,7 @@ class OnnxDetector:
 
     def __init__(self, config: Config) -> None:
         """Raises ConfigError for a file that is no such model, HardwareError for a device that is not there."""
-        model = read_model(config)
+        model = read_onnx_model(config)
         path, self._form, self._min_score = model.path, model.form, model.min_score
         self.labels = model.form.labels
         """All that it can call a thing; empty where the model has only numbers."""
@@ -116,7 +123,7 @@ class OnnxDetector:
         return [tuple(refined(picture, one) if one.label in self._refine else one for one in found)
                 for picture, found in zip(pictures, together, strict=True)]
 
-    def _warm_up(self, model: "Model", config: Config) -> None:
+    def _warm_up(self, model: "OnnxModel", config: Config) -> None:
         """Run warm, on the known picture, and compare: with what the model brought, or with itself on the CPU."""
         picture, path, expected = Picture(golden_picture(), 1), model.path, model.expected
         form, least = model.own_form, model.own_min_score
@@ -136,43 +143,43 @@ class OnnxDetector:
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
+class OnnxModel:
     """A model's file and what it says of itself."""
 
     path: Path
     header: OnnxHeader
-    form: Form
+    form: ModelFormat
     min_score: float
     expected: list[Detection] | None
     """What it should find in the known picture, if it says: by its own labels, from its own least score on."""
-    own_form: Form
+    own_form: ModelFormat
     own_min_score: float
     digest: str
 
 
-def read_model(config: OnnxDetector.Config) -> Model:
+def read_onnx_model(config: OnnxDetector.Config) -> OnnxModel:
     """The model, without running it. Raises ConfigError for a file that is none, or none of a form known here."""
     path = Path(config.address).expanduser() if config.address else SHIPPED
     data = _bytes_of(path)
     digest = hashlib.sha256(data).hexdigest()[:HASH_DIGITS]
     try:
         header = read_onnx_header(data)
-        form, least = form_of(header, config.names, config.colour), _least(config.min_score, header)
+        form, least = model_format(header, config.names, config.colour), _least(config.min_score, header)
         if KEY not in header.metadata:
-            return Model(path, header, form, least, None, form, _least(None, header), digest)
+            return OnnxModel(path, header, form, least, None, form, _least(None, header), digest)
         own = replace(form, labels=own_labels(header.metadata))
-        return Model(path, header, form, least, read_golden(header.metadata[KEY]), own, _least(None, header), digest)
+        return OnnxModel(path, header, form, least, read_golden(header.metadata[KEY]), own, _least(None, header), digest)
     except ValueError as error:
         raise ConfigError(f"model {path}: {error}; see docs/detectors.md") from None
 
 
-def _found(engine: Engine, pictures: Sequence[Picture], form: Form, min_score: float) -> list[tuple[Detection, ...]]:
+def _found(engine: Engine, pictures: Sequence[Picture], form: ModelFormat, min_score: float) -> list[tuple[Detection, ...]]:
     """In each picture; more than one only where form and engine take them."""
     fitted = [fit_picture(picture, form) for picture in pictures]
     if len(fitted) == 1:
         each = [engine.run(fitted[0][0])]
     else:
-        each = apart(engine.run(np.concatenate([pixels for pixels, _ in fitted])), len(pictures))
+        each = split_batch(engine.run(np.concatenate([pixels for pixels, _ in fitted])), len(pictures))
     return [read_outputs(outputs, form, fitting, picture, min_score)
             for outputs, (_, fitting), picture in zip(each, fitted, pictures, strict=True)]
 

@@ -31,7 +31,7 @@ _MAX_LABELS: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Fitting:
+class Letterbox:
     """Where the picture lies in the input: `scale` input pixels for each of its own, from (`left`, `top`)."""
 
     scale: float
@@ -40,7 +40,7 @@ class Fitting:
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class ModelFormat:
     """How one model takes and gives."""
 
     floats: bool
@@ -55,7 +55,7 @@ class Form:
     """Whether it takes several pictures at once: how many is left open, in what it takes and gives."""
 
 
-def form_of(header: OnnxHeader, names: Sequence[str], colour: str) -> Form:
+def model_format(header: OnnxHeader, names: Sequence[str], colour: str) -> ModelFormat:
     """Raises ValueError for a model that takes or gives something else."""
     if len(header.inputs) != 1:
         raise ValueError(f"it takes {len(header.inputs)} inputs; one picture is what there is")
@@ -72,7 +72,7 @@ def form_of(header: OnnxHeader, names: Sequence[str], colour: str) -> Form:
     labels = tuple(map(clean_label, names)) or own_labels(header.metadata)
     kind = _kind(header.outputs, labels)
     batched = size is not None and one.shape[0] is None and all(_is_for_several(one, kind) for one in header.outputs)
-    return Form(floats, floats if colour == "auto" else colour == "rgb", size, kind, labels, one.type, batched)
+    return ModelFormat(floats, floats if colour == "auto" else colour == "rgb", size, kind, labels, one.type, batched)
 
 
 def _is_for_several(output: Tensor, kind: str) -> bool:
@@ -117,7 +117,7 @@ def own_labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(clean_label(str(one)) for one in found)
 
 
-def fit_picture(picture: Picture, form: Form) -> tuple[NDArray[Any], Fitting]:
+def fit_picture(picture: Picture, form: ModelFormat) -> tuple[NDArray[Any], Letterbox]:
     """The input, the picture in its middle, and where it lies there."""
     bgr: NDArray[Any] = picture.bgr
     rows, columns = form.size or tuple(-(-one // _STEP_PX) * _STEP_PX for one in bgr.shape[:2])
@@ -132,14 +132,14 @@ def fit_picture(picture: Picture, form: Form) -> tuple[NDArray[Any], Fitting]:
     if form.rgb:
         bgr = bgr[..., ::-1]
     if not form.floats:
-        return np.ascontiguousarray(bgr)[None], Fitting(scale, left, top)
+        return np.ascontiguousarray(bgr)[None], Letterbox(scale, left, top)
     planes = np.ascontiguousarray(bgr.transpose(2, 0, 1), dtype=form.dtype)[None]
     planes /= 255
-    return planes, Fitting(scale, left, top)
+    return planes, Letterbox(scale, left, top)
 
 
 def read_outputs(
-    outputs: Arrays, form: Form, fitting: Fitting, picture: Picture, min_score: float
+    outputs: Arrays, form: ModelFormat, fitting: Letterbox, picture: Picture, min_score: float
 ) -> tuple[Detection, ...]:
     """What the model saw, surest first, in pixels of the encoded picture.
 
@@ -167,7 +167,7 @@ def read_outputs(
     return tuple(one for one in (clipped(one, width, height) for one in found) if one is not None)
 
 
-def apart(outputs: Arrays, count: int) -> list[dict[str, NDArray[Any]]]:
+def split_batch(outputs: Arrays, count: int) -> list[dict[str, NDArray[Any]]]:
     """The outputs for `count` pictures, for each by itself. Raises ValueError if there are not as many."""
     if any(one.shape[:1] != (count,) for one in outputs.values()):
         raise ValueError(f"outputs of {', '.join(str(one.shape) for one in outputs.values())} for {count} pictures")

@@ -14,7 +14,7 @@ Pictures of 1920x1080, decoded at half scale, are 1.6 MB each: 100 MB at most. A
 """
 
 
-class OwnDecoders:
+class DecoderPool:
     """Decoders of one thread."""
 
     def __init__(self, max_pixels: int) -> None:

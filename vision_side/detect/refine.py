@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision_side.decode import Picture
-from vision_side.detect.disc import Fit, Outline, round_part
+from vision_side.detect.disc import Fit, Outline, fit_round_part
 from vision_side.detect.edge import Box, blob_between
 from vision_side.detect.hsv import disc_detection, own_edge
 from vision_side.detect.port import Circle, Detection
@@ -70,7 +70,7 @@ def _disc(
         return None
     bounds = cv2.boundingRect(outline)
     edge = own_edge(outline, bounds, origin_px, shape)
-    fit = round_part(edge, _LEAST_RADIUS_PX, _ROUGHNESS)
+    fit = fit_round_part(edge, _LEAST_RADIUS_PX, _ROUGHNESS)
     return (bounds, *fit) if fit is not None and len(fit[1]) >= _LEAST_EDGE * len(edge) else None
 
 

@@ -14,12 +14,12 @@ from typing import Final
 
 from protocol.clock import monotonic_us
 from protocol.transports.link import Link
-from vision_side.detect.agreement import Agreement, GoesBy
-from vision_side.detect.around import attach_detector, close_detector, news_of
+from vision_side.detect.agreement import Agreement, LabelTest
+from vision_side.detect.around import attach_detector, close_detector, notices_of
 from vision_side.detect.by_session import MAX_ROBOTS
-from vision_side.detect.checking import checked
-from vision_side.detect.news import News
-from vision_side.detect.own_decoders import OwnDecoders
+from vision_side.detect.checking import validated
+from vision_side.detect.news import Notices
+from vision_side.detect.own_decoders import DecoderPool
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
 
 _PATIENCE_US: Final = 1_000_000
@@ -34,7 +34,7 @@ class _Pair:
     """What is known of one robot."""
 
     session: str
-    goes_by: GoesBy
+    goes_by: LabelTest
     """What its mission may go by."""
     agreement: Agreement = field(default_factory=Agreement)
     promoted: bool = False
@@ -52,11 +52,11 @@ class _Task:
     promoted: bool
 
 
-class Shadowed:
+class ShadowDetector:
     """A detector that drives, and one that could."""
 
     def __init__(
-        self, driving: Detector, shadow: Detector, name: str, max_pixels: int, goes_by: GoesBy = lambda _label: True
+        self, driving: Detector, shadow: Detector, name: str, max_pixels: int, goes_by: LabelTest = lambda _label: True
     ) -> None:
         """`goes_by` holds for each robot until `go_by` says what its mission may go by."""
         self._eyes = (driving, shadow)
@@ -64,8 +64,8 @@ class Shadowed:
         self._answered_us: list[int | None] = [None, None]
         self._name, self._goes_by = name, goes_by
         self._pairs: OrderedDict[str, _Pair] = OrderedDict()
-        self._decoders = OwnDecoders(max_pixels)
-        self._news = News()
+        self._decoders = DecoderPool(max_pixels)
+        self._news = Notices()
         self._tasks: OrderedDict[str, _Task] = OrderedDict()
         self._bell = threading.Condition()
         self._ending = False
@@ -106,7 +106,7 @@ class Shadowed:
             pair.agreement, pair.answered = Agreement(), False
         return ""
 
-    def go_by(self, robot: str, goes_by: GoesBy) -> None:
+    def go_by(self, robot: str, goes_by: LabelTest) -> None:
         """What the robot's mission may go by: the two are compared by that. Counting begins anew where it changes."""
         pair = self._pairs.get(robot)
         if pair is not None and pair.goes_by != goes_by:
@@ -123,7 +123,7 @@ class Shadowed:
 
     def news(self) -> list[str]:
         """Where the two disagree, at most every few seconds, and what both have to say."""
-        return [*(line for eye in self._eyes for line in news_of(eye)), *self._news.take()]
+        return [*(line for eye in self._eyes for line in notices_of(eye)), *self._news.take()]
 
     def close(self) -> None:
         """End the thread, then close both."""
@@ -194,7 +194,7 @@ class Shadowed:
         answer = None
         try:
             given = self._ask(not task.promoted, [frame], monotonic_us() + _PATIENCE_US)[0]
-            answer = given and checked(frame, given)
+            answer = given and validated(frame, given)
         finally:
             if pair.promoted is task.promoted:
                 pair.answered = answer is not None

@@ -40,7 +40,7 @@ def timed(
     return timed_together([frame], maker, lambda pictures: [look(one) for one in pictures])[0]
 
 
-class Clocked:
+class TimedDetector:
     """A detector of one picture, and how long it looked the last time; None before the first."""
 
     def __init__(self, inner: PictureDetector) -> None:

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from vision_side.detect.around import Around
-from vision_side.detect.by_session import BySession
+from vision_side.detect.around import DetectorWrapper
+from vision_side.detect.by_session import PerSession
 from vision_side.detect.overlap import corners, overlap
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
 
@@ -27,12 +27,12 @@ class _Track:
     t_us: int
 
 
-class Tracked(Around):
+class TrackIds(DetectorWrapper):
     """A detector whose detections carry ids."""
 
     def __init__(self, detector: Detector) -> None:
         super().__init__(detector)
-        self._memories = BySession(_Memory)
+        self._memories = PerSession(_Memory)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """What the other finds, with ids."""

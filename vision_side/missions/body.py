@@ -12,7 +12,7 @@ from vision_side.missions.ranging import Points
 _STILL_MPS = 1e-6
 
 
-class Body(Config):
+class Footprint(Config):
     """A rectangle about the axle's midpoint: the Thymio's, if nothing else is said."""
 
     front_m: Annotated[float, Field(ge=0, le=2)] = 0.08
@@ -38,7 +38,7 @@ def braking_mps(room_m: float, delay_s: float, brake_mps2: float) -> float:
     return math.sqrt(lost * lost + 2 * brake_mps2 * room_m) - lost
 
 
-def clear_of(points: Points, body: Body, twist: tuple[float, float], keep_m: float, brake_mps2: float) -> float:
+def clear_of(points: Points, body: Footprint, twist: tuple[float, float], keep_m: float, brake_mps2: float) -> float:
     """The part (0..1) of `twist` that lets the robot come no nearer than `keep_m` to any of `points`.
 
     Speed towards a point is what counts: along a wall and away from it the robot may go as it likes.

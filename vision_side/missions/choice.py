@@ -13,9 +13,9 @@ from protocol.errors import ConfigError
 from protocol.messages import CameraModel
 from protocol.mission_messages import MissionRequest
 from vision_side.config import TargetConfig, VisionConfig
-from vision_side.detect.labels import may_be_followed
+from vision_side.detect.labels import is_followable
 from vision_side.missions.port import Mission
-from vision_side.plugin_choice import Family, settings_model
+from vision_side.plugin_choice import PluginRegistry, config_model
 
 BUILT_IN: Final = {
     "follow": "vision_side.missions.follow:Follow",
@@ -31,11 +31,11 @@ BUILT_IN: Final = {
 }
 """Here and not as entry points, so that a checkout that nobody installed has them too."""
 GROUP: Final = "sightline.missions"
-FAMILY: Final = Family("mission", BUILT_IN, GROUP)
+REGISTRY: Final = PluginRegistry("mission", BUILT_IN, GROUP)
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class MissionSpec:
     """A mission that can be built, as often as is needed: for each session of the robot anew."""
 
     name: str
@@ -57,7 +57,7 @@ class Chosen:
         own, target = getattr(self.config, "label", None), getattr(self.config, "target", None)
         if isinstance(own, str):
             return own in ("", label)
-        return may_be_followed(label, target.label) if isinstance(target, TargetConfig) else True
+        return is_followable(label, target.label) if isinstance(target, TargetConfig) else True
 
     def build(self, camera: CameraModel) -> Mission:
         """A new one, that knows nothing yet."""
@@ -65,9 +65,9 @@ class Chosen:
         return mission
 
 
-def configured(config: VisionConfig) -> Chosen:
+def configured_mission(config: VisionConfig) -> MissionSpec:
     """The mission of `config.mission`. Raises ConfigError as `choose` does."""
-    return choose(config.mission.kind, _own_options(config.mission.kind, config), config)
+    return mission_spec(config.mission.kind, _own_options(config.mission.kind, config), config)
 
 
 def _own_options(kind: str, config: VisionConfig) -> dict[str, Any]:
@@ -76,17 +76,17 @@ def _own_options(kind: str, config: VisionConfig) -> dict[str, Any]:
     return {**config.missions.get(kind, {}), **own}
 
 
-def check_choices(config: VisionConfig) -> None:
+def check_missions(config: VisionConfig) -> None:
     """Raise ConfigError, one line, for what is wrong with the configured mission, or with the options that others have
     for when somebody asks for them: their waypoints come with the request."""
-    configured(config)
+    configured_mission(config)
     for kind, options in config.missions.items():
-        settings = settings_model(FAMILY.load(kind))
+        settings = config_model(REGISTRY.load(kind))
         missing = {"waypoints": [(0.0, 0.0)]} if settings and "waypoints" in settings.model_fields else {}
-        choose(kind, {**missing, **options}, config)
+        mission_spec(kind, {**missing, **options}, config)
 
 
-def requested(request: MissionRequest, config: VisionConfig) -> Chosen:
+def requested_mission(request: MissionRequest, config: VisionConfig) -> MissionSpec:
     """The mission that somebody asked for: its options over those that `config` has for the same one.
 
     Raises ConfigError for an unknown one or a wrong option.
@@ -98,7 +98,7 @@ def requested(request: MissionRequest, config: VisionConfig) -> Chosen:
         _lay(options, name.split("."), value)
     if request.waypoints:
         options["waypoints"] = request.waypoints
-    return choose(request.name, options, config)
+    return mission_spec(request.name, options, config)
 
 
 def _lay(options: dict[str, Any], path: list[str], value: Any) -> None:
@@ -109,10 +109,10 @@ def _lay(options: dict[str, Any], path: list[str], value: Any) -> None:
     options[path[-1]] = value
 
 
-def choose(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Chosen:
+def mission_spec(kind: str, options: Mapping[str, Any], config: VisionConfig) -> MissionSpec:
     """The mission called `kind` with its checked configuration.
 
     Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option.
     """
-    plugin = FAMILY.load(kind)
-    return Chosen(kind, plugin, FAMILY.settings(kind, plugin, options, config))
+    plugin = REGISTRY.load(kind)
+    return MissionSpec(kind, plugin, REGISTRY.settings(kind, plugin, options, config))

@@ -7,29 +7,29 @@ from dataclasses import replace
 from typing import Final
 
 from protocol.messages import STILL, CameraModel
-from vision_side.detect.around import PLUGIN_RAISES
-from vision_side.missions.choice import Chosen
+from vision_side.detect.around import PLUGIN_ERRORS
+from vision_side.missions.choice import MissionSpec
 from vision_side.missions.port import Plan, View
 
 SETTLE_S: Final = 1.0
 """A robot that still moves after this long is not moved by us; the new mission begins all the same."""
 STILL_MPS: Final = 0.01
 STILL_RAD_S: Final = 0.03
-MAX_ASKED: Final = 1000.0
+MAX_COMMAND: Final = 1000.0
 """m/s and rad/s; beyond it a mission computes nonsense, and its text might not fit a twist's 64 bytes."""
 
 
-class Duty:
+class MissionSwitch:
     """What is to be done. `step` always answers, whatever a mission does."""
 
-    def __init__(self, chosen: Chosen, camera: CameraModel) -> None:
+    def __init__(self, chosen: MissionSpec, camera: CameraModel) -> None:
         self.chosen = chosen
         """The newest chosen, also while the robot still comes to rest for it."""
         self._switching = False
         self._waited_s = 0.0
         self._begin(camera)
 
-    def switch(self, chosen: Chosen) -> None:
+    def switch(self, chosen: MissionSpec) -> None:
         """From the next frame on come to rest, then carry out `chosen`."""
         self.chosen, self._switching, self._waited_s = chosen, True, 0.0
 
@@ -58,15 +58,15 @@ class Duty:
         self._over: Plan | None = None
         try:
             self._mission = self.chosen.build(camera)
-        except PLUGIN_RAISES as error:
+        except PLUGIN_ERRORS as error:
             self._over = _failed(error)
 
     def _checked(self, view: View) -> Plan:
         try:
             plan = self._mission.step(view)
-            if max(abs(plan.twist.linear_mps), abs(plan.twist.angular_rad_s)) > MAX_ASKED:
+            if max(abs(plan.twist.linear_mps), abs(plan.twist.angular_rad_s)) > MAX_COMMAND:
                 raise ValueError(f"asks for {plan.twist.linear_mps:g} m/s, {plan.twist.angular_rad_s:g} rad/s")
-        except PLUGIN_RAISES as error:  # vision goes on, the robot stands still
+        except PLUGIN_ERRORS as error:  # vision goes on, the robot stands still
             plan = _failed(error)
         if plan.done:
             self._over = plan = replace(plan, twist=STILL, target=None)

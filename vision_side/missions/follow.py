@@ -10,12 +10,12 @@ from protocol.config import Config as Settings
 from protocol.messages import STILL, CameraModel, FrameHeader, Pose, Twist
 from vision_side.config import BoxesConfig, LatencyConfig, SearchConfig, SteerConfig, TargetConfig, TrackConfig
 from vision_side.detect.boxes import locate_box
-from vision_side.detect.labels import may_be_followed
+from vision_side.detect.labels import is_followable
 from vision_side.detect.port import Detection
-from vision_side.foretell import Foretelling, Motion
+from vision_side.foretell import MotionPredictor, Motion
 from vision_side.missions.port import Plan, View
 from vision_side.search import Search
-from vision_side.sphere import Sighting, locate
+from vision_side.sphere import Sighting, locate_sphere
 from vision_side.steer import Aim, Steer
 from vision_side.track import Target, Track, from_odometry
 
@@ -42,7 +42,7 @@ class Follow:
         self._track = Track(config.track)
         self._steer = Steer(config.steer, config.target.stand_off_m)
         self._search = Search(config.search)
-        self._foretelling = Foretelling(config.latency)
+        self._foretelling = MotionPredictor(config.latency)
 
     def step(self, view: View) -> Plan:
         """The plan for one frame."""
@@ -66,7 +66,7 @@ class Follow:
         otherwise_m, sizes = self._expected_m(view.header.pose), self._config.boxes
         return [
             locate_box(one, self._camera, sizes, otherwise_m) if self._is_box(one, view)
-            else locate(one, self._camera, self._config.target.radius_m)
+            else locate_sphere(one, self._camera, self._config.target.radius_m)
             for one in view.detections if self._is_meant(one, view)
         ]
 
@@ -79,7 +79,7 @@ class Follow:
     def _is_meant(self, one: Detection, view: View) -> bool:
         """By its label. Somebody else's boxes were chosen when they came."""
         label = self._config.target.label
-        return (view.picture is None and not label) or may_be_followed(one.label, label)
+        return (view.picture is None and not label) or is_followable(one.label, label)
 
     def _sightings(self, places: list[Sighting | None]) -> list[Sighting]:
         target = self._config.target

@@ -13,7 +13,7 @@ _DETOUR_M, _MAX_DETOURS = 0.3, 8
 _APPLIED = 1e-3
 
 
-class PatienceConfig(Config):
+class ProgressCheckerConfig(Config):
     """How long to wait before giving up."""
 
     closed_s: Annotated[float, Field(ge=0, le=60)] = 1.5
@@ -22,10 +22,10 @@ class PatienceConfig(Config):
     """Driving this long without coming nearer by the known way, and without anything new seen, is going round."""
 
 
-class Patience:
+class ProgressChecker:
     """Counts the time that brought nothing."""
 
-    def __init__(self, config: PatienceConfig) -> None:
+    def __init__(self, config: ProgressCheckerConfig) -> None:
         self._config = config
         self.start_again()
 

@@ -14,13 +14,13 @@ from pydantic import Field
 from protocol.config import Config
 from protocol.messages import STILL, CameraModel, Pose, Twist
 from vision_side.config import LatencyConfig
-from vision_side.foretell import Foretelling, Motion
-from vision_side.missions.body import Body, braking_mps, clear_of
-from vision_side.missions.giving_up import Patience, PatienceConfig
-from vision_side.missions.ground import CELL_M, Ground
+from vision_side.foretell import MotionPredictor, Motion
+from vision_side.missions.body import Footprint, braking_mps, clear_of
+from vision_side.missions.giving_up import ProgressChecker, ProgressCheckerConfig
+from vision_side.missions.ground import CELL_M, Costmap
 from vision_side.missions.port import Plan, RangeScan, View
 from vision_side.missions.ranging import PoseMemory, about_robot, echoes, in_odometry
-from vision_side.missions.route import Point, Route
+from vision_side.missions.route import Point, Planner
 from vision_side.track import to_odometry
 
 Metres = Annotated[float, Field(ge=-100, le=100)]
@@ -41,7 +41,7 @@ class GotoConfig(Config):
 
     waypoints: Annotated[tuple[tuple[Metres, Metres], ...], Field(min_length=1, max_length=64)]
     """(x, y) in the odometry frame, one after the other."""
-    body: Body = Body()
+    body: Footprint = Footprint()
     sensor_x_m: Annotated[float, Field(ge=-2, le=2)] = 0.0
     """Where the scan's rays start, forward of the axle."""
     sight_m: Annotated[float, Field(gt=0, le=50)] = 0.2
@@ -60,7 +60,7 @@ class GotoConfig(Config):
     creep_mps: Annotated[float, Field(gt=0, le=1)] = 0.1
     """For backing out, and where the delay leaves no faster."""
     max_scan_age_s: Annotated[float, Field(gt=0, le=2)] = 0.4
-    patience: PatienceConfig = PatienceConfig()
+    patience: ProgressCheckerConfig = ProgressCheckerConfig()
     latency: LatencyConfig = LatencyConfig()
 
 
@@ -74,12 +74,12 @@ class Goto:
     def __init__(self, config: GotoConfig, camera: CameraModel) -> None:  # noqa: ARG002  every mission is given it
         self._config = config
         self._keep_m = config.body.radius_m + config.clearance_m
-        self._ground = Ground()
+        self._ground = Costmap()
         self._poses = PoseMemory()
-        self._foretelling = Foretelling(config.latency)
-        self._patience = Patience(config.patience)
+        self._foretelling = MotionPredictor(config.latency)
+        self._patience = ProgressChecker(config.patience)
         self._reached = 0
-        self._route: Route | None = None
+        self._route: Planner | None = None
         self._planned = -1
         self._scan: RangeScan | None = None
         self._carrot: Point | None = None
@@ -170,7 +170,7 @@ class Goto:
         header = view.header
         return self._foretelling.motion(header.t_us, header.pose, header.moving, header.applied)
 
-    def _chosen(self, route: Route, robot: Point, carrot: Point, left_m: float) -> Point:
+    def _chosen(self, route: Planner, robot: Point, carrot: Point, left_m: float) -> Point:
         """`carrot`, or the one before it where the way over that, on the other side, is hardly longer."""
         old = self._carrot
         if old is None or math.dist(robot, old) < self._config.clearance_m or not route.sees(robot, old):
@@ -180,15 +180,15 @@ class Goto:
             return carrot
         return old if math.dist(robot, old) + route.left_from(old) < left_m + _SIDE_M else carrot
 
-    def _plan(self, robot: Point) -> Route:
+    def _plan(self, robot: Point) -> Planner:
         route = self._route
         if route is None or self._planned != self._ground.version or not route.covers(robot):
-            route = self._route = Route(self._ground.cells(), robot, self._goal(), self._keep_m,
+            route = self._route = Planner(self._ground.cells(), robot, self._goal(), self._keep_m,
                                         self._keep_m + _ROOMY_M)
             self._planned = self._ground.version
         return route
 
-    def _drive(self, view: View, route: Route, carrot: Point) -> Plan:
+    def _drive(self, view: View, route: Planner, carrot: Point) -> Plan:
         header, config, then = view.header, self._config, self._then(view)
         bearing_rad = _bearing(then.pose, carrot)
         room = self._room(then) if abs(bearing_rad) > _TURN_RAD else None

@@ -21,7 +21,7 @@ _SHY_CELLS = 2.5  # a ray says nothing of the cells this near to its echo: a wal
 _PROGRESS_CELL_M = 0.12  # something new was learned when a cell of this size is seen filled for the first time
 
 
-class Ground:
+class Costmap:
     """Cells that something stands in. `version` changes whenever one comes or goes."""
 
     def __init__(self) -> None:

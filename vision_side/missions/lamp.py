@@ -16,7 +16,7 @@ from pydantic import Field
 from protocol.config import Config
 from vision_side.config import Fraction, HsvRange
 from vision_side.decode import Picture
-from vision_side.detect.colour import colour_table
+from vision_side.detect.colour import color_table
 from vision_side.detect.edge import sharp_outline
 from vision_side.detect.port import Detection
 
@@ -67,13 +67,13 @@ class Light:
     box: Detection
 
 
-class HousingReader:
+class HousingLightReader:
     """Lights with three lamps in a dark housing."""
 
     def __init__(self, config: LampConfig) -> None:
         self._config = config
         self._ranges = _ranges(config)
-        self._lit = colour_table(tuple(self._ranges.values()))
+        self._lit = color_table(tuple(self._ranges.values()))
 
     def read(self, picture: Picture, not_these: Iterable[Detection] = ()) -> list[Light]:  # noqa: ARG002
         """Every housing in view, largest first; the colour is unknown where place and hue do not agree."""
@@ -155,12 +155,12 @@ class HousingReader:
         return float(level[brightest].mean()), colours[brightest].mean(axis=0)
 
 
-class BoxReader:
+class BoxLightReader:
     """Lights that are one box, which changes its colour as a whole."""
 
     def __init__(self, config: LampConfig) -> None:
         self._config = config
-        self._tables = {name: colour_table((one,)) for name, one in _ranges(config).items()}
+        self._tables = {name: color_table((one,)) for name, one in _ranges(config).items()}
 
     def read(self, picture: Picture, not_these: Iterable[Detection] = ()) -> list[Light]:
         """Every box of one of the three colours, largest first, but for `not_these`."""

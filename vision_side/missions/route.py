@@ -28,7 +28,7 @@ _NEAREST_CELLS = 6  # steering for a nearer point than this is weaving
 _TRIED_EVERY = 3  # of the way's cells, which are looked at for a straight line to them
 
 
-class Route:
+class Planner:
     """One plan, good for any place of the robot until `ground` changes.
 
     `keep_m`: how far from a filled cell's middle the robot's own middle has to stay; `roomy_m`: how far it does where

@@ -16,8 +16,8 @@ from protocol.messages import STILL, CameraModel, Pose, Twist
 from vision_side.config import BoxesConfig, LatencyConfig
 from vision_side.detect.boxes import locate_box
 from vision_side.detect.port import Detection
-from vision_side.foretell import Foretelling, Motion
-from vision_side.missions.lamp import UNKNOWN, BoxReader, HousingReader, LampConfig, Light
+from vision_side.foretell import MotionPredictor, Motion
+from vision_side.missions.lamp import UNKNOWN, BoxLightReader, HousingLightReader, LampConfig, Light
 from vision_side.missions.lane import Lane, LaneConfig, Line
 from vision_side.missions.port import Plan, View
 from vision_side.missions.stop_line import StopConfig, StopLine
@@ -52,13 +52,13 @@ class TrafficLight:
     """Three lamps in a housing."""
 
     Config = TrafficLightConfig
-    reader: ClassVar[type[HousingReader] | type[BoxReader]] = HousingReader
+    reader: ClassVar[type[HousingLightReader] | type[BoxLightReader]] = HousingLightReader
 
     def __init__(self, config: TrafficLightConfig, camera: CameraModel) -> None:
         self._config, self._camera = config, camera
         self._reader = self.reader(config.lamp)
         self._lane = Lane(config.lane)
-        self._foretelling = Foretelling(config.latency)
+        self._foretelling = MotionPredictor(config.latency)
         self._light: Place | None = None
         self._sure = 0.0
         self._stop = StopLine(config.stop)
@@ -130,7 +130,7 @@ class TrafficLight:
 
     def _light_place(self, one: Light, pose: Pose) -> Place | None:
         """Its middle: what is measured is the face towards the robot, half its depth nearer."""
-        lamp, is_box = self._config.lamp, self.reader is BoxReader
+        lamp, is_box = self._config.lamp, self.reader is BoxLightReader
         height_m = lamp.box_height_m if is_box else lamp.housing_height_m
         depth_m = lamp.box_depth_m if is_box else lamp.housing_depth_m
         seen_m = height_m + depth_m * self._underside(one.box)
@@ -208,7 +208,7 @@ class TrafficLight:
 class TrafficLightBoxes(TrafficLight):
     """A whole box that changes its colour. The lane's blocks must have another colour."""
 
-    reader = BoxReader
+    reader = BoxLightReader
 
 
 def _inside(one: Detection, box: Detection) -> bool:

@@ -10,7 +10,7 @@ from protocol.clock import monotonic_us
 from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
-from vision_side.detect.remote.refusing import NoAnswerError, Reason, Tally
+from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason, ErrorCounters
 
 REMOTE: Final = "remote"
 """What a result was made on, where the server does not say."""
@@ -19,7 +19,7 @@ LONGEST_WAIT_S: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ServerAnswer:
     """What a server said of one frame, checked, and who said it."""
 
     detections: tuple[Detection, ...]
@@ -29,7 +29,7 @@ class Answer:
 class Server(Protocol):
     """How one kind of server is asked."""
 
-    def ask(self, frame: DetectFrame, until_us: int) -> Answer:
+    def ask(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
         """Its answer; blocks until about `until_us`. Raises NoAnswerError for everything else."""
         ...
 
@@ -42,7 +42,7 @@ class FrameByFrame(ABC):
     """A `Detector` that asks elsewhere about one frame after the other, and counts what it refused."""
 
     def __init__(self, name: str) -> None:
-        self._tally = Tally(name)
+        self._tally = ErrorCounters(name)
 
     @property
     def refused(self) -> Counter[str]:
@@ -71,7 +71,7 @@ class FrameByFrame(ABC):
         return self._tally.news.take()
 
 
-class Asking(FrameByFrame):
+class ServerDetector(FrameByFrame):
     """Over one server. It may block for longer than the deadline: see `ByDeadline` for who must not."""
 
     def __init__(self, name: str, server: Server) -> None:
@@ -88,10 +88,10 @@ class Asking(FrameByFrame):
         try:
             answer = self._server.ask(frame, deadline_us)
         except WireError as error:  # of pixels that were asked for
-            raise NoAnswerError(Reason.BAD_PICTURE, error.detail) from None
+            raise NoAnswerError(NoAnswerReason.BAD_PICTURE, error.detail) from None
         ended_us = monotonic_us()
         if ended_us > deadline_us:
-            raise NoAnswerError(Reason.LATE, f"{(ended_us - deadline_us) / 1000:.0f} ms after the deadline")
+            raise NoAnswerError(NoAnswerReason.LATE, f"{(ended_us - deadline_us) / 1000:.0f} ms after the deadline")
         return result_of(frame, answer.detections, answer.maker, ended_us - began_us)
 
 
@@ -100,11 +100,11 @@ def _check_picture(frame: DetectFrame) -> None:
     try:
         size = read_jpeg_size(frame.jpeg, frame.width_px * frame.height_px)
     except WireError as error:
-        raise NoAnswerError(Reason.BAD_PICTURE, error.detail) from None
+        raise NoAnswerError(NoAnswerReason.BAD_PICTURE, error.detail) from None
     if (size.width_px, size.height_px) != (frame.width_px, frame.height_px):
-        raise NoAnswerError(Reason.BAD_PICTURE, f"the frame is {size.width_px}x{size.height_px}")
+        raise NoAnswerError(NoAnswerReason.BAD_PICTURE, f"the frame is {size.width_px}x{size.height_px}")
 
 
-def left_s(until_us: int) -> float:
+def seconds_left(until_us: int) -> float:
     """What is left until then, 0 if nothing is; bounded for who has no deadline."""
     return min(max(0, until_us - monotonic_us()) / 1e6, LONGEST_WAIT_S)

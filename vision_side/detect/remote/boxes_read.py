@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from protocol.messages import MAX_DETECTED_BOXES, DetectedBox
 from vision_side.detect.labels import clean_label
 from vision_side.detect.port import Circle, Detection, clipped
-from vision_side.detect.remote.refusing import NoAnswerError, Reason
+from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 MAX_ROWS: Final = 1024
 """Security limit: a model with a fixed number of rows fills up with scores of 0; more than this is no detector's."""
@@ -31,7 +31,7 @@ def read_columns(
     """
     _check_shapes(boxes, scores, labels)
     if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
-        raise NoAnswerError(Reason.NOT_FINITE, "a box or score is nan or infinite")
+        raise NoAnswerError(NoAnswerReason.NOT_FINITE, "a box or score is nan or infinite")
     order = [int(row) for row in np.argsort(-scores, kind="stable") if scores[row] >= min_score]
     found = [_detection(boxes[row], float(scores[row]), labels[row], stretch, size_px) for row in order]
     return tuple(one for one in found if one)[:MAX_DETECTED_BOXES]
@@ -41,9 +41,9 @@ def _check_shapes(boxes: Numbers, scores: Numbers, labels: Sequence[str]) -> Non
     rows = len(scores) if scores.ndim == 1 else -1
     if boxes.ndim != 2 or boxes.shape[1] != 4 or boxes.shape[0] != rows or len(labels) != rows:
         got = f"boxes {boxes.shape}, scores {scores.shape}, {len(labels)} labels"
-        raise NoAnswerError(Reason.MALFORMED, f"{got}; expected (K, 4), (K,) and K")
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{got}; expected (K, 4), (K,) and K")
     if rows > MAX_ROWS:
-        raise NoAnswerError(Reason.TOO_MANY, f"{rows} boxes, at most {MAX_ROWS}")
+        raise NoAnswerError(NoAnswerReason.TOO_MANY, f"{rows} boxes, at most {MAX_ROWS}")
 
 
 def _detection(
@@ -54,7 +54,7 @@ def _detection(
     x1, y1, x2, y2 = (float(value) for value in box)
     if x2 < x1 or y2 < y1 or score > 1:
         corners = f"{x1:g} {y1:g} {x2:g} {y2:g}"
-        raise NoAnswerError(Reason.MALFORMED, f"a box inside out or a score over 1: {corners}, {score:g}")
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"a box inside out or a score over 1: {corners}, {score:g}")
     one = Detection(x1 * across, y1 * down, x2 * across, y2 * down, score, clean_label(label))
     return clipped(one, *size_px)
 

@@ -14,12 +14,12 @@ from pydantic import Field
 from protocol.clock import monotonic_us
 from protocol.errors import SightlineError
 from protocol.transports.link import LatestSlot, Link
-from vision_side.detect.around import attach_detector, close_detector, news_of
-from vision_side.detect.checking import SILENT, asked
-from vision_side.detect.news import News
-from vision_side.detect.own_decoders import OwnDecoders
+from vision_side.detect.around import attach_detector, close_detector, notices_of
+from vision_side.detect.checking import NO_ANSWER_IN_TIME, checked_results
+from vision_side.detect.news import Notices
+from vision_side.detect.own_decoders import DecoderPool
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
-from vision_side.detect.remote.asking import LONGEST_WAIT_S, left_s
+from vision_side.detect.remote.asking import LONGEST_WAIT_S, seconds_left
 
 Results = list[DetectionResult | None]
 PixelBound = Annotated[int, Field(ge=256, le=4096 * 4096)]
@@ -44,7 +44,7 @@ class Pending:
 
     def take(self, wait: bool) -> Results | None:
         """The results, once; None if they are not there, with `wait` by the deadline."""
-        return self._place.take(left_s(self.deadline_us) if wait else 0.0)
+        return self._place.take(seconds_left(self.deadline_us) if wait else 0.0)
 
     @property
     def over(self) -> bool:
@@ -52,7 +52,7 @@ class Pending:
         return monotonic_us() > self.deadline_us
 
 
-class ByDeadline:
+class DeadlineDetector:
     """A `Detector` over another one, which is used on one thread only and closed there."""
 
     waits: ClassVar[bool] = True
@@ -60,9 +60,9 @@ class ByDeadline:
     def __init__(self, inner: Detector, max_pixels: int = MAX_PIXELS) -> None:
         """Security limit: pictures of more than `max_pixels` are not decoded."""
         self._inner = inner
-        self._decoders = OwnDecoders(max_pixels)
+        self._decoders = DecoderPool(max_pixels)
         self._failed: Counter[str] = Counter()
-        self._news = News()
+        self._news = Notices()
         self._asked: LatestSlot[Pending | None] = LatestSlot()
         self._ending = threading.Event()
         self._ended_by: SightlineError | None = None
@@ -96,7 +96,7 @@ class ByDeadline:
 
     def news(self) -> list[str]:
         """What the inner one has to say, and that it failed."""
-        return [*news_of(self._inner), *self._news.take()]
+        return [*notices_of(self._inner), *self._news.take()]
 
     def close(self) -> None:
         """End the thread; one that hangs is left behind. Raises ConfigError if the inner one's `close` fails."""
@@ -122,9 +122,9 @@ class ByDeadline:
 
     def _answer(self, pending: Pending) -> None:
         frames = [self._decoders.again(one, at) for at, one in enumerate(pending.frames)]
-        results = asked(self._inner, frames, pending.deadline_us, monotonic_us)
+        results = checked_results(self._inner, frames, pending.deadline_us, monotonic_us)
         for why in results:
-            if isinstance(why, str) and why is not SILENT:
+            if isinstance(why, str) and why is not NO_ANSWER_IN_TIME:
                 self._fail(why)
         if not pending.over:
             pending.answer([None if isinstance(one, str) else one for one in results])

@@ -11,11 +11,11 @@ from typing import Final, Protocol, runtime_checkable
 
 from protocol.clock import monotonic_us
 from protocol.transports.link import Link
-from vision_side.detect.around import attach_detector, close_detector, news_of
+from vision_side.detect.around import attach_detector, close_detector, notices_of
 from vision_side.detect.by_session import MAX_ROBOTS
-from vision_side.detect.news import News
+from vision_side.detect.news import Notices
 from vision_side.detect.port import DetectFrame, DetectionResult, Detector
-from vision_side.detect.remote.by_deadline import MAX_PIXELS, ByDeadline
+from vision_side.detect.remote.by_deadline import MAX_PIXELS, DeadlineDetector
 
 GOOD_ANSWERS: Final = 10
 """In a row; a third of a second at 30 fps."""
@@ -24,7 +24,7 @@ RESERVE_US: Final = 20_000
 Results = list[DetectionResult | None]
 
 
-class Asked(Protocol):
+class PendingAnswer(Protocol):
     """What was asked and may be answered."""
 
     begun: bool
@@ -44,7 +44,7 @@ class Asked(Protocol):
 class Remote(Detector, Protocol):
     """A detector that can be asked without waiting, such as `ByDeadline`."""
 
-    def ask(self, frames: Sequence[DetectFrame], deadline_us: int) -> Asked:
+    def ask(self, frames: Sequence[DetectFrame], deadline_us: int) -> PendingAnswer:
         """Begin to ask about `frames`."""
         ...
 
@@ -56,13 +56,13 @@ class Fallback:
         self, first: Detector, second: Detector, good_answers: int = GOOD_ANSWERS, max_pixels: int = MAX_PIXELS
     ) -> None:
         """A `first` that cannot be asked without waiting is asked on a thread of its own, about up to `max_pixels`."""
-        self._first: Remote = first if isinstance(first, Remote) else ByDeadline(first, max_pixels)
+        self._first: Remote = first if isinstance(first, Remote) else DeadlineDetector(first, max_pixels)
         self._second = second
-        self._news = News()
+        self._news = Notices()
         self._good_answers = good_answers
         self._good: OrderedDict[str, int] = OrderedDict()
         """For each robot that the second drives: good answers of the first in a row."""
-        self._beside: list[tuple[list[str], Asked]] = []
+        self._beside: list[tuple[list[str], PendingAnswer]] = []
         """Whose frames the first was asked about beside; each robot is in one at most."""
         self.switched = 0
 
@@ -98,7 +98,7 @@ class Fallback:
 
     def news(self) -> list[str]:
         """What both have to say, and which of them drives."""
-        return [*news_of(self._first), *self._news.take(), *news_of(self._second)]
+        return [*notices_of(self._first), *self._news.take(), *notices_of(self._second)]
 
     def _switch(self, robot: str) -> None:
         """From now on the second drives."""

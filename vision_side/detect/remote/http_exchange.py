@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from protocol.clock import monotonic_us
-from vision_side.detect.remote.asking import left_s
-from vision_side.detect.remote.refusing import NoAnswerError, Reason
+from vision_side.detect.remote.asking import seconds_left
+from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 MAX_ANSWER_BYTES: Final = 1 << 20
 """Security limit: 1024 rows of boxes as JSON are a tenth of it."""
@@ -72,7 +72,7 @@ class HttpExchange:
             return self._once(method, head, body, until_us)
         except NoAnswerError as error:
             self.close()
-            if not kept or error.reason is not Reason.UNREACHABLE:
+            if not kept or error.reason is not NoAnswerReason.UNREACHABLE:
                 raise
         self.lost += 1
         try:
@@ -88,13 +88,13 @@ class HttpExchange:
             connection.sendall(head + body)
             return self._read(connection, method, until_us)
         except TimeoutError:
-            raise NoAnswerError(Reason.LATE, "nothing, or not all of it, by the deadline") from None
+            raise NoAnswerError(NoAnswerReason.LATE, "nothing, or not all of it, by the deadline") from None
         except http.client.RemoteDisconnected:
-            raise NoAnswerError(Reason.UNREACHABLE, "it ended the connection") from None
+            raise NoAnswerError(NoAnswerReason.UNREACHABLE, "it ended the connection") from None
         except OSError as error:
             raise self._unreachable(error) from None
         except (http.client.HTTPException, ValueError) as error:
-            raise NoAnswerError(Reason.MALFORMED, f"not HTTP: {type(error).__name__}: {error}") from None
+            raise NoAnswerError(NoAnswerReason.MALFORMED, f"not HTTP: {type(error).__name__}: {error}") from None
 
     def _is_kept(self) -> bool:
         """Whether the last connection can be used again. Bytes that wait on it answer nothing that will be asked."""
@@ -113,7 +113,7 @@ class HttpExchange:
 
     def _connect(self, until_us: int) -> socket.socket:
         if monotonic_us() < self._not_before_us:
-            raise NoAnswerError(Reason.UNREACHABLE, f"{self._host}:{self._port} is tried again in a moment")
+            raise NoAnswerError(NoAnswerReason.UNREACHABLE, f"{self._host}:{self._port} is tried again in a moment")
         connection = self._reach(until_us)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket = connection
@@ -138,7 +138,7 @@ class HttpExchange:
         if self._socket is None:
             self._not_before_us = monotonic_us() + RETRY_US
         why = error.strerror or str(error) or type(error).__name__
-        return NoAnswerError(Reason.UNREACHABLE, f"{self._host}:{self._port}: {why}; does the server run there?")
+        return NoAnswerError(NoAnswerReason.UNREACHABLE, f"{self._host}:{self._port}: {why}; does the server run there?")
 
     def _read(self, connection: socket.socket, method: str, until_us: int) -> Reply:
         source: Any = _Timed(connection, until_us)
@@ -146,16 +146,16 @@ class HttpExchange:
             response.begin()
             encoding = response.headers.get("Content-Encoding", "identity").strip().lower()
             if encoding not in ("", "identity"):
-                raise NoAnswerError(Reason.ENCODED, f"Content-Encoding {encoding[:20]!r}, where none was asked for")
+                raise NoAnswerError(NoAnswerReason.ENCODED, f"Content-Encoding {encoding[:20]!r}, where none was asked for")
             if (response.length or 0) > MAX_ANSWER_BYTES:
-                raise NoAnswerError(Reason.TOO_LARGE, f"{response.length} bytes, at most {MAX_ANSWER_BYTES}")
+                raise NoAnswerError(NoAnswerReason.TOO_LARGE, f"{response.length} bytes, at most {MAX_ANSWER_BYTES}")
             body = response.read(MAX_ANSWER_BYTES + 1)
             if len(body) > MAX_ANSWER_BYTES:
-                raise NoAnswerError(Reason.TOO_LARGE, f"an answer of more than {MAX_ANSWER_BYTES} bytes")
+                raise NoAnswerError(NoAnswerReason.TOO_LARGE, f"an answer of more than {MAX_ANSWER_BYTES} bytes")
             if response.length:
-                raise NoAnswerError(Reason.UNREACHABLE, f"it went away {response.length} bytes before the end")
+                raise NoAnswerError(NoAnswerReason.UNREACHABLE, f"it went away {response.length} bytes before the end")
             if response.status != http.client.OK:
-                raise NoAnswerError(Reason.REFUSED, f"status {response.status}: {body[:80].decode('utf-8', 'replace')}")
+                raise NoAnswerError(NoAnswerReason.REFUSED, f"status {response.status}: {body[:80].decode('utf-8', 'replace')}")
             if response.will_close or not response.isclosed():
                 self.close()
             return Reply({name.lower(): value for name, value in response.headers.items()}, body)
@@ -193,13 +193,13 @@ class _Timed(io.RawIOBase):
         count = self._connection.recv_into(buffer)
         self._taken_bytes += count
         if self._taken_bytes > _MAX_TAKEN_BYTES:
-            raise NoAnswerError(Reason.TOO_LARGE, f"an answer of more than {MAX_ANSWER_BYTES} bytes")
+            raise NoAnswerError(NoAnswerReason.TOO_LARGE, f"an answer of more than {MAX_ANSWER_BYTES} bytes")
         return count
 
 
 def _left_s(until_us: int) -> float:
     """Raises TimeoutError when nothing is left: a timeout of 0 would mean something else to a socket."""
-    left = left_s(until_us)
+    left = seconds_left(until_us)
     if left <= 0:
         raise TimeoutError
     return left

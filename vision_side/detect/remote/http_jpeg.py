@@ -13,20 +13,20 @@ from protocol.codec import decode
 from protocol.config import Config as Settings
 from protocol.errors import WireError
 from protocol.messages import Counter, Detections, SessionId
-from protocol.refusals import Refusal
+from protocol.refusals import RejectReason
 from vision_side.config import Fraction
 from vision_side.detect.labels import clean_label
 from vision_side.detect.port import DetectFrame, Maker
 from vision_side.detect.remote.address import Address, parse_address
-from vision_side.detect.remote.asking import REMOTE, Answer, Asking
+from vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector
 from vision_side.detect.remote.boxes_read import MIN_SCORE, hash_of, read_boxes
-from vision_side.detect.remote.by_deadline import MAX_PIXELS, ByDeadline, PixelBound
+from vision_side.detect.remote.by_deadline import MAX_PIXELS, DeadlineDetector, PixelBound
 from vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES, HttpExchange
-from vision_side.detect.remote.refusing import NoAnswerError, Reason
+from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 SESSION, SEQ = "X-Sightline-Session", "X-Sightline-Seq"
 """Headers that name the frame, for servers that log or that answer out of order."""
-_REASONS: Final = {Refusal.NOT_FINITE: Reason.NOT_FINITE}
+_REASONS: Final = {RejectReason.NOT_FINITE: NoAnswerReason.NOT_FINITE}
 
 
 class JpegAnswer(Detections):
@@ -45,7 +45,7 @@ class JpegServer:
         self._path, self._min_score = address.path, min_score
         self._name = f"{address.scheme}:{address.path}"[:64]
 
-    def ask(self, frame: DetectFrame, until_us: int) -> Answer:
+    def ask(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
         """As `Server` says."""
         named = {"Content-Type": "image/jpeg", SESSION: frame.header.session, SEQ: str(frame.header.seq)}
         body = self._http.post(self._path, named, frame.jpeg, until_us).body
@@ -53,14 +53,14 @@ class JpegServer:
         found = read_boxes(said.boxes, (frame.width_px, frame.height_px), self._min_score)
         device = clean_label(said.device) if said.device else REMOTE
         name = clean_label(said.detector) if said.detector else self._name
-        return Answer(found, Maker(name, hash_of(said.model_hash or said.model), device))
+        return ServerAnswer(found, Maker(name, hash_of(said.model_hash or said.model), device))
 
     def close(self) -> None:
         """Let go of the connection."""
         self._http.close()
 
 
-class HttpJpeg(ByDeadline):
+class HttpJpeg(DeadlineDetector):
     """The detector `http+jpeg://HOST[:PORT]/PATH`."""
 
     class Config(Settings):
@@ -74,7 +74,7 @@ class HttpJpeg(ByDeadline):
         """Raises ConfigError for an address that is none. Nothing is connected before the first frame."""
         address = parse_address(config.address)
         server = JpegServer(address, config.min_score)
-        super().__init__(Asking(config.address, server), config.max_pixels)
+        super().__init__(ServerDetector(config.address, server), config.max_pixels)
 
 
 def read_jpeg_answer(body: bytes, frame: DetectFrame) -> JpegAnswer:
@@ -82,15 +82,15 @@ def read_jpeg_answer(body: bytes, frame: DetectFrame) -> JpegAnswer:
     try:
         said = decode(JpegAnswer, body, MAX_ANSWER_BYTES)
     except WireError as error:
-        reason = Reason.TOO_MANY if "at most 64 items" in error.detail else _reason(error)
+        reason = NoAnswerReason.TOO_MANY if "at most 64 items" in error.detail else _reason(error)
         raise NoAnswerError(reason, error.detail) from None
     if said.session not in (None, frame.header.session) or said.seq not in (None, frame.header.seq):
-        raise NoAnswerError(Reason.OTHER_FRAME, f"it answers frame {said.seq} of {said.session}")
+        raise NoAnswerError(NoAnswerReason.OTHER_FRAME, f"it answers frame {said.seq} of {said.session}")
     if (said.width_px, said.height_px) != (frame.width_px, frame.height_px):
-        raise NoAnswerError(Reason.OTHER_SIZE, f"boxes of a {said.width_px}x{said.height_px} picture, the frame is "
+        raise NoAnswerError(NoAnswerReason.OTHER_SIZE, f"boxes of a {said.width_px}x{said.height_px} picture, the frame is "
                                           f"{frame.width_px}x{frame.height_px}")
     return said
 
 
-def _reason(error: WireError) -> Reason:
-    return Reason.NOT_FINITE if "finite number" in error.detail else _REASONS.get(error.reason, Reason.MALFORMED)
+def _reason(error: WireError) -> NoAnswerReason:
+    return NoAnswerReason.NOT_FINITE if "finite number" in error.detail else _REASONS.get(error.reason, NoAnswerReason.MALFORMED)

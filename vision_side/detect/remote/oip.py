@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from vision_side.detect.port import DetectFrame, Detection
 from vision_side.detect.remote.boxes_read import MIN_SCORE, read_columns
-from vision_side.detect.remote.refusing import NoAnswerError, Reason
+from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 NUMBERS: Final = {"FP16": "<f2", "FP32": "<f4", "FP64": "<f8", "UINT8": "u1", "INT8": "i1", "INT16": "<i2",
                   "UINT16": "<u2", "INT32": "<i4", "UINT32": "<u4", "INT64": "<i8", "UINT64": "<u8", "BOOL": "?"}
@@ -40,7 +40,7 @@ class Slot:
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
+class OipModel:
     """What is known of a model: how it is asked, and which outputs it is asked for."""
 
     name: str
@@ -80,7 +80,7 @@ class Inferred:
 
 
 @dataclass(frozen=True, slots=True)
-class Looking:
+class OutputOptions:
     """How an answer is read: names of labels that are numbers, the least score; and in which order colours go."""
 
     labels: tuple[str, ...] = ()
@@ -88,7 +88,7 @@ class Looking:
     rgb: bool = False
 
 
-def model_of(name: str, version: str, inputs: Sequence[Slot], outputs: Sequence[Slot]) -> Model:
+def model_of(name: str, version: str, inputs: Sequence[Slot], outputs: Sequence[Slot]) -> OipModel:
     """The model, if it can be used here. Raises NoAnswerError UNFIT with what it lacks."""
     if len(inputs) != 1:
         raise _unfit(name, f"it takes {len(inputs)} inputs, one picture is given")
@@ -103,11 +103,11 @@ def model_of(name: str, version: str, inputs: Sequence[Slot], outputs: Sequence[
     if missing:
         raise _unfit(name, f"it gives {', '.join(sorted(given)) or 'nothing'}; {' and '.join(sorted(missing))} missing")
     wanted = (BOXES, SCORES, LABELS) if LABELS in given else (BOXES, SCORES)
-    return Model(name, version, one, wanted)
+    return OipModel(name, version, one, wanted)
 
 
 def _unfit(name: str, why: str) -> NoAnswerError:
-    return NoAnswerError(Reason.UNFIT, f"model {name!r}: {why}; see docs/remote-detectors.md")
+    return NoAnswerError(NoAnswerReason.UNFIT, f"model {name!r}: {why}; see docs/remote-detectors.md")
 
 
 def _layout(shape: tuple[int, ...]) -> tuple[int, int, bool] | None:
@@ -118,7 +118,7 @@ def _layout(shape: tuple[int, ...]) -> tuple[int, int, bool] | None:
     return (last[1], last[2], True) if last[0] == _CHANNELS else None
 
 
-def tensor_of(model: Model, frame: DetectFrame, rgb: bool) -> tuple[Tensor, tuple[float, float]]:
+def tensor_of(model: OipModel, frame: DetectFrame, rgb: bool) -> tuple[Tensor, tuple[float, float]]:
     """What is sent for `frame`, and what turns the answer's pixels into those of the encoded picture.
 
     Raises WireError where pixels are asked for and the JPEG has none.
@@ -140,7 +140,7 @@ def _fitted(bgr: NDArray[np.uint8], shape: tuple[int, ...], rgb: bool) -> NDArra
     rows, columns, _ = _layout(shape) or (-1, -1, False)
     rows, columns = (rows if rows > 0 else bgr.shape[0]), (columns if columns > 0 else bgr.shape[1])
     if max(rows, columns) > _MAX_SIDE:
-        raise NoAnswerError(Reason.UNFIT, f"its input is {columns}x{rows} pixels, at most {_MAX_SIDE} a side")
+        raise NoAnswerError(NoAnswerReason.UNFIT, f"its input is {columns}x{rows} pixels, at most {_MAX_SIDE} a side")
     fitted: NDArray[Any] = bgr
     if fitted.shape[:2] != (rows, columns):
         fitted = cv2.resize(bgr, (columns, rows), interpolation=cv2.INTER_AREA)
@@ -154,10 +154,10 @@ def read_number_tensor(datatype: str, shape: Sequence[int], data: bytes) -> NDAr
     """A tensor of numbers from its bytes. Raises NoAnswerError if they do not fit together."""
     kind = NUMBERS.get(datatype)
     if kind is None:
-        raise NoAnswerError(Reason.MALFORMED, f"a tensor of datatype {datatype[:20]!r}")
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"a tensor of datatype {datatype[:20]!r}")
     count = elements_of(shape)
     if len(data) != count * np.dtype(kind).itemsize:
-        raise NoAnswerError(Reason.MALFORMED, f"{len(data)} bytes for a {datatype} tensor of shape {list(shape)}")
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{len(data)} bytes for a {datatype} tensor of shape {list(shape)}")
     return np.frombuffer(data, kind).reshape(tuple(shape))
 
 
@@ -167,26 +167,26 @@ def read_text_tensor(shape: Sequence[int], data: bytes) -> list[str]:
     for _ in range(elements_of(shape)):
         end = at + 4 + int.from_bytes(data[at : at + 4], "little")
         if at + 4 > len(data) or end > len(data):
-            raise NoAnswerError(Reason.MALFORMED, "a BYTES tensor is cut short")
+            raise NoAnswerError(NoAnswerReason.MALFORMED, "a BYTES tensor is cut short")
         texts.append(data[at + 4 : end].decode("utf-8", "replace"))
         at = end
     if at != len(data):
-        raise NoAnswerError(Reason.MALFORMED, f"{len(data) - at} bytes too many in a BYTES tensor")
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{len(data) - at} bytes too many in a BYTES tensor")
     return texts
 
 
 def elements_of(shape: Sequence[int]) -> int:
     """How many there are in a tensor of `shape`. Raises NoAnswerError for a shape that none has, or of too many."""
     if len(shape) > MAX_DIMENSIONS or any(not 0 <= size <= MAX_ELEMENTS for size in shape):
-        raise NoAnswerError(Reason.MALFORMED, f"a tensor of shape {list(shape)[:MAX_DIMENSIONS]}")
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"a tensor of shape {list(shape)[:MAX_DIMENSIONS]}")
     count = math.prod(shape)
     if count > MAX_ELEMENTS:
-        raise NoAnswerError(Reason.TOO_MANY, f"a tensor of {count} elements, at most {MAX_ELEMENTS}")
+        raise NoAnswerError(NoAnswerReason.TOO_MANY, f"a tensor of {count} elements, at most {MAX_ELEMENTS}")
     return count
 
 
 def detections_of(
-    answer: Inferred, looking: Looking, stretch: tuple[float, float], size_px: tuple[int, int]
+    answer: Inferred, looking: OutputOptions, stretch: tuple[float, float], size_px: tuple[int, int]
 ) -> tuple[Detection, ...]:
     """What an answer's tensors say. Raises NoAnswerError for a missing or misshapen one."""
     outputs = answer.tensors
@@ -201,7 +201,7 @@ def detections_of(
 def _numbers(outputs: Mapping[str, NDArray[Any] | list[str]], name: str) -> NDArray[Any]:
     found = outputs.get(name)
     if not isinstance(found, np.ndarray):
-        raise NoAnswerError(Reason.MALFORMED, f"no numbers called {name!r} in the answer")
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"no numbers called {name!r} in the answer")
     return found
 
 
@@ -221,6 +221,6 @@ def _labels(found: NDArray[Any] | list[str] | None, rows: int, names: tuple[str,
         whole = numbers.astype(np.int64)  # many exported models give their classes as floats
         numbers = whole if np.array_equal(whole, numbers) else numbers
     if numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer):
-        raise NoAnswerError(Reason.MALFORMED, f"labels of shape {numbers.shape} and type {numbers.dtype}; they are "
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"labels of shape {numbers.shape} and type {numbers.dtype}; they are "
                                               "text or whole numbers")
     return [names[number] if 0 <= number < len(names) else str(number) for number in numbers.tolist()]

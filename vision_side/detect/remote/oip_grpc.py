@@ -6,10 +6,10 @@ from typing import Any, Final
 from protocol.errors import ConfigError
 from vision_side.detect.port import DetectFrame, Maker
 from vision_side.detect.remote.address import Address, parse_address
-from vision_side.detect.remote.asking import REMOTE, Answer, Asking, left_s
-from vision_side.detect.remote.by_deadline import ByDeadline
+from vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector, seconds_left
+from vision_side.detect.remote.by_deadline import DeadlineDetector
 from vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES
-from vision_side.detect.remote.oip import Looking, Model, detections_of, tensor_of
+from vision_side.detect.remote.oip import OutputOptions, OipModel, detections_of, tensor_of
 from vision_side.detect.remote.oip_messages import (
     INFER,
     METADATA,
@@ -19,7 +19,7 @@ from vision_side.detect.remote.oip_messages import (
     read_metadata,
 )
 from vision_side.detect.remote.oip_settings import OipSettings
-from vision_side.detect.remote.refusing import NoAnswerError, Reason
+from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 _OPTIONS: Final = (
     ("grpc.max_receive_message_length", MAX_ANSWER_BYTES),  # security limit, of what is unpacked too
@@ -30,15 +30,15 @@ _OPTIONS: Final = (
     ("grpc.enable_retries", 0),
 )
 _NO_GRPC: Final = "grpcio is not installed: pip install 'sightline[grpc]', or use oip+http://"
-_REASONS: Final = {"DEADLINE_EXCEEDED": Reason.LATE, "UNAVAILABLE": Reason.UNREACHABLE,
-                   "RESOURCE_EXHAUSTED": Reason.TOO_LARGE, "INTERNAL": Reason.MALFORMED}
+_REASONS: Final = {"DEADLINE_EXCEEDED": NoAnswerReason.LATE, "UNAVAILABLE": NoAnswerReason.UNREACHABLE,
+                   "RESOURCE_EXHAUSTED": NoAnswerReason.TOO_LARGE, "INTERNAL": NoAnswerReason.MALFORMED}
 
 
 class GrpcServer:
     """A `Server`. What the model is like is asked again after every call that failed otherwise than by
     lateness."""
 
-    def __init__(self, address: Address, looking: Looking) -> None:
+    def __init__(self, address: Address, looking: OutputOptions) -> None:
         """Raises ConfigError without grpcio."""
         try:
             import grpc
@@ -49,9 +49,9 @@ class GrpcServer:
         self._channel = grpc.insecure_channel(f"{host}:{address.port}", options=_OPTIONS)
         self._calls = {path: self._channel.unary_unary(path) for path in (METADATA, INFER)}
         self._address, self._looking = address, looking
-        self._model: Model | None = None
+        self._model: OipModel | None = None
 
-    def ask(self, frame: DetectFrame, until_us: int) -> Answer:
+    def ask(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
         """As `Server` says."""
         model = self._known_model(until_us)
         tensor, stretch = tensor_of(model, frame, self._looking.rgb)
@@ -59,27 +59,27 @@ class GrpcServer:
         data = self._call(INFER, infer_request(model, self._address.version, tensor, number), until_us)
         answer = read_infer(data, number)
         found = detections_of(answer, self._looking, stretch, (frame.width_px, frame.height_px))
-        return Answer(found, Maker(model.title(self._address.scheme, answer.version), device=REMOTE))
+        return ServerAnswer(found, Maker(model.title(self._address.scheme, answer.version), device=REMOTE))
 
     def close(self) -> None:
         """End the channel."""
         self._channel.close()
 
-    def _known_model(self, until_us: int) -> Model:
+    def _known_model(self, until_us: int) -> OipModel:
         if self._model is None:
             request = metadata_request(self._address.model, self._address.version)
             self._model = read_metadata(self._call(METADATA, request, until_us))
         return self._model
 
     def _call(self, path: str, request: bytes, until_us: int) -> bytes:
-        left = left_s(until_us)
+        left = seconds_left(until_us)
         if left <= 0:
-            raise NoAnswerError(Reason.LATE, "nothing is left of the deadline")
+            raise NoAnswerError(NoAnswerReason.LATE, "nothing is left of the deadline")
         try:
             answer: bytes = self._calls[path](request, timeout=left)
         except self._failed as error:
             refused = _no_answer(error)
-            if refused.reason is not Reason.LATE:  # to ask anew would make the next answer later still
+            if refused.reason is not NoAnswerReason.LATE:  # to ask anew would make the next answer later still
                 self._model = None
             raise refused from None
         return answer
@@ -87,10 +87,10 @@ class GrpcServer:
 
 def _no_answer(error: Any) -> NoAnswerError:
     code = getattr(error.code(), "name", "UNKNOWN")
-    return NoAnswerError(_REASONS.get(code, Reason.REFUSED), f"{code}: {error.details()}")
+    return NoAnswerError(_REASONS.get(code, NoAnswerReason.REFUSED), f"{code}: {error.details()}")
 
 
-class OipGrpc(ByDeadline):
+class OipGrpc(DeadlineDetector):
     """The detector `oip+grpc://HOST[:PORT]/MODEL[/VERSION]`."""
 
     Config = OipSettings
@@ -103,4 +103,4 @@ class OipGrpc(ByDeadline):
     def __init__(self, config: OipSettings) -> None:
         """Raises ConfigError for an address that is none, or without grpcio. Connects with the first frame."""
         server = GrpcServer(parse_address(config.address), config.looking())
-        super().__init__(Asking(config.address, server), config.max_pixels)
+        super().__init__(ServerDetector(config.address, server), config.max_pixels)

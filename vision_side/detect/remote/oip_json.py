@@ -12,7 +12,7 @@ from vision_side.detect.remote.oip import (
     MAX_TENSORS,
     NUMBERS,
     Inferred,
-    Model,
+    OipModel,
     Slot,
     Tensor,
     elements_of,
@@ -20,7 +20,7 @@ from vision_side.detect.remote.oip import (
     read_number_tensor,
     read_text_tensor,
 )
-from vision_side.detect.remote.refusing import NoAnswerError, Reason
+from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 HEADER_LENGTH: Final = "Inference-Header-Content-Length"
 """How many bytes of a body are JSON; tensors follow."""
@@ -65,14 +65,14 @@ class _Answer(_Said):
     outputs: Annotated[tuple[_Output, ...], Field(max_length=MAX_TENSORS)]
 
 
-def read_metadata(body: bytes) -> Model:
+def read_metadata(body: bytes) -> OipModel:
     """The model that `GET v2/models/NAME` describes. Raises NoAnswerError."""
     said = _validated(_Metadata, body)
     slots = [[Slot(one.name, one.datatype, one.shape) for one in of] for of in (said.inputs, said.outputs)]
     return model_of(said.name, said.versions[-1] if said.versions else "", *slots)
 
 
-def infer_body(model: Model, tensor: Tensor, number: str) -> tuple[int, bytes]:
+def infer_body(model: OipModel, tensor: Tensor, number: str) -> tuple[int, bytes]:
     """The body of `POST v2/models/NAME/infer`, and how much of it is JSON; `number` comes back as the answer's id."""
     head = json.dumps({
         "id": number,
@@ -88,7 +88,7 @@ def read_infer(body: bytes, json_length: str | None, number: str) -> Inferred:
     length = _json_length(json_length, len(body))
     said = _validated(_Answer, body[:length])
     if said.id not in (None, "", number):
-        raise NoAnswerError(Reason.OTHER_FRAME, f"the answer's id is {said.id[:40]!r}, asked was {number!r}")
+        raise NoAnswerError(NoAnswerReason.OTHER_FRAME, f"the answer's id is {said.id[:40]!r}, asked was {number!r}")
     tensors, at = {}, length
     for one in said.outputs:
         size = one.parameters.binary_data_size
@@ -96,7 +96,7 @@ def read_infer(body: bytes, json_length: str | None, number: str) -> Inferred:
             tensors[one.name] = _from_list(one)
             continue
         if at + size > len(body):
-            raise NoAnswerError(Reason.MALFORMED, f"output {one.name[:40]!r} ends behind the end of the answer")
+            raise NoAnswerError(NoAnswerReason.MALFORMED, f"output {one.name[:40]!r} ends behind the end of the answer")
         tensors[one.name] = _from_bytes(one, body[at : at + size])
         at += size
     return Inferred(tensors, said.model_version)
@@ -106,7 +106,7 @@ def _json_length(text: str | None, whole: int) -> int:
     if text is None:
         return whole
     if not (text.isascii() and text.isdecimal() and len(text) < 10 and int(text) <= whole):
-        raise NoAnswerError(Reason.MALFORMED, f"{HEADER_LENGTH} {text[:20]!r} of an answer of {whole} bytes")
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{HEADER_LENGTH} {text[:20]!r} of an answer of {whole} bytes")
     return int(text)
 
 
@@ -121,9 +121,9 @@ def _from_list(one: _Output) -> NDArray[Any] | list[str]:
     try:
         values = np.asarray(one.data, dtype=object if one.datatype == "BYTES" else NUMBERS[one.datatype]).reshape(-1)
     except (ValueError, TypeError, OverflowError, KeyError) as error:
-        raise NoAnswerError(Reason.MALFORMED, f"output {one.name[:40]!r}: {error}") from None
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"output {one.name[:40]!r}: {error}") from None
     if values.size != elements_of(one.shape):
-        raise NoAnswerError(Reason.MALFORMED, f"{values.size} values for a tensor of shape {list(one.shape)}")
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{values.size} values for a tensor of shape {list(one.shape)}")
     return [str(value) for value in values] if one.datatype == "BYTES" else values.reshape(one.shape)
 
 
@@ -133,4 +133,4 @@ def _validated(model: type[Said], data: bytes) -> Said:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"]) or "answer"
-        raise NoAnswerError(Reason.MALFORMED, f"{where}: {first['msg']}") from None
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{where}: {first['msg']}") from None

@@ -14,14 +14,14 @@ from vision_side.detect.protobuf import Bytes, as_bytes, fields, integers, put, 
 from vision_side.detect.remote.oip import (
     MAX_TENSORS,
     Inferred,
-    Model,
+    OipModel,
     Slot,
     Tensor,
     model_of,
     read_number_tensor,
     read_text_tensor,
 )
-from vision_side.detect.remote.refusing import NoAnswerError, Reason
+from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 METADATA: Final = "/inference.GRPCInferenceService/ModelMetadata"
 INFER: Final = "/inference.GRPCInferenceService/ModelInfer"
@@ -33,7 +33,7 @@ def _malformed() -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise NoAnswerError(Reason.MALFORMED, f"not Protocol Buffers: {error}") from None
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"not Protocol Buffers: {error}") from None
 
 
 def metadata_request(model: str, version: str) -> bytes:
@@ -42,7 +42,7 @@ def metadata_request(model: str, version: str) -> bytes:
 
 
 @_malformed()
-def read_metadata(data: bytes) -> Model:
+def read_metadata(data: bytes) -> OipModel:
     """ModelMetadataResponse. Raises NoAnswerError."""
     name, versions, slots = "", [""], {4: list[Slot](), 5: list[Slot]()}
     for number, value in fields(data):
@@ -53,11 +53,11 @@ def read_metadata(data: bytes) -> Model:
         elif number in slots:
             slots[number].append(_slot(as_bytes(value)))
     if max(len(some) for some in slots.values()) > MAX_TENSORS:
-        raise NoAnswerError(Reason.UNFIT, f"model {name[:40]!r} has more than {MAX_TENSORS} inputs or outputs")
+        raise NoAnswerError(NoAnswerReason.UNFIT, f"model {name[:40]!r} has more than {MAX_TENSORS} inputs or outputs")
     return model_of(name, versions[-1], slots[4], slots[5])
 
 
-def infer_request(model: Model, asked_version: str, tensor: Tensor, number: str) -> bytes:
+def infer_request(model: OipModel, asked_version: str, tensor: Tensor, number: str) -> bytes:
     """ModelInferRequest, its tensor as raw contents; `number` comes back as the answer's id."""
     one = put(1, tensor.name) + put(2, tensor.datatype) + put_integers(3, tensor.shape)
     return b"".join((
@@ -72,7 +72,7 @@ def read_infer(data: bytes, number: str) -> Inferred:
     version, slots, contents = "", list[Slot](), list[bytes]()
     for which, value in fields(data):
         if which == 3 and text(value) not in ("", number):
-            raise NoAnswerError(Reason.OTHER_FRAME, f"the answer's id is {text(value)[:40]!r}, asked was {number!r}")
+            raise NoAnswerError(NoAnswerReason.OTHER_FRAME, f"the answer's id is {text(value)[:40]!r}, asked was {number!r}")
         if which == 2:
             version = text(value)
         elif which == 5:
@@ -80,7 +80,7 @@ def read_infer(data: bytes, number: str) -> Inferred:
         elif which == 6:
             contents.append(bytes(as_bytes(value)))
     if len(slots) != len(contents) or len(slots) > MAX_TENSORS:
-        raise NoAnswerError(Reason.MALFORMED, f"{len(slots)} outputs, {len(contents)} raw contents; they go together")
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{len(slots)} outputs, {len(contents)} raw contents; they go together")
     return Inferred({slot.name: _tensor(slot, raw) for slot, raw in zip(slots, contents, strict=True)}, version)
 
 

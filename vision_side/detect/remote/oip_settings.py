@@ -9,7 +9,7 @@ from vision_side.config import Fraction
 from vision_side.detect.labels import Label
 from vision_side.detect.remote.boxes_read import MIN_SCORE
 from vision_side.detect.remote.by_deadline import MAX_PIXELS, PixelBound
-from vision_side.detect.remote.oip import Looking
+from vision_side.detect.remote.oip import OutputOptions
 
 
 class OipSettings(Settings):
@@ -23,6 +23,6 @@ class OipSettings(Settings):
     """Of the colours, where the model takes pixels."""
     max_pixels: PixelBound = MAX_PIXELS
 
-    def looking(self) -> Looking:
+    def looking(self) -> OutputOptions:
         """How its answers are read."""
-        return Looking(self.labels, self.min_score, self.order == "rgb")
+        return OutputOptions(self.labels, self.min_score, self.order == "rgb")

@@ -4,7 +4,7 @@ from collections import Counter
 from enum import StrEnum
 from typing import Final
 
-from vision_side.detect.news import News
+from vision_side.detect.news import Notices
 
 _LONGEST: Final = 160
 _TOLD_AT: Final = frozenset(10**power for power in range(10))
@@ -15,7 +15,7 @@ _IN_A_ROW: Final = 10
 robot of several is not answered; a line for each of them would be one for each frame."""
 
 
-class Reason(StrEnum):
+class NoAnswerReason(StrEnum):
     """What is counted. All of them mean "no answer": none of them moves the robot."""
 
     LATE = "LATE"  # not there by the deadline
@@ -35,18 +35,18 @@ class Reason(StrEnum):
 class NoAnswerError(Exception):
     """There is no answer that counts; `detail` is one line for a person."""
 
-    def __init__(self, reason: Reason, detail: str) -> None:
+    def __init__(self, reason: NoAnswerReason, detail: str) -> None:
         self.reason = reason
         self.detail = " ".join(detail.split())[:_LONGEST]
         super().__init__(f"{reason}: {self.detail}")
 
 
-class Tally:
+class ErrorCounters:
     """Counts what was refused of one remote, and says so where that is news."""
 
     def __init__(self, name: str) -> None:
         self.refused: Counter[str] = Counter()
-        self.news = News()
+        self.news = Notices()
         self._name = name
         self._said = ""
         self._good = self._bad = 0

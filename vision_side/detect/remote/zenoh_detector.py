@@ -18,9 +18,9 @@ from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.config import Fraction
 from vision_side.detect.labels import clean_label
 from vision_side.detect.port import DetectFrame, DetectionResult, Maker, result_of
-from vision_side.detect.remote.asking import REMOTE, FrameByFrame, left_s
+from vision_side.detect.remote.asking import REMOTE, FrameByFrame, seconds_left
 from vision_side.detect.remote.boxes_read import MIN_SCORE, hash_of, read_boxes
-from vision_side.detect.remote.refusing import NoAnswerError, Reason
+from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 ROLE: Final = "detector"
 """The source under which a detector service speaks."""
@@ -108,20 +108,20 @@ class ZenohDetector(FrameByFrame):
 
     def _of(self, robot: str) -> _Heard:
         if robot not in self._heard:
-            raise NoAnswerError(Reason.UNREACHABLE, f"there is no link to robot {robot}: it works within a vision only")
+            raise NoAnswerError(NoAnswerReason.UNREACHABLE, f"there is no link to robot {robot}: it works within a vision only")
         return self._heard[robot]
 
     def _wait(self, heard: _Heard, frame: DetectFrame, deadline_us: int) -> DetectionResult:
         """The boxes that cite `frame`. Raises NoAnswerError if none come by the deadline, or those of a newer one."""
         while True:
-            message = heard.take(left_s(deadline_us))
+            message = heard.take(seconds_left(deadline_us))
             if heard.slot.others and not heard.told:
                 heard.told = True
                 self._tally.news.add(f"detector zenoh ({self._config.source}): several services look at robot "
                                      f"{frame.robot}; the first is kept to. End the others, or share the robots out "
                                      "among them with --robot")
             if message is None:
-                raise NoAnswerError(Reason.LATE, f"no boxes from {self._config.source} by the deadline; does it run?")
+                raise NoAnswerError(NoAnswerReason.LATE, f"no boxes from {self._config.source} by the deadline; does it run?")
             try:
                 header, ahead = _cites(message, frame)
             except NoAnswerError as error:
@@ -131,7 +131,7 @@ class ZenohDetector(FrameByFrame):
                 continue
             if ahead > 0:
                 heard.kept = message
-                raise NoAnswerError(Reason.OTHER_FRAME, "it looked at a newer frame instead")
+                raise NoAnswerError(NoAnswerReason.OTHER_FRAME, "it looked at a newer frame instead")
             result = _result(message, header, frame, self._config.min_score)
             heard.slot.keep_to(header.session)
             return result
@@ -143,15 +143,15 @@ def _cites(message: Message, frame: DetectFrame) -> tuple[DetectionsHeader, int]
     try:
         header = decode(DetectionsHeader, message.header)
     except WireError as error:
-        raise NoAnswerError(Reason.MALFORMED, error.detail) from None
+        raise NoAnswerError(NoAnswerReason.MALFORMED, error.detail) from None
     echo, asked = header.echo, frame.header
     if header.source != message.source or echo is None or echo.channel != FRAME.name or echo.session != asked.session:
-        raise NoAnswerError(Reason.OTHER_FRAME, "boxes of no frame of this robot's session, or not of who says so")
+        raise NoAnswerError(NoAnswerReason.OTHER_FRAME, "boxes of no frame of this robot's session, or not of who says so")
     ahead = echo.seq - asked.seq
     is_newer = ahead > 0 and asked.t_us < echo.t_us <= asked.t_us + _NEWER_US
     is_older = ahead < 0 and echo.t_us < asked.t_us
     if not (is_newer or is_older or (echo.seq, echo.t_us) == (asked.seq, asked.t_us)):
-        raise NoAnswerError(Reason.OTHER_FRAME, f"boxes of frame {echo.seq}, asked about is {asked.seq}")
+        raise NoAnswerError(NoAnswerReason.OTHER_FRAME, f"boxes of frame {echo.seq}, asked about is {asked.seq}")
     return header, ahead
 
 
@@ -159,10 +159,10 @@ def _result(message: Message, header: DetectionsHeader, frame: DetectFrame, min_
     try:
         said = decode(Detections, message.payload, DETECTIONS.max_payload_bytes)
     except WireError as error:
-        raise NoAnswerError(Reason.MALFORMED, error.detail) from None
+        raise NoAnswerError(NoAnswerReason.MALFORMED, error.detail) from None
     size = frame.width_px, frame.height_px
     if (said.width_px, said.height_px) != size:
-        raise NoAnswerError(Reason.OTHER_SIZE, f"boxes of a {said.width_px}x{said.height_px} picture")
+        raise NoAnswerError(NoAnswerReason.OTHER_SIZE, f"boxes of a {said.width_px}x{said.height_px} picture")
     name = clean_label(said.detector) if said.detector else f"zenoh ({header.source})"
     maker = Maker(name, hash_of(said.model), clean_label(said.device) if said.device else REMOTE)
     return result_of(frame, read_boxes(said.boxes, size, min_score), maker, header.compute_us)
