@@ -11,7 +11,7 @@ from typing import Any, Final
 from operator_side import around_text
 from protocol.errors import ConfigError, LinkError, SightlineError
 from protocol.transports.endpoints import parse_zenoh_endpoint
-from protocol.transports.zenoh_around import Discovered, find_listeners, discover
+from protocol.transports.zenoh_around import Discovered, discover, find_listeners
 from robot_side.config import DEFAULT_ENDPOINT
 
 SCOUT_S: Final = 0.4

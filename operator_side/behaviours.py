@@ -15,7 +15,7 @@ from operator_side.extras import needs
 from operator_side.score import Score, score
 from operator_side.score_course import figures_of
 from operator_side.score_runs import Case, run_of
-from operator_side.speed_runs import SpeedRun, speed_run, speed_cases
+from operator_side.speed_runs import SpeedRun, speed_cases, speed_run
 from operator_side.worker_pool import worker_pool
 
 Progress = Callable[[int], AbstractContextManager[Callable[[], None]]]

@@ -11,14 +11,14 @@ import typer
 from operator_side import cli_detector_serve as serving
 from operator_side.cli_people import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure
 from operator_side.cli_services import ConfigFile, LogForm, MaybeSecure, Sets
-from operator_side.cli_services import ServiceConnect as MaybeConnect
 from operator_side.cli_services import Listen as MaybeListen
+from operator_side.cli_services import ServiceConnect as MaybeConnect
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
 
 if TYPE_CHECKING:
-    from vision_side.detect.contract import Times, PromiseResult
+    from vision_side.detect.contract import PromiseResult, Times
     from vision_side.detect.port import Detector
 
 CHECK_FAILED = 5
@@ -113,7 +113,7 @@ def check(
     given: Any = load_service("vision", file=config, sets=(), options=options, environ=os.environ).config
     with needs("vision"):
         from vision_side.detect.around import notices_of
-        from vision_side.detect.choice import check_device, check_takes_pictures, build_detector
+        from vision_side.detect.choice import build_detector, check_device, check_takes_pictures
         from vision_side.detect.contract import check_detector, time_detector
     settings = given.model_copy(update={"detector": given.detector.model_copy(update={"kind": name})})
     check_device(settings)

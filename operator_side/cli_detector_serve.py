@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from operator_side.cli_services import ConfigFile, ServiceConnect, Listen, LogForm, MaybeSecure, Sets
+from operator_side.cli_services import ConfigFile, Listen, LogForm, MaybeSecure, ServiceConnect, Sets
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError

@@ -17,7 +17,7 @@ from operator_side.waypoints import Waypoints
 from protocol.channels import MISSION, REPORT
 from protocol.codec import decode, encode
 from protocol.errors import ConfigError, LinkError, WireError
-from protocol.messages import RequestId, Echo, RequestHeader
+from protocol.messages import Echo, RequestHeader, RequestId
 from protocol.mission_messages import MAX_OPTIONS, MissionReport, MissionRequest
 from protocol.transports.link import Link, Message
 

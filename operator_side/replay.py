@@ -12,7 +12,7 @@ from operator_side.recording import read_about, read_recording
 from protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MISSION, SCAN, TWIST
 from protocol.codec import decode
 from protocol.errors import ConfigError, WireError
-from protocol.messages import AnswerHeader, RequestId, CameraModel, DetectionsHeader, FrameHeader, RequestHeader, Stamp
+from protocol.messages import AnswerHeader, CameraModel, DetectionsHeader, FrameHeader, RequestHeader, RequestId, Stamp
 from protocol.mission_messages import MissionRequest
 from protocol.transports.link import Message
 from protocol.twist_text import format_twist
@@ -20,7 +20,7 @@ from vision_side.config import VisionConfig
 from vision_side.detect.boxes import BoxReader
 from vision_side.detect.choice import configured_detector
 from vision_side.missions.choice import requested_mission
-from vision_side.pipeline import SOURCE, PipelineAnswer, Frame, Pipeline
+from vision_side.pipeline import SOURCE, Frame, Pipeline, PipelineAnswer
 from vision_side.scan import decode_scan
 
 VISION_CONFIG = "vision_config"

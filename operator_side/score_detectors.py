@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from sim.scenes import Scene, LabelledBox
+from sim.scenes import LabelledBox, Scene
 from vision_side.detect.overlap import corners, overlap
 from vision_side.detect.port import Detection
 

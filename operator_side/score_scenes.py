@@ -12,8 +12,8 @@ from typing import Any, Final
 from operator_side.score_detectors import (
     BALL_LABELS,
     Figures,
-    LabelMatches,
     FrameResult,
+    LabelMatches,
     figures,
     frame_result,
     precisions,
@@ -26,7 +26,7 @@ from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
 from vision_side.detect.around import close_detector, notices_of
 from vision_side.detect.checking import checked_results as checked_answers
-from vision_side.detect.choice import check_takes_pictures, build_detector
+from vision_side.detect.choice import build_detector, check_takes_pictures
 from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Detector
 
 _FRAME_US: Final = 33_333

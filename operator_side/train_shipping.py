@@ -6,16 +6,16 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
-from operator_side.score_detectors import LabelMatches, FrameResult
+from operator_side.score_detectors import FrameResult, LabelMatches
 from operator_side.score_scenes import (
     LABELLED,
     LIGHT_SHARE,
     Report,
     Subject,
     detections,
+    scene_result,
     score_scenes,
     shown,
-    scene_result,
 )
 from operator_side.train_choice import ball_threshold, label_threshold
 from operator_side.train_export import Weights, onnx_bytes

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import simplejpeg
 
 from protocol.messages import CameraModel
-from robot_side.ports import scaled_size, scaled_quality
+from robot_side.ports import scaled_quality, scaled_size
 from sim.engine import pybullet
 from sim.look import Look
 from sim.scenario import Wall

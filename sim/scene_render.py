@@ -21,11 +21,11 @@ from sim.scenes import (
     WIDTH_PX,
     Box,
     Column,
+    LabelledBox,
     Lens,
     Scene,
     ScenePlan,
     Solid,
-    LabelledBox,
 )
 from sim.thing_bodies import ball_visual
 from sim.things import Color, Legs

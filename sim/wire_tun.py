@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from protocol.clock import monotonic_us
 from protocol.errors import ConfigError, HardwareError
-from sim.wire import Leg, LinkShapes, EmulatedLink
+from sim.wire import EmulatedLink, Leg, LinkShapes
 
 ADDRESS_A: Final = "10.213.77.1"
 ADDRESS_B: Final = "10.213.77.2"

@@ -13,7 +13,7 @@ from benchmarks.network_figures import Stretch, figures_of, network_checks, sent
 from benchmarks.network_rows import CASES, Case, chosen, spans_s
 from benchmarks.network_stage import NetworkSetting
 from protocol.errors import ConfigError
-from sim.wire import LinkShape, LinkShapes, EmulatedLink
+from sim.wire import EmulatedLink, LinkShape, LinkShapes
 from sim.wire_tun import why_impossible
 
 SECOND_US = 1_000_000

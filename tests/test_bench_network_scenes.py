@@ -9,7 +9,7 @@ import pytest
 from benchmarks.network_fleet import ROBOTS, fleet_checks
 from benchmarks.network_wheels import moves_again_s, on_old_sight, read_wheel_commands
 from operator_side.faults.judge import MotorRow
-from operator_side.network_medium import reported_check, stop_checks_of, reached_ms
+from operator_side.network_medium import reached_ms, reported_check, stop_checks_of
 from sim.wire_tun import why_impossible
 
 TICK_US = 20_000

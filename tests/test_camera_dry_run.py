@@ -14,7 +14,7 @@ from tests.robot_process import RobotProcess
 from tests.vision_rig import camera, jpeg_of, scene
 from vision_side.config import VisionConfig
 from vision_side.dry_run import AckingService, ProgressPrinter, watch_camera, watch_robot
-from vision_side.pipeline import PipelineAnswer, Observation
+from vision_side.pipeline import Observation, PipelineAnswer
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))

@@ -13,7 +13,7 @@ import pytest
 
 from protocol.errors import ConfigError, HardwareError
 from robot_side.config import PluginChoice
-from robot_side.hardware.buffer_time import Clocks, CaptureClock
+from robot_side.hardware.buffer_time import CaptureClock, Clocks
 from robot_side.hardware.v4l2_camera import V4l2Camera
 from robot_side.hardware.v4l2_device import whole_jpeg
 from robot_side.hardware.v4l2_trouble import check_device, device_owner, open_error

@@ -15,7 +15,7 @@ from tests.onnx_rig import brightness_model, without_gpu
 from vision_side import plugin_choice
 from vision_side.config import DetectorConfig, VisionConfig
 from vision_side.decode import Decoder
-from vision_side.detect.choice import REGISTRY, GROUP, build_detector, configured_detector, is_plain, split_kind
+from vision_side.detect.choice import GROUP, REGISTRY, build_detector, configured_detector, is_plain, split_kind
 from vision_side.detect.colour_filter import ColorFilter
 from vision_side.detect.label_filter import LabelFilter
 from vision_side.detect.local import Adaptive, Hsv

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.log_lines import LOG_FORMAT_VARIABLE, JsonLineStream, AsyncLineWriter, to_json_line, set_log_format
+from protocol.log_lines import LOG_FORMAT_VARIABLE, AsyncLineWriter, JsonLineStream, set_log_format, to_json_line
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 

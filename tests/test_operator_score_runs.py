@@ -7,7 +7,7 @@ import pytest
 
 from operator_side import cli
 from operator_side.score import Score
-from operator_side.score_runs import Case, ScoreReport, cases, scored_figures, run_case, run_cases
+from operator_side.score_runs import Case, ScoreReport, cases, run_case, run_cases, scored_figures
 from operator_side.score_table import score_text
 from protocol.errors import ConfigError
 

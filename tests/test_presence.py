@@ -15,10 +15,10 @@ from protocol.transports.presence import (
     MAX_PEERS,
     PeerInfo,
     Presence,
-    presence_key,
-    robot_with_same_id,
     best_round_trips,
     parse_presence_reply,
+    presence_key,
+    robot_with_same_id,
 )
 from protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
 from protocol.transports.zenoh import open_zenoh

@@ -22,7 +22,7 @@ from protocol.channels import (
 from protocol.codec import check_sizes, decode, decode_ranges, encode, encode_ranges
 from protocol.errors import ConfigError, WireError
 from protocol.golden_cases import CASES
-from protocol.messages import MAX_INTEGER, AnswerHeader, RequestId, Echo, FrameHeader, RequestHeader, ScanHeader, Stamp
+from protocol.messages import MAX_INTEGER, AnswerHeader, Echo, FrameHeader, RequestHeader, RequestId, ScanHeader, Stamp
 from protocol.refusals import RejectReason
 
 MODELS = sorted(

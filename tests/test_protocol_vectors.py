@@ -14,7 +14,7 @@ from protocol.channels import CHANNELS
 from protocol.field_words import doc_of, unit_of
 from protocol.golden_case import MessageCase
 from protocol.golden_cases import CASES
-from protocol.golden_wires import READERS, FRAMING_CASES
+from protocol.golden_wires import FRAMING_CASES, READERS
 from protocol.refusals import RejectReason
 from protocol.twist_text import MAX_TWIST_BYTES
 

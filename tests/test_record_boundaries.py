@@ -5,7 +5,7 @@ import pytest
 from protocol.errors import WireError
 from protocol.messages import AnswerHeader, Echo, Holder
 from protocol.refusals import RejectReason
-from robot_side.judge import FreshnessRecord, IssuedRecord, SequenceRecord, CommandResult
+from robot_side.judge import CommandResult, FreshnessRecord, IssuedRecord, SequenceRecord
 
 ROBOT, OTHER = "0000aaaa", "0000cccc"
 VISION, OTHER_VISION = Holder(source="vision", session="0000bbbb"), Holder(source="vision", session="0000cccc")

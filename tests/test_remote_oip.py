@@ -12,8 +12,8 @@ from tests.remote_rig import ASKED, BALL_JPEG, COLUMNS, JPEG_INPUT, OUTPUTS, fra
 from vision_side.detect.protobuf import fields, put, put_integers, varint
 from vision_side.detect.remote.oip import (
     Inferred,
-    OutputOptions,
     OipModel,
+    OutputOptions,
     Slot,
     Tensor,
     detections_of,

@@ -12,7 +12,7 @@ from vision_side.detect.remote.address import parse_address
 from vision_side.detect.remote.asking import ServerDetector
 from vision_side.detect.remote.oip import Inferred, OutputOptions, detections_of
 from vision_side.detect.remote.oip_http import HttpServer
-from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason, ErrorCounters
+from vision_side.detect.remote.refusing import ErrorCounters, NoAnswerError, NoAnswerReason
 
 
 def _refuse(tally, count):

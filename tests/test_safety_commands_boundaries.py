@@ -9,7 +9,7 @@ from protocol.messages import STILL, Echo, LastRejection, State, Twist, Verb
 from protocol.refusals import RejectReason
 from robot_side.limits import SafetyConfig
 from robot_side.safety import Decision, SafetyGate
-from robot_side.states import TRANSITIONS, Event, next_state, is_armed
+from robot_side.states import TRANSITIONS, Event, is_armed, next_state
 from tests.gate_rig import GUEST, VISION_HOLDER, A, D, F, G, H, S, driving, guest, guest_driving
 from tests.safety_rig import HUMAN, OTHER, ROBOT, VISION, Rig
 

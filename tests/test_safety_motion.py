@@ -17,7 +17,7 @@ from robot_side.limits import (
     clamp_twist,
     stop_bound,
 )
-from robot_side.states import TRANSITIONS, Event, next_state, is_armed
+from robot_side.states import TRANSITIONS, Event, is_armed, next_state
 from tests.safety_rig import HUMAN, MS, VISION, Rig
 
 

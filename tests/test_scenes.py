@@ -11,7 +11,7 @@ pytest.importorskip("pybullet")
 import simplejpeg
 
 from sim import scene_backdrop
-from sim.scene_defects import as_seen, with_defects, streak
+from sim.scene_defects import as_seen, streak, with_defects
 from sim.scene_plan import plan_scene
 from sim.scene_render import SceneRenderer
 from sim.scene_texture_parts import SIDE

@@ -13,7 +13,7 @@ pytest.importorskip("pybullet")
 from operator_side import cli, cli_score_detectors
 from operator_side import score_scenes as score_scenes_file
 from operator_side.score_detectors import Figures
-from operator_side.score_detectors_bounds import LEAST_HITS, detector_checks, all_detector_checks
+from operator_side.score_detectors_bounds import LEAST_HITS, all_detector_checks, detector_checks
 from operator_side.score_detectors_text import check_lines
 from operator_side.score_scenes import LABELLED, Report, close_subjects, score_scenes, subjects
 from protocol.config import Config as Settings

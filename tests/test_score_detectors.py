@@ -11,13 +11,13 @@ pytest.importorskip("pybullet")
 import cv2
 
 from operator_side import cli, cli_score_detectors
-from operator_side.score_detectors import LabelMatches, FrameResult, figures, frame_result, precisions
+from operator_side.score_detectors import FrameResult, LabelMatches, figures, frame_result, precisions
 from operator_side.score_detectors_text import markdown, text
 from operator_side.score_scenes import score_scenes, subjects
 from operator_side.score_sheet import Sheet
 from operator_side.train_choice import ball_threshold, label_threshold
 from sim.scene_plan import plan_scene
-from sim.scenes import COLUMNS, JUDGED_FROM, Scene, LabelledBox
+from sim.scenes import COLUMNS, JUDGED_FROM, LabelledBox, Scene
 from vision_side.detect.overlap import overlap
 from vision_side.detect.port import Circle, Detection
 

@@ -25,9 +25,9 @@ from protocol.transports.secured import (
     ROLES,
     SOURCES_OF_ROLE,
     certificate_role,
-    may_subscribe,
-    may_publish,
     load_role_keys,
+    may_publish,
+    may_subscribe,
 )
 from protocol.transports.websocket_keys import read_tokens
 from protocol.transports.zenoh import open_zenoh

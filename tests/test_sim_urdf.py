@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import pytest
 
 from protocol.errors import ConfigError
-from sim.body import urdf_body, outline, urdf_from_model
+from sim.body import outline, urdf_body, urdf_from_model
 from sim.robot_model import ROBOTS, load_robot, robot_names
 from sim.urdf import Urdf
 

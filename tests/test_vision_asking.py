@@ -9,11 +9,11 @@ from protocol.channels import CAMERA, FRAME, MISSION, REPORT, SCAN, TWIST
 from protocol.codec import decode, encode, encode_ranges
 from protocol.messages import (
     AnswerHeader,
-    RequestId,
     DetectionsHeader,
     Echo,
     FrameHeader,
     RequestHeader,
+    RequestId,
     ScanHeader,
     Stamp,
 )

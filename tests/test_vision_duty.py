@@ -3,7 +3,7 @@
 import pytest
 
 from protocol.errors import ConfigError
-from protocol.messages import STILL, RequestId, FrameHeader, Twist
+from protocol.messages import STILL, FrameHeader, RequestId, Twist
 from tests.mission_contract import CAMERA
 from tests.vision_rig import jpeg_of, scene
 from vision_side.config import MissionConfig, VisionConfig

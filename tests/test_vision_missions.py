@@ -16,7 +16,7 @@ from vision_side import plugin_choice
 from vision_side.config import VisionConfig
 from vision_side.detect.port import Circle, Detection
 from vision_side.missions import choice
-from vision_side.missions.choice import BUILT_IN, mission_spec, configured_mission, requested_mission
+from vision_side.missions.choice import BUILT_IN, configured_mission, mission_spec, requested_mission
 from vision_side.missions.port import Plan, View
 
 CONFIG = VisionConfig()

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 import vision_side
 from protocol.channels import MAX_HEADER_BYTES
 from protocol.codec import decode, encode
-from protocol.messages import STILL, AnswerHeader, RequestId, FrameHeader
+from protocol.messages import STILL, AnswerHeader, FrameHeader, RequestId
 from protocol.twist_text import format_twist
 from tests.vision_rig import Rig, camera, eight, jpeg_of, scene
 from vision_side.config import VisionConfig
-from vision_side.pipeline import PipelineAnswer, Frame, Pipeline, Observation, answer_header, encode_answer
+from vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header, encode_answer
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))

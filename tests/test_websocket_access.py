@@ -15,8 +15,8 @@ from protocol.transports.websocket import open_websocket
 from protocol.transports.websocket_access import (
     NO_TOKEN,
     NOT_LISTED,
-    client_address_problem,
     check_listening,
+    client_address_problem,
     grants_of_role,
     role_of_token,
 )

@@ -19,10 +19,10 @@ from protocol.transports.websocket import open_websocket
 from protocol.transports.websocket_access import grants_of_role
 from protocol.transports.websocket_listen import TOO_MANY_CLIENTS
 from protocol.transports.websocket_places import (
-    RESERVED_SLOTS,
     MAX_CLIENTS,
     MAX_HANDSHAKES,
     MAX_HANDSHAKES_PER_ADDRESS,
+    RESERVED_SLOTS,
     ConnectionLimits,
     may_control,
 )

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from operator_side.faults.wires import BenchWire
 from protocol.errors import ConfigError
-from sim.wire import IP_HEADER_BYTES, MAX_WAITING, Leg, Medium, LinkShape, LinkShapes, EmulatedLink
+from sim.wire import IP_HEADER_BYTES, MAX_WAITING, EmulatedLink, Leg, LinkShape, LinkShapes, Medium
 from sim.wire_tun import ADDRESS_A, _read_shapes, why_impossible
 
 PACKET = bytes(range(100))

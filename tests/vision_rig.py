@@ -14,7 +14,7 @@ import numpy as np
 from protocol.messages import CameraModel, FrameHeader, Twist
 from vision_side.config import VisionConfig
 from vision_side.detect.port import Circle, Detection
-from vision_side.pipeline import Frame, Pipeline, Observation
+from vision_side.pipeline import Frame, Observation, Pipeline
 
 TICK_US = 4_000
 FRAME_US = 33_333

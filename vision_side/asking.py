@@ -10,7 +10,7 @@ from typing import Final
 from protocol.channels import MISSION
 from protocol.codec import decode
 from protocol.errors import ConfigError, WireError
-from protocol.messages import RequestId, FrameHeader, RequestHeader
+from protocol.messages import FrameHeader, RequestHeader, RequestId
 from protocol.mission_messages import MissionRequest
 from protocol.refusals import RejectReason
 from protocol.transports.link import Message

@@ -14,7 +14,7 @@ from protocol.messages import FrameHeader
 from protocol.transports.link import LatestSlot, Link, Message
 from vision_side.config import VisionConfig
 from vision_side.detect.boxes import REMEMBERED, BoxReader
-from vision_side.pipeline import PipelineAnswer, Observation
+from vision_side.pipeline import Observation, PipelineAnswer
 from vision_side.service import LogLine, Service
 
 _BOXES_SILENCE_S = 2.0

@@ -37,7 +37,7 @@ from vision_side.detect.around import maker_of, notices_of
 from vision_side.detect.checking import checked_results
 from vision_side.detect.own_decoders import DecoderPool
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
-from vision_side.detector_turns import FrameCounters, QueuedFrame, FairQueue
+from vision_side.detector_turns import FairQueue, FrameCounters, QueuedFrame
 from vision_side.service_process import ends_on_signal
 
 ROLE: Final = "detector"

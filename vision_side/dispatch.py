@@ -6,16 +6,16 @@ from collections.abc import Callable
 from protocol.channels import MISSION, REPORT, SCAN
 from protocol.codec import encode
 from protocol.errors import WireError
-from protocol.messages import RequestId, DetectionsHeader, Echo, FrameHeader
+from protocol.messages import DetectionsHeader, Echo, FrameHeader, RequestId
 from protocol.transports.link import LatestSlot, Link, Message
-from vision_side.asking import MissionRequests, DetectorSwap
+from vision_side.asking import DetectorSwap, MissionRequests
 from vision_side.config import VisionConfig
 from vision_side.detect.around import notices_of
 from vision_side.detect.port import Detector
 from vision_side.detect.shadow import ShadowDetector
 from vision_side.detect.timing import TimedDetector
 from vision_side.missions.choice import configured_mission
-from vision_side.pipeline import SOURCE, Pipeline, Observation
+from vision_side.pipeline import SOURCE, Observation, Pipeline
 from vision_side.reporting import Reporter
 from vision_side.scan import decode_scan
 

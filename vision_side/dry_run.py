@@ -16,7 +16,7 @@ from vision_side.config import VisionConfig
 from vision_side.detect.around import notices_of
 from vision_side.detect.choice import configured_detector
 from vision_side.dispatch import MissionChannel
-from vision_side.pipeline import SOURCE, PipelineAnswer, Frame, Pipeline, Observation
+from vision_side.pipeline import SOURCE, Frame, Observation, Pipeline, PipelineAnswer
 from vision_side.service import Service
 
 _TELL_EVERY_S = 0.5

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from protocol import VERSION
 from protocol.errors import WireError
-from protocol.messages import AnswerHeader, RequestId, CameraModel, Echo, FrameHeader, ScanHeader, Twist
+from protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, RequestId, ScanHeader, Twist
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder, Picture
 from vision_side.detect.checking import checked_results

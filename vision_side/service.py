@@ -25,7 +25,7 @@ from vision_side.detect.hsv import HsvDetector
 from vision_side.detect.port import Detector
 from vision_side.detect.timing import TimedDetector
 from vision_side.dispatch import NO_FRAMES, MissionChannel
-from vision_side.pipeline import PipelineAnswer, Frame, Pipeline, Observation, encode_answer
+from vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, encode_answer
 from vision_side.sessions import SessionSelector
 from vision_side.viewing import ViewPublisher
 

@@ -17,7 +17,7 @@ from operator_side.faults.judge import (
     stop_checks,
 )
 from operator_side.faults.rig import RobotFixture
-from operator_side.faults.row import Injected, Outcome, Case
+from operator_side.faults.row import Case, Injected, Outcome
 from operator_side.faults.sampler import STALL_US
 from operator_side.score import Check
 from protocol.errors import SightlineError

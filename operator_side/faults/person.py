@@ -4,7 +4,8 @@ import threading
 from typing import TYPE_CHECKING
 
 from operator_side.faults.ledger import INJECTED, REQUESTED, EventLog
-from operator_side.requests import SOURCE as OPERATOR_SOURCE, Operator
+from operator_side.requests import SOURCE as OPERATOR_SOURCE
+from operator_side.requests import Operator
 from protocol.messages import Verb
 from protocol.transports.zenoh import open_zenoh
 

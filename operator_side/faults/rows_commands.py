@@ -5,7 +5,7 @@ from typing import Final
 
 from operator_side.faults.judge import at_least, at_most, most_gain_mps2, wheel_mps
 from operator_side.faults.rig import RobotFixture, Setup
-from operator_side.faults.row import Injected, Case
+from operator_side.faults.row import Case, Injected
 from operator_side.faults.rows_processes import SETTLED_S
 from protocol.clock import monotonic_us
 from robot_side.limits import SafetyConfig

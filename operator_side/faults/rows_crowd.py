@@ -9,7 +9,7 @@ from operator_side.faults.crowd import ADMITTED, HANDSHAKES, READY, SEEN, VIEWER
 from operator_side.faults.judge import MotorRow, at_least, at_most, wheel_mps
 from operator_side.faults.ledger import INJECTED
 from operator_side.faults.rig import READY_S, RobotFixture, Setup
-from operator_side.faults.row import Injected, Case
+from operator_side.faults.row import Case, Injected
 from operator_side.faults.rows_processes import AGAIN_S, BUSY, SETTLED_S, busy_processes
 from operator_side.faults.sampler import Hole
 from operator_side.score import Check

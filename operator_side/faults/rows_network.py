@@ -4,7 +4,7 @@ from functools import partial
 from typing import Final
 
 from operator_side.faults.rig import RobotFixture, Setup
-from operator_side.faults.row import Injected, Case
+from operator_side.faults.row import Case, Injected
 from operator_side.faults.rows_processes import drives_again
 from protocol.clock import monotonic_us
 from sim.wire import LinkShape, LinkShapes

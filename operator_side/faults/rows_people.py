@@ -7,7 +7,7 @@ from typing import Final
 from operator_side.faults.judge import MotorRow, at_least, at_most, wheel_mps
 from operator_side.faults.ledger import REQUESTED
 from operator_side.faults.rig import RobotFixture, Setup
-from operator_side.faults.row import Injected, Case
+from operator_side.faults.row import Case, Injected
 from operator_side.faults.rows_network import LOSSY, shape
 from operator_side.faults.rows_processes import AGAIN_S, SETTLED_S, drives_again
 from protocol.clock import monotonic_us

@@ -12,7 +12,7 @@ from typing import Final
 
 from operator_side.faults.judge import at_most
 from operator_side.faults.rig import RobotFixture, Setup
-from operator_side.faults.row import Injected, Case
+from operator_side.faults.row import Case, Injected
 from protocol.clock import monotonic_us
 
 STOPPED_S: Final = 3.0

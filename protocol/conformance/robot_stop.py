@@ -4,7 +4,7 @@ from typing import Final
 
 from protocol.conformance.bench import Bench
 from protocol.conformance.case import Suite
-from protocol.conformance.robot_arming import is_soon, expect_arm_rejected
+from protocol.conformance.robot_arming import expect_arm_rejected, is_soon
 from protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, arm, armed
 from protocol.messages import State, Status
 

@@ -25,7 +25,7 @@ from protocol.log_lines import log_line
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.link_rules import INEXACT_KEY, LinkRules
 from protocol.transports.websocket_dial import Client as Dialer
-from protocol.transports.websocket_dialects import SightlineV1, PeerCodec
+from protocol.transports.websocket_dialects import PeerCodec, SightlineV1
 from protocol.transports.websocket_doorlog import BurstLimiter
 from protocol.transports.websocket_endpoints import WebSocketEndpoint, parse_websocket_endpoint
 from protocol.transports.websocket_framing import IncomingMessage

@@ -15,8 +15,8 @@ from protocol.transports.secured import certificate_role
 from protocol.transports.websocket_access import (
     NO_TOKEN,
     NOT_LISTED,
-    client_address_problem,
     check_listening,
+    client_address_problem,
     grants_of_role,
     role_of_token,
 )
@@ -26,7 +26,7 @@ from protocol.transports.websocket_endpoints import WebSocketEndpoint, host_prob
 from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
 from protocol.transports.websocket_keys import read_tokens
 from protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS, Promote, count_close
-from protocol.transports.websocket_places import Slot, ConnectionLimits, may_control
+from protocol.transports.websocket_places import ConnectionLimits, Slot, may_control
 from protocol.transports.websocket_tls import server_tls_context, tls_handshake
 from protocol.transports.websocket_wire import CLOSE_S, Connection
 

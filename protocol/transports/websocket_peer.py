@@ -13,7 +13,7 @@ from protocol.clock import monotonic_us
 from protocol.errors import WireError
 from protocol.log_lines import RepeatLimiter
 from protocol.transports.link_rules import OVERSIZE
-from protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, SightlineV1, PeerCodec, PeerError
+from protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, PeerCodec, PeerError, SightlineV1
 from protocol.transports.websocket_framing import IncomingMessage
 from protocol.transports.websocket_life import Keepalive
 from protocol.transports.websocket_outbox import Outbox, Publication

@@ -21,7 +21,7 @@ from protocol.transports.endpoints import check_zenoh_endpoints
 from protocol.transports.link import LatestSlot, Message
 from protocol.transports.link_rules import NOT_A_PUT, LinkRules
 from protocol.transports.presence import PeerInfo
-from protocol.transports.secured import ROBOT_ROLE, KNOWN_SOURCES, load_role_keys
+from protocol.transports.secured import KNOWN_SOURCES, ROBOT_ROLE, load_role_keys
 from protocol.transports.zenoh_presence import PresenceAnnouncer, query_presence
 from protocol.transports.zenoh_session import CLOSED_SESSION, open_session
 

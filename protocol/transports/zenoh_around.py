@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Final
 
 from protocol.channels import KEY_PREFIX, STATUS, parse_key
 from protocol.errors import ConfigError
-from protocol.transports.endpoints import parse_zenoh_endpoint, check_zenoh_endpoints
+from protocol.transports.endpoints import check_zenoh_endpoints, parse_zenoh_endpoint
 from protocol.transports.link import Message
 from protocol.transports.link_rules import LinkRules
-from protocol.transports.presence import QUERY_ROUNDS, MAX_PEERS, PeerInfo, best_round_trips
+from protocol.transports.presence import MAX_PEERS, QUERY_ROUNDS, PeerInfo, best_round_trips
 from protocol.transports.secured import RoleKeys, load_role_keys
 from protocol.transports.zenoh_discovery import multicast_address
 from protocol.transports.zenoh_presence import REPLY_TIMEOUT_S, query_presence

@@ -19,14 +19,14 @@ from protocol.clock import monotonic_us
 from protocol.codec import encode
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.presence import (
-    PRESENCE_PATTERN,
     MAX_ABOUT,
     MAX_PEERS,
+    PRESENCE_PATTERN,
     PeerInfo,
     Presence,
+    parse_presence_reply,
     presence_key,
     robot_with_same_id,
-    parse_presence_reply,
 )
 
 if TYPE_CHECKING:

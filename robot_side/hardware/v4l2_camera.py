@@ -12,7 +12,7 @@ from protocol.errors import HardwareError
 from protocol.messages import CameraModel
 from robot_side.hardware.lens import camera_model
 from robot_side.hardware.newest import LatestPicture
-from robot_side.hardware.v4l2_device import Capture, V4l2Device, V4l2CameraConfig, open_capture
+from robot_side.hardware.v4l2_device import Capture, V4l2CameraConfig, V4l2Device, open_capture
 from robot_side.ports import Picture
 
 _RETRY_S = 0.5

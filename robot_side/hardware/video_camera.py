@@ -15,7 +15,7 @@ from protocol.errors import ConfigError, HardwareError
 from protocol.jpeg import JpegSize
 from robot_side.hardware.lens import LensConfig, camera_model
 from robot_side.hardware.pace import FrameTimer
-from robot_side.ports import Picture, scaled_size, scaled_quality
+from robot_side.ports import Picture, scaled_quality, scaled_size
 
 _USUAL_FPS = 30.0
 _CATCH_UP_S = 1.0  # after a longer pause the video goes on where it was, as if paused

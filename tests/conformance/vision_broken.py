@@ -11,7 +11,7 @@ from protocol.messages import STILL, FrameHeader
 from protocol.transports.link import Message
 from protocol.twist_text import format_twist
 from tests.conformance.vision_rig import COMPUTE_US, VirtualVision
-from vision_side.pipeline import PipelineAnswer, Observation, answer_header
+from vision_side.pipeline import Observation, PipelineAnswer, answer_header
 
 BROKEN = {}
 STANDING = PipelineAnswer(STILL, Observation("broken"))

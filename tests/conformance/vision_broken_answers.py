@@ -5,7 +5,7 @@ from protocol.conformance.vision_pictures import picture
 from protocol.golden_case import packed
 from protocol.messages import Stamp
 from tests.conformance.vision_broken import STANDING, BrokenVision, breaks, frame_header
-from vision_side.pipeline import PipelineAnswer, Observation
+from vision_side.pipeline import Observation, PipelineAnswer
 
 
 def rewriting(case, wrong, change=lambda fields: {}, text=lambda text: text, **how):

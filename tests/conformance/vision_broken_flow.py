@@ -7,7 +7,7 @@ from protocol.channels import FRAME
 from protocol.conformance.vision_flow import BROKEN_STATUS
 from tests.conformance.vision_broken import STANDING, BrokenVision, breaks
 from tests.conformance.vision_broken_answers import PerSession
-from vision_side.pipeline import PipelineAnswer, Observation
+from vision_side.pipeline import Observation, PipelineAnswer
 
 
 class Queueing(BrokenVision):

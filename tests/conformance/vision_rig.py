@@ -13,7 +13,7 @@ from protocol.transports.memory import MemoryLink, MemoryNetwork
 from vision_side.config import VisionConfig
 from vision_side.decode import Decoder
 from vision_side.detect.hsv import HsvDetector
-from vision_side.pipeline import PipelineAnswer, Pipeline
+from vision_side.pipeline import Pipeline, PipelineAnswer
 from vision_side.service import Service
 
 COMPUTE_US = 2_000

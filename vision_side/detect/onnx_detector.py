@@ -23,11 +23,11 @@ from vision_side.detect.onnx_engine import Engine, open_engine
 from vision_side.detect.onnx_header import OnnxHeader, read_onnx_header
 from vision_side.detect.onnx_reading import (
     ModelFormat,
-    split_batch,
     fit_picture,
     model_format,
     own_labels,
     read_outputs,
+    split_batch,
 )
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
 from vision_side.detect.refine import refined

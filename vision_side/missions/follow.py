@@ -12,7 +12,7 @@ from vision_side.config import BoxesConfig, LatencyConfig, SearchConfig, SteerCo
 from vision_side.detect.boxes import locate_box
 from vision_side.detect.labels import is_followable
 from vision_side.detect.port import Detection
-from vision_side.foretell import MotionPredictor, Motion
+from vision_side.foretell import Motion, MotionPredictor
 from vision_side.missions.port import Plan, View
 from vision_side.search import Search
 from vision_side.sphere import Sighting, locate_sphere

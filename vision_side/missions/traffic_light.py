@@ -16,7 +16,7 @@ from protocol.messages import STILL, CameraModel, Pose, Twist
 from vision_side.config import BoxesConfig, LatencyConfig
 from vision_side.detect.boxes import locate_box
 from vision_side.detect.port import Detection
-from vision_side.foretell import MotionPredictor, Motion
+from vision_side.foretell import Motion, MotionPredictor
 from vision_side.missions.lamp import UNKNOWN, BoxLightReader, HousingLightReader, LampConfig, Light
 from vision_side.missions.lane import Lane, LaneConfig, Line
 from vision_side.missions.port import Plan, View

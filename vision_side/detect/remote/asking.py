@@ -10,7 +10,7 @@ from protocol.clock import monotonic_us
 from protocol.errors import WireError
 from protocol.jpeg import read_jpeg_size
 from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
-from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason, ErrorCounters
+from vision_side.detect.remote.refusing import ErrorCounters, NoAnswerError, NoAnswerReason
 
 REMOTE: Final = "remote"
 """What a result was made on, where the server does not say."""

@@ -9,7 +9,7 @@ from vision_side.detect.remote.address import Address, parse_address
 from vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector, seconds_left
 from vision_side.detect.remote.by_deadline import DeadlineDetector
 from vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES
-from vision_side.detect.remote.oip import OutputOptions, OipModel, detections_of, tensor_of
+from vision_side.detect.remote.oip import OipModel, OutputOptions, detections_of, tensor_of
 from vision_side.detect.remote.oip_messages import (
     INFER,
     METADATA,

@@ -5,7 +5,7 @@ from vision_side.detect.remote.address import Address, parse_address
 from vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector
 from vision_side.detect.remote.by_deadline import DeadlineDetector
 from vision_side.detect.remote.http_exchange import HttpExchange
-from vision_side.detect.remote.oip import OutputOptions, OipModel, detections_of, tensor_of
+from vision_side.detect.remote.oip import OipModel, OutputOptions, detections_of, tensor_of
 from vision_side.detect.remote.oip_json import HEADER_LENGTH, infer_body, read_infer, read_metadata
 from vision_side.detect.remote.oip_settings import OipSettings
 from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
