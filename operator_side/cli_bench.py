@@ -10,11 +10,11 @@ import typer
 from operator_side.cli_bench_detector import register_detector_benches
 from operator_side.cli_bench_loop import register_loop_benches
 from operator_side.cli_bench_network import register_network_bench
-from operator_side.cli_judge import CHECK_FAILED, Json, numbers
+from operator_side.cli_options import CHECK_FAILED, Json, numbers
 from operator_side.extras import needs
 
 if TYPE_CHECKING:
-    from operator_side.score import Check
+    from operator_side.check_text import Check
 
 
 def register_benches(app: typer.Typer) -> None:
@@ -36,7 +36,7 @@ def register_benches(app: typer.Typer) -> None:
 def codec(*, as_json: Json = False) -> int:
     """Encode and decode a frame header and a twist."""
     from benchmarks.codec import measure_codec
-    from operator_side.score import Check
+    from operator_side.check_text import Check
 
     costs = measure_codec()
     return print_checks([Check(cost.name, cost.median_us, "us", cost.bound_us, cost.ok) for cost in costs], as_json)
@@ -45,7 +45,7 @@ def codec(*, as_json: Json = False) -> int:
 def gate(*, as_json: Json = False) -> int:
     """Judge one command and decide one step, as the driver does."""
     from benchmarks.gate import GATE_BOUND_US, measure_gate
-    from operator_side.score import Check
+    from operator_side.check_text import Check
 
     took_us = measure_gate()
     return print_checks([Check("offer and step", took_us, "us", GATE_BOUND_US, took_us <= GATE_BOUND_US)], as_json)
@@ -55,7 +55,7 @@ def pipeline(*, as_json: Json = False) -> int:
     """Picture in, command out: decode, detect, track, steer. And the learned detector's network."""
     with needs("vision"):
         from benchmarks.pipeline import LEARNED_BOUND_US, time_learned, time_steps
-    from operator_side.score import Check
+    from operator_side.check_text import Check
 
     checks = []
     for one in time_steps():
@@ -87,7 +87,7 @@ def odometry(
     """Dead reckoning against the simulated world's truth, of every simulated robot."""
     with needs("sim"):
         from benchmarks.odometry import measure_odometry
-    from operator_side.score import Check
+    from operator_side.check_text import Check
 
     errors = measure_odometry(robot_model or ())
     checks = [Check(one.name, one.percent, "%", one.bound_percent, one.percent <= one.bound_percent) for one in errors]
@@ -100,7 +100,7 @@ def robot(
     """The robot service in a bare environment of its own: frame rate and memory. Needs a checkout and pip."""
     with needs("all"):
         from benchmarks.light_robot import NETWORK_BOUND_MB, measure_light_robot
-    from operator_side.score import Check
+    from operator_side.check_text import Check
 
     seen = measure_light_robot(seconds)
     checks = [

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from operator_side.cli_judge import Json
+from operator_side.cli_options import Json
 from operator_side.extras import needs
 
 if TYPE_CHECKING:
-    from operator_side.score import Check
+    from operator_side.check_text import Check
 
 _READY_S = 30.0
 _BOUND_US = {"zenoh": 1_000.0, "oip+http": 2_000.0}
@@ -39,7 +39,7 @@ def detector(
 
     with needs("vision"):
         from benchmarks.detector_remote import HOT_S, PACED_S, measure_cost
-        from operator_side.score import Check
+        from operator_side.check_text import Check
         from vision_side.config import VisionConfig
         from vision_side.detect.around import attach_detector, close_detector
         from vision_side.detect.choice import build_detector
@@ -72,7 +72,7 @@ def streams(
     """Many robots at one detector service that can look at half of their frames: age, fairness, memory."""
     with needs("vision"):
         from benchmarks import detector_streams as bench
-        from operator_side.score import Check
+        from operator_side.check_text import Check
 
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
         load = bench.measure_streams(_free_endpoint(), Path(folder), streams, seconds)

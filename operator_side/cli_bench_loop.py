@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from operator_side.cli_judge import CHECK_FAILED, Json
+from operator_side.cli_options import CHECK_FAILED, Json
 from operator_side.extras import needs
 from protocol.errors import ConfigError
 
@@ -180,6 +180,6 @@ def _row(name: str, race: "Race") -> str:
 
 def _check_lines(checks: "Sequence[AnyCheck]") -> list[str]:
     from operator_side.check_text import check_line
-    from operator_side.score import Check
+    from operator_side.check_text import Check
 
     return [check_line(Check(one.name, one.value, one.unit, one.bound, one.ok)) for one in checks]

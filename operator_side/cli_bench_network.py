@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from operator_side.cli_judge import CHECK_FAILED, Json, numbers
+from operator_side.cli_options import CHECK_FAILED, Json, numbers
 from operator_side.extras import needs
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def _print_worst(runs: "Sequence[NetworkRun]") -> None:
 
 def _print_network_checks(checks: "Sequence[LoopCheck]", *, as_json: bool) -> None:
     from operator_side.check_text import check_line
-    from operator_side.score import Check
+    from operator_side.check_text import Check
 
     for check in checks:
         typer.echo("  " + check_line(Check(check.name, check.value, check.unit, check.bound, check.ok)), err=as_json)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from operator_side.cli_people import DEFAULT_CONNECT, Connect, Json, Robot, Secure
+from operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Robot, Secure
 from operator_side.extras import needs
 from operator_side.pictures import Pictures, viewer_role
 from protocol.channels import FRAME, OVERLAY

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from pydantic import BaseModel
 
-from operator_side.cli_services import Sets
+from operator_side.cli_options import Sets
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from operator_side.settings import model_of

@@ -16,8 +16,8 @@ from protocol.conformance.live import LiveBench
 from protocol.conformance.report import to_dict, to_junit, to_page
 from protocol.conformance.runner import Result, chosen, passed, run_cases
 from protocol.errors import ConfigError, LinkError
+from operator_side.cli_options import CHECK_FAILED
 
-CHECK_FAILED = 5
 _ROLES = ("vision", "operator")
 """Whom the kit plays where each role has keys of its own."""
 TRIES = 3

@@ -9,21 +9,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from operator_side import cli_detector_serve as serving
-from operator_side.cli_people import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure
-from operator_side.cli_services import ConfigFile, LogForm, MaybeSecure, Sets
-from operator_side.cli_services import Listen as MaybeListen
-from operator_side.cli_services import ServiceConnect as MaybeConnect
+from operator_side.cli_options import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure
+from operator_side.cli_options import ConfigFile, LogForm, MaybeSecure, Sets
+from operator_side.cli_options import Listen as MaybeListen
+from operator_side.cli_options import ServiceConnect as MaybeConnect
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
+from operator_side.cli_options import CHECK_FAILED
+from operator_side.cli_options import Device
 
 if TYPE_CHECKING:
     from vision_side.detect.contract import PromiseResult, Times
     from vision_side.detect.port import Detector
-
-CHECK_FAILED = 5
-Device = Annotated[str | None, typer.Option("--device", help="auto, cpu, cuda or tensorrt [default: auto].")]
-
 
 def register_detector(app: typer.Typer) -> None:
     """Add the commands to `app`."""
@@ -135,7 +133,7 @@ def check(
 
 def own_options(texts: Sequence[str]) -> dict[str, Any]:
     """What `--set KEY=VALUE` gives a detector's own `Config`; a dot is for a section. Raises ConfigError."""
-    from operator_side.cli_mission import options_of
+    from operator_side.cli_options import options_of
 
     return _nested(options_of(texts))
 

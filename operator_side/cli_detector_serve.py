@@ -5,16 +5,16 @@ from typing import Annotated, Any
 
 import typer
 
-from operator_side.cli_services import ConfigFile, Listen, LogForm, MaybeSecure, ServiceConnect, Sets
+from operator_side.cli_options import ConfigFile, Listen, LogForm, MaybeSecure, ServiceConnect, Sets
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
 from protocol.log_lines import set_log_format
+from operator_side.cli_options import Device
 
 Robots = Annotated[
     str | None, typer.Option(metavar="ID", help="A robot's id, or several by * and ? [default: the configured or *].")
 ]
-Device = Annotated[str | None, typer.Option("--device", help="auto, cpu, cuda or tensorrt [default: auto].")]
 DeadlineMs = Annotated[
     float, typer.Option("--deadline-ms", min=5, max=1000, help="From a frame's arrival to its boxes, at most.")
 ]

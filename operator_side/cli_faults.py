@@ -11,11 +11,11 @@ import typer
 
 from operator_side.extras import needs
 from operator_side.out_file import check_out_file
+from operator_side.cli_options import CHECK_FAILED
 
 if TYPE_CHECKING:
     from operator_side.faults.report import Results
 
-CHECK_FAILED = 5
 JOBS = min(4, (os.cpu_count() or 1) + 1)
 """A row waits more than it computes; a row that was disturbed too much says so and runs again."""
 SAFETY_PAGE = "safety.md"

@@ -13,12 +13,9 @@ import typer
 from operator_side.cli_score_detectors import detectors
 from operator_side.extras import needs
 from protocol.errors import ConfigError
-
-CHECK_FAILED = 5
-Number = TypeVar("Number", int, float)
-
-Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
-
+from operator_side.cli_options import CHECK_FAILED
+from operator_side.cli_options import Json
+from operator_side.cli_options import numbers
 
 def register_demo_and_score(app: typer.Typer) -> None:
     """Add the commands to `app`."""
@@ -135,9 +132,3 @@ def _write_page(page: Path, seeds: list[int], jobs: int) -> int:
     return 0 if write_page(page, seeds, jobs, progress) else CHECK_FAILED
 
 
-def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:
-    """The numbers of an option, separated by commas. Raises ConfigError with an example."""
-    try:
-        return [kind(part) for part in text.split(",")]
-    except ValueError:
-        raise ConfigError(f"{option} {text!r}: numbers separated by commas, e.g. {option} 1,2,3") from None

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from operator_side.cli_people import DEFAULT_CONNECT, Connect, Robot, Secure
+from operator_side.cli_options import DEFAULT_CONNECT, Connect, Robot, Secure
 from operator_side.extras import needs
 from protocol.transports.opening import open_link
 

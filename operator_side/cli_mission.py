@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from operator_side.cli_people import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure
+from operator_side.cli_options import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure
 from operator_side.mission_asking import MissionClient, request_of
 from operator_side.mission_text import cannot, detector_line, mission_line
 from operator_side.requests import SOURCE
@@ -17,6 +17,7 @@ from operator_side.waypoints import Waypoints, waypoints_of, waypoints_of_file
 from protocol.errors import ConfigError
 from protocol.mission_messages import MissionReport
 from protocol.transports.opening import open_link
+from operator_side.cli_options import options_of
 
 Sets = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option of the mission, e.g. linear_mps=0.2.")
@@ -79,20 +80,6 @@ def goto(
                 typer.echo(f"{robot}: {mission_line(report)}")
         code = _print_report(robot, report, as_json, asked=True)
         return REJECTED_EXIT if cannot(report) else code
-
-
-def options_of(texts: Sequence[str]) -> dict[str, Any]:
-    """The options of `--set KEY=VALUE`, values read as TOML, as text if they are none. Raises ConfigError."""
-    options: dict[str, Any] = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals or not name.strip():
-            raise ConfigError(f"--set {text!r} is no setting: write key=value, e.g. --set linear_mps=0.2")
-        try:
-            options[name.strip()] = tomllib.loads(f"value = {value}")["value"]
-        except tomllib.TOMLDecodeError:
-            options[name.strip()] = value
-    return options
 
 
 def _given(numbers: list[str], file: Path | None) -> Waypoints:

@@ -17,21 +17,15 @@ from operator_side.status_text import status_line, status_lines
 from protocol.messages import Reply, Status, Verb
 from protocol.transports.opening import open_link
 from robot_side.config import DEFAULT_ENDPOINT
+from operator_side.cli_options import REJECTED_EXIT
+from operator_side.cli_options import DEFAULT_CONNECT
+from operator_side.cli_options import Robot
+from operator_side.cli_options import Connect
+from operator_side.cli_options import MaybeConnect
+from operator_side.cli_options import Secure
+from operator_side.cli_options import Json
 
-REJECTED_EXIT = 5
 _REPORT_S = 0.8  # vision reports twice a second; where one drives, that is worth waiting for
-
-Robot = Annotated[str, typer.Argument(metavar="[ROBOT]", help="The robot's id.")]
-Connect = Annotated[list[str], typer.Option("--connect", metavar="ENDPOINT", help="Where the robot or router listens.")]
-MaybeConnect = Annotated[
-    list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Where a robot or router listens.")
-]
-Secure = Annotated[
-    str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; endpoints are then tls/...")
-]
-Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
-DEFAULT_CONNECT = [DEFAULT_ENDPOINT]
-
 
 def register_operator(app: typer.Typer) -> None:
     """Add the commands to `app`."""

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from operator_side.cli_detector_serve import Device
-from operator_side.cli_services import ConfigFile, Sets
+from operator_side.cli_options import Device
+from operator_side.cli_options import ConfigFile, Sets
 from operator_side.extras import needs
 from operator_side.out_file import check_out_file
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
 
 if TYPE_CHECKING:
-    from operator_side.score import Check
+    from operator_side.check_text import Check
     from operator_side.score_scenes import Report, ScoredScene, Subject
     from operator_side.score_sheet import Sheet
     from operator_side.settings import Loaded
@@ -114,7 +114,7 @@ def _check_device(names: Sequence[str], settings: Any) -> None:
 
 
 def _print_report(report: "Report", checks: "list[Check] | None", as_json: bool) -> int:
-    from operator_side.cli_judge import CHECK_FAILED
+    from operator_side.cli_options import CHECK_FAILED
     from operator_side.score_detectors_text import check_lines, silence_lines, text
 
     ok = all(check.ok for check in checks or ())

@@ -11,29 +11,15 @@ from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
 from protocol.log_lines import set_log_format
 from robot_side.config import DEFAULT_ENDPOINT
-
-ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help="TOML file; see `sightline config`.")]
-Sets = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Set one value; `sightline config show SERVICE` lists the keys."),
-]
-Listen = Annotated[
-    list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Listen here, e.g. tcp/0.0.0.0:7447 or ws://0.0.0.0:9090.")
-]
-ServiceConnect = Annotated[
-    list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Connect here, e.g. tcp/192.168.1.20:7447.")
-]
-_SECURE = typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; endpoints are then tls/...")
-Secure = Annotated[str, _SECURE]
-MaybeSecure = Annotated[str | None, _SECURE]
-RobotName = Annotated[str | None, typer.Option("--robot", metavar="ID", help="The robot's id [default: r1].")]
-LogForm = Annotated[
-    str | None, typer.Option("--log", metavar="FORM", help="text, or json: one object a line [default: text].")
-]
-SocketDir = Annotated[
-    str | None, typer.Option("--socket-dir", metavar="DIR", help="Where the simulation's sockets are.")
-]
-
+from operator_side.cli_options import Secure
+from operator_side.cli_options import MaybeSecure
+from operator_side.cli_options import ConfigFile
+from operator_side.cli_options import ServiceConnect
+from operator_side.cli_options import Sets
+from operator_side.cli_options import Listen
+from operator_side.cli_options import RobotName
+from operator_side.cli_options import LogForm
+from operator_side.cli_options import SocketDir
 
 def register_services(app: typer.Typer) -> None:
     """Add the commands to `app`."""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from operator_side.cli_people import DEFAULT_CONNECT, Connect, Robot, Secure
+from operator_side.cli_options import DEFAULT_CONNECT, Connect, Robot, Secure
 
 _Gamepad = Annotated[
     str | None,

@@ -14,7 +14,7 @@ from operator_side.train_rounds import Training
 from protocol.errors import ConfigError, HardwareError
 
 if TYPE_CHECKING:  # it needs the extra
-    from operator_side.train_export import Weights
+    from operator_side.train_network import Weights
 
 STEPS = [15_000, 14_000, 13_000, 14_000, 20_000, 20_000]
 SCENES = 100_000

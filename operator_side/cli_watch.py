@@ -11,7 +11,7 @@ import typer
 
 from operator_side.channel_inbox import ChannelInbox
 from operator_side.channel_text import message_line, message_object
-from operator_side.cli_people import DEFAULT_CONNECT, Connect, Json, Robot, Secure
+from operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Robot, Secure
 from operator_side.mission_asking import MissionClient
 from operator_side.mission_text import mission_lines
 from operator_side.pictures import viewer_role
@@ -21,6 +21,7 @@ from protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, Channel, Direct
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.link import Link, Message
 from protocol.transports.opening import open_link
+from operator_side.cli_options import Port
 
 _SHOWN = (OVERLAY.name, PREVIEW.name, FRAME.name)
 _TEXT_PERIOD_S = 0.25
@@ -29,9 +30,6 @@ _SILENCE_S = 3.0
 _EVER = float("inf")
 
 Seconds = Annotated[float | None, typer.Option("--seconds", min=0.1, help="End by itself after this long.")]
-Port = Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page, on this machine; 0 is any free one.")]
-
-
 def register_watch(app: typer.Typer) -> None:
     """Add the command to `app`."""
     app.command(epilog="Example: sightline watch r1   or   sightline watch r1 scan --json")(watch)

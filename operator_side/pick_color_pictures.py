@@ -14,8 +14,7 @@ from operator_side.loopback_page import Answer, PageRequest
 from operator_side.pictures import Pictures
 from operator_side.reel import FrameBuffer
 from protocol.errors import ConfigError, LinkError, WireError
-
-Image = NDArray[np.uint8]
+from operator_side.pick_color import Image
 
 MAX_FILE_BYTES: Final = 50_000_000
 MAX_PIXELS: Final = 25_000_000

@@ -43,17 +43,6 @@ class Score:
         return value
 
 
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One demanded figure: at most `bound`, or at least, where the name begins so."""
-
-    name: str
-    value: float | None
-    unit: str
-    bound: float
-    ok: bool
-
-
 def score(
     samples: Sequence[Truth], stand_off_m: float, figures: Mapping[str, float | None] | None = None
 ) -> Score:

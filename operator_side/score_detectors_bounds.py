@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
-from operator_side.score import Check
+from operator_side.check_text import Check
 from operator_side.score_detectors import Figures
 from operator_side.score_scenes import LABELLED, Report
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from operator_side.score import Check
+from operator_side.check_text import Check
 from operator_side.score_detectors import BALL_LABELS, Figures
 from operator_side.score_scenes import Report
 

@@ -11,7 +11,8 @@ from typing import Any, Final
 
 from operator_side.lockstep import Conditions, Run, run_lockstep
 from operator_side.scenario_settings import robot_of, vision_config
-from operator_side.score import Check, Score, median_and_worst, score
+from operator_side.check_text import Check
+from operator_side.score import Score, median_and_worst, score
 from operator_side.score_bounds import checks_of
 from operator_side.score_course import figures_of
 from operator_side.worker_pool import worker_pool

@@ -26,6 +26,7 @@ from operator_side.train_network import (
     network,
 )
 from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX
+from operator_side.train_network import Weights
 
 OPSET: Final = 17
 IR_VERSION: Final = 8
@@ -36,9 +37,6 @@ SAME_BOX: Final = 0.5
 _LARGEST: Final = 3.2  # of a log size: 390 pixels; keeps exp() finite on any picture
 
 _NO_PEAK: Final = -30.0
-
-Weights = dict[str, npt.NDArray[np.float32]]
-
 
 class Graph:
     """Nodes and constants as they are added."""

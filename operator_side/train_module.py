@@ -21,9 +21,7 @@ from operator_side.train_network import (
     network,
 )
 from sim.scenes import LABELS
-
-Weights = dict[str, npt.NDArray[np.float32]]
-"""`NAME.weight` and `NAME.bias` of every layer that has them."""
+from operator_side.train_network import Weights
 
 _RARE = -4.6  # bias of the heat maps at the beginning: a hundredth of the cells
 

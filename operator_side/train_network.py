@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from sim.scenes import LABELS
+import numpy as np
+import numpy.typing as npt
 
 STRIDE: Final = 4
 """Pixels to one cell of the heat map, each way."""
@@ -32,6 +34,8 @@ LOOKED_AT: Final = 16
 COLOURS: Final = 3
 
 Kind = Literal["conv", "depthwise", "add", "add-up", "head"]
+
+Weights = dict[str, npt.NDArray[np.float32]]
 
 
 @dataclass(frozen=True, slots=True)

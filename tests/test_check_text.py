@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from operator_side.check_text import check_line, number
-from operator_side.score import Check
+from operator_side.check_text import Check
 
 
 @pytest.mark.parametrize(("value", "text"), [

@@ -19,7 +19,6 @@ from operator_side.faults.judge import (
     Blind,
     MotorRow,
     SentCommand,
-    at_most,
     last_valid_us,
     measure_stop,
     most_gain_mps2,
@@ -27,13 +26,14 @@ from operator_side.faults.judge import (
     read_motors,
     stop_checks,
 )
+from operator_side.check_text import at_most
 from operator_side.faults.ledger import GOOD, INJECTED, EventLog, read_events
 from operator_side.faults.machine import describe_machine
 from operator_side.faults.report import markdown, passed, run_line, to_dict, worst_checks
 from operator_side.faults.row import Outcome
 from operator_side.faults.rows import CASES, chosen
 from operator_side.faults.sampler import read_holes, stalled_us
-from operator_side.score import Check
+from operator_side.check_text import Check
 from protocol.channels import TWIST
 from protocol.errors import ConfigError, WireError
 from protocol.jpeg import read_jpeg_size

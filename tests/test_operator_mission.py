@@ -2,7 +2,7 @@
 
 import pytest
 
-from operator_side.cli_mission import options_of
+from operator_side.cli_options import options_of
 from operator_side.mission_asking import request_of
 from operator_side.mission_text import cannot, mission_line, mission_lines
 from operator_side.waypoints import waypoints_of, waypoints_of_file

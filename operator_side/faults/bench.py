@@ -9,17 +9,16 @@ from operator_side.faults.judge import (
     MEMORY_MB,
     Blind,
     Stop,
-    at_least,
-    at_most,
     last_valid_us,
     measure_stop,
     moved_on_old_sight,
     stop_checks,
 )
+from operator_side.check_text import at_least, at_most
 from operator_side.faults.rig import RobotFixture
 from operator_side.faults.row import Case, Injected, Outcome
 from operator_side.faults.sampler import STALL_US
-from operator_side.score import Check
+from operator_side.check_text import Check
 from protocol.errors import SightlineError
 from sim.wire_tun import why_impossible
 

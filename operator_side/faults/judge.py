@@ -8,9 +8,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from operator_side.score import Check
+from operator_side.check_text import Check
 from robot_side.kinematics import DiffDriveConfig
 from robot_side.limits import TICK_US, SafetyConfig, stop_bound
+from operator_side.check_text import at_most
 
 FALLS_MS: Final = 340.0
 ZERO_MS: Final = 700.0
@@ -193,11 +194,3 @@ def stop_checks(stop: Stop, zero_ms: float = ZERO_MS, distance_m: float = DISTAN
     ]
 
 
-def at_most(name: str, value: float | None, unit: str, bound: float) -> Check:
-    """A figure that must have happened and be within its bound."""
-    return Check(name, value, unit, bound, value is not None and value <= bound)
-
-
-def at_least(name: str, value: float, unit: str, bound: float) -> Check:
-    """A figure that must reach its bound."""
-    return Check(name, value, unit, bound, value >= bound)

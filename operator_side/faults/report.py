@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from operator_side.check_text import number
 from operator_side.faults.row import Outcome
-from operator_side.score import Check
+from operator_side.check_text import Check
 
 Results = Sequence[Sequence[Outcome]]
 _LOWEST_IS_WORST: Final = ("injected", "drives again", "sent", "speed kept", "commands after it", "reset refused",

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from operator_side.faults.judge import DISTANCE_M, FALLS_MS, OLD_US, ZERO_MS
-from operator_side.score import Check
+from operator_side.check_text import Check
 
 if TYPE_CHECKING:
     from operator_side.faults.rig import RobotFixture, Setup

@@ -3,7 +3,8 @@
 from functools import partial
 from typing import Final
 
-from operator_side.faults.judge import at_least, at_most, most_gain_mps2, wheel_mps
+from operator_side.check_text import at_least, at_most
+from operator_side.faults.judge import most_gain_mps2, wheel_mps
 from operator_side.faults.rig import RobotFixture, Setup
 from operator_side.faults.row import Case, Injected
 from operator_side.faults.rows_processes import SETTLED_S

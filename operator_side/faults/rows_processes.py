@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Final
 
-from operator_side.faults.judge import at_most
+from operator_side.check_text import at_most
 from operator_side.faults.rig import RobotFixture, Setup
 from operator_side.faults.row import Case, Injected
 from protocol.clock import monotonic_us

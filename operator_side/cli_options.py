@@ -1,0 +1,88 @@
+"""Options and exit codes that several command groups share. Shell (typer)."""
+
+from robot_side.config import DEFAULT_ENDPOINT
+from typing import Annotated
+import typer
+from typing import TypeVar
+from collections.abc import Callable
+from protocol.errors import ConfigError
+from typing import Any
+from collections.abc import Sequence
+import tomllib
+
+REJECTED_EXIT = 5
+
+CHECK_FAILED = 5
+
+DEFAULT_CONNECT = [DEFAULT_ENDPOINT]
+
+Robot = Annotated[str, typer.Argument(metavar="[ROBOT]", help="The robot's id.")]
+
+Connect = Annotated[list[str], typer.Option("--connect", metavar="ENDPOINT", help="Where the robot or router listens.")]
+
+MaybeConnect = Annotated[
+    list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Where a robot or router listens.")
+]
+
+Secure = Annotated[
+    str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; endpoints are then tls/...")
+]
+
+_SECURE = typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; endpoints are then tls/...")
+
+MaybeSecure = Annotated[str | None, _SECURE]
+
+Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
+
+ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help="TOML file; see `sightline config`.")]
+
+ServiceConnect = Annotated[
+    list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Connect here, e.g. tcp/192.168.1.20:7447.")
+]
+
+Sets = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Set one value; `sightline config show SERVICE` lists the keys."),
+]
+
+Listen = Annotated[
+    list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Listen here, e.g. tcp/0.0.0.0:7447 or ws://0.0.0.0:9090.")
+]
+
+RobotName = Annotated[str | None, typer.Option("--robot", metavar="ID", help="The robot's id [default: r1].")]
+
+LogForm = Annotated[
+    str | None, typer.Option("--log", metavar="FORM", help="text, or json: one object a line [default: text].")
+]
+
+SocketDir = Annotated[
+    str | None, typer.Option("--socket-dir", metavar="DIR", help="Where the simulation's sockets are.")
+]
+
+Port = Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page, on this machine; 0 is any free one.")]
+
+Device = Annotated[str | None, typer.Option("--device", help="auto, cpu, cuda or tensorrt [default: auto].")]
+
+Number = TypeVar("Number", int, float)
+
+
+def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:
+    """The numbers of an option, separated by commas. Raises ConfigError with an example."""
+    try:
+        return [kind(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"{option} {text!r}: numbers separated by commas, e.g. {option} 1,2,3") from None
+
+
+def options_of(texts: Sequence[str]) -> dict[str, Any]:
+    """The options of `--set KEY=VALUE`, values read as TOML, as text if they are none. Raises ConfigError."""
+    options: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not name.strip():
+            raise ConfigError(f"--set {text!r} is no setting: write key=value, e.g. --set linear_mps=0.2")
+        try:
+            options[name.strip()] = tomllib.loads(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError:
+            options[name.strip()] = value
+    return options
