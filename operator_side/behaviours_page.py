@@ -4,8 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from operator_side.behaviours_rows import CHARACTER, LATENCY_MS, LOSS, Row
-from operator_side.check_text import number
-from operator_side.check_text import Check
+from operator_side.check_text import Check, number
 from operator_side.score import Score, median_and_worst
 from operator_side.score_bounds import BOUNDS, EXACT, UNITS, checks_of
 from operator_side.score_course import HARDEST_MPS2, READ_WITHIN_M, SETTLED_S

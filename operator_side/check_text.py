@@ -1,8 +1,7 @@
 """Checks and figures as text. Pure."""
 
-from typing import Final
 from dataclasses import dataclass
-
+from typing import Final
 
 _WHOLE_FROM: Final = 999.5  # three digits of what is more have an exponent
 

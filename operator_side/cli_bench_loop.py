@@ -179,7 +179,6 @@ def _row(name: str, race: "Race") -> str:
 
 
 def _check_lines(checks: "Sequence[AnyCheck]") -> list[str]:
-    from operator_side.check_text import check_line
-    from operator_side.check_text import Check
+    from operator_side.check_text import Check, check_line
 
     return [check_line(Check(one.name, one.value, one.unit, one.bound, one.ok)) for one in checks]

@@ -88,8 +88,7 @@ def _print_worst(runs: "Sequence[NetworkRun]") -> None:
 
 
 def _print_network_checks(checks: "Sequence[LoopCheck]", *, as_json: bool) -> None:
-    from operator_side.check_text import check_line
-    from operator_side.check_text import Check
+    from operator_side.check_text import Check, check_line
 
     for check in checks:
         typer.echo("  " + check_line(Check(check.name, check.value, check.unit, check.bound, check.ok)), err=as_json)

@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from operator_side.cli_options import Json
-from operator_side.cli_options import Secure
+from operator_side.cli_options import Json, RobotName, Secure, ServiceConnect
 from operator_side.cli_robot_tools import drive
-from operator_side.cli_options import RobotName, ServiceConnect
 from operator_side.extras import needs
 from operator_side.out_file import check_out_file
 from protocol.errors import ConfigError

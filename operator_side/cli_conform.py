@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from operator_side.cli_options import CHECK_FAILED
 from operator_side.conform_access import access_for
 from operator_side.conform_table import listing, print_results, progress
 from operator_side.out_file import check_out_file
@@ -16,7 +17,6 @@ from protocol.conformance.live import LiveBench
 from protocol.conformance.report import to_dict, to_junit, to_page
 from protocol.conformance.runner import Result, chosen, passed, run_cases
 from protocol.errors import ConfigError, LinkError
-from operator_side.cli_options import CHECK_FAILED
 
 _ROLES = ("vision", "operator")
 """Whom the kit plays where each role has keys of its own."""

@@ -9,15 +9,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from operator_side import cli_detector_serve as serving
-from operator_side.cli_options import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure
-from operator_side.cli_options import ConfigFile, LogForm, MaybeSecure, Sets
+from operator_side.cli_options import (
+    CHECK_FAILED,
+    DEFAULT_CONNECT,
+    REJECTED_EXIT,
+    ConfigFile,
+    Connect,
+    Device,
+    Json,
+    LogForm,
+    MaybeSecure,
+    Robot,
+    Secure,
+    Sets,
+)
 from operator_side.cli_options import Listen as MaybeListen
 from operator_side.cli_options import ServiceConnect as MaybeConnect
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
-from operator_side.cli_options import CHECK_FAILED
-from operator_side.cli_options import Device
 
 if TYPE_CHECKING:
     from vision_side.detect.contract import PromiseResult, Times

@@ -5,12 +5,11 @@ from typing import Annotated, Any
 
 import typer
 
-from operator_side.cli_options import ConfigFile, Listen, LogForm, MaybeSecure, ServiceConnect, Sets
+from operator_side.cli_options import ConfigFile, Device, Listen, LogForm, MaybeSecure, ServiceConnect, Sets
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
 from protocol.log_lines import set_log_format
-from operator_side.cli_options import Device
 
 Robots = Annotated[
     str | None, typer.Option(metavar="ID", help="A robot's id, or several by * and ? [default: the configured or *].")

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from operator_side.cli_options import CHECK_FAILED
 from operator_side.extras import needs
 from operator_side.out_file import check_out_file
-from operator_side.cli_options import CHECK_FAILED
 
 if TYPE_CHECKING:
     from operator_side.faults.report import Results

@@ -3,19 +3,16 @@
 import json
 import os
 import webbrowser
-from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import typer
 
+from operator_side.cli_options import CHECK_FAILED, Json, numbers
 from operator_side.cli_score_detectors import detectors
 from operator_side.extras import needs
-from protocol.errors import ConfigError
-from operator_side.cli_options import CHECK_FAILED
-from operator_side.cli_options import Json
-from operator_side.cli_options import numbers
+
 
 def register_demo_and_score(app: typer.Typer) -> None:
     """Add the commands to `app`."""

@@ -1,15 +1,14 @@
 """Commands that say what vision is to do: `mission`, `goto`. Shell."""
 
 import json
-import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from operator_side.cli_options import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure
+from operator_side.cli_options import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure, options_of
 from operator_side.mission_asking import MissionClient, request_of
 from operator_side.mission_text import cannot, detector_line, mission_line
 from operator_side.requests import SOURCE
@@ -17,7 +16,6 @@ from operator_side.waypoints import Waypoints, waypoints_of, waypoints_of_file
 from protocol.errors import ConfigError
 from protocol.mission_messages import MissionReport
 from protocol.transports.opening import open_link
-from operator_side.cli_options import options_of
 
 Sets = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option of the mission, e.g. linear_mps=0.2.")

@@ -1,14 +1,13 @@
 """Options and exit codes that several command groups share. Shell (typer)."""
 
-from robot_side.config import DEFAULT_ENDPOINT
-from typing import Annotated
-import typer
-from typing import TypeVar
-from collections.abc import Callable
-from protocol.errors import ConfigError
-from typing import Any
-from collections.abc import Sequence
 import tomllib
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, TypeVar
+
+import typer
+
+from protocol.errors import ConfigError
+from robot_side.config import DEFAULT_ENDPOINT
 
 REJECTED_EXIT = 5
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from operator_side.around import discover_all
+from operator_side.cli_options import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, MaybeConnect, Robot, Secure
 from operator_side.mission_asking import MissionClient
 from operator_side.mission_text import mission_lines
 from operator_side.pictures import viewer_role
@@ -16,14 +17,6 @@ from operator_side.requests import SOURCE, Operator
 from operator_side.status_text import status_line, status_lines
 from protocol.messages import Reply, Status, Verb
 from protocol.transports.opening import open_link
-from robot_side.config import DEFAULT_ENDPOINT
-from operator_side.cli_options import REJECTED_EXIT
-from operator_side.cli_options import DEFAULT_CONNECT
-from operator_side.cli_options import Robot
-from operator_side.cli_options import Connect
-from operator_side.cli_options import MaybeConnect
-from operator_side.cli_options import Secure
-from operator_side.cli_options import Json
 
 _REPORT_S = 0.8  # vision reports twice a second; where one drives, that is worth waiting for
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Secure
-from operator_side.cli_options import Port
+from operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Port, Secure
 from operator_side.extras import needs
 from operator_side.pictures import Pictures, viewer_role
 from protocol.channels import FRAME

@@ -7,8 +7,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from operator_side.cli_options import numbers
-from operator_side.cli_options import ConfigFile, Sets
+from operator_side.cli_options import ConfigFile, Sets, numbers
 from operator_side.out_file import check_out_file
 from operator_side.service_settings import load_service
 from operator_side.settings_errors import no_such_name

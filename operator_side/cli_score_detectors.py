@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from operator_side.cli_options import Device
-from operator_side.cli_options import ConfigFile, Sets
+from operator_side.cli_options import ConfigFile, Device, Sets
 from operator_side.extras import needs
 from operator_side.out_file import check_out_file
 from operator_side.service_settings import load_service

@@ -6,20 +6,23 @@ from typing import Annotated, Any
 
 import typer
 
+from operator_side.cli_options import (
+    ConfigFile,
+    Listen,
+    LogForm,
+    MaybeSecure,
+    RobotName,
+    Secure,
+    ServiceConnect,
+    Sets,
+    SocketDir,
+)
 from operator_side.extras import needs
 from operator_side.service_settings import load_service
 from protocol.errors import ConfigError
 from protocol.log_lines import set_log_format
 from robot_side.config import DEFAULT_ENDPOINT
-from operator_side.cli_options import Secure
-from operator_side.cli_options import MaybeSecure
-from operator_side.cli_options import ConfigFile
-from operator_side.cli_options import ServiceConnect
-from operator_side.cli_options import Sets
-from operator_side.cli_options import Listen
-from operator_side.cli_options import RobotName
-from operator_side.cli_options import LogForm
-from operator_side.cli_options import SocketDir
+
 
 def register_services(app: typer.Typer) -> None:
     """Add the commands to `app`."""

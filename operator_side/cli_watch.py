@@ -11,7 +11,7 @@ import typer
 
 from operator_side.channel_inbox import ChannelInbox
 from operator_side.channel_text import message_line, message_object
-from operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Robot, Secure
+from operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Port, Robot, Secure
 from operator_side.mission_asking import MissionClient
 from operator_side.mission_text import mission_lines
 from operator_side.pictures import viewer_role
@@ -21,7 +21,6 @@ from protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, Channel, Direct
 from protocol.errors import ConfigError, LinkError
 from protocol.transports.link import Link, Message
 from protocol.transports.opening import open_link
-from operator_side.cli_options import Port
 
 _SHOWN = (OVERLAY.name, PREVIEW.name, FRAME.name)
 _TEXT_PERIOD_S = 0.25

@@ -6,12 +6,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from operator_side.check_text import check_line
+from operator_side.check_text import Check, check_line
 from operator_side.demo import RECORDING, DemoRun
 from operator_side.extras import needs
 from operator_side.processes import last_line
 from operator_side.replay import Replayed, Step, replay
-from operator_side.check_text import Check
 from operator_side.score import Score, score
 from operator_side.score_bounds import checks_of
 from operator_side.score_course import figures_of

@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, field
 from itertools import groupby, product
 from typing import Any, Final
 
+from operator_side.check_text import Check
 from operator_side.lockstep import Conditions, Run, run_lockstep
 from operator_side.scenario_settings import robot_of, vision_config
-from operator_side.check_text import Check
 from operator_side.score import Score, median_and_worst, score
 from operator_side.score_bounds import checks_of
 from operator_side.score_course import figures_of

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import onnx
 from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
@@ -23,10 +22,10 @@ from operator_side.train_network import (
     SIZE_PX,
     STRIDE,
     Layer,
+    Weights,
     network,
 )
 from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX
-from operator_side.train_network import Weights
 
 OPSET: Final = 17
 IR_VERSION: Final = 8

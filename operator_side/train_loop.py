@@ -17,8 +17,7 @@ import numpy as np
 import torch
 
 from operator_side.train_module import Network, begin_from, folded
-from operator_side.train_network import Weights
-from operator_side.train_network import OUTPUTS, TAUGHT
+from operator_side.train_network import OUTPUTS, TAUGHT, Weights
 from operator_side.train_rounds import Training
 from operator_side.train_samples import CUT_PX, WHOLE_PX, Sample, sample
 from operator_side.train_scenes import DrawnScenes

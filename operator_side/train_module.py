@@ -5,7 +5,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import nn
 
@@ -18,10 +17,10 @@ from operator_side.train_network import (
     OUTPUTS,
     TAUGHT,
     Layer,
+    Weights,
     network,
 )
 from sim.scenes import LABELS
-from operator_side.train_network import Weights
 
 _RARE = -4.6  # bias of the heat maps at the beginning: a hundredth of the cells
 

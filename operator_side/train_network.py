@@ -7,9 +7,10 @@ large the thing. Depthwise layers carry the width; 240 rows halve evenly four ti
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from sim.scenes import LABELS
 import numpy as np
 import numpy.typing as npt
+
+from sim.scenes import LABELS
 
 STRIDE: Final = 4
 """Pixels to one cell of the heat map, each way."""

@@ -18,8 +18,8 @@ from operator_side.score_scenes import (
     shown,
 )
 from operator_side.train_choice import ball_threshold, label_threshold
-from operator_side.train_network import Weights
 from operator_side.train_export import onnx_bytes
+from operator_side.train_network import Weights
 from operator_side.worker_pool import worker_pool
 from sim.scenes import COLUMNS, LABELS, THINGS, VALIDATED_FROM, Column
 from vision_side.config import VisionConfig

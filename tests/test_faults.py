@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from operator_side import cli_faults
+from operator_side.check_text import Check, at_most
 from operator_side.faults import camera
 from operator_side.faults.attacks import ATTACKS, MALFORMED, OVERSIZED
 from operator_side.faults.bench import run_case, watched_us
@@ -26,14 +27,12 @@ from operator_side.faults.judge import (
     read_motors,
     stop_checks,
 )
-from operator_side.check_text import at_most
 from operator_side.faults.ledger import GOOD, INJECTED, EventLog, read_events
 from operator_side.faults.machine import describe_machine
 from operator_side.faults.report import markdown, passed, run_line, to_dict, worst_checks
 from operator_side.faults.row import Outcome
 from operator_side.faults.rows import CASES, chosen
 from operator_side.faults.sampler import read_holes, stalled_us
-from operator_side.check_text import Check
 from protocol.channels import TWIST
 from protocol.errors import ConfigError, WireError
 from protocol.jpeg import read_jpeg_size

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
+from operator_side.check_text import Check, at_least, at_most
 from operator_side.faults.judge import (
     MEMORY_MB,
     Blind,
@@ -14,11 +15,9 @@ from operator_side.faults.judge import (
     moved_on_old_sight,
     stop_checks,
 )
-from operator_side.check_text import at_least, at_most
 from operator_side.faults.rig import RobotFixture
 from operator_side.faults.row import Case, Injected, Outcome
 from operator_side.faults.sampler import STALL_US
-from operator_side.check_text import Check
 from protocol.errors import SightlineError
 from sim.wire_tun import why_impossible
 

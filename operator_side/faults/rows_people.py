@@ -4,8 +4,8 @@ import signal
 from functools import partial
 from typing import Final
 
-from operator_side.faults.judge import MotorRow, wheel_mps
 from operator_side.check_text import at_least, at_most
+from operator_side.faults.judge import MotorRow, wheel_mps
 from operator_side.faults.ledger import REQUESTED
 from operator_side.faults.rig import RobotFixture, Setup
 from operator_side.faults.row import Case, Injected
