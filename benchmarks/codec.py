@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.codec import decode, encode
-from protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
-from protocol.twist_text import format_twist, parse_twist
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
+from sightline.protocol.twist_text import format_twist, parse_twist
 
 CODEC_BOUND_US: Final = 10.0
 _ROUNDS: Final = 200

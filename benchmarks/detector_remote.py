@@ -10,13 +10,13 @@ from itertools import count
 from statistics import median
 from typing import Final
 
-from protocol.channels import FRAME
-from protocol.clock import monotonic_us
-from protocol.codec import encode
-from protocol.messages import FrameHeader
-from protocol.transports.link import Link
-from vision_side.decode import Decoder
-from vision_side.detect.port import DetectFrame, Detector
+from sightline.protocol.channels import FRAME
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import FrameHeader
+from sightline.protocol.transports.link import Link
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.port import DetectFrame, Detector
 
 PACED_S: Final = 1 / 30
 HOT_S: Final = 0.0

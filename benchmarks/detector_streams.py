@@ -13,16 +13,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from benchmarks.loop_pictures import write_pictures
-from protocol.channels import DETECTIONS, FRAME, STATUS
-from protocol.clock import monotonic_us
-from protocol.codec import decode, encode
-from protocol.errors import SightlineError, WireError
-from protocol.messages import DetectionsHeader, FrameHeader, Stamp, State, Status
-from protocol.transports.link import Message
-from protocol.transports.link_rules import LinkRules
-from protocol.transports.zenoh import ZenohLink
-from protocol.transports.zenoh_session import open_session
+from sightline.benchmarks.loop_pictures import write_pictures
+from sightline.protocol.channels import DETECTIONS, FRAME, STATUS
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import SightlineError, WireError
+from sightline.protocol.messages import DetectionsHeader, FrameHeader, Stamp, State, Status
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.link_rules import LinkRules
+from sightline.protocol.transports.zenoh import ZenohLink
+from sightline.protocol.transports.zenoh_session import open_session
 
 DEADLINE_MS: Final = 100.0
 FAIRNESS_PERCENT: Final = 10.0
@@ -125,7 +125,7 @@ def measure_streams(endpoint: str, folder: Path, streams: int = 40, seconds: flo
 
 
 def _service(endpoint: str, each_us: int, log: Path) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-u", "-m", "operator_side.cli", "detector", "--serve", "benchmarks.slow_eyes:SlowDetector",
+    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli", "detector", "--serve", "sightline.benchmarks.slow_eyes:SlowDetector",
                "--connect", endpoint, "--set", f"detector.options.each_us={each_us}"]
     with log.open("wb") as out:
         return subprocess.Popen(command, stdout=out, stderr=out)

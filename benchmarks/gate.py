@@ -4,9 +4,9 @@ import time
 from statistics import median
 from typing import Final
 
-from protocol.messages import AnswerHeader, Echo, Twist
-from robot_side.limits import SafetyConfig
-from robot_side.safety import SafetyGate
+from sightline.protocol.messages import AnswerHeader, Echo, Twist
+from sightline.robot_side.limits import SafetyConfig
+from sightline.robot_side.safety import SafetyGate
 
 GATE_BOUND_US: Final = 20.0
 _SESSION: Final = "0000aaaa"

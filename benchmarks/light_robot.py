@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from protocol.channels import STATUS
-from protocol.codec import decode
-from protocol.errors import HardwareError
-from protocol.messages import State, Status
-from protocol.transports.link import LatestSlot, Message
-from protocol.transports.zenoh import open_zenoh
+from sightline.protocol.channels import STATUS
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import HardwareError
+from sightline.protocol.messages import State, Status
+from sightline.protocol.transports.link import LatestSlot, Message
+from sightline.protocol.transports.zenoh import open_zenoh
 
 ROOT: Final = Path(__file__).parent.parent
 ENDPOINT: Final = "tcp/127.0.0.1:17461"
@@ -89,7 +89,7 @@ def _service(python: str, arguments: list[str], folder: Path, ready: str) -> Ite
     log = folder / f"{arguments[0]}.log"
     with log.open("wb") as out:
         # Not from the checkout, so that a bare environment finds nothing but what it has installed.
-        command = [python, "-m", "operator_side.cli", *arguments]
+        command = [python, "-m", "sightline.operator_side.cli", *arguments]
         process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=folder)
     try:
         _wait_for(log, ready, process)

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from benchmarks.interrupted import terminated_like_interrupted
-from benchmarks.loop_course import Sample, joined
-from benchmarks.loop_figures import Figures, LoopCheck, figures_of, loop_checks
-from benchmarks.loop_ours import endpoint_of
-from benchmarks.loop_overload import overloaded
-from benchmarks.loop_pictures import write_pictures
-from benchmarks.loop_sample import take_sample
-from benchmarks.loop_setting import FLOOR, OURS, LoopSetting
+from sightline.benchmarks.interrupted import terminated_like_interrupted
+from sightline.benchmarks.loop_course import Sample, joined
+from sightline.benchmarks.loop_figures import Figures, LoopCheck, figures_of, loop_checks
+from sightline.benchmarks.loop_ours import endpoint_of
+from sightline.benchmarks.loop_overload import overloaded
+from sightline.benchmarks.loop_pictures import write_pictures
+from sightline.benchmarks.loop_sample import take_sample
+from sightline.benchmarks.loop_setting import FLOOR, OURS, LoopSetting
 
 _TURNS: Final = 3
 _LEAST_TURN_S: Final = 3.0

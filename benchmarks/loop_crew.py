@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from protocol.errors import HardwareError
+from sightline.protocol.errors import HardwareError
 
 READY_S: Final = 20.0
 _END_S: Final = 4.0

@@ -2,14 +2,14 @@
 
 import time
 
-from benchmarks.loop_pictures import camera_of
-from protocol.messages import CameraModel, FrameHeader
-from protocol.twist_text import format_twist
-from vision_side.config import VisionConfig
-from vision_side.decode import Picture
-from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.port import Detection, PictureDetector
-from vision_side.pipeline import Frame, Pipeline
+from sightline.benchmarks.loop_pictures import camera_of
+from sightline.protocol.messages import CameraModel, FrameHeader
+from sightline.protocol.twist_text import format_twist
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.port import Detection, PictureDetector
+from sightline.vision_side.pipeline import Frame, Pipeline
 
 
 class SlowDetector:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Final
 
-from benchmarks.loop_course import Sample
-from benchmarks.loop_setting import FLOOR, OURS, PEERS, TAKEN_BOUND_PERCENT, TCP, LoopSetting
+from sightline.benchmarks.loop_course import Sample
+from sightline.benchmarks.loop_setting import FLOOR, OURS, PEERS, TAKEN_BOUND_PERCENT, TCP, LoopSetting
 
 P50_OVER_FLOOR_MS: Final = 1.5
 P95_OVER_FLOOR_MS: Final = 5.0

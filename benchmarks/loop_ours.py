@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from benchmarks.loop_course import Accepted, Course, course_of_headers
-from benchmarks.loop_crew import BenchProcesses, free_port
-from benchmarks.loop_machine import children_of
-from benchmarks.loop_setting import LoopSetting
-from protocol.channels import STATUS
-from protocol.codec import decode
-from protocol.errors import ConfigError
-from protocol.messages import Stamp, Status
-from protocol.transports.link import Message
-from protocol.transports.opening import open_link
+from sightline.benchmarks.loop_course import Accepted, Course, course_of_headers
+from sightline.benchmarks.loop_crew import BenchProcesses, free_port
+from sightline.benchmarks.loop_machine import children_of
+from sightline.benchmarks.loop_setting import LoopSetting
+from sightline.protocol.channels import STATUS
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import Stamp, Status
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.opening import open_link
 
 ROBOT: Final = "r1"
 TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{}"}
@@ -55,14 +55,14 @@ def running_services(setting: LoopSetting, folder: Path, crew: BenchProcesses) -
     """Robot and vision, seen working. Raises HardwareError with a service's own words if one does not start."""
     port = free_port()
     endpoint = endpoint_of(setting.transport, port)
-    driver = crew.start("robot", "operator_side.cli", "robot", "--config", str(_robot_toml(setting, folder, endpoint)))
+    driver = crew.start("robot", "sightline.operator_side.cli", "robot", "--config", str(_robot_toml(setting, folder, endpoint)))
     crew.wait_line("robot", f"robot {ROBOT}: on")
     with open_link(ROBOT, connect=[endpoint], role="operator") as link:
         tally = folder / "headers.json"
         config = {"robot": ROBOT, "connect": [endpoint]}
         slow = {"delay_ms": setting.detector_delay_ms, "busy_ms": setting.busy_ms}
         settings = {"config": config, "tally": str(tally), **slow}
-        vision = crew.start("vision", "benchmarks.loop_vision", json.dumps(settings))
+        vision = crew.start("vision", "sightline.benchmarks.loop_vision", json.dumps(settings))
         pids = {"driver": driver, "network": children_of(driver)[0], "vision": vision}
         ours = Ours(pids, (port,), endpoint, tally)
         link.subscribe(STATUS, ours.note)

@@ -8,8 +8,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from benchmarks.loop import Race
-from benchmarks.loop_setting import FLOOR, OUR_DETECTOR, OURS, TCP, LoopSetting
+from sightline.benchmarks.loop import Race
+from sightline.benchmarks.loop_setting import FLOOR, OUR_DETECTOR, OURS, TCP, LoopSetting
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

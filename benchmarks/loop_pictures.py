@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import CameraModel
+from sightline.protocol.messages import CameraModel
 
 COUNT: Final = 30
 _BYTES_PER_PIXEL: Final = 0.15

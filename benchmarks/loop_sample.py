@@ -12,17 +12,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
-from benchmarks.loop_course import Course, Sample, course_of_tally
-from benchmarks.loop_crew import BenchProcesses, free_port
-from benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
-from benchmarks.loop_ours import running_services
-from benchmarks.loop_setting import FLOOR, OUR_DETECTOR, OURS, OWN_DETECTOR, TAKEN_BOUND_PERCENT, LoopSetting
-from benchmarks.loop_sockets import carried_between, carried_bytes
-from protocol.clock import monotonic_us
+from sightline.benchmarks.loop_course import Course, Sample, course_of_tally
+from sightline.benchmarks.loop_crew import BenchProcesses, free_port
+from sightline.benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
+from sightline.benchmarks.loop_ours import running_services
+from sightline.benchmarks.loop_setting import FLOOR, OUR_DETECTOR, OURS, OWN_DETECTOR, TAKEN_BOUND_PERCENT, LoopSetting
+from sightline.benchmarks.loop_sockets import carried_between, carried_bytes
+from sightline.protocol.clock import monotonic_us
 
 _SETTLE_S: Final = 1.5
 _DRAIN_S: Final = 0.3
-_MODULE: Final = "benchmarks.peers"
+_MODULE: Final = "sightline.benchmarks.peers"
 
 
 class Contestant(Protocol):

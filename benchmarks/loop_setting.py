@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 
 OURS: Final = "sightline"
 FLOOR: Final = "floor"

@@ -6,7 +6,7 @@ Kept in memory, at the cost of an append, and written at the end. All processes 
 import json
 from pathlib import Path
 
-from protocol.clock import monotonic_us
+from sightline.protocol.clock import monotonic_us
 
 
 class Tally:

@@ -1,6 +1,6 @@
 """The vision service with a tap: keeps what the frames' headers say, and may be made slow. Shell.
 
-`python -m benchmarks.loop_vision SETTINGS`. The service is `vision_side.service.Service` as it is; the tap costs an
+`python -m sightline.benchmarks.loop_vision SETTINGS`. The service is `sightline.vision_side.service.Service` as it is; the tap costs an
 append per frame, and only a detector made slow is put into its pipeline.
 """
 
@@ -10,15 +10,15 @@ import sys
 import threading
 from pathlib import Path
 
-from benchmarks.loop_eyes import build_pipeline
-from protocol.channels import MAX_HEADER_BYTES
-from protocol.codec import decode
-from protocol.messages import CameraModel, FrameHeader
-from protocol.transports.link import Link, Message
-from protocol.transports.opening import open_link
-from vision_side.config import VisionConfig
-from vision_side.pipeline import SOURCE
-from vision_side.service import Service
+from sightline.benchmarks.loop_eyes import build_pipeline
+from sightline.protocol.channels import MAX_HEADER_BYTES
+from sightline.protocol.codec import decode
+from sightline.protocol.messages import CameraModel, FrameHeader
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.opening import open_link
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.pipeline import SOURCE
+from sightline.vision_side.service import Service
 
 _WAIT_S = 0.2
 

@@ -14,14 +14,14 @@ from typing import Final
 import cv2
 import numpy as np
 
-from benchmarks.interrupted import terminated_like_interrupted
-from benchmarks.loop_crew import BenchProcesses
-from benchmarks.loop_figures import LoopCheck, at_most
-from benchmarks.loop_pictures import write_pictures
-from benchmarks.network_figures import Stretch, figures_of, network_checks
-from benchmarks.network_fleet import fleet
-from benchmarks.network_rows import Case, spans_s
-from benchmarks.network_stage import (
+from sightline.benchmarks.interrupted import terminated_like_interrupted
+from sightline.benchmarks.loop_crew import BenchProcesses
+from sightline.benchmarks.loop_figures import LoopCheck, at_most
+from sightline.benchmarks.loop_pictures import write_pictures
+from sightline.benchmarks.network_figures import Stretch, figures_of, network_checks
+from sightline.benchmarks.network_fleet import fleet
+from sightline.benchmarks.network_rows import Case, spans_s
+from sightline.benchmarks.network_stage import (
     BenchWire,
     NetworkRun,
     NetworkSetting,
@@ -31,13 +31,13 @@ from benchmarks.network_stage import (
     start_robot,
     start_vision,
 )
-from benchmarks.network_takeover import moved, router, standby
-from benchmarks.network_uplink import uplink
-from benchmarks.network_wheels import on_old_sight, read_wheel_commands
-from protocol.clock import monotonic_us
-from protocol.errors import ConfigError, HardwareError
-from sim.wire import LinkShapes
-from sim.wire_tun import ADDRESS_A, why_impossible
+from sightline.benchmarks.network_takeover import moved, router, standby
+from sightline.benchmarks.network_uplink import uplink
+from sightline.benchmarks.network_wheels import on_old_sight, read_wheel_commands
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.sim.wire import LinkShapes
+from sightline.sim.wire_tun import ADDRESS_A, why_impossible
 
 WIDTH_PX, HEIGHT_PX, FPS = 640, 480, 30.0
 SCENES: Final[Mapping[str, Scene]] = {
@@ -130,7 +130,7 @@ def _wheel_checks(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) ->
 def _start(row: Case, wire: BenchWire, crew: BenchProcesses, stage: Stage) -> None:
     """Robot and watcher on one side, vision on the other, seen driving over the wire as it is."""
     start_robot(stage, crew, wire.robot_side, passes_through=row.passes_through)
-    crew.start("watch", "benchmarks.network_watch", stage.form.format("127.0.0.1"), str(stage.folder / "notes.json"),
+    crew.start("watch", "sightline.benchmarks.network_watch", stage.form.format("127.0.0.1"), str(stage.folder / "notes.json"),
                namespace=wire.robot_side)
     crew.wait_line("watch", "watching")
     start_vision(stage, crew, wire.far_side, stage.form.format(ADDRESS_A))

@@ -1,6 +1,6 @@
 """Twenty robots in one process, for `bench network`: real sessions, real headers and credit, recorded pictures. Shell.
 
-    python -m benchmarks.network_robots SETTINGS_AS_JSON
+    python -m sightline.benchmarks.network_robots SETTINGS_AS_JSON
 
 A robot's own two processes, twenty times on two cores, would measure themselves. Each robot here has its session, its
 credit and its 10 Hz status; it has no driver, so it takes every answer for accepted. Ages are from capture to the
@@ -17,19 +17,19 @@ from contextlib import ExitStack
 from pathlib import Path
 from random import Random
 
-from benchmarks.loop_pictures import camera_of
-from protocol.channels import ACK, FRAME, STATUS, TWIST
-from protocol.clock import monotonic_us
-from protocol.codec import decode, encode
-from protocol.config import Config
-from protocol.jpeg import read_jpeg_size
-from protocol.messages import AnswerHeader, Holder, Stamp, State, Status
-from protocol.transports.link import Link, Message
-from protocol.transports.opening import open_link
-from robot_side.ipc import CommandAck
-from robot_side.ports import Picture
-from robot_side.sending import NetworkCore
-from robot_side.stream import StreamConfig
+from sightline.benchmarks.loop_pictures import camera_of
+from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.config import Config
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.messages import AnswerHeader, Holder, Stamp, State, Status
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.opening import open_link
+from sightline.robot_side.ipc import CommandAck
+from sightline.robot_side.ports import Picture
+from sightline.robot_side.sending import NetworkCore
+from sightline.robot_side.stream import StreamConfig
 
 _STATUS_US = 100_000
 _CONNECT_S = 15.0

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.errors import ConfigError
-from sim.wire import LinkShape, LinkShapes
+from sightline.protocol.errors import ConfigError
+from sightline.sim.wire import LinkShape, LinkShapes
 
 HOLD_AGE_MS: Final = 400.0
 """A frame older than this is not driven on; the robot's default `safety.zero_speed_age_ms`."""

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from benchmarks.loop_crew import BenchProcesses
-from benchmarks.loop_figures import LoopCheck
-from benchmarks.loop_ours import ROBOT
-from benchmarks.network_figures import NetworkFigures
-from benchmarks.network_rows import WEBSOCKET, ZENOH, Case
-from protocol.errors import ConfigError
-from sim.wire import LinkShapes
+from sightline.benchmarks.loop_crew import BenchProcesses
+from sightline.benchmarks.loop_figures import LoopCheck
+from sightline.benchmarks.loop_ours import ROBOT
+from sightline.benchmarks.network_figures import NetworkFigures
+from sightline.benchmarks.network_rows import WEBSOCKET, ZENOH, Case
+from sightline.protocol.errors import ConfigError
+from sightline.sim.wire import LinkShapes
 
 PORTS: Final = {ZENOH: "tcp/{}:7447", WEBSOCKET: "ws://{}:9090"}
 EVERYWHERE: Final = "0.0.0.0"
@@ -109,7 +109,7 @@ Scene = Callable[[Case, Stage], NetworkRun]
 def start_robot(stage: Stage, crew: BenchProcesses, namespace: str, *, connect: str = "", passes_through: bool = False) -> int:
     """A robot that listens, or connects where a router is; returns its process id once it is on."""
     config = _robot_toml(stage, connect, passes_through)
-    pid = crew.start("robot", "operator_side.cli", "robot", "--config", str(config), namespace=namespace)
+    pid = crew.start("robot", "sightline.operator_side.cli", "robot", "--config", str(config), namespace=namespace)
     crew.wait_line("robot", f"robot {ROBOT}: on")
     return pid
 
@@ -117,7 +117,7 @@ def start_robot(stage: Stage, crew: BenchProcesses, namespace: str, *, connect: 
 def start_vision(stage: Stage, crew: BenchProcesses, namespace: str, endpoint: str) -> int:
     """A vision, seen working; returns its process id."""
     secure = ("--secure", str(stage.folder)) if stage.setting.transport in _TOKENED else ()
-    pid = crew.start("vision", "operator_side.cli", "vision", "--robot", ROBOT, "--connect", endpoint, *secure,
+    pid = crew.start("vision", "sightline.operator_side.cli", "vision", "--robot", ROBOT, "--connect", endpoint, *secure,
                      namespace=namespace)
     crew.wait_line("vision", "target seen")
     return pid

@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Final
 
-from benchmarks.loop_crew import BenchProcesses
-from benchmarks.loop_figures import LoopCheck, at_most
-from benchmarks.network_rows import Case
-from benchmarks.network_stage import EVERYWHERE, BenchWire, NetworkRun, Stage, start_robot, start_vision
-from benchmarks.network_wheels import WheelCommand, moves_again_s, read_wheel_commands
-from protocol.clock import monotonic_us
-from protocol.errors import HardwareError
-from sim.wire_tun import ADDRESS_A, ADDRESS_B, move_address
+from sightline.benchmarks.loop_crew import BenchProcesses
+from sightline.benchmarks.loop_figures import LoopCheck, at_most
+from sightline.benchmarks.network_rows import Case
+from sightline.benchmarks.network_stage import EVERYWHERE, BenchWire, NetworkRun, Stage, start_robot, start_vision
+from sightline.benchmarks.network_wheels import WheelCommand, moves_again_s, read_wheel_commands
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import HardwareError
+from sightline.sim.wire_tun import ADDRESS_A, ADDRESS_B, move_address
 
 TAKES_OVER_S: Final = 1.5
 BACK_S: Final = 3.0
@@ -91,7 +91,7 @@ def moved(row: Case, stage: Stage) -> NetworkRun:
 
 def start_router(crew: BenchProcesses, wire: BenchWire) -> int:
     """`sightline router` beyond the radio; returns its process id."""
-    pid = crew.start("router", "operator_side.cli", "router", "--listen", f"tcp/{EVERYWHERE}:7447",
+    pid = crew.start("router", "sightline.operator_side.cli", "router", "--listen", f"tcp/{EVERYWHERE}:7447",
                      namespace=wire.far_side)
     crew.wait_line("router", "router: on")
     return pid

@@ -1,6 +1,6 @@
 """Notes what a robot says of itself, for `bench network`. Shell.
 
-    python -m benchmarks.network_watch ENDPOINT FILE [statuses]
+    python -m sightline.benchmarks.network_watch ENDPOINT FILE [statuses]
 
 It runs beside the robot, on the near side of the wire, so that watching costs the wire nothing, and acknowledges
 nothing. Written at SIGTERM as JSON: frames (seq, t_us, latency_us, bytes), statuses (t_us and what `NOTED` names), and
@@ -14,13 +14,13 @@ import threading
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.loop_ours import ROBOT
-from protocol.channels import FRAME, STATUS, TWIST
-from protocol.clock import monotonic_us
-from protocol.codec import decode
-from protocol.messages import AnswerHeader, FrameHeader, Stamp, Status
-from protocol.transports.link import Message
-from protocol.transports.opening import open_link
+from sightline.benchmarks.loop_ours import ROBOT
+from sightline.protocol.channels import FRAME, STATUS, TWIST
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode
+from sightline.protocol.messages import AnswerHeader, FrameHeader, Stamp, Status
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.opening import open_link
 
 NOTED: Final = ("t_us", "state", "frame_age_us", "accepted", "stale", "window", "timeouts", "speed", "quality", "scale",
                 "sent")

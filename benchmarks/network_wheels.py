@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from robot_side.limits import TICK_US, SafetyConfig, stop_bound
+from sightline.robot_side.limits import TICK_US, SafetyConfig, stop_bound
 
 _LATE_US: Final = 2 * TICK_US
 """A decision holds for a tick; who notes a twist may hear it a little after the robot."""

@@ -7,11 +7,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from protocol.messages import Twist
-from robot_side.kinematics import DiffDriveConfig, Odometer, wheel_speeds
-from sim.robot_model import RobotModel, load_robot, robot_names
-from sim.scenario import Start, load_scenario
-from sim.world import STEP_US, World
+from sightline.protocol.messages import Twist
+from sightline.robot_side.kinematics import DiffDriveConfig, Odometer, wheel_speeds
+from sightline.sim.robot_model import RobotModel, load_robot, robot_names
+from sightline.sim.scenario import Start, load_scenario
+from sightline.sim.world import STEP_US, World
 
 _TICK_STEPS = 5  # 50 Hz, as the driver reads its encoders
 _SHARE = 2 / 3

@@ -11,15 +11,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from protocol.messages import CameraModel, FrameHeader
-from vision_side.config import VisionConfig
-from vision_side.decode import Decoder
-from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.onnx_detector import OnnxDetector, read_onnx_model
-from vision_side.detect.onnx_engine import open_engine
-from vision_side.detect.onnx_reading import fit_picture
-from vision_side.detect.port import NO_DEADLINE, DetectFrame
-from vision_side.pipeline import Frame, Pipeline
+from sightline.protocol.messages import CameraModel, FrameHeader
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.onnx_detector import OnnxDetector, read_onnx_model
+from sightline.vision_side.detect.onnx_engine import open_engine
+from sightline.vision_side.detect.onnx_reading import fit_picture
+from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame
+from sightline.vision_side.pipeline import Frame, Pipeline
 
 BOUNDS_US = {(320, 240): 350.0, (640, 480): 800.0}
 LEARNED_BOUND_US = 2000.0

@@ -17,8 +17,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.report_sections import SECTIONS, Section
-from protocol.errors import ConfigError
+from sightline.benchmarks.report_sections import SECTIONS, Section
+from sightline.protocol.errors import ConfigError
 
 CHECK_FAILED: Final = 5
 _HEADING: Final = "## "
@@ -76,7 +76,7 @@ def _measured(section: Section, pictures: Path) -> dict[str, Any]:
 
 def _run(arguments: Sequence[str]) -> dict[str, Any]:
     """The command's JSON object. Raises RuntimeError with its error line if it printed none."""
-    command = [sys.executable, "-m", "operator_side.cli", *arguments, "--json"]
+    command = [sys.executable, "-m", "sightline.operator_side.cli", *arguments, "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode not in (0, CHECK_FAILED):
         raise RuntimeError(f"{' '.join(arguments)}: {done.stderr.strip()}")

@@ -6,12 +6,12 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.config import Config as Settings
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
+from sightline.protocol.config import Config as Settings
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
 
 
 class SlowDetector:
-    """`--serve benchmarks.slow_eyes:SlowDetector`."""
+    """`--serve sightline.benchmarks.slow_eyes:SlowDetector`."""
 
     class Config(Settings):
         """How slow."""

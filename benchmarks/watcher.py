@@ -1,4 +1,4 @@
-"""Viewers of the robot's pictures, for `bench watchers`: `python -m benchmarks.watcher ENDPOINT COUNT NAP_S`. Shell.
+"""Viewers of the robot's pictures, for `bench watchers`: `python -m sightline.benchmarks.watcher ENDPOINT COUNT NAP_S`. Shell.
 
 Opens COUNT links, each with its own connection, and takes every frame; with NAP_S it sleeps so long over each one, on
 the transport's thread, so that its connection is read no faster than that.
@@ -9,10 +9,10 @@ import threading
 import time
 from contextlib import ExitStack
 
-from benchmarks.loop_ours import ROBOT
-from protocol.channels import FRAME
-from protocol.transports.link import Message
-from protocol.transports.opening import open_link
+from sightline.benchmarks.loop_ours import ROBOT
+from sightline.protocol.channels import FRAME
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.opening import open_link
 
 
 def main(endpoint: str, count: int, nap_s: float) -> None:

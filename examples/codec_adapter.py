@@ -9,10 +9,10 @@ import json
 import sys
 from typing import Any
 
-from protocol.golden import outcome
-from protocol.golden_wires import READERS, framing_outcome
-from protocol.messages import Twist
-from protocol.twist_text import format_twist
+from sightline.protocol.golden import outcome
+from sightline.protocol.golden_wires import READERS, framing_outcome
+from sightline.protocol.messages import Twist
+from sightline.protocol.twist_text import format_twist
 
 
 def answer(question: dict[str, Any]) -> dict[str, Any]:

@@ -17,14 +17,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.channels import DETECTIONS, FRAME
-from protocol.codec import decode, encode
-from protocol.errors import SightlineError, WireError
-from protocol.jpeg import read_jpeg_size
-from protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader
-from protocol.refusals import RejectReason
-from protocol.transports.link import Message
-from protocol.transports.opening import open_link
+from sightline.protocol.channels import DETECTIONS, FRAME
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import SightlineError, WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.opening import open_link
 
 SOURCE, SESSION = "detector", secrets.token_hex(4)
 YELLOW = (18, 128, 40), (34, 255, 255)

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import cv2
 from pydantic import Field
 
-from protocol.config import Config as Settings
-from protocol.errors import WireError
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, clipped, result_of
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.errors import WireError
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, clipped, result_of
 
 SPOT_PX = 16
 WHO = Maker("brightest-spot", device="cpu")

@@ -6,9 +6,9 @@ A drive is a class with a `Config`, `set`, `wheels` and `close` (robot_side/port
 import time
 from pathlib import Path
 
-from protocol.config import Config
-from protocol.errors import HardwareError
-from robot_side.ports import WheelAngles
+from sightline.protocol.config import Config
+from sightline.protocol.errors import HardwareError
+from sightline.robot_side.ports import WheelAngles
 
 
 class MyDriveConfig(Config):

@@ -7,9 +7,9 @@ import math
 
 from pydantic import Field
 
-from protocol.config import Config
-from protocol.messages import STILL, CameraModel, Twist
-from vision_side.missions.port import Plan, View
+from sightline.protocol.config import Config
+from sightline.protocol.messages import STILL, CameraModel, Twist
+from sightline.vision_side.missions.port import Plan, View
 
 
 class Shy:

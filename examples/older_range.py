@@ -6,8 +6,8 @@ It is (20, 25, 25) to (64, 255, 255) in OpenCV's units: half degrees, and 25 of 
 test for round things too, which the write-up did not have.
 """
 
-from vision_side.config import HsvRange
-from vision_side.detect.local import Hsv
+from sightline.vision_side.config import HsvRange
+from sightline.vision_side.detect.local import Hsv
 
 RANGE = HsvRange(hue_low_deg=40, hue_high_deg=128, saturation_low=0.098, value_low=0.098)
 

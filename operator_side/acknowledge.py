@@ -2,12 +2,12 @@
 
 import secrets
 
-from protocol.channels import ACK
-from protocol.codec import decode, encode
-from protocol.errors import WireError
-from protocol.messages import AnswerHeader, Echo, FrameHeader
-from protocol.transports.link import Link, Message
-from protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
+from sightline.protocol.channels import ACK
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
 
 
 class Viewer:

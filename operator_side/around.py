@@ -8,11 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Final
 
-from operator_side import around_text
-from protocol.errors import ConfigError, LinkError, SightlineError
-from protocol.transports.endpoints import parse_zenoh_endpoint
-from protocol.transports.zenoh_around import Discovered, discover, find_listeners
-from robot_side.config import DEFAULT_ENDPOINT
+from sightline.operator_side import around_text
+from sightline.protocol.errors import ConfigError, LinkError, SightlineError
+from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
+from sightline.protocol.transports.zenoh_around import Discovered, discover, find_listeners
+from sightline.robot_side.config import DEFAULT_ENDPOINT
 
 SCOUT_S: Final = 0.4
 """Who hears a multicast answers within some milliseconds; one is repeated within this, since Wi-Fi loses many."""

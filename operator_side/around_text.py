@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from operator_side.requests import read_report
-from operator_side.status_text import status_line
-from protocol.errors import WireError
-from protocol.transports.link import Message
-from protocol.transports.presence import PeerInfo
-from protocol.transports.secured import ROBOT_ROLE
+from sightline.operator_side.requests import read_report
+from sightline.operator_side.status_text import status_line
+from sightline.protocol.errors import WireError
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.presence import PeerInfo
+from sightline.protocol.transports.secured import ROBOT_ROLE
 
 _ROLE_WIDTH = 9
 

@@ -9,14 +9,14 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from operator_side.behaviours_page import SPEEDS, kept, page_lines, picture_name
-from operator_side.behaviours_rows import ROWS, Row
-from operator_side.extras import needs
-from operator_side.score import Score, score
-from operator_side.score_course import figures_of
-from operator_side.score_runs import Case, run_of
-from operator_side.speed_runs import SpeedRun, speed_cases, speed_run
-from operator_side.worker_pool import worker_pool
+from sightline.operator_side.behaviours_page import SPEEDS, kept, page_lines, picture_name
+from sightline.operator_side.behaviours_rows import ROWS, Row
+from sightline.operator_side.extras import needs
+from sightline.operator_side.score import Score, score
+from sightline.operator_side.score_course import figures_of
+from sightline.operator_side.score_runs import Case, run_of
+from sightline.operator_side.speed_runs import SpeedRun, speed_cases, speed_run
+from sightline.operator_side.worker_pool import worker_pool
 
 Progress = Callable[[int], AbstractContextManager[Callable[[], None]]]
 
@@ -48,7 +48,7 @@ def _picture(folder: Path, case: Case, seeds: Sequence[int]) -> Path | None:
 
 def _run(case: Case, picture: Path | None) -> Score:
     with needs("report"):
-        from operator_side.plot import plot_run
+        from sightline.operator_side.plot import plot_run
     scenario, run = run_of(case)
     if picture is not None:
         whose = f" on {case.robot}" if case.robot else ""
@@ -59,6 +59,6 @@ def _run(case: Case, picture: Path | None) -> Score:
 
 def _draw_speeds(path: Path, speeds: Sequence[SpeedRun]) -> None:
     with needs("report"):
-        from operator_side.plot_speeds import plot_speeds
+        from sightline.operator_side.plot_speeds import plot_speeds
     if speeds:
         plot_speeds(path, speeds)

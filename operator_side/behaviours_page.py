@@ -3,14 +3,14 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
-from operator_side.behaviours_rows import CHARACTER, LATENCY_MS, LOSS, Row
-from operator_side.check_text import Check, number
-from operator_side.score import Score, median_and_worst
-from operator_side.score_bounds import BOUNDS, EXACT, UNITS, checks_of
-from operator_side.score_course import HARDEST_MPS2, READ_WITHIN_M, SETTLED_S
-from operator_side.score_runs import Case
-from operator_side.speed_runs import SpeedRun
-from sim.scenario import load_scenario
+from sightline.operator_side.behaviours_rows import CHARACTER, LATENCY_MS, LOSS, Row
+from sightline.operator_side.check_text import Check, number
+from sightline.operator_side.score import Score, median_and_worst
+from sightline.operator_side.score_bounds import BOUNDS, EXACT, UNITS, checks_of
+from sightline.operator_side.score_course import HARDEST_MPS2, READ_WITHIN_M, SETTLED_S
+from sightline.operator_side.score_runs import Case
+from sightline.operator_side.speed_runs import SpeedRun
+from sightline.sim.scenario import load_scenario
 
 Results = Mapping[Case, Score]
 SPEEDS: Final = "thymio-speeds.png"

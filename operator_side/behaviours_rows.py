@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from operator_side.score_runs import Case
-from sim.scenario import load_scenario
+from sightline.operator_side.score_runs import Case
+from sightline.sim.scenario import load_scenario
 
 LATENCY_MS, LOSS = 50.0, 0.1
 LOOKS: Final = ("dim", "bright", "warm", "desaturated", "quality30")

@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.errors import ConfigError, WireError
-from protocol.jpeg import JpegSize, read_jpeg_size
-from protocol.messages import CameraModel
-from vision_side.config import HsvConfig
-from vision_side.decode import Decoder
-from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.port import Detection
-from vision_side.sphere import locate_sphere
+from sightline.protocol.errors import ConfigError, WireError
+from sightline.protocol.jpeg import JpegSize, read_jpeg_size
+from sightline.protocol.messages import CameraModel
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.sphere import locate_sphere
 
 MIN_BOARDS = 5
 MAX_RMS_PX = 1.0

@@ -8,12 +8,12 @@ from typing import Final
 
 import cv2
 
-from operator_side.film import Film
-from operator_side.jpeg_pixels import jpeg_pixels
-from operator_side.out_file import check_out_file
-from operator_side.pictures import Pictures, Shot
-from protocol.channels import OVERLAY, Channel
-from protocol.errors import ConfigError, LinkError, WireError
+from sightline.operator_side.film import Film
+from sightline.operator_side.jpeg_pixels import jpeg_pixels
+from sightline.operator_side.out_file import check_out_file
+from sightline.operator_side.pictures import Pictures, Shot
+from sightline.protocol.channels import OVERLAY, Channel
+from sightline.protocol.errors import ConfigError, LinkError, WireError
 
 PICTURES: Final = (".png", ".jpg", ".jpeg")
 VIDEO: Final = ".mp4"

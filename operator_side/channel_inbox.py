@@ -3,9 +3,9 @@
 import queue
 from typing import Final
 
-from operator_side.acknowledge import Viewer
-from protocol.channels import FRAME, JPEG, Channel
-from protocol.transports.link import LatestSlot, Link, Message
+from sightline.operator_side.acknowledge import Viewer
+from sightline.protocol.channels import FRAME, JPEG, Channel
+from sightline.protocol.transports.link import LatestSlot, Link, Message
 
 MAX_WAITING: Final = 64
 """Words that wait to be printed; what comes while they do is dropped and counted."""

@@ -4,13 +4,13 @@ import math
 from collections.abc import Mapping
 from typing import Any, Final
 
-from protocol.channels import JPEG, SCAN, TWIST, Channel
-from protocol.codec import decode, decode_ranges
-from protocol.errors import WireError
-from protocol.jpeg import read_jpeg_size
-from protocol.messages import WireModel
-from protocol.transports.link import Message
-from protocol.twist_text import parse_twist
+from sightline.protocol.channels import JPEG, SCAN, TWIST, Channel
+from sightline.protocol.codec import decode, decode_ranges
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.messages import WireModel
+from sightline.protocol.transports.link import Message
+from sightline.protocol.twist_text import parse_twist
 
 _LEFT_OUT: Final = ("v",)
 _EMPTY: Final[tuple[Any, ...]] = (None, "", {}, [], ())

@@ -12,28 +12,28 @@ from typing import Final
 
 import typer
 
-from operator_side.cli_bench import register_benches as register_bench
-from operator_side.cli_calibrate import register_calibrate
-from operator_side.cli_capture import register_capture
-from operator_side.cli_config import register_config
-from operator_side.cli_conform import register_conform
-from operator_side.cli_detector import register_detector
-from operator_side.cli_doctor import register_doctor
-from operator_side.cli_faults import register_faults
-from operator_side.cli_install import register_install
-from operator_side.cli_judge import register_demo_and_score as register_judge
-from operator_side.cli_keys import register_keys
-from operator_side.cli_metrics import register_metrics
-from operator_side.cli_mission import register_missions as register_mission
-from operator_side.cli_people import register_operator as register_people
-from operator_side.cli_pick_color import register_pick_color
-from operator_side.cli_scenarios import register_scenarios
-from operator_side.cli_services import register_services
-from operator_side.cli_teleop import register_teleop
-from operator_side.cli_train import register_train
-from operator_side.cli_watch import register_watch
-from operator_side.settings_errors import no_such_name
-from protocol.errors import SightlineError
+from sightline.operator_side.cli_bench import register_benches as register_bench
+from sightline.operator_side.cli_calibrate import register_calibrate
+from sightline.operator_side.cli_capture import register_capture
+from sightline.operator_side.cli_config import register_config
+from sightline.operator_side.cli_conform import register_conform
+from sightline.operator_side.cli_detector import register_detector
+from sightline.operator_side.cli_doctor import register_doctor
+from sightline.operator_side.cli_faults import register_faults
+from sightline.operator_side.cli_install import register_install
+from sightline.operator_side.cli_judge import register_demo_and_score as register_judge
+from sightline.operator_side.cli_keys import register_keys
+from sightline.operator_side.cli_metrics import register_metrics
+from sightline.operator_side.cli_mission import register_missions as register_mission
+from sightline.operator_side.cli_people import register_operator as register_people
+from sightline.operator_side.cli_pick_color import register_pick_color
+from sightline.operator_side.cli_scenarios import register_scenarios
+from sightline.operator_side.cli_services import register_services
+from sightline.operator_side.cli_teleop import register_teleop
+from sightline.operator_side.cli_train import register_train
+from sightline.operator_side.cli_watch import register_watch
+from sightline.operator_side.settings_errors import no_such_name
+from sightline.protocol.errors import SightlineError
 
 INTERRUPTED: Final = 130
 UNEXPECTED: Final = 1

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from operator_side.cli_bench_detector import register_detector_benches
-from operator_side.cli_bench_loop import register_loop_benches
-from operator_side.cli_bench_network import register_network_bench
-from operator_side.cli_options import CHECK_FAILED, Json, numbers
-from operator_side.extras import needs
+from sightline.operator_side.cli_bench_detector import register_detector_benches
+from sightline.operator_side.cli_bench_loop import register_loop_benches
+from sightline.operator_side.cli_bench_network import register_network_bench
+from sightline.operator_side.cli_options import CHECK_FAILED, Json, numbers
+from sightline.operator_side.extras import needs
 
 if TYPE_CHECKING:
-    from operator_side.check_text import Check
+    from sightline.operator_side.check_text import Check
 
 
 def register_benches(app: typer.Typer) -> None:
@@ -35,8 +35,8 @@ def register_benches(app: typer.Typer) -> None:
 
 def codec(*, as_json: Json = False) -> int:
     """Encode and decode a frame header and a twist."""
-    from benchmarks.codec import measure_codec
-    from operator_side.check_text import Check
+    from sightline.benchmarks.codec import measure_codec
+    from sightline.operator_side.check_text import Check
 
     costs = measure_codec()
     return print_checks([Check(cost.name, cost.median_us, "us", cost.bound_us, cost.ok) for cost in costs], as_json)
@@ -44,8 +44,8 @@ def codec(*, as_json: Json = False) -> int:
 
 def gate(*, as_json: Json = False) -> int:
     """Judge one command and decide one step, as the driver does."""
-    from benchmarks.gate import GATE_BOUND_US, measure_gate
-    from operator_side.check_text import Check
+    from sightline.benchmarks.gate import GATE_BOUND_US, measure_gate
+    from sightline.operator_side.check_text import Check
 
     took_us = measure_gate()
     return print_checks([Check("offer and step", took_us, "us", GATE_BOUND_US, took_us <= GATE_BOUND_US)], as_json)
@@ -54,8 +54,8 @@ def gate(*, as_json: Json = False) -> int:
 def pipeline(*, as_json: Json = False) -> int:
     """Picture in, command out: decode, detect, track, steer. And the learned detector's network."""
     with needs("vision"):
-        from benchmarks.pipeline import LEARNED_BOUND_US, time_learned, time_steps
-    from operator_side.check_text import Check
+        from sightline.benchmarks.pipeline import LEARNED_BOUND_US, time_learned, time_steps
+    from sightline.operator_side.check_text import Check
 
     checks = []
     for one in time_steps():
@@ -86,8 +86,8 @@ def odometry(
 ) -> int:
     """Dead reckoning against the simulated world's truth, of every simulated robot."""
     with needs("sim"):
-        from benchmarks.odometry import measure_odometry
-    from operator_side.check_text import Check
+        from sightline.benchmarks.odometry import measure_odometry
+    from sightline.operator_side.check_text import Check
 
     errors = measure_odometry(robot_model or ())
     checks = [Check(one.name, one.percent, "%", one.bound_percent, one.percent <= one.bound_percent) for one in errors]
@@ -99,8 +99,8 @@ def robot(
 ) -> int:
     """The robot service in a bare environment of its own: frame rate and memory. Needs a checkout and pip."""
     with needs("all"):
-        from benchmarks.light_robot import NETWORK_BOUND_MB, measure_light_robot
-    from operator_side.check_text import Check
+        from sightline.benchmarks.light_robot import NETWORK_BOUND_MB, measure_light_robot
+    from sightline.operator_side.check_text import Check
 
     seen = measure_light_robot(seconds)
     checks = [
@@ -124,11 +124,11 @@ def demo(
 ) -> int:
     """Many demos in real time; the median over seeds is judged."""
     with needs("all"):
-        from benchmarks.real_time import Kinds, measure_demos
-        from operator_side.check_text import number
-        from operator_side.score import AT_LEAST
-        from operator_side.score_bounds import EXACT
-        from sim.scenario import load_scenario, scenario_names
+        from sightline.benchmarks.real_time import Kinds, measure_demos
+        from sightline.operator_side.check_text import number
+        from sightline.operator_side.score import AT_LEAST
+        from sightline.operator_side.score_bounds import EXACT
+        from sightline.sim.scenario import load_scenario, scenario_names
     names = scenario_names() if scenario == "all" else scenario.split(",")
     for name in names:
         load_scenario(name)
@@ -153,14 +153,14 @@ def report(
     ] = None,
 ) -> int:
     """Run the measurements that the performance page shows, and write them into it. All of them take over an hour."""
-    from benchmarks.report import sections_named, write_report
+    from sightline.benchmarks.report import sections_named, write_report
 
     return 0 if write_report(out, sections_named(section or ()), typer.echo) else CHECK_FAILED
 
 
 def print_checks(checks: "list[Check]", as_json: bool) -> int:
     """Print them, and return the exit code."""
-    from operator_side.check_text import check_line
+    from sightline.operator_side.check_text import check_line
 
     ok = all(check.ok for check in checks)
     if as_json:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from operator_side.cli_options import Json
-from operator_side.extras import needs
+from sightline.operator_side.cli_options import Json
+from sightline.operator_side.extras import needs
 
 if TYPE_CHECKING:
-    from operator_side.check_text import Check
+    from sightline.operator_side.check_text import Check
 
 _READY_S = 30.0
 _BOUND_US = {"zenoh": 1_000.0, "oip+http": 2_000.0}
@@ -35,14 +35,14 @@ def detector(
     as_json: Json = False,
 ) -> int:
     """What a detector elsewhere adds to the time of the same frames here (hsv), 320x240."""
-    from operator_side.cli_detector import own_options
+    from sightline.operator_side.cli_detector import own_options
 
     with needs("vision"):
-        from benchmarks.detector_remote import HOT_S, PACED_S, measure_cost
-        from operator_side.check_text import Check
-        from vision_side.config import VisionConfig
-        from vision_side.detect.around import attach_detector, close_detector
-        from vision_side.detect.choice import build_detector
+        from sightline.benchmarks.detector_remote import HOT_S, PACED_S, measure_cost
+        from sightline.operator_side.check_text import Check
+        from sightline.vision_side.config import VisionConfig
+        from sightline.vision_side.detect.around import attach_detector, close_detector
+        from sightline.vision_side.detect.choice import build_detector
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder, _service(name, Path(folder)) as robot:
         here = build_detector("hsv", {}, VisionConfig())
         there = build_detector(name, own_options(sets or ()), VisionConfig())
@@ -71,8 +71,8 @@ def streams(
 ) -> int:
     """Many robots at one detector service that can look at half of their frames: age, fairness, memory."""
     with needs("vision"):
-        from benchmarks import detector_streams as bench
-        from operator_side.check_text import Check
+        from sightline.benchmarks import detector_streams as bench
+        from sightline.operator_side.check_text import Check
 
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
         load = bench.measure_streams(_free_endpoint(), Path(folder), streams, seconds)
@@ -91,8 +91,8 @@ def streams(
 @contextmanager
 def _service(name: str, folder: Path) -> "Iterator[Any]":
     """For `zenoh` a service, and a link that is both the robot's and vision's, where they meet; else None."""
-    from operator_side.processes import Processes
-    from protocol.transports.opening import open_link
+    from sightline.operator_side.processes import Processes
+    from sightline.protocol.transports.opening import open_link
 
     if name != "zenoh":
         yield None
@@ -109,9 +109,9 @@ def _service(name: str, folder: Path) -> "Iterator[Any]":
 
 def _publish_status(robot: Any, processes: Any) -> None:
     """Until the service has taken note."""
-    from protocol.channels import STATUS
-    from protocol.codec import encode
-    from protocol.messages import Stamp, State, Status
+    from sightline.protocol.channels import STATUS
+    from sightline.protocol.codec import encode
+    from sightline.protocol.messages import Stamp, State, Status
 
     stamp, status = encode(Stamp(session="0000abcd", seq=1, t_us=1)), encode(Status(state=State.HOLD, reason="bench"))
     while "looks at the pictures" not in processes.log("detector").read_text("utf-8", "replace"):
@@ -120,7 +120,7 @@ def _publish_status(robot: Any, processes: Any) -> None:
 
 
 def _picture(folder: Path) -> bytes:
-    from benchmarks.loop_pictures import write_pictures
+    from sightline.benchmarks.loop_pictures import write_pictures
 
     write_pictures(folder, 320, 240)
     return min(folder.glob("*.jpg")).read_bytes()
@@ -135,6 +135,6 @@ def _free_endpoint() -> str:
 
 
 def _print(checks: "list[Check]", as_json: bool) -> int:
-    from operator_side.cli_bench import print_checks
+    from sightline.operator_side.cli_bench import print_checks
 
     return print_checks(checks, as_json)

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from operator_side.cli_options import CHECK_FAILED, Json, numbers
-from operator_side.extras import needs
+from sightline.operator_side.cli_options import CHECK_FAILED, Json, numbers
+from sightline.operator_side.extras import needs
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from benchmarks.loop_figures import LoopCheck
-    from benchmarks.network_stage import NetworkRun
+    from sightline.benchmarks.loop_figures import LoopCheck
+    from sightline.benchmarks.network_stage import NetworkRun
 
 
 def register_network_bench(group: typer.Typer) -> None:
@@ -31,11 +31,11 @@ def network(
 ) -> int:
     """Robots, visions and people in two network namespaces: what slow, lossy, far, broken and shared wires cost."""
     with needs("all"):
-        from benchmarks.network import Progress, run_network
-        from benchmarks.network_rows import chosen
-        from benchmarks.network_stage import NetworkSetting
-        from operator_side.faults.wires import BenchWire
-        from operator_side.network_medium import medium
+        from sightline.benchmarks.network import Progress, run_network
+        from sightline.benchmarks.network_rows import chosen
+        from sightline.benchmarks.network_stage import NetworkSetting
+        from sightline.operator_side.faults.wires import BenchWire
+        from sightline.operator_side.network_medium import medium
     setting = NetworkSetting(transport, seconds, tuple(numbers("--seeds", seeds, int)))
     telling = Progress(lambda line: typer.echo(line, err=True), lambda run: _print_run(run, as_json=as_json))
     runs = run_network(chosen(only or (), transport), setting, BenchWire, telling, {"medium": medium})
@@ -60,14 +60,14 @@ def _network_result(runs: "Sequence[NetworkRun]", transport: str) -> dict[str, A
 
 def _worst(runs: "Sequence[NetworkRun]") -> "Iterator[LoopCheck]":
     """Of each demand on a row, the seed that did worst."""
-    from benchmarks.network_figures import worst_of_seeds
+    from sightline.benchmarks.network_figures import worst_of_seeds
 
     for name in dict.fromkeys(run.row.name for run in runs):
         yield from worst_of_seeds(name, [run.checks for run in runs if run.row.name == name])
 
 
 def _print_run(run: "NetworkRun", *, as_json: bool) -> None:
-    from operator_side.check_text import number
+    from sightline.operator_side.check_text import number
 
     typer.echo(f"{run.row.name} ({run.row.what}), seed {run.seed}", err=as_json)
     for last in run.figures[-1:]:
@@ -88,7 +88,7 @@ def _print_worst(runs: "Sequence[NetworkRun]") -> None:
 
 
 def _print_network_checks(checks: "Sequence[LoopCheck]", *, as_json: bool) -> None:
-    from operator_side.check_text import Check, check_line
+    from sightline.operator_side.check_text import Check, check_line
 
     for check in checks:
         typer.echo("  " + check_line(Check(check.name, check.value, check.unit, check.bound, check.ok)), err=as_json)

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from operator_side.cli_options import Json, RobotName, Secure, ServiceConnect
-from operator_side.cli_robot_tools import drive
-from operator_side.extras import needs
-from operator_side.out_file import check_out_file
-from protocol.errors import ConfigError
-from robot_side.config import DEFAULT_ENDPOINT
+from sightline.operator_side.cli_options import Json, RobotName, Secure, ServiceConnect
+from sightline.operator_side.cli_robot_tools import drive
+from sightline.operator_side.extras import needs
+from sightline.operator_side.out_file import check_out_file
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
-    from operator_side.calibrate import Ball, Board, Calibration, Mounting
+    from sightline.operator_side.calibrate import Ball, Board, Calibration, Mounting
 
 _BOARD = re.compile(r"([0-9]{1,2})x([0-9]{1,2})")
 _BALL_PICTURES = 20
@@ -89,7 +89,7 @@ def camera(
 
 def _subject(board: str, square_m: float, radius_m: float | None, distance_m: float | None) -> "Board | Ball":
     with needs("vision"):
-        from operator_side.calibrate import Ball, Board
+        from sightline.operator_side.calibrate import Ball, Board
     if radius_m is not None and distance_m is not None:
         return Ball(radius_m, distance_m)
     if radius_m is not None or distance_m is not None:
@@ -108,19 +108,19 @@ def _source(
     seconds: float,
 ) -> tuple[Iterator[bytes], dict[str, float]]:
     """The pictures, and the mounting that is known already. Exactly one source must be named."""
-    from operator_side import calibrate_pictures as sources
+    from sightline.operator_side import calibrate_pictures as sources
 
     if sum((folder is not None, plugin[0] is not None, robot[:2] != (None, None))) != 1:
         raise ConfigError("say where the pictures come from, once: --pictures DIR, --camera KIND, or --robot ID")
     if folder is not None:
         return sources.folder_pictures(folder), {}
     if plugin[0] is not None:
-        from operator_side.local_camera import local_camera
+        from sightline.operator_side.local_camera import local_camera
 
         opened = ending.enter_context(local_camera(plugin[0], plugin[1]))
         return sources.camera_pictures(opened, seconds), {}
-    from operator_side.pictures import viewer_role
-    from protocol.transports.opening import open_link
+    from sightline.operator_side.pictures import viewer_role
+    from sightline.protocol.transports.opening import open_link
 
     name, connect, secure = robot
     role = viewer_role(secure) if secure else sources.ROLE
@@ -132,7 +132,7 @@ def _source(
 
 
 def _mounting(known: dict[str, float], given: dict[str, float | None]) -> "Mounting":
-    from operator_side.calibrate import Mounting
+    from sightline.operator_side.calibrate import Mounting
 
     return Mounting(**{**known, **{name: value for name, value in given.items() if value is not None}})
 
@@ -146,8 +146,8 @@ def _measure(
     config: str | None,
     say: Callable[[str], None],
 ) -> "Calibration":
-    from operator_side import calibrate
-    from operator_side.calibrate_pictures import collect
+    from sightline.operator_side import calibrate
+    from sightline.operator_side.calibrate_pictures import collect
 
     if isinstance(wanted, calibrate.Board):
         boards = collect(pictures, lambda _: lambda jpeg: calibrate.find_board(jpeg, wanted), calibrate.is_new_view,
@@ -159,13 +159,13 @@ def _measure(
 
 
 def _vision_config(file: str | None) -> Any:
-    from operator_side.service_settings import load_service
+    from sightline.operator_side.service_settings import load_service
 
     return load_service("vision", file=file, environ=os.environ).config
 
 
 def _write(path: Path, made: "Calibration") -> None:
-    from operator_side.toml_text import toml_text
+    from sightline.operator_side.toml_text import toml_text
 
     head = f"# {made.used} of {made.given} pictures, {made.error:.2f} {made.error_unit}\n"
     try:

@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Robot, Secure
-from operator_side.extras import needs
-from operator_side.pictures import Pictures, viewer_role
-from protocol.channels import FRAME, OVERLAY
-from protocol.transports.opening import open_link
+from sightline.operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Robot, Secure
+from sightline.operator_side.extras import needs
+from sightline.operator_side.pictures import Pictures, viewer_role
+from sightline.protocol.channels import FRAME, OVERLAY
+from sightline.protocol.transports.opening import open_link
 
 _SECONDS = 5.0
 
@@ -37,7 +37,7 @@ def capture(
 ) -> None:
     """Save what a robot sees: one picture, or with --seconds or an .mp4 a video. Ctrl-C ends a video early."""
     with needs("vision"):
-        from operator_side.capture import PICTURES, check_target, film, snapshot
+        from sightline.operator_side.capture import PICTURES, check_target, film, snapshot
     kind = "mp4" if seconds is not None else "png"
     path = (out or Path(f"{robot}-{time.strftime('%Y%m%d-%H%M%S')}.{kind}")).expanduser()
     check_target(path, seconds)

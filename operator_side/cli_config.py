@@ -7,17 +7,17 @@ from typing import Annotated
 import typer
 from pydantic import BaseModel
 
-from operator_side.cli_options import Sets
-from operator_side.extras import needs
-from operator_side.service_settings import load_service
-from operator_side.settings import model_of
-from operator_side.toml_text import toml_text
-from robot_side.config import RobotConfig
-from robot_side.plugins import load_device
-from sim.robot_model import load_robot
-from sim.scenario import load_scenario
-from sim.service import SimConfig
-from vision_side.config import VisionConfig
+from sightline.operator_side.cli_options import Sets
+from sightline.operator_side.extras import needs
+from sightline.operator_side.service_settings import load_service
+from sightline.operator_side.settings import model_of
+from sightline.operator_side.toml_text import toml_text
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.plugins import load_device
+from sightline.sim.robot_model import load_robot
+from sightline.sim.scenario import load_scenario
+from sightline.sim.service import SimConfig
+from sightline.vision_side.config import VisionConfig
 
 ServiceName = Annotated[str, typer.Argument(metavar="SERVICE", help="robot, vision or sim.")]
 File = Annotated[str | None, typer.Argument(metavar="[FILE]", help="The service's TOML file.")]
@@ -54,7 +54,7 @@ def _check_names(config: BaseModel) -> None:
         load_robot(config.robot or load_scenario(config.scenario).robot)
     if isinstance(config, VisionConfig):
         with needs("vision"):
-            from vision_side.detect.choice import check_vision
+            from sightline.vision_side.detect.choice import check_vision
         check_vision(config)
 
 

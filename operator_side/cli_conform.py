@@ -8,15 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
-from operator_side.cli_options import CHECK_FAILED
-from operator_side.conform_access import access_for
-from operator_side.conform_table import listing, print_results, progress
-from operator_side.out_file import check_out_file
-from protocol.conformance.html_report import to_html
-from protocol.conformance.live import LiveBench
-from protocol.conformance.report import to_dict, to_junit, to_page
-from protocol.conformance.runner import Result, chosen, passed, run_cases
-from protocol.errors import ConfigError, LinkError
+from sightline.operator_side.cli_options import CHECK_FAILED
+from sightline.operator_side.conform_access import access_for
+from sightline.operator_side.conform_table import listing, print_results, progress
+from sightline.operator_side.out_file import check_out_file
+from sightline.protocol.conformance.html_report import to_html
+from sightline.protocol.conformance.live import LiveBench
+from sightline.protocol.conformance.report import to_dict, to_junit, to_page
+from sightline.protocol.conformance.runner import Result, chosen, passed, run_cases
+from sightline.protocol.errors import ConfigError, LinkError
 
 _ROLES = ("vision", "operator")
 """Whom the kit plays where each role has keys of its own."""
@@ -81,11 +81,11 @@ def robot(
     as_json: Json = False,
 ) -> int:
     """Test a robot as its driver, its watcher and its enemy. It is armed and its wheels turn: lift it off the floor."""
-    from protocol.conformance import robot as side
-    from protocol.conformance.robot_sockets import put_over_websocket
-    from protocol.conformance.strangers import RawZenoh
-    from protocol.conformance.virtual import FROM_ROBOT
-    from protocol.transports.opening import open_link
+    from sightline.protocol.conformance import robot as side
+    from sightline.protocol.conformance.robot_sockets import put_over_websocket
+    from sightline.protocol.conformance.strangers import RawZenoh
+    from sightline.protocol.conformance.virtual import FROM_ROBOT
+    from sightline.protocol.transports.opening import open_link
 
     cases = chosen(side.CASES, only or (), groups or ())
     if list_cases:
@@ -131,10 +131,10 @@ def vision(
     as_json: Json = False,
 ) -> int:
     """Test a vision: the kit plays its robot at ENDPOINT; start the vision against it, before or after."""
-    from protocol.conformance import vision as side
-    from protocol.conformance.strangers import RawZenoh
-    from protocol.conformance.virtual import TO_ROBOT
-    from protocol.transports.opening import open_link
+    from sightline.protocol.conformance import vision as side
+    from sightline.protocol.conformance.strangers import RawZenoh
+    from sightline.protocol.conformance.virtual import TO_ROBOT
+    from sightline.protocol.transports.opening import open_link
 
     cases = chosen(side.CASES, only or (), groups or ())
     if list_cases:
@@ -174,7 +174,7 @@ def codec(
     as_json: Json = False,
 ) -> int:
     """Test a codec in any language: a program that answers one line of JSON with one line of JSON."""
-    from protocol.conformance import codec as side
+    from sightline.protocol.conformance import codec as side
 
     cases = chosen(side.CASES, only or (), groups or ())
     if list_cases:

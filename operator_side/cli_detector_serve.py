@@ -5,11 +5,11 @@ from typing import Annotated, Any
 
 import typer
 
-from operator_side.cli_options import ConfigFile, Device, Listen, LogForm, MaybeSecure, ServiceConnect, Sets
-from operator_side.extras import needs
-from operator_side.service_settings import load_service
-from protocol.errors import ConfigError
-from protocol.log_lines import set_log_format
+from sightline.operator_side.cli_options import ConfigFile, Device, Listen, LogForm, MaybeSecure, ServiceConnect, Sets
+from sightline.operator_side.extras import needs
+from sightline.operator_side.service_settings import load_service
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.log_lines import set_log_format
 
 Robots = Annotated[
     str | None, typer.Option(metavar="ID", help="A robot's id, or several by * and ? [default: the configured or *].")
@@ -49,9 +49,9 @@ def serve(
     everybody = {} if given.origin(("robot",)) != "default" else {"robot": "*"}
     loaded: Any = given.config.model_copy(update=everybody)
     with needs("vision"):
-        from vision_side.detect.around import close_detector
-        from vision_side.detect.choice import build_detector, configured_detector
-        from vision_side.detector_service import ServingOptions, run
+        from sightline.vision_side.detect.around import close_detector
+        from sightline.vision_side.detect.choice import build_detector, configured_detector
+        from sightline.vision_side.detector_service import ServingOptions, run
 
         detector = configured_detector(loaded) or build_detector("hsv", {}, loaded)
         try:

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from operator_side.doctor.finding import Finding, as_object
-from protocol.transports.opening import check_endpoint
+from sightline.operator_side.doctor.finding import Finding, as_object
+from sightline.protocol.transports.opening import check_endpoint
 
 
 def register_doctor(app: typer.Typer) -> None:
@@ -48,7 +48,7 @@ def doctor(
 
 
 def _findings(robot: str, peer: str | None, camera: str | None, sets: list[str], secure: str) -> Iterator[Finding]:
-    from operator_side.doctor import between, cameras, machine
+    from sightline.operator_side.doctor import between, cameras, machine
 
     yield from machine.findings(secure)
     yield from cameras.modes()

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from operator_side.cli_options import CHECK_FAILED
-from operator_side.extras import needs
-from operator_side.out_file import check_out_file
+from sightline.operator_side.cli_options import CHECK_FAILED
+from sightline.operator_side.extras import needs
+from sightline.operator_side.out_file import check_out_file
 
 if TYPE_CHECKING:
-    from operator_side.faults.report import Results
+    from sightline.operator_side.faults.report import Results
 
 JOBS = min(4, (os.cpu_count() or 1) + 1)
 """A row waits more than it computes; a row that was disturbed too much says so and runs again."""
@@ -47,10 +47,10 @@ def faults(
 ) -> int:
     """Start real processes, break one thing at a time, and judge from the simulated motors' own log."""
     with needs("all"):
-        from operator_side.faults.machine import describe_machine
-        from operator_side.faults.parallel import run_cases
-        from operator_side.faults.report import markdown, passed, progress_line, to_dict, with_rows_of
-        from operator_side.faults.rows import chosen
+        from sightline.operator_side.faults.machine import describe_machine
+        from sightline.operator_side.faults.parallel import run_cases
+        from sightline.operator_side.faults.report import markdown, passed, progress_line, to_dict, with_rows_of
+        from sightline.operator_side.faults.rows import chosen
     rows = chosen(only or (), short=short)
     if listing:
         typer.echo("\n".join(f"{row.id:<22} {row.what}: {row.demanded}" for row in rows))
@@ -71,7 +71,7 @@ def faults(
 
 def _write_report(out: Path, report: str) -> None:
     """The report, and its worst values into the page of promises beside it."""
-    from operator_side.faults.worst import page_with_summary
+    from sightline.operator_side.faults.worst import page_with_summary
 
     out.write_text(report, "utf-8")
     page = out.with_name(SAFETY_PAGE)

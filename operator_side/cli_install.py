@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from operator_side import install as units
-from operator_side.service_settings import load_service
-from robot_side.config import RobotConfig
+from sightline.operator_side import install as units
+from sightline.operator_side.service_settings import load_service
+from sightline.robot_side.config import RobotConfig
 
 
 def register_install(app: typer.Typer) -> None:

@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from operator_side.cli_options import CHECK_FAILED, Json, numbers
-from operator_side.cli_score_detectors import detectors
-from operator_side.extras import needs
+from sightline.operator_side.cli_options import CHECK_FAILED, Json, numbers
+from sightline.operator_side.cli_score_detectors import detectors
+from sightline.operator_side.extras import needs
 
 
 def register_demo_and_score(app: typer.Typer) -> None:
@@ -46,8 +46,8 @@ def demo(
     """
     _check_installed("pybullet", "av", "matplotlib", "mcap")
     with needs("all"):
-        from operator_side.demo import DemoOptions, run_demo
-        from operator_side.demo_report import report, summary
+        from sightline.operator_side.demo import DemoOptions, run_demo
+        from sightline.operator_side.demo_report import report, summary
     say = _to_stderr if as_json else typer.echo
     lasting_s = _seconds(scenario, seconds)
     run = run_demo(DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission, detector), say)
@@ -64,7 +64,7 @@ def demo(
 
 def _seconds(scenario: str, asked: float | None) -> float:
     """A ball is followed for as long as one likes; a course is driven to its end."""
-    from sim.scenario import load_scenario
+    from sightline.sim.scenario import load_scenario
 
     if asked is not None:
         return asked
@@ -106,9 +106,9 @@ def score(
     if context.invoked_subcommand is not None:
         return 0
     with needs("all"):
-        from operator_side.score_runs import cases, run_cases
-        from operator_side.score_table import progress, score_text
-        from sim.scenario import scenario_names
+        from sightline.operator_side.score_runs import cases, run_cases
+        from sightline.operator_side.score_table import progress, score_text
+        from sightline.sim.scenario import scenario_names
     if page is not None:
         return _write_page(page, numbers("--seeds", seeds, int), jobs or os.cpu_count() or 1)
     wanted = cases(
@@ -124,8 +124,8 @@ def score(
 
 def _write_page(page: Path, seeds: list[int], jobs: int) -> int:
     with needs("all"):
-        from operator_side.behaviours import write_page
-        from operator_side.score_table import progress
+        from sightline.operator_side.behaviours import write_page
+        from sightline.operator_side.score_table import progress
     return 0 if write_page(page, seeds, jobs, progress) else CHECK_FAILED
 
 

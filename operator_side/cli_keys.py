@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from operator_side.extras import needs
+from sightline.operator_side.extras import needs
 
 Hosts = Annotated[
     list[str] | None,
@@ -31,7 +31,7 @@ def register_keys(app: typer.Typer) -> None:
 def _keys() -> ModuleType:
     with needs("secure"):
         import_module("cryptography.x509")
-    from operator_side import keys
+    from sightline.operator_side import keys
 
     return keys
 

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from operator_side.cli_options import DEFAULT_CONNECT, Connect, Robot, Secure
-from operator_side.extras import needs
-from protocol.transports.opening import open_link
+from sightline.operator_side.cli_options import DEFAULT_CONNECT, Connect, Robot, Secure
+from sightline.operator_side.extras import needs
+from sightline.protocol.transports.opening import open_link
 
 ROLE = "metrics"
 
@@ -29,8 +29,8 @@ def metrics(
     """Serve a robot's status to Prometheus at /metrics, and whether it is heard at /health, until Ctrl-C."""
     with needs("metrics"):
         import_module("prometheus_client")
-    from operator_side.metrics import Watched
-    from operator_side.metrics_server import serving
+    from sightline.operator_side.metrics import Watched
+    from sightline.operator_side.metrics_server import serving
 
     ending = threading.Event()
     with open_link(robot, connect=connect, role=ROLE, secure=secure) as link, serving(Watched(link), host, port) as at:

@@ -6,8 +6,8 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from protocol.errors import ConfigError
-from robot_side.config import DEFAULT_ENDPOINT
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import DEFAULT_ENDPOINT
 
 REJECTED_EXIT = 5
 

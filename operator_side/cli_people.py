@@ -8,15 +8,23 @@ from typing import Annotated
 
 import typer
 
-from operator_side.around import discover_all
-from operator_side.cli_options import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, MaybeConnect, Robot, Secure
-from operator_side.mission_asking import MissionClient
-from operator_side.mission_text import mission_lines
-from operator_side.pictures import viewer_role
-from operator_side.requests import SOURCE, Operator
-from operator_side.status_text import status_line, status_lines
-from protocol.messages import Reply, Status, Verb
-from protocol.transports.opening import open_link
+from sightline.operator_side.around import discover_all
+from sightline.operator_side.cli_options import (
+    DEFAULT_CONNECT,
+    REJECTED_EXIT,
+    Connect,
+    Json,
+    MaybeConnect,
+    Robot,
+    Secure,
+)
+from sightline.operator_side.mission_asking import MissionClient
+from sightline.operator_side.mission_text import mission_lines
+from sightline.operator_side.pictures import viewer_role
+from sightline.operator_side.requests import SOURCE, Operator
+from sightline.operator_side.status_text import status_line, status_lines
+from sightline.protocol.messages import Reply, Status, Verb
+from sightline.protocol.transports.opening import open_link
 
 _REPORT_S = 0.8  # vision reports twice a second; where one drives, that is worth waiting for
 

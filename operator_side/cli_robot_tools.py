@@ -7,14 +7,14 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from operator_side.cli_options import ConfigFile, Sets, numbers
-from operator_side.out_file import check_out_file
-from operator_side.service_settings import load_service
-from operator_side.settings_errors import no_such_name
-from operator_side.wheel_test import check_confirmed, opened_drive, try_wheels, turn_for
-from protocol.errors import ConfigError
-from robot_side.config import RobotConfig
-from robot_side.hardware.gpio_table import table_of, table_text
+from sightline.operator_side.cli_options import ConfigFile, Sets, numbers
+from sightline.operator_side.out_file import check_out_file
+from sightline.operator_side.service_settings import load_service
+from sightline.operator_side.settings_errors import no_such_name
+from sightline.operator_side.wheel_test import check_confirmed, opened_drive, try_wheels, turn_for
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.hardware.gpio_table import table_of, table_text
 
 TASKS: Final = ("test-wheels",)
 _CHECK_FAILED: Final = 5

@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 import typer
 
-from operator_side.extras import needs
-from operator_side.toml_text import toml_text
-from protocol.errors import ConfigError
-from robot_side.config import DEFAULT_ENDPOINT
+from sightline.operator_side.extras import needs
+from sightline.operator_side.toml_text import toml_text
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import DEFAULT_ENDPOINT
 
 
 def register_scenarios(app: typer.Typer) -> None:
@@ -41,7 +41,7 @@ def scenarios(
 
 
 def _list(as_json: bool) -> None:
-    from sim.scenario import load_scenario, scenario_names
+    from sightline.sim.scenario import load_scenario, scenario_names
 
     all_of_them = [load_scenario(name) for name in scenario_names()]
     if as_json:
@@ -54,9 +54,15 @@ def _list(as_json: bool) -> None:
 
 def _files(name: str, seed: int) -> dict[str, dict[str, Any]]:
     with needs("vision"):
-        from operator_side.scenario_settings import robot_config, robot_of, robot_table, vision_config, vision_table
-        from sim.scenario import load_scenario
-        from vision_side.missions.choice import configured_mission
+        from sightline.operator_side.scenario_settings import (
+            robot_config,
+            robot_of,
+            robot_table,
+            vision_config,
+            vision_table,
+        )
+        from sightline.sim.scenario import load_scenario
+        from sightline.vision_side.missions.choice import configured_mission
     scenario = load_scenario(name)
     model = robot_of(scenario)
     robot_config(model)
@@ -68,7 +74,7 @@ def _files(name: str, seed: int) -> dict[str, dict[str, Any]]:
 
 
 def _write(out: Path, name: str, files: dict[str, dict[str, Any]]) -> None:
-    from sim.scenario import load_scenario
+    from sightline.sim.scenario import load_scenario
 
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -94,8 +100,8 @@ def labels(
 ) -> int:
     """Publish what the simulation labels in its pictures as boxes, in place of a detector, until Ctrl-C."""
     with needs("zenoh"):
-        from operator_side.labels_service import run
-        from sim.bus import default_socket_dir
+        from sightline.operator_side.labels_service import run
+        from sightline.sim.bus import default_socket_dir
 
         return run(robot, connect or [DEFAULT_ENDPOINT], secure, socket_dir or default_socket_dir(), _print_line)
 

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from operator_side.cli_options import ConfigFile, Device, Sets
-from operator_side.extras import needs
-from operator_side.out_file import check_out_file
-from operator_side.service_settings import load_service
-from protocol.errors import ConfigError
+from sightline.operator_side.cli_options import ConfigFile, Device, Sets
+from sightline.operator_side.extras import needs
+from sightline.operator_side.out_file import check_out_file
+from sightline.operator_side.service_settings import load_service
+from sightline.protocol.errors import ConfigError
 
 if TYPE_CHECKING:
-    from operator_side.check_text import Check
-    from operator_side.score_scenes import Report, ScoredScene, Subject
-    from operator_side.score_sheet import Sheet
-    from operator_side.settings import Loaded
+    from sightline.operator_side.check_text import Check
+    from sightline.operator_side.score_scenes import Report, ScoredScene, Subject
+    from sightline.operator_side.score_sheet import Sheet
+    from sightline.operator_side.settings import Loaded
 
 COMPARED = ("hsv", "onnx")
 FRAMES = 100
@@ -51,11 +51,11 @@ def detectors(
     for judging only: nothing may be trained or tuned on them.
     """
     with needs("all"):
-        from operator_side.score_detectors_bounds import FRAMES as DEMANDED_FRAMES
-        from operator_side.score_detectors_bounds import all_detector_checks
-        from operator_side.score_scenes import LIGHT_SHARE, close_subjects, score_scenes
-        from operator_side.score_sheet import Sheet
-        from operator_side.score_table import progress
+        from sightline.operator_side.score_detectors_bounds import FRAMES as DEMANDED_FRAMES
+        from sightline.operator_side.score_detectors_bounds import all_detector_checks
+        from sightline.operator_side.score_scenes import LIGHT_SHARE, close_subjects, score_scenes
+        from sightline.operator_side.score_sheet import Sheet
+        from sightline.operator_side.score_table import progress
     if demand and seeds < FROM:
         raise ConfigError(f"--demand judges, which only seeds from {FROM} up are for, not {seeds}")
     if sheet is not None:
@@ -78,7 +78,7 @@ def _subjects(
     names: Sequence[str], file: str | None, sets: Sequence[str], device: str | None
 ) -> "list[Subject]":
     """As `sightline vision` with the same options would build them; only the detectors, nothing that goes around."""
-    from operator_side.score_scenes import subjects
+    from sightline.operator_side.score_scenes import subjects
 
     loaded = load_service("vision", file=file, sets=sets, options={"detector.device": device}, environ=os.environ)
     settings: Any = loaded.config
@@ -98,7 +98,7 @@ def _whose_options(names: Sequence[str], loaded: "Loaded") -> str:
 
 def _check_device(names: Sequence[str], settings: Any) -> None:
     """Raise ConfigError where none of them has a device to choose."""
-    from vision_side.detect.choice import check_device
+    from sightline.vision_side.detect.choice import check_device
 
     alone = {"fallback": "", "shadow": ""}
     errors = []
@@ -113,8 +113,8 @@ def _check_device(names: Sequence[str], settings: Any) -> None:
 
 
 def _print_report(report: "Report", checks: "list[Check] | None", as_json: bool) -> int:
-    from operator_side.cli_options import CHECK_FAILED
-    from operator_side.score_detectors_text import check_lines, silence_lines, text
+    from sightline.operator_side.cli_options import CHECK_FAILED
+    from sightline.operator_side.score_detectors_text import check_lines, silence_lines, text
 
     ok = all(check.ok for check in checks or ())
     judged = {} if checks is None else {"ok": ok, "checks": [asdict(check) for check in checks]}
@@ -128,8 +128,8 @@ def _print_report(report: "Report", checks: "list[Check] | None", as_json: bool)
 
 
 def _columns(asked: str) -> list[str]:
-    from operator_side.settings_errors import no_such_name
-    from sim.scenes import COLUMNS
+    from sightline.operator_side.settings_errors import no_such_name
+    from sightline.sim.scenes import COLUMNS
 
     names = list(COLUMNS) if asked == "all" else [one.strip() for one in asked.split(",")]
     for one in names:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from operator_side.cli_options import (
+from sightline.operator_side.cli_options import (
     ConfigFile,
     Listen,
     LogForm,
@@ -17,11 +17,11 @@ from operator_side.cli_options import (
     Sets,
     SocketDir,
 )
-from operator_side.extras import needs
-from operator_side.service_settings import load_service
-from protocol.errors import ConfigError
-from protocol.log_lines import set_log_format
-from robot_side.config import DEFAULT_ENDPOINT
+from sightline.operator_side.extras import needs
+from sightline.operator_side.service_settings import load_service
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.log_lines import set_log_format
+from sightline.robot_side.config import DEFAULT_ENDPOINT
 
 
 def register_services(app: typer.Typer) -> None:
@@ -49,7 +49,7 @@ def sim(
     log: LogForm = None,
 ) -> int:
     """Simulate a robot's hardware, in place of a real one, until Ctrl-C."""
-    from sim.service import run
+    from sightline.sim.service import run
 
     set_log_format(log, "sim")
     options = {
@@ -87,8 +87,8 @@ def robot(
 
     With no configuration its hardware is the simulation (`sightline sim`).
     """
-    from robot_side.driver import run
-    from robot_side.driver import zero_motors as set_to_zero
+    from sightline.robot_side.driver import run
+    from sightline.robot_side.driver import zero_motors as set_to_zero
 
     set_log_format(log, "robot")
     options: dict[str, Any] = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure}
@@ -97,7 +97,7 @@ def robot(
         "robot", profile=profile, file=config, sets=sets or (), options=options, environ=os.environ
     )
     if task is not None:
-        from operator_side.cli_robot_tools import run_task
+        from sightline.operator_side.cli_robot_tools import run_task
 
         return run_task(task, loaded.config, yes)  # type: ignore[arg-type]
     with needs("zenoh"):
@@ -155,10 +155,10 @@ def vision(
         if dry_run:
             return _dry_run(loaded.config, camera, camera_sets or [])
         if shape is not None:
-            from operator_side.shaped_vision import run_shaped
+            from sightline.operator_side.shaped_vision import run_shaped
 
             return run_shaped(loaded.config, shape)  # type: ignore[arg-type]
-        from vision_side.service_process import run
+        from sightline.vision_side.service_process import run
 
         if metrics is not None:
             return _measured(run, loaded.config, metrics)
@@ -168,7 +168,7 @@ def vision(
 def _measured(run: Any, config: Any, where: str) -> int:
     with needs("metrics"):
         import_module("prometheus_client")
-    from operator_side.vision_metrics import served
+    from sightline.operator_side.vision_metrics import served
 
     with served(where) as observe:
         return int(run(config, observe))
@@ -178,15 +178,15 @@ def router(listen: Listen = None, connect: ServiceConnect = None, secure: Secure
     """Run the place where robots, visions and people of one site meet, until Ctrl-C. All of them connect to it."""
     set_log_format(log, "router")
     with needs("zenoh"):
-        from operator_side.router import run
+        from sightline.operator_side.router import run
 
         return run(listen or [DEFAULT_ENDPOINT], connect or [], secure)
 
 
 def _dry_run(config: Any, camera: str | None, camera_sets: list[str]) -> int:
-    from operator_side.local_camera import local_camera
-    from vision_side.detect.choice import check_takes_pictures, check_vision
-    from vision_side.dry_run import watch_camera, watch_robot
+    from sightline.operator_side.local_camera import local_camera
+    from sightline.vision_side.detect.choice import check_takes_pictures, check_vision
+    from sightline.vision_side.dry_run import watch_camera, watch_robot
 
     if config.detector.kind == "boxes":
         raise ConfigError("--dry-run looks with vision's own eyes; name a detector, e.g. --detector hsv")

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from operator_side.extras import needs
-from operator_side.train_rounds import Training
-from protocol.errors import ConfigError, HardwareError
+from sightline.operator_side.extras import needs
+from sightline.operator_side.train_rounds import Training
+from sightline.protocol.errors import ConfigError, HardwareError
 
 if TYPE_CHECKING:  # it needs the extra
-    from operator_side.train_network import Weights
+    from sightline.operator_side.train_network import Weights
 
 STEPS = [15_000, 14_000, 13_000, 14_000, 20_000, 20_000]
 SCENES = 100_000
@@ -51,7 +51,7 @@ def train(
     with needs("train"):
         import torch
 
-        from operator_side.train_run import TrainOptions, run_training
+        from sightline.operator_side.train_run import TrainOptions, run_training
     if device == "cuda" and not torch.cuda.is_available():
         raise HardwareError("--device cuda: this PyTorch sees no GPU; check `nvidia-smi` and that PyTorch is a CUDA "
                             "build, or take --device cpu")
@@ -70,7 +70,7 @@ def train(
 
 def _begun(model: Path) -> "tuple[Weights, str]":
     """The model's weights, and its SHA-256."""
-    from operator_side.train_export import weights_in
+    from sightline.operator_side.train_export import weights_in
 
     try:
         data = model.read_bytes()

@@ -9,18 +9,18 @@ from typing import Annotated
 
 import typer
 
-from operator_side.channel_inbox import ChannelInbox
-from operator_side.channel_text import message_line, message_object
-from operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Port, Robot, Secure
-from operator_side.mission_asking import MissionClient
-from operator_side.mission_text import mission_lines
-from operator_side.pictures import viewer_role
-from operator_side.settings_errors import no_such_name
-from operator_side.status_text import status_lines
-from protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, Channel, Direction
-from protocol.errors import ConfigError, LinkError
-from protocol.transports.link import Link, Message
-from protocol.transports.opening import open_link
+from sightline.operator_side.channel_inbox import ChannelInbox
+from sightline.operator_side.channel_text import message_line, message_object
+from sightline.operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Port, Robot, Secure
+from sightline.operator_side.mission_asking import MissionClient
+from sightline.operator_side.mission_text import mission_lines
+from sightline.operator_side.pictures import viewer_role
+from sightline.operator_side.settings_errors import no_such_name
+from sightline.operator_side.status_text import status_lines
+from sightline.protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, Channel, Direction
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.opening import open_link
 
 _SHOWN = (OVERLAY.name, PREVIEW.name, FRAME.name)
 _TEXT_PERIOD_S = 0.25
@@ -75,7 +75,7 @@ def watch(
 
 
 def _page(link: Link, role: str, first: Channel, port: int, secure: str) -> AbstractContextManager[str]:
-    from operator_side.watch_page import watch_page
+    from sightline.operator_side.watch_page import watch_page
 
     return watch_page(link, role, first, port, secure)
 
@@ -109,7 +109,7 @@ def _why_silent(channel: Channel) -> str:
 
 
 def _show_text(link: Link, ends_s: float) -> int:
-    from operator_side.live_text import LiveText
+    from sightline.operator_side.live_text import LiveText
 
     desk = MissionClient(link)
     with LiveText() as live:

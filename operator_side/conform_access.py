@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from protocol.conformance.bench import Access
-from protocol.errors import ConfigError
-from protocol.transports.websocket_keys import own_token
+from sightline.protocol.conformance.bench import Access
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.websocket_keys import own_token
 
 _EXAMPLE = "e.g. --token vision=keys/vision.token"
 

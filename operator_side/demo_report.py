@@ -6,16 +6,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from operator_side.check_text import Check, check_line
-from operator_side.demo import RECORDING, DemoRun
-from operator_side.extras import needs
-from operator_side.processes import last_line
-from operator_side.replay import Replayed, Step, replay
-from operator_side.score import Score, score
-from operator_side.score_bounds import checks_of
-from operator_side.score_course import figures_of
-from operator_side.shaped_vision import INJECTED
-from protocol.errors import SightlineError
+from sightline.operator_side.check_text import Check, check_line
+from sightline.operator_side.demo import RECORDING, DemoRun
+from sightline.operator_side.extras import needs
+from sightline.operator_side.processes import last_line
+from sightline.operator_side.replay import Replayed, Step, replay
+from sightline.operator_side.score import Score, score
+from sightline.operator_side.score_bounds import checks_of
+from sightline.operator_side.score_course import figures_of
+from sightline.operator_side.shaped_vision import INJECTED
+from sightline.protocol.errors import SightlineError
 
 REAL_TIME_FACTOR: Final = 1.5
 """The bounds are those of lockstep; a real machine is granted this much more."""
@@ -74,8 +74,8 @@ def _printed(step: Step) -> tuple[int, str, str]:
 
 def _draw(run: DemoRun, recording: Path) -> None:
     with needs("report"):
-        from operator_side.plot import plot_run
-        from operator_side.video import film_run
+        from sightline.operator_side.plot import plot_run
+        from sightline.operator_side.video import film_run
     options = run.options
     title = f"{run.scenario.name}, seed {options.seed}, +{options.latency_ms:g} ms, {options.loss:.0%} loss"
     plot_run(run.folder / "trajectory.png", run.samples, run.scenario, title)

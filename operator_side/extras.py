@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 
 _OURS = ("protocol", "robot_side", "vision_side", "sim", "operator_side", "benchmarks")
 _PYBULLET_UP_TO = (3, 11)

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operator_side.extras import needs
-from protocol.errors import ConfigError
+from sightline.operator_side.extras import needs
+from sightline.protocol.errors import ConfigError
 
 Image = NDArray[np.uint8]
 _TICKS_PER_S: Final = 90_000  # what players expect of H.264

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from protocol.errors import ConfigError
-from robot_side.config import RobotConfig
-from robot_side.plugins import load_device
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.plugins import load_device
 
 SERVICES = ("robot", "vision")
 UNIT_DIR = Path("/etc/systemd/system")
@@ -56,7 +56,7 @@ def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UN
         return None
     _, options = load_device("drives", robot.motors)
     pins = " ".join(str(number) for number in (*options.pins, *options.enable_pins))
-    text = files("robot_side").joinpath("systemd", _DROP_IN).read_text().replace(_DROP_INS_PINS, f"gpio_low {pins}")
+    text = files("sightline.robot_side").joinpath("systemd", _DROP_IN).read_text().replace(_DROP_INS_PINS, f"gpio_low {pins}")
     return Plan("robot", drop_in_path(unit_dir), _fitted(text, "robot", program, config))
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from protocol.errors import WireError
-from protocol.jpeg import read_jpeg_size
-from protocol.refusals import RejectReason
-from vision_side.config import VisionConfig
-from vision_side.decode import Decoder
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.refusals import RejectReason
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.decode import Decoder
 
 
 def jpeg_pixels(jpeg: bytes) -> NDArray[np.uint8]:

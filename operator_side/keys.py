@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protocol.errors import ConfigError
-from protocol.transports.secured import ROLES
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.secured import ROLES
 
 if TYPE_CHECKING:
     from cryptography import x509

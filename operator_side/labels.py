@@ -4,13 +4,13 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from typing import Any
 
-from protocol.codec import encode
-from protocol.jpeg import JpegSize
-from protocol.messages import CameraModel, DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader
-from sim.label_bus import KEPT
-from vision_side.config import BoxesConfig
-from vision_side.detect.boxes import BoxReader
-from vision_side.detect.port import Detection
+from sightline.protocol.codec import encode
+from sightline.protocol.jpeg import JpegSize
+from sightline.protocol.messages import CameraModel, DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader
+from sightline.sim.label_bus import KEPT
+from sightline.vision_side.config import BoxesConfig
+from sightline.vision_side.detect.boxes import BoxReader
+from sightline.vision_side.detect.port import Detection
 
 SOURCE = "guest"
 """Whose boxes they are: somebody's who looks at frames and drives nothing."""

@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from operator_side.status_text import millis, twist_text
-from protocol.messages import Status
-from sim.truth import Truth
+from sightline.operator_side.status_text import millis, twist_text
+from sightline.protocol.messages import Status
+from sightline.sim.truth import Truth
 
 REFRESH_S: Final = 0.2
 PLAIN_S: Final = 1.0

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from protocol.errors import ConfigError
-from robot_side.config import PluginChoice
-from robot_side.plugins import build_device
-from robot_side.ports import Camera
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import PluginChoice
+from sightline.robot_side.plugins import build_device
+from sightline.robot_side.ports import Camera
 
 
 @contextmanager

@@ -9,29 +9,29 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from operator_side.labels import Labels
-from operator_side.scenario_settings import robot_config, vision_config
-from protocol.channels import ACK, FRAME, SCAN, TWIST
-from protocol.codec import decode, encode
-from protocol.messages import FrameHeader, State
-from protocol.transports.link import LatestSlot, Message
-from protocol.transports.memory import MemoryNetwork
-from protocol.twist_text import format_twist
-from robot_side.config import RobotConfig
-from robot_side.driving import DriverCore
-from robot_side.limits import TICK_US
-from robot_side.ports import Picture
-from robot_side.sending import NetworkCore
-from sim.cadence import PeriodicTimer
-from sim.robot_model import RobotModel
-from sim.scenario import Scenario
-from sim.truth import Truth
-from sim.world import World
-from vision_side.config import VisionConfig
-from vision_side.detect.around import close_detector, notices_of
-from vision_side.detect.choice import configured_detector
-from vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
-from vision_side.scan import decode_scan
+from sightline.operator_side.labels import Labels
+from sightline.operator_side.scenario_settings import robot_config, vision_config
+from sightline.protocol.channels import ACK, FRAME, SCAN, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import FrameHeader, State
+from sightline.protocol.transports.link import LatestSlot, Message
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.twist_text import format_twist
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.driving import DriverCore
+from sightline.robot_side.limits import TICK_US
+from sightline.robot_side.ports import Picture
+from sightline.robot_side.sending import NetworkCore
+from sightline.sim.cadence import PeriodicTimer
+from sightline.sim.robot_model import RobotModel
+from sightline.sim.scenario import Scenario
+from sightline.sim.truth import Truth
+from sightline.sim.world import World
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.around import close_detector, notices_of
+from sightline.vision_side.detect.choice import configured_detector
+from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
+from sightline.vision_side.scan import decode_scan
 
 COMPUTE_US = 4_000
 """What one frame costs the vision side in virtual time: one step of the world, above what it takes in truth."""

@@ -12,9 +12,9 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, Protocol
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from operator_side.bounded_threads import BoundedThreads
-from protocol.errors import LinkError
-from protocol.transports.port_owner import port_owner
+from sightline.operator_side.bounded_threads import BoundedThreads
+from sightline.protocol.errors import LinkError
+from sightline.protocol.transports.port_owner import port_owner
 
 if TYPE_CHECKING:
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily

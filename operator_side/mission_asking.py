@@ -12,14 +12,14 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from operator_side.requests import SOURCE, Operator
-from operator_side.waypoints import Waypoints
-from protocol.channels import MISSION, REPORT
-from protocol.codec import decode, encode
-from protocol.errors import ConfigError, LinkError, WireError
-from protocol.messages import Echo, RequestHeader, RequestId
-from protocol.mission_messages import MAX_OPTIONS, MissionReport, MissionRequest
-from protocol.transports.link import Link, Message
+from sightline.operator_side.requests import SOURCE, Operator
+from sightline.operator_side.waypoints import Waypoints
+from sightline.protocol.channels import MISSION, REPORT
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import ConfigError, LinkError, WireError
+from sightline.protocol.messages import Echo, RequestHeader, RequestId
+from sightline.protocol.mission_messages import MAX_OPTIONS, MissionReport, MissionRequest
+from sightline.protocol.transports.link import Link, Message
 
 REPEAT_S: Final = 0.2
 PATIENCE_S: Final = 3.0

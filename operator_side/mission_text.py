@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from protocol.mission_messages import MissionReport
+from sightline.protocol.mission_messages import MissionReport
 
 
 def mission_line(report: MissionReport) -> str:

@@ -6,15 +6,15 @@ Judged from the simulated motors' own log, with the fault bench's robot and judg
 from collections.abc import Sequence
 from typing import Final
 
-from benchmarks.loop_figures import LoopCheck, at_most, percentile
-from benchmarks.network_rows import Case
-from benchmarks.network_stage import NetworkRun, Stage
-from operator_side.faults.judge import MotorRow, measure_stop, moved_on_old_sight, wheel_mps
-from operator_side.faults.ledger import REQUESTED
-from operator_side.faults.rig import ROBOT, RobotFixture, Setup
-from operator_side.network_person import RESET, STOPPED
-from protocol.errors import HardwareError, SightlineError
-from sim.wire import LinkShapes
+from sightline.benchmarks.loop_figures import LoopCheck, at_most, percentile
+from sightline.benchmarks.network_rows import Case
+from sightline.benchmarks.network_stage import NetworkRun, Stage
+from sightline.operator_side.faults.judge import MotorRow, measure_stop, moved_on_old_sight, wheel_mps
+from sightline.operator_side.faults.ledger import REQUESTED
+from sightline.operator_side.faults.rig import ROBOT, RobotFixture, Setup
+from sightline.operator_side.network_person import RESET, STOPPED
+from sightline.protocol.errors import HardwareError, SightlineError
+from sightline.sim.wire import LinkShapes
 
 REACHES_MS: Final = 300.0
 REPORTED_MS: Final = REACHES_MS + 100.0
@@ -39,7 +39,7 @@ def _medium_run(row: Case, stage: Stage, rig: RobotFixture) -> NetworkRun:
     before = rig.wire.shape(stage.seeded(row.phases[0].shapes))
     ledger = rig.folder / "person.ledger"
     arguments = [rig.endpoint, ROBOT, str(ledger), str(stage.setting.seconds), str(stage.seed)]
-    rig.fleet.run("person", "operator_side.network_person", arguments, namespace=rig.wire.far_side)
+    rig.fleet.run("person", "sightline.operator_side.network_person", arguments, namespace=rig.wire.far_side)
     rig.fleet.wait_line("person", "person ready", _READY_S)
     if rig.fleet.exit_code("person", stage.setting.seconds + _BESIDE_S) != 0:
         raise HardwareError(f"the person gave up: {rig.fleet.log('person').read_text('utf-8').strip()[-200:]}")

@@ -1,6 +1,6 @@
 """A person who says STOP again and again, for `bench network`: once it drives STOP, then reset and arm. Shell.
 
-    python -m operator_side.network_person ENDPOINT ROBOT LEDGER SECONDS SEED
+    python -m sightline.operator_side.network_person ENDPOINT ROBOT LEDGER SECONDS SEED
 """
 
 import sys
@@ -10,11 +10,11 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
-from operator_side.faults.ledger import REQUESTED, EventLog
-from operator_side.requests import SOURCE, Operator
-from protocol.messages import Reply, State, Status, Verb
-from protocol.refusals import RejectReason
-from protocol.transports.zenoh import open_zenoh
+from sightline.operator_side.faults.ledger import REQUESTED, EventLog
+from sightline.operator_side.requests import SOURCE, Operator
+from sightline.protocol.messages import Reply, State, Status, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.zenoh import open_zenoh
 
 STOPPED: Final = "stopped"
 """Noted with the stamp of the first status that said so."""

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 
 
 def check_out_file(path: Path) -> None:

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.errors import ConfigError
-from vision_side.config import HsvRange
-from vision_side.detect.colour import ColorMask
+from sightline.protocol.errors import ConfigError
+from sightline.vision_side.config import HsvRange
+from sightline.vision_side.detect.colour import ColorMask
 
 Image = NDArray[np.uint8]
 Numbers = NDArray[np.float32]

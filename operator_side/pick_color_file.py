@@ -5,10 +5,10 @@ from pathlib import Path
 
 import cv2
 
-from operator_side.pick_color import Image, Ranges, mask_picture
-from operator_side.pick_color_toml import with_ranges
-from operator_side.service_settings import load_service
-from protocol.errors import ConfigError
+from sightline.operator_side.pick_color import Image, Ranges, mask_picture
+from sightline.operator_side.pick_color_toml import with_ranges
+from sightline.operator_side.service_settings import load_service
+from sightline.protocol.errors import ConfigError
 
 
 def check_config(path: Path) -> None:

@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
-from operator_side.loopback_page import Answer, PageRequest, Route, as_json, page
-from operator_side.pick_color import Box, Image, Ranges, check_trial, pick, ranges_text, trial_text, try_out
-from operator_side.pick_color_file import mask_png
-from operator_side.pick_color_pictures import Gallery
-from operator_side.pick_color_toml import ranges_toml
-from protocol.errors import ConfigError
+from sightline.operator_side.loopback_page import Answer, PageRequest, Route, as_json, page
+from sightline.operator_side.pick_color import Box, Image, Ranges, check_trial, pick, ranges_text, trial_text, try_out
+from sightline.operator_side.pick_color_file import mask_png
+from sightline.operator_side.pick_color_pictures import Gallery
+from sightline.operator_side.pick_color_toml import ranges_toml
+from sightline.protocol.errors import ConfigError
 
 _FIELDS = ("x_px", "y_px", "width_px", "height_px")
 

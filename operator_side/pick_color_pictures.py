@@ -8,12 +8,12 @@ from typing import Any, Final, Protocol
 import cv2
 import numpy as np
 
-from operator_side.jpeg_pixels import jpeg_pixels
-from operator_side.loopback_page import Answer, PageRequest
-from operator_side.pick_color import Image
-from operator_side.pictures import Pictures
-from operator_side.reel import FrameBuffer
-from protocol.errors import ConfigError, LinkError, WireError
+from sightline.operator_side.jpeg_pixels import jpeg_pixels
+from sightline.operator_side.loopback_page import Answer, PageRequest
+from sightline.operator_side.pick_color import Image
+from sightline.operator_side.pictures import Pictures
+from sightline.operator_side.reel import FrameBuffer
+from sightline.protocol.errors import ConfigError, LinkError, WireError
 
 MAX_FILE_BYTES: Final = 50_000_000
 MAX_PIXELS: Final = 25_000_000

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from operator_side.pick_color import Ranges
-from protocol.errors import ConfigError
+from sightline.operator_side.pick_color import Ranges
+from sightline.protocol.errors import ConfigError
 
 _TABLE: Final = ("hsv",)
 _KEY: Final = ("hsv", "ranges")

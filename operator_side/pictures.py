@@ -10,16 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from operator_side.acknowledge import Viewer
-from operator_side.requests import SOURCE as OPERATOR
-from protocol.channels import FRAME, OVERLAY, STATUS, Channel
-from protocol.clock import monotonic_us
-from protocol.codec import decode
-from protocol.errors import WireError
-from protocol.jpeg import read_jpeg_size
-from protocol.messages import DetectionsHeader, FrameHeader, Stamp
-from protocol.robot_clock import RobotClock
-from protocol.transports.link import Link, Message
+from sightline.operator_side.acknowledge import Viewer
+from sightline.operator_side.requests import SOURCE as OPERATOR
+from sightline.protocol.channels import FRAME, OVERLAY, STATUS, Channel
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.messages import DetectionsHeader, FrameHeader, Stamp
+from sightline.protocol.robot_clock import RobotClock
+from sightline.protocol.transports.link import Link, Message
 
 VIEWER: Final = "viewer"
 PATIENCE_S: Final = 1.5

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from operator_side.extras import needs
-from sim.scenario import Scenario, Wall
-from sim.things import Static
-from sim.truth import Truth
+from sightline.operator_side.extras import needs
+from sightline.sim.scenario import Scenario, Wall
+from sightline.sim.things import Static
+from sightline.sim.truth import Truth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

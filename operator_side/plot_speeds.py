@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from operator_side.extras import needs
-from operator_side.plot import ROBOT_COLOUR
-from operator_side.speed_runs import GOALS_M, LAWS, SpeedRun
+from sightline.operator_side.extras import needs
+from sightline.operator_side.plot import ROBOT_COLOUR
+from sightline.operator_side.speed_runs import GOALS_M, LAWS, SpeedRun
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

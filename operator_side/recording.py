@@ -16,11 +16,23 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final, Self
 
-from operator_side.extras import needs
-from protocol.channels import ACK, CAMERA, CHANNELS, DETECTIONS, FRAME, MISSION, REPORT, SCAN, STATUS, TWIST, Channel
-from protocol.errors import ConfigError
-from protocol.log_lines import log_line
-from protocol.transports.link import Link, Message
+from sightline.operator_side.extras import needs
+from sightline.protocol.channels import (
+    ACK,
+    CAMERA,
+    CHANNELS,
+    DETECTIONS,
+    FRAME,
+    MISSION,
+    REPORT,
+    SCAN,
+    STATUS,
+    TWIST,
+    Channel,
+)
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.log_lines import log_line
+from sightline.protocol.transports.link import Link, Message
 
 if TYPE_CHECKING:
     from mcap.writer import Writer

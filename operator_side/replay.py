@@ -8,20 +8,28 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from operator_side.recording import read_about, read_recording
-from protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MISSION, SCAN, TWIST
-from protocol.codec import decode
-from protocol.errors import ConfigError, WireError
-from protocol.messages import AnswerHeader, CameraModel, DetectionsHeader, FrameHeader, RequestHeader, RequestId, Stamp
-from protocol.mission_messages import MissionRequest
-from protocol.transports.link import Message
-from protocol.twist_text import format_twist
-from vision_side.config import VisionConfig
-from vision_side.detect.boxes import BoxReader
-from vision_side.detect.choice import configured_detector
-from vision_side.missions.choice import requested_mission
-from vision_side.pipeline import SOURCE, Frame, Pipeline, PipelineAnswer
-from vision_side.scan import decode_scan
+from sightline.operator_side.recording import read_about, read_recording
+from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MISSION, SCAN, TWIST
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import ConfigError, WireError
+from sightline.protocol.messages import (
+    AnswerHeader,
+    CameraModel,
+    DetectionsHeader,
+    FrameHeader,
+    RequestHeader,
+    RequestId,
+    Stamp,
+)
+from sightline.protocol.mission_messages import MissionRequest
+from sightline.protocol.transports.link import Message
+from sightline.protocol.twist_text import format_twist
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.boxes import BoxReader
+from sightline.vision_side.detect.choice import configured_detector
+from sightline.vision_side.missions.choice import requested_mission
+from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, PipelineAnswer
+from sightline.vision_side.scan import decode_scan
 
 VISION_CONFIG = "vision_config"
 """Key of the recording's metadata that holds the configuration of vision, as JSON."""

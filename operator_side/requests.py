@@ -12,12 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.channels import REPLY, REQUEST, STATUS
-from protocol.codec import decode, encode
-from protocol.errors import LinkError, WireError
-from protocol.messages import Echo, Reply, Request, RequestHeader, Stamp, State, Status, Verb
-from protocol.refusals import RejectReason
-from protocol.transports.link import Link, Message
+from sightline.protocol.channels import REPLY, REQUEST, STATUS
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import LinkError, WireError
+from sightline.protocol.messages import Echo, Reply, Request, RequestHeader, Stamp, State, Status, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Link, Message
 
 SOURCE: Final = "operator"
 REPEAT_S: Final = 0.2

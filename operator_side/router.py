@@ -8,10 +8,10 @@ import threading
 from collections.abc import Sequence
 from contextlib import closing
 
-from protocol.transports.endpoints import check_zenoh_endpoints
-from protocol.transports.secured import ROBOT_ROLE, load_role_keys
-from protocol.transports.zenoh_log import log_rejected_peers
-from protocol.transports.zenoh_session import open_session
+from sightline.protocol.transports.endpoints import check_zenoh_endpoints
+from sightline.protocol.transports.secured import ROBOT_ROLE, load_role_keys
+from sightline.protocol.transports.zenoh_log import log_rejected_peers
+from sightline.protocol.transports.zenoh_session import open_session
 
 _REACH_S = 5.0
 

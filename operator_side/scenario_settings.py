@@ -10,16 +10,16 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from protocol.errors import ConfigError
-from robot_side.config import RobotConfig
-from robot_side.dead_zone import BlindZoneError, check_blind_zone
-from robot_side.ports import Ranges
-from sim.body import outline
-from sim.robot_model import RobotModel, load_robot
-from sim.scenario import Scenario
-from sim.start import goals_seen
-from sim.toml_file import laid_over
-from vision_side.config import VisionConfig
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.dead_zone import BlindZoneError, check_blind_zone
+from sightline.robot_side.ports import Ranges
+from sightline.sim.body import outline
+from sightline.sim.robot_model import RobotModel, load_robot
+from sightline.sim.scenario import Scenario
+from sightline.sim.start import goals_seen
+from sightline.sim.toml_file import laid_over
+from sightline.vision_side.config import VisionConfig
 
 Table = dict[str, Any]
 Model = TypeVar("Model", bound=BaseModel)

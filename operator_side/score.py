@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 
-from sim.truth import Truth
+from sightline.sim.truth import Truth
 
 ACQUIRED_WITHIN_DEG = 2.0
 ACQUIRED_WITHIN_M = 0.05

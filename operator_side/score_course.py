@@ -8,9 +8,9 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
-from operator_side.score import score
-from sim.scenario import Scenario
-from sim.truth import Truth
+from sightline.operator_side.score import score
+from sightline.sim.scenario import Scenario
+from sightline.sim.truth import Truth
 
 Figures = dict[str, float | None]
 MissionPhases = Sequence[tuple[int, str, str]]

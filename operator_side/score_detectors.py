@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from sim.scenes import LabelledBox, Scene
-from vision_side.detect.overlap import corners, overlap
-from vision_side.detect.port import Detection
+from sightline.sim.scenes import LabelledBox, Scene
+from sightline.vision_side.detect.overlap import corners, overlap
+from sightline.vision_side.detect.port import Detection
 
 BALL_LABELS: Final = ("ball", "target")
 HIT_OVERLAP: Final = 0.5

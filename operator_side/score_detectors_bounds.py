@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
-from operator_side.check_text import Check
-from operator_side.score_detectors import Figures
-from operator_side.score_scenes import LABELLED, Report
+from sightline.operator_side.check_text import Check
+from sightline.operator_side.score_detectors import Figures
+from sightline.operator_side.score_scenes import LABELLED, Report
 
 FRAMES: Final = 500
 LEAST_HITS: Final = {

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from operator_side.check_text import Check
-from operator_side.score_detectors import BALL_LABELS, Figures
-from operator_side.score_scenes import Report
+from sightline.operator_side.check_text import Check
+from sightline.operator_side.score_detectors import BALL_LABELS, Figures
+from sightline.operator_side.score_scenes import Report
 
 _HEAD = ("column", "detector", "hits", "missed", "wrong object", "false alarms", "centre p50 / p95 px", "ms p50")
 _MOST_LABELS = 3

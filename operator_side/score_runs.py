@@ -9,18 +9,18 @@ from dataclasses import asdict, dataclass, field
 from itertools import groupby, product
 from typing import Any, Final
 
-from operator_side.check_text import Check
-from operator_side.lockstep import Conditions, Run, run_lockstep
-from operator_side.scenario_settings import robot_of, vision_config
-from operator_side.score import Score, median_and_worst, score
-from operator_side.score_bounds import checks_of
-from operator_side.score_course import figures_of
-from operator_side.worker_pool import worker_pool
-from protocol.errors import ConfigError
-from sim.look import look_named
-from sim.scenario import Scenario, load_scenario
-from vision_side.detect.choice import check_choice
-from vision_side.missions.choice import REGISTRY, configured_mission
+from sightline.operator_side.check_text import Check
+from sightline.operator_side.lockstep import Conditions, Run, run_lockstep
+from sightline.operator_side.scenario_settings import robot_of, vision_config
+from sightline.operator_side.score import Score, median_and_worst, score
+from sightline.operator_side.score_bounds import checks_of
+from sightline.operator_side.score_course import figures_of
+from sightline.operator_side.worker_pool import worker_pool
+from sightline.protocol.errors import ConfigError
+from sightline.sim.look import look_named
+from sightline.sim.scenario import Scenario, load_scenario
+from sightline.vision_side.detect.choice import check_choice
+from sightline.vision_side.missions.choice import REGISTRY, configured_mission
 
 _MOST_NOTICES: Final = 3
 """Of each group: later ones repeat the first with higher counts."""

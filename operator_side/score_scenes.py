@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from operator_side.score_detectors import (
+from sightline.operator_side.score_detectors import (
     BALL_LABELS,
     Figures,
     FrameResult,
@@ -18,16 +18,16 @@ from operator_side.score_detectors import (
     frame_result,
     precisions,
 )
-from protocol.messages import FrameHeader
-from sim.scene_defects import as_seen
-from sim.scene_render import SceneRenderer
-from sim.scenes import COLUMNS, HEIGHT_PX, JUDGED_FROM, LABELS, THINGS, WIDTH_PX, Column, Scene
-from vision_side.config import VisionConfig
-from vision_side.decode import Decoder
-from vision_side.detect.around import close_detector, notices_of
-from vision_side.detect.checking import checked_results as checked_answers
-from vision_side.detect.choice import build_detector, check_takes_pictures
-from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Detector
+from sightline.protocol.messages import FrameHeader
+from sightline.sim.scene_defects import as_seen
+from sightline.sim.scene_render import SceneRenderer
+from sightline.sim.scenes import COLUMNS, HEIGHT_PX, JUDGED_FROM, LABELS, THINGS, WIDTH_PX, Column, Scene
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.around import close_detector, notices_of
+from sightline.vision_side.detect.checking import checked_results as checked_answers
+from sightline.vision_side.detect.choice import build_detector, check_takes_pictures
+from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Detector
 
 _FRAME_US: Final = 33_333
 _ROBOT: Final = "judge"

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from operator_side.check_text import number
-from operator_side.score_runs import ScoredFigure, ScoreReport
+from sightline.operator_side.check_text import number
+from sightline.operator_side.score_runs import ScoredFigure, ScoreReport
 
 
 @contextmanager

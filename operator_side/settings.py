@@ -14,13 +14,13 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from operator_side.settings_errors import explain, no_such_name
-from operator_side.settings_keys import is_known, known_keys
-from protocol.channels import check_robot_id
-from protocol.config import Config
-from protocol.errors import ConfigError
-from protocol.log_lines import LOG_FORMAT_VARIABLE
-from protocol.transports.opening import check_endpoint
+from sightline.operator_side.settings_errors import explain, no_such_name
+from sightline.operator_side.settings_keys import is_known, known_keys
+from sightline.protocol.channels import check_robot_id
+from sightline.protocol.config import Config
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.log_lines import LOG_FORMAT_VARIABLE
+from sightline.protocol.transports.opening import check_endpoint
 
 SERVICES: Final = ("robot", "vision", "sim")
 ENV_PREFIX: Final = "SIGHTLINE_"
@@ -57,15 +57,15 @@ class Loaded:
 def model_of(service: str) -> type[Config]:
     """The configuration model of a service. Raises ConfigError for a service that is none."""
     if service == "robot":
-        from robot_side.config import RobotConfig
+        from sightline.robot_side.config import RobotConfig
 
         return RobotConfig
     if service == "vision":
-        from vision_side.config import VisionConfig
+        from sightline.vision_side.config import VisionConfig
 
         return VisionConfig
     if service == "sim":
-        from sim.service import SimConfig
+        from sightline.sim.service import SimConfig
 
         return SimConfig
     raise ConfigError(no_such_name("service", service, SERVICES))

@@ -12,10 +12,10 @@ from random import Random
 from types import TracebackType
 from typing import Any, Final, Self
 
-from protocol.channels import Channel, Direction
-from protocol.clock import monotonic_us
-from protocol.transports.link import LatestSlot, Link, Message
-from protocol.transports.memory import Leg, split_legs
+from sightline.protocol.channels import Channel, Direction
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.transports.memory import Leg, split_legs
 
 MAX_WAITING: Final = 256
 """Messages under way on one leg; more are dropped and counted: 8 s of frames at 30 fps."""

@@ -6,12 +6,12 @@ import threading
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
-from operator_side.shaped_link import ShapedLink
-from protocol.errors import ConfigError
-from protocol.transports.opening import open_link
-from vision_side.config import VisionConfig
-from vision_side.pipeline import SOURCE
-from vision_side.service_process import serve
+from sightline.operator_side.shaped_link import ShapedLink
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.opening import open_link
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.pipeline import SOURCE
+from sightline.vision_side.service_process import serve
 
 INJECTED = "injected: "
 """How the line begins that says, at the end, what the legs did."""

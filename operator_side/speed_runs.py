@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from operator_side.behaviours_rows import LATENCY_MS, LOSS
-from operator_side.lockstep import Conditions, run_lockstep
-from operator_side.scenario_settings import robot_of
-from operator_side.score_course import REACHED_WITHIN_M
-from sim.scenario import Scenario, Start, load_scenario
-from sim.truth import Truth
+from sightline.operator_side.behaviours_rows import LATENCY_MS, LOSS
+from sightline.operator_side.lockstep import Conditions, run_lockstep
+from sightline.operator_side.scenario_settings import robot_of
+from sightline.operator_side.score_course import REACHED_WITHIN_M
+from sightline.sim.scenario import Scenario, Start, load_scenario
+from sightline.sim.truth import Truth
 
 LAWS: Final = ("goto", "goto-baseline")
 GOALS_M: Final = (0.2, 2.0, 10.0)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from protocol.messages import Status, StreamStatus
+from sightline.protocol.messages import Status, StreamStatus
 
 
 def status_line(robot: str, status: Status) -> str:

@@ -8,13 +8,22 @@ from collections.abc import Iterator
 from enum import Enum
 from typing import Final
 
-from operator_side.requests import Report, read_report
-from operator_side.teleop_keys import FRESH_US, HAND_OVER, MOST_AT_ONCE, MOVES, SPEEDS, STOPS, Hold, split_keys
-from operator_side.teleop_speed import Speeds, SpeedUp
-from protocol.channels import ACK, REPLY, REQUEST, TWIST, Channel
-from protocol.codec import decode, encode
-from protocol.errors import WireError
-from protocol.messages import (
+from sightline.operator_side.requests import Report, read_report
+from sightline.operator_side.teleop_keys import (
+    FRESH_US,
+    HAND_OVER,
+    MOST_AT_ONCE,
+    MOVES,
+    SPEEDS,
+    STOPS,
+    Hold,
+    split_keys,
+)
+from sightline.operator_side.teleop_speed import Speeds, SpeedUp
+from sightline.protocol.channels import ACK, REPLY, REQUEST, TWIST, Channel
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import (
     STILL,
     AnswerHeader,
     Echo,
@@ -26,9 +35,9 @@ from protocol.messages import (
     Twist,
     Verb,
 )
-from protocol.refusals import RejectReason
-from protocol.transports.link import Message
-from protocol.twist_text import format_twist
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
+from sightline.protocol.twist_text import format_twist
 
 SOURCE: Final = "teleop"
 PERIOD_US: Final = 30_000

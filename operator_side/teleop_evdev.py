@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from operator_side.extras import needs
-from operator_side.teleop_pad import ABS_RX, ABS_X, ABS_Y, BTN_SOUTH, BTN_TL, EV_ABS, EV_KEY, Pad, PadKey
-from protocol.errors import HardwareError
+from sightline.operator_side.extras import needs
+from sightline.operator_side.teleop_pad import ABS_RX, ABS_X, ABS_Y, BTN_SOUTH, BTN_TL, EV_ABS, EV_KEY, Pad, PadKey
+from sightline.protocol.errors import HardwareError
 
 _ANY: Final = "auto"
 

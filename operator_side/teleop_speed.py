@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.messages import STILL, Status, Twist
+from sightline.protocol.messages import STILL, Status, Twist
 
 _STEP: Final = 1.1
 """A key press changes a speed by 10 %."""

@@ -16,14 +16,14 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Final
 
-from operator_side.teleop import Teleop
-from operator_side.teleop_evdev import Gamepad
-from operator_side.teleop_pad import PadKey
-from operator_side.teleop_text import KEYS, live_line
-from protocol.channels import FRAME, REPLY, STATUS, Channel
-from protocol.clock import monotonic_us
-from protocol.errors import ConfigError, HardwareError
-from protocol.transports.link import LatestSlot, Link, Message
+from sightline.operator_side.teleop import Teleop
+from sightline.operator_side.teleop_evdev import Gamepad
+from sightline.operator_side.teleop_pad import PadKey
+from sightline.operator_side.teleop_text import KEYS, live_line
+from sightline.protocol.channels import FRAME, REPLY, STATUS, Channel
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.transports.link import LatestSlot, Link, Message
 
 _TICK_S: Final = 0.01
 _SHOW_US: Final = 100_000

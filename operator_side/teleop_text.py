@@ -2,9 +2,9 @@
 
 from typing import Final
 
-from operator_side.status_text import millis, twist_text
-from operator_side.teleop import Mode, Teleop
-from protocol.messages import Status
+from sightline.operator_side.status_text import millis, twist_text
+from sightline.operator_side.teleop import Mode, Teleop
+from sightline.protocol.messages import Status
 
 KEYS: Final = """\
       forward            hold a key to drive, let go to stop

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operator_side.plot import wall_corners
-from sim.scenario import Scenario
-from sim.things import Static
-from sim.truth import Truth
+from sightline.operator_side.plot import wall_corners
+from sightline.sim.scenario import Scenario
+from sightline.sim.things import Static
+from sightline.sim.truth import Truth
 
 Image = NDArray[np.uint8]
 Point = tuple[int, int]

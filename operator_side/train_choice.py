@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from operator_side.score_detectors import FrameResult, LabelMatches
+from sightline.operator_side.score_detectors import FrameResult, LabelMatches
 
 MOST_FALSE: Final = 0.02
 """Of false alarms and of wrong objects, in every column. A judge allows 5 of a hundred frames without a ball: what is

@@ -12,7 +12,7 @@ import onnx
 from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
 
-from operator_side.train_network import (
+from sightline.operator_side.train_network import (
     BRIGHTNESS,
     COLOURS,
     DARKEST,
@@ -25,7 +25,7 @@ from operator_side.train_network import (
     Weights,
     network,
 )
-from sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX
+from sightline.sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX
 
 OPSET: Final = 17
 IR_VERSION: Final = 8

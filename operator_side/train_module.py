@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from operator_side.train_network import (
+from sightline.operator_side.train_network import (
     AGAINST,
     BRIGHTNESS,
     COLOURS,
@@ -20,7 +20,7 @@ from operator_side.train_network import (
     Weights,
     network,
 )
-from sim.scenes import LABELS
+from sightline.sim.scenes import LABELS
 
 _RARE = -4.6  # bias of the heat maps at the beginning: a hundredth of the cells
 

@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from sim.scenes import LABELS
+from sightline.sim.scenes import LABELS
 
 STRIDE: Final = 4
 """Pixels to one cell of the heat map, each way."""

@@ -5,13 +5,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from operator_side.train_card import Card, card_text
-from operator_side.train_export import shifted
-from operator_side.train_loop import start_from, train
-from operator_side.train_network import Weights
-from operator_side.train_rounds import Training
-from operator_side.train_scenes import drawn_scenes
-from operator_side.train_shipping import Progress, chosen_thresholds, final_report, written
+from sightline.operator_side.train_card import Card, card_text
+from sightline.operator_side.train_export import shifted
+from sightline.operator_side.train_loop import start_from, train
+from sightline.operator_side.train_network import Weights
+from sightline.operator_side.train_rounds import Training
+from sightline.operator_side.train_scenes import drawn_scenes
+from sightline.operator_side.train_shipping import Progress, chosen_thresholds, final_report, written
 
 MODEL, CARD = "sightline.onnx", "sightline.md"
 

@@ -11,10 +11,19 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from operator_side.worker_pool import worker_pool
-from protocol.errors import ConfigError
-from sim.scene_render import SceneRenderer
-from sim.scenes import HARDER_FROM, HEIGHT_PX, LATER_FROM, VALIDATED_FROM, WIDTH_PX, Box, LabelledBox, trained_column
+from sightline.operator_side.worker_pool import worker_pool
+from sightline.protocol.errors import ConfigError
+from sightline.sim.scene_render import SceneRenderer
+from sightline.sim.scenes import (
+    HARDER_FROM,
+    HEIGHT_PX,
+    LATER_FROM,
+    VALIDATED_FROM,
+    WIDTH_PX,
+    Box,
+    LabelledBox,
+    trained_column,
+)
 
 _SLICE: Final = 100
 """Scenes that one process draws before it says so."""

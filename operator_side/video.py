@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operator_side.film import Film
-from operator_side.replay import Step, replay_steps
-from operator_side.top_view import TopView
-from sim.scenario import Scenario
-from sim.truth import Truth
+from sightline.operator_side.film import Film
+from sightline.operator_side.replay import Step, replay_steps
+from sightline.operator_side.top_view import TopView
+from sightline.sim.scenario import Scenario
+from sightline.sim.truth import Truth
 
 Image = NDArray[np.uint8]
 

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
-from operator_side.metrics_server import counter, gauge, serving
-from protocol.errors import ConfigError
-from vision_side.counts import Counts, CountsNow, Observe
+from sightline.operator_side.metrics_server import counter, gauge, serving
+from sightline.protocol.errors import ConfigError
+from sightline.vision_side.counts import Counts, CountsNow, Observe
 
 if TYPE_CHECKING:
-    from operator_side.metrics_server import Family
+    from sightline.operator_side.metrics_server import Family
 
 _WHERE: Final = re.compile(r"(?:([^\s:]+):)?([0-9]{1,5})")
 _LOOPBACK: Final = "127.0.0.1"

@@ -5,15 +5,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from operator_side.loopback_page import Answer, PageRequest, as_json, page, served
-from operator_side.mission_asking import MissionClient
-from operator_side.mission_text import detector_line, mission_line
-from operator_side.pictures import Pictures
-from operator_side.reel import FrameBuffer, fill
-from operator_side.status_text import drops_text, encoding_text, millis, refusals_text, twist_text
-from protocol.channels import Channel
-from protocol.messages import Status
-from protocol.transports.link import Link
+from sightline.operator_side.loopback_page import Answer, PageRequest, as_json, page, served
+from sightline.operator_side.mission_asking import MissionClient
+from sightline.operator_side.mission_text import detector_line, mission_line
+from sightline.operator_side.pictures import Pictures
+from sightline.operator_side.reel import FrameBuffer, fill
+from sightline.operator_side.status_text import drops_text, encoding_text, millis, refusals_text, twist_text
+from sightline.protocol.channels import Channel
+from sightline.protocol.messages import Status
+from sightline.protocol.transports.link import Link
 
 _SHOWN_PICTURES = 2  # the newest, and the one before, which a second page may be about to fetch
 

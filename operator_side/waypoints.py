@@ -6,8 +6,8 @@ A file has one waypoint a line, its numbers separated by blanks or a comma; what
 import re
 from collections.abc import Sequence
 
-from protocol.errors import ConfigError
-from protocol.mission_messages import MAX_WAYPOINT_M, MAX_WAYPOINTS
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.mission_messages import MAX_WAYPOINT_M, MAX_WAYPOINTS
 
 Waypoints = tuple[tuple[float, float], ...]
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?")

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Final
 
-from protocol.errors import ConfigError
-from robot_side.config import PluginChoice, RobotConfig
-from robot_side.ending import EXIT_SIGNALS
-from robot_side.plugins import build_device, load_device
-from robot_side.ports import Drive
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.ending import EXIT_SIGNALS
+from sightline.robot_side.plugins import build_device, load_device
+from sightline.robot_side.ports import Drive
 
 TURN_S: Final = 1.0
 _SHARE: Final = 0.5

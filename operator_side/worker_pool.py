@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 
-from protocol.errors import HardwareError
+from sightline.protocol.errors import HardwareError
 
 
 @contextmanager

@@ -2,11 +2,11 @@
 
 from typing import Any, Final
 
-from protocol import VERSION
-from protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REPLY, REQUEST, Channel, Direction
-from protocol.legacy import MAX_BOXES_BYTES
-from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
-from protocol.twist_text import MAX_TWIST_BYTES
+from sightline.protocol import VERSION
+from sightline.protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REPLY, REQUEST, Channel, Direction
+from sightline.protocol.legacy import MAX_BOXES_BYTES
+from sightline.protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
+from sightline.protocol.twist_text import MAX_TWIST_BYTES
 
 Node = dict[str, Any]
 ROBOT_ID: Final = "^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"

@@ -9,8 +9,8 @@ from enum import Enum
 from functools import lru_cache
 from typing import Final
 
-from protocol.errors import ConfigError
-from protocol.messages import (
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import (
     AnswerHeader,
     CameraModel,
     Detections,
@@ -25,8 +25,8 @@ from protocol.messages import (
     Status,
     WireModel,
 )
-from protocol.mission_messages import MissionReport, MissionRequest
-from protocol.twist_text import MAX_TWIST_BYTES
+from sightline.protocol.mission_messages import MissionReport, MissionRequest
+from sightline.protocol.twist_text import MAX_TWIST_BYTES
 
 MAX_HEADER_BYTES = 512
 KEY_PREFIX = "sightline"

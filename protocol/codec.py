@@ -9,11 +9,11 @@ from typing import TypeVar, cast
 
 from pydantic import ValidationError
 
-from protocol import VERSION
-from protocol.channels import MAX_HEADER_BYTES, SCAN, Channel
-from protocol.errors import WireError
-from protocol.messages import WireModel
-from protocol.refusals import RejectReason
+from sightline.protocol import VERSION
+from sightline.protocol.channels import MAX_HEADER_BYTES, SCAN, Channel
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import WireModel
+from sightline.protocol.refusals import RejectReason
 
 Model = TypeVar("Model", bound=WireModel)
 

@@ -7,7 +7,7 @@
      └─ WireError             bytes from a peer that are not the protocol; never ends a loop
 """
 
-from protocol.refusals import RejectReason
+from sightline.protocol.refusals import RejectReason
 
 
 class SightlineError(Exception):

@@ -15,14 +15,14 @@ import math
 from pathlib import Path
 from typing import Any
 
-from protocol.channels import ACK, JPEG, SCAN, TWIST, Channel, parse_key
-from protocol.codec import check_sizes, decode, decode_ranges
-from protocol.errors import WireError
-from protocol.golden_case import MessageCase
-from protocol.golden_cases import CASES
-from protocol.golden_wires import FRAMING_CASES, FramingCase, framing_outcome
-from protocol.jpeg import read_jpeg_size
-from protocol.twist_text import parse_twist
+from sightline.protocol.channels import ACK, JPEG, SCAN, TWIST, Channel, parse_key
+from sightline.protocol.codec import check_sizes, decode, decode_ranges
+from sightline.protocol.errors import WireError
+from sightline.protocol.golden_case import MessageCase
+from sightline.protocol.golden_cases import CASES
+from sightline.protocol.golden_wires import FRAMING_CASES, FramingCase, framing_outcome
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.twist_text import parse_twist
 
 INEXACT_KEY = "INEXACT_KEY"
 """The outcome of a key that is not exact: nobody is told, the receiver counts it."""

@@ -1,6 +1,17 @@
 """Golden cases of twists and acknowledgements. Pure."""
 
-from protocol.golden_case import ANSWER, ECHO, INEXACT, MALFORMED, NOT_FINITE, PEER, MessageCase, case, echoing, without
+from sightline.protocol.golden_case import (
+    ANSWER,
+    ECHO,
+    INEXACT,
+    MALFORMED,
+    NOT_FINITE,
+    PEER,
+    MessageCase,
+    case,
+    echoing,
+    without,
+)
 
 _TWISTS_GOOD = {
     "zero": b"0|0",

@@ -5,7 +5,7 @@ import struct
 from dataclasses import dataclass
 from typing import Any
 
-from protocol.channels import CHANNELS, key_for
+from sightline.protocol.channels import CHANNELS, key_for
 
 
 @dataclass(frozen=True, slots=True)

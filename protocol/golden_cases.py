@@ -2,11 +2,11 @@
 
 from typing import Any
 
-from protocol.channels import CHANNELS
-from protocol.golden_answers import answers, twists
-from protocol.golden_case import MALFORMED, USUAL, VERSION, MessageCase, case, packed, without
-from protocol.golden_frames import frames, pictures, views
-from protocol.golden_payloads import detections, missions, payloads, reports
+from sightline.protocol.channels import CHANNELS
+from sightline.protocol.golden_answers import answers, twists
+from sightline.protocol.golden_case import MALFORMED, USUAL, VERSION, MessageCase, case, packed, without
+from sightline.protocol.golden_frames import frames, pictures, views
+from sightline.protocol.golden_payloads import detections, missions, payloads, reports
 
 
 def _usual() -> list[MessageCase]:

@@ -1,6 +1,6 @@
 """Golden cases of frames: headers and pictures. Pure."""
 
-from protocol.golden_case import (
+from sightline.protocol.golden_case import (
     ANSWER,
     FRAME_HEADER,
     INEXACT,

@@ -3,7 +3,7 @@
 import struct
 from typing import Any
 
-from protocol.golden_case import (
+from sightline.protocol.golden_case import (
     ANSWER,
     ASK,
     BOX,

@@ -15,10 +15,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from protocol.errors import WireError
-from protocol.golden_case import ANSWER, ECHO, FRAME_HEADER, MALFORMED, NOT_FINITE, PEER, VERSION, jpeg, packed, without
-from protocol.legacy import decode_picture, encode_picture, parse_boxes, parse_dashed
-from protocol.transports.websocket_framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, parse_hello, unpack
+from sightline.protocol.errors import WireError
+from sightline.protocol.golden_case import (
+    ANSWER,
+    ECHO,
+    FRAME_HEADER,
+    MALFORMED,
+    NOT_FINITE,
+    PEER,
+    VERSION,
+    jpeg,
+    packed,
+    without,
+)
+from sightline.protocol.legacy import decode_picture, encode_picture, parse_boxes, parse_dashed
+from sightline.protocol.transports.websocket_framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, parse_hello, unpack
 
 Fields = dict[str, Any]
 

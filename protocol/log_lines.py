@@ -17,7 +17,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Final, TextIO
 
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 
 LOG_FORMAT_VARIABLE: Final = "SIGHTLINE_LOG"
 LOG_FORMATS: Final = ("text", "json")

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from protocol import VERSION
+from sightline.protocol import VERSION
 
 MAX_INTEGER = 2**53 - 1  # the largest integer that every JSON reader holds exactly
 MAX_CHANNELS_SHOWN = 16

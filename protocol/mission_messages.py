@@ -4,7 +4,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from protocol.messages import Counter, Microseconds, Number, RequestId, WireModel
+from sightline.protocol.messages import Counter, Microseconds, Number, RequestId, WireModel
 
 MAX_WAYPOINTS: Final = 64
 """Of one mission; a longer way is several."""

@@ -1,7 +1,7 @@
 """Writes, or verifies, what is generated from the models: README tables, schemas, golden vectors. Shell.
 
-    python -m protocol.schema --verify    exit code 5 and the names of what differs, if anything does
-    python -m protocol.schema --write
+    python -m sightline.protocol.schema --verify    exit code 5 and the names of what differs, if anything does
+    python -m sightline.protocol.schema --write
 """
 
 import argparse
@@ -16,12 +16,12 @@ from typing import Any, Final
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from protocol import golden, refusals
-from protocol.asyncapi import document
-from protocol.channels import CHANNELS, key_for
-from protocol.field_words import doc_of, unit_of
-from protocol.refusals import CLAMPED, RejectReason
-from protocol.transports.websocket_framing import Hello
+from sightline.protocol import golden, refusals
+from sightline.protocol.asyncapi import document
+from sightline.protocol.channels import CHANNELS, key_for
+from sightline.protocol.field_words import doc_of, unit_of
+from sightline.protocol.refusals import CLAMPED, RejectReason
+from sightline.protocol.transports.websocket_framing import Hello
 
 HERE: Final = Path(__file__).parent
 _BLOCK = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- /generated -->)", re.DOTALL)
@@ -188,7 +188,7 @@ def write() -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line; returns the exit code: 0, or 5 if `--verify` found a difference."""
-    parser = argparse.ArgumentParser(prog="python -m protocol.schema", description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m sightline.protocol.schema", description=__doc__.partition("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--write", action="store_true", help="bring the generated files up to date")
     what.add_argument("--verify", action="store_true", help="exit 5 if they are not")
@@ -197,7 +197,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     wrong = differing()
     for path in wrong:
-        print(f"protocol/{path} is not what the code says: python -m protocol.schema --write", file=sys.stderr)
+        print(f"protocol/{path} is not what the code says: python -m sightline.protocol.schema --write", file=sys.stderr)
     return 5 if wrong else 0
 
 

@@ -7,9 +7,9 @@ Grammar: NUMBER "|" NUMBER, NUMBER = [+-] (DIGITS [. DIGITS*] | . DIGITS) [(e|E)
 import math
 import re
 
-from protocol.errors import WireError
-from protocol.messages import Twist
-from protocol.refusals import RejectReason
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import Twist
+from sightline.protocol.refusals import RejectReason
 
 MAX_TWIST_BYTES = 64
 

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 
-from protocol.errors import HardwareError
-from protocol.messages import MAX_CHANNELS_SHOWN, CameraModel, StreamStatus
-from robot_side.encoding import EncodingTarget
-from robot_side.ports import Adjustable, Camera, Picture, scaled_model
+from sightline.protocol.errors import HardwareError
+from sightline.protocol.messages import MAX_CHANNELS_SHOWN, CameraModel, StreamStatus
+from sightline.robot_side.encoding import EncodingTarget
+from sightline.robot_side.ports import Adjustable, Camera, Picture, scaled_model
 
 
 class CameraAdaptation:

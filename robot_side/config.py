@@ -6,13 +6,13 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from protocol.config import Config
-from protocol.messages import RobotId
-from protocol.transports.websocket_endpoints import with_allowed
-from robot_side.guard import GuardConfig
-from robot_side.kinematics import DiffDriveConfig
-from robot_side.limits import SafetyConfig
-from robot_side.stream import StreamConfig
+from sightline.protocol.config import Config
+from sightline.protocol.messages import RobotId
+from sightline.protocol.transports.websocket_endpoints import with_allowed
+from sightline.robot_side.guard import GuardConfig
+from sightline.robot_side.kinematics import DiffDriveConfig
+from sightline.robot_side.limits import SafetyConfig
+from sightline.robot_side.stream import StreamConfig
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 

@@ -6,9 +6,9 @@ Otherwise a robot that creeps up to something loses sight of it before the guard
 import math
 from collections.abc import Iterator
 
-from protocol.errors import ConfigError
-from robot_side.guard import GuardConfig
-from robot_side.ports import Ranges
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.guard import GuardConfig
+from sightline.robot_side.ports import Ranges
 
 
 class BlindZoneError(ConfigError):

@@ -12,24 +12,24 @@ from collections import Counter
 from contextlib import ExitStack, suppress
 from types import FrameType
 
-from protocol.channels import REQUEST, TWIST, check_robot_id
-from protocol.clock import monotonic_us
-from protocol.codec import decode
-from protocol.errors import WireError
-from protocol.messages import LastRejection, State, StreamStatus
-from robot_side import ipc
-from robot_side.child import DriverEnd
-from robot_side.config import RobotConfig
-from robot_side.dead_zone import BlindZoneError, check_blind_zone
-from robot_side.driving import DriverCore
-from robot_side.ending import EXIT_SIGNALS, IGNORED_SIGNALS
-from robot_side.latch import StopLatch
-from robot_side.limits import MIN_TICK_US, TICK_US
-from robot_side.plugins import build_device
-from robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
-from robot_side.refusal_log import RejectionLog
-from robot_side.scribe import BackgroundWriter
-from robot_side.supervision import SystemdNotifier, request_real_time
+from sightline.protocol.channels import REQUEST, TWIST, check_robot_id
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import LastRejection, State, StreamStatus
+from sightline.robot_side import ipc
+from sightline.robot_side.child import DriverEnd
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.dead_zone import BlindZoneError, check_blind_zone
+from sightline.robot_side.driving import DriverCore
+from sightline.robot_side.ending import EXIT_SIGNALS, IGNORED_SIGNALS
+from sightline.robot_side.latch import StopLatch
+from sightline.robot_side.limits import MIN_TICK_US, TICK_US
+from sightline.robot_side.plugins import build_device
+from sightline.robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
+from sightline.robot_side.refusal_log import RejectionLog
+from sightline.robot_side.scribe import BackgroundWriter
+from sightline.robot_side.supervision import SystemdNotifier, request_real_time
 
 _SHUTDOWN_US = 2_000_000
 _WATCHDOG_PERIOD_US = 100_000

@@ -3,10 +3,10 @@
 from collections import Counter
 from collections.abc import Iterator
 
-from protocol.channels import ODOMETRY, REPLY, SCAN, STATUS, Channel
-from protocol.codec import check_sizes, decode, encode, encode_ranges
-from protocol.errors import WireError
-from protocol.messages import (
+from sightline.protocol.channels import ODOMETRY, REPLY, SCAN, STATUS, Channel
+from sightline.protocol.codec import check_sizes, decode, encode, encode_ranges
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import (
     STILL,
     AnswerHeader,
     Holder,
@@ -22,15 +22,15 @@ from protocol.messages import (
     StreamStatus,
     WireModel,
 )
-from protocol.refusals import RejectReason
-from protocol.transports.link import Message
-from protocol.twist_text import parse_twist
-from robot_side.config import RobotConfig
-from robot_side.guard import RangeGuard
-from robot_side.ipc import CommandAck, Motion
-from robot_side.kinematics import Odometer, wheel_speeds
-from robot_side.ports import Ranges, WheelAngles
-from robot_side.safety import SafetyGate
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
+from sightline.protocol.twist_text import parse_twist
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.guard import RangeGuard
+from sightline.robot_side.ipc import CommandAck, Motion
+from sightline.robot_side.kinematics import Odometer, wheel_speeds
+from sightline.robot_side.ports import Ranges, WheelAngles
+from sightline.robot_side.safety import SafetyGate
 
 _PERIODS_US = {STATUS.name: 100_000, ODOMETRY.name: 50_000}
 _CITES_NOTHING_OF_OURS = (RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME, RejectReason.FROM_FUTURE)

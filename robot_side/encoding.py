@@ -1,12 +1,12 @@
 """How pictures are to be encoded so that they pass in time: a budget of bytes, then quality, then size. Pure.
 
 Down by a factor when the link shows that it is full, up by a little while it is calm. Only cameras that encode
-themselves can follow (`robot_side.ports.Adjustable`); for the others the wish is no more than that.
+themselves can follow (`sightline.robot_side.ports.Adjustable`); for the others the wish is no more than that.
 """
 
 from typing import Final, NamedTuple
 
-from robot_side.window import LinkCapacity
+from sightline.robot_side.window import LinkCapacity
 
 PICTURE_US: Final = 28_000
 """For how long a picture may occupy the link: its age grows by as much, and thirty a second pass with room to spare."""

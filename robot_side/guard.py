@@ -12,9 +12,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.config import Config
-from protocol.messages import STILL, Twist
-from robot_side.ports import Ranges
+from sightline.protocol.config import Config
+from sightline.protocol.messages import STILL, Twist
+from sightline.robot_side.ports import Ranges
 
 # First the speed gives way; without it a turn can come too close to a point looked at before, so it gives way in the
 # second pass, and for all points in the third. At zero speed a smaller turn is safe for every point: no fourth.

@@ -6,10 +6,10 @@ A twist that finds no room is dropped, for a newer one follows. A request comes 
 from collections.abc import Callable
 from typing import Final
 
-from protocol.codec import decode
-from protocol.errors import WireError
-from protocol.messages import Request, Verb
-from protocol.transports.link import Message
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import Request, Verb
+from sightline.protocol.transports.link import Message
 
 MAX_PENDING: Final = 32
 

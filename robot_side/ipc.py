@@ -20,9 +20,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
-from protocol.channels import CHANNELS
-from protocol.messages import Holder, Planar, Pose
-from protocol.transports.link import Message
+from sightline.protocol.channels import CHANNELS
+from sightline.protocol.messages import Holder, Planar, Pose
+from sightline.protocol.transports.link import Message
 
 MAX_PACKET_BYTES = 65_536
 _ISSUED = struct.Struct("<BQQI")

@@ -6,9 +6,9 @@ Nothing here trusts a sender: a frame is known because this robot issued it, and
 from collections import OrderedDict
 from dataclasses import dataclass
 
-from protocol.errors import WireError
-from protocol.messages import AnswerHeader, Echo, State, Twist
-from protocol.refusals import RejectReason
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import AnswerHeader, Echo, State, Twist
+from sightline.protocol.refusals import RejectReason
 
 _KEPT_PER_CHANNEL = 256  # 8 s of 30 fps frames; anything older is STALE long before
 _KEPT_SENDERS = 64

@@ -5,9 +5,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.config import Config
-from protocol.messages import STILL, Planar, Pose, Twist
-from robot_side.ports import WheelAngles
+from sightline.protocol.config import Config
+from sightline.protocol.messages import STILL, Planar, Pose, Twist
+from sightline.robot_side.ports import WheelAngles
 
 _RATE_WINDOW_US = 40_000  # speeds are taken over at least this long: one encoder step in 20 ms is already 0.2 rad/s
 

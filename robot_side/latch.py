@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 
 _NO_SYNC: Final = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)  # of a folder, on some file systems in user space
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from protocol.messages import Holder
+from sightline.protocol.messages import Holder
 
 RANKS = {"guest": 0, "vision": 1, "teleop": 2}
 """Roles that may drive; STOP stands above all and is no driver."""

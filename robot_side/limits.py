@@ -6,8 +6,8 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from protocol.config import Config
-from protocol.messages import STILL, Twist
+from sightline.protocol.config import Config
+from sightline.protocol.messages import STILL, Twist
 
 TICK_US = 20_000
 """The driver's period: 50 Hz."""

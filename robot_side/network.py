@@ -1,6 +1,6 @@
 """The network process: camera and link; forwards raw commands to the driver, publishes for it. Shell.
 
-Started by `robot_side.child` with its ends of two socket pairs; it ends when the first closes.
+Started by `sightline.robot_side.child` with its ends of two socket pairs; it ends when the first closes.
 """
 
 import os
@@ -13,23 +13,23 @@ import zlib
 from collections import Counter
 from contextlib import ExitStack, suppress
 
-from protocol.channels import ACK, FRAME, REQUEST, TWIST
-from protocol.clock import monotonic_us
-from protocol.codec import encode
-from protocol.errors import HardwareError, SightlineError, WireError
-from protocol.log_lines import log_line, set_log_format
-from protocol.transports.link import Link, Message
-from protocol.transports.opening import open_link
-from protocol.transports.relay import Relay
-from protocol.transports.zenoh_log import log_rejected_peers
-from robot_side import ipc
-from robot_side.addresses import reachable_endpoints
-from robot_side.adjusting import CameraAdaptation
-from robot_side.child import NetworkSetup
-from robot_side.parent import NetworkEnd
-from robot_side.plugins import build_device
-from robot_side.ports import Camera, Picture
-from robot_side.sending import NetworkCore
+from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import HardwareError, SightlineError, WireError
+from sightline.protocol.log_lines import log_line, set_log_format
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.relay import Relay
+from sightline.protocol.transports.zenoh_log import log_rejected_peers
+from sightline.robot_side import ipc
+from sightline.robot_side.addresses import reachable_endpoints
+from sightline.robot_side.adjusting import CameraAdaptation
+from sightline.robot_side.child import NetworkSetup
+from sightline.robot_side.parent import NetworkEnd
+from sightline.robot_side.plugins import build_device
+from sightline.robot_side.ports import Camera, Picture
+from sightline.robot_side.sending import NetworkCore
 
 _STREAM_STATUS_US = 200_000
 _CAMERA_TIMEOUT_S = 0.2

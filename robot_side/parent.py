@@ -4,10 +4,10 @@ import socket
 import threading
 from contextlib import suppress
 
-from protocol.channels import REQUEST
-from protocol.transports.link import Message
-from robot_side import ipc
-from robot_side.held import PendingRequests
+from sightline.protocol.channels import REQUEST
+from sightline.protocol.transports.link import Message
+from sightline.robot_side import ipc
+from sightline.robot_side.held import PendingRequests
 
 
 class NetworkEnd:

@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from pydantic import BaseModel, ValidationError
 
-from protocol.errors import ConfigError
-from robot_side.config import PluginChoice
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import PluginChoice
 
 _WORDS: Final = {"cameras": "camera", "drives": "drive", "range_sensors": "range sensor"}
 

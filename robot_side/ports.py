@@ -10,8 +10,8 @@ import array
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from protocol.jpeg import JpegSize
-from protocol.messages import CameraModel
+from sightline.protocol.jpeg import JpegSize
+from sightline.protocol.messages import CameraModel
 
 
 @dataclass(frozen=True, slots=True)

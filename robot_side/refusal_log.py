@@ -3,7 +3,7 @@
 from collections import Counter
 from typing import Final
 
-from protocol.messages import LastRejection
+from sightline.protocol.messages import LastRejection
 
 _FIRST_PERIOD_US: Final = 1_000_000
 _LONGEST_PERIOD_US: Final = 60_000_000

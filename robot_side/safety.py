@@ -7,14 +7,31 @@ Liveness is the accepted command: refused commands, acks and open connections re
 import math
 from collections import Counter
 
-from protocol.errors import WireError
-from protocol.messages import STILL, AnswerHeader, Holder, LastRejection, Request, RequestHeader, State, Twist, Verb
-from protocol.refusals import CLAMPED, RejectReason
-from robot_side.guard import RangeGuard
-from robot_side.judge import AcceptedCommand, CommandResult, Decision, FreshnessRecord, IssuedRecord, SequenceRecord
-from robot_side.lease import HUMANS, RANKS, Lease
-from robot_side.limits import Ramp, SafetyConfig, age_factor, clamp_twist
-from robot_side.states import Event, is_armed, next_state
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import (
+    STILL,
+    AnswerHeader,
+    Holder,
+    LastRejection,
+    Request,
+    RequestHeader,
+    State,
+    Twist,
+    Verb,
+)
+from sightline.protocol.refusals import CLAMPED, RejectReason
+from sightline.robot_side.guard import RangeGuard
+from sightline.robot_side.judge import (
+    AcceptedCommand,
+    CommandResult,
+    Decision,
+    FreshnessRecord,
+    IssuedRecord,
+    SequenceRecord,
+)
+from sightline.robot_side.lease import HUMANS, RANKS, Lease
+from sightline.robot_side.limits import Ramp, SafetyConfig, age_factor, clamp_twist
+from sightline.robot_side.states import Event, is_armed, next_state
 
 _GUEST = Holder(source="guest", session="00000000")
 _MAX_REQUEST_AGE_US = 2_000_000  # an `arm` that a link kept back must not arm when it is delivered at last

@@ -1,13 +1,22 @@
 """The network process's own logic: pictures in, frames out, credit. Pure; `network.py` is its shell."""
 
-from protocol.channels import CAMERA, FRAME
-from protocol.codec import decode, encode
-from protocol.messages import AnswerHeader, CameraModel, FrameHeader, Holder, Planar, Pose, Stamp, StreamStatus
-from protocol.transports.link import Message
-from robot_side.encoding import EncodingTarget
-from robot_side.ipc import CommandAck, Motion
-from robot_side.ports import Picture
-from robot_side.stream import Stream, StreamConfig
+from sightline.protocol.channels import CAMERA, FRAME
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import (
+    AnswerHeader,
+    CameraModel,
+    FrameHeader,
+    Holder,
+    Planar,
+    Pose,
+    Stamp,
+    StreamStatus,
+)
+from sightline.protocol.transports.link import Message
+from sightline.robot_side.encoding import EncodingTarget
+from sightline.robot_side.ipc import CommandAck, Motion
+from sightline.robot_side.ports import Picture
+from sightline.robot_side.stream import Stream, StreamConfig
 
 _CAMERA_PERIOD_US = 500_000
 

@@ -11,7 +11,7 @@
 
 from enum import Enum
 
-from protocol.messages import State
+from sightline.protocol.messages import State
 
 
 class Event(Enum):

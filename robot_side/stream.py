@@ -12,10 +12,10 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.config import Config
-from protocol.messages import Holder, StreamStatus
-from robot_side.encoding import BitrateControl, EncodingTarget
-from robot_side.window import AckSample, CongestionWindow
+from sightline.protocol.config import Config
+from sightline.protocol.messages import Holder, StreamStatus
+from sightline.robot_side.encoding import BitrateControl, EncodingTarget
+from sightline.robot_side.window import AckSample, CongestionWindow
 
 _FIRST_TIMEOUT_US = 120_000
 _REMEMBERED = 64

@@ -7,10 +7,10 @@ radii differ are hung so that both touch the floor and the plate stays level.
 from dataclasses import dataclass
 from pathlib import Path
 
-from sim.frames import Transform
-from sim.robot_model import Caster, Chassis, RobotModel
-from sim.urdf import Outline, Urdf
-from sim.xacro import urdf_text
+from sightline.sim.frames import Transform
+from sightline.sim.robot_model import Caster, Chassis, RobotModel
+from sightline.sim.urdf import Outline, Urdf
+from sightline.sim.xacro import urdf_text
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,12 +26,12 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.codec import decode
-from protocol.config import Config
-from protocol.errors import HardwareError
-from protocol.messages import CameraModel
-from robot_side.ports import Picture, Ranges, WheelAngles
-from sim.truth import Truth
+from sightline.protocol.codec import decode
+from sightline.protocol.config import Config
+from sightline.protocol.errors import HardwareError
+from sightline.protocol.messages import CameraModel
+from sightline.robot_side.ports import Picture, Ranges, WheelAngles
+from sightline.sim.truth import Truth
 
 MOTION, RANGE, CAMERA, TRUTH = "motion.sock", "range.sock", "camera.sock", "truth.sock"
 MOTION_SET = struct.Struct("<dd")
@@ -176,7 +176,7 @@ class SimCamera:
         return Picture(message[PICTURE_HEAD.size :], t_us, scale_percent)
 
     def adjust(self, quality_percent: int, scale_percent: int) -> bool:
-        """As `robot_side.ports.Adjustable` says."""
+        """As `sightline.robot_side.ports.Adjustable` says."""
         self._request = PICTURE_REQUEST.pack(quality_percent, scale_percent)
         return True
 

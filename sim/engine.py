@@ -1,6 +1,6 @@
 """PyBullet, imported without the build time that it prints. Shell (file descriptors).
 
-Every file that needs it takes it from here: `from sim.engine import pybullet`.
+Every file that needs it takes it from here: `from sightline.sim.engine import pybullet`.
 """
 
 import os

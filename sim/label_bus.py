@@ -8,7 +8,7 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from sim.bus import TRUTH, Connection
+from sightline.sim.bus import TRUTH, Connection
 
 KEPT = 64
 """Pictures whose labels are remembered: two seconds of them."""

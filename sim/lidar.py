@@ -11,10 +11,10 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from robot_side.ports import Ranges
-from sim.engine import pybullet
-from sim.physics import TARGET, WALL, Vector
-from sim.robot_model import LidarModel, RangeSensorMount
+from sightline.robot_side.ports import Ranges
+from sightline.sim.engine import pybullet
+from sightline.sim.physics import TARGET, WALL, Vector
+from sightline.sim.robot_model import LidarModel, RangeSensorMount
 
 Numbers = npt.NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
-from protocol.config import Config
-from sim.things import Amounts, Color, Degrees, Point, Side
+from sightline.protocol.config import Config
+from sightline.sim.things import Amounts, Color, Degrees, Point, Side
 
 State = Literal["red", "yellow", "green"]
 

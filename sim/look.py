@@ -6,9 +6,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.config import Config
-from protocol.errors import ConfigError
-from sim.toml_file import check, read_table
+from sightline.protocol.config import Config
+from sightline.protocol.errors import ConfigError
+from sightline.sim.toml_file import check, read_table
 
 LOOKS = Path(__file__).parent / "looks.toml"
 

@@ -6,9 +6,9 @@ The log is what stopping is judged by, so a line is with the kernel before its c
 import math
 from pathlib import Path
 
-from protocol.clock import monotonic_us
-from protocol.errors import ConfigError
-from sim.bus import MOTION_SET
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError
+from sightline.sim.bus import MOTION_SET
 
 LOG_HEADER = b"t_us,left_rad_s,right_rad_s,left_rad,right_rad\n"
 

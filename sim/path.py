@@ -5,7 +5,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import Field
 
-from protocol.config import Config
+from sightline.protocol.config import Config
 
 
 class Leg(Config):

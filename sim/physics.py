@@ -9,13 +9,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from protocol.errors import ConfigError
-from sim.body import UrdfBody, urdf_body
-from sim.engine import pybullet
-from sim.frames import Transform
-from sim.path import Place
-from sim.robot_model import RobotModel
-from sim.scenario import Wall
+from sightline.protocol.errors import ConfigError
+from sightline.sim.body import UrdfBody, urdf_body
+from sightline.sim.engine import pybullet
+from sightline.sim.frames import Transform
+from sightline.sim.path import Place
+from sightline.sim.robot_model import RobotModel
+from sightline.sim.scenario import Wall
 
 FLOOR, ROBOT, TARGET, WALL = 1, 2, 4, 8
 """Collision groups; rays choose by them what they may hit."""

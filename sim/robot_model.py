@@ -10,13 +10,13 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from protocol.config import Config
-from protocol.errors import ConfigError
-from protocol.messages import CameraModel
-from sim.frames import Transform
-from sim.toml_file import check, find, names_in, read_table
-from sim.urdf import Front, Urdf
-from sim.xacro import urdf_text
+from sightline.protocol.config import Config
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import CameraModel
+from sightline.sim.frames import Transform
+from sightline.sim.toml_file import check, find, names_in, read_table
+from sightline.sim.urdf import Front, Urdf
+from sightline.sim.xacro import urdf_text
 
 ROBOTS = Path(__file__).parent / "robots"
 

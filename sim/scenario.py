@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from protocol.config import Config
-from sim.light import Light
-from sim.look import Look, look_named
-from sim.things import Amounts, Color, Forced, Moving, OnPath, Point, Pushed, Span, Standing, Static
-from sim.toml_file import check, find, names_in, read_table
+from sightline.protocol.config import Config
+from sightline.sim.light import Light
+from sightline.sim.look import Look, look_named
+from sightline.sim.things import Amounts, Color, Forced, Moving, OnPath, Point, Pushed, Span, Standing, Static
+from sightline.sim.toml_file import check, find, names_in, read_table
 
 __all__ = ["Forced", "OnPath", "Pushed", "Scenario", "Start", "Static", "Wall", "load_scenario", "scenario_names"]
 

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from sim.scene_texture_parts import SIDE
-from sim.scene_textures import texture
-from sim.scenes import HEIGHT_PX, WIDTH_PX, Lens, ScenePlan, Surface
+from sightline.sim.scene_texture_parts import SIDE
+from sightline.sim.scene_textures import texture
+from sightline.sim.scenes import HEIGHT_PX, WIDTH_PX, Lens, ScenePlan, Surface
 
 Plane = npt.NDArray[np.float32]
 _SHADED = (0.7, 1.0)  # the wall's brightness, by its turn

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim.scene_texture_parts import any_rgb
-from sim.scene_textures import families
-from sim.scenes import (
+from sightline.sim.scene_texture_parts import any_rgb
+from sightline.sim.scene_textures import families
+from sightline.sim.scenes import (
     BALL_PX,
     HEIGHT_PX,
     LIGHT_SIZES,
@@ -27,7 +27,7 @@ from sim.scenes import (
     Surface,
     is_judged,
 )
-from sim.things import Color
+from sightline.sim.things import Color
 
 _YELLOW = {"saturation": (0.72, 1.0), "value": (0.75, 1.0), "hue_deg": (42.0, 58.0)}
 _JUDGED_LIGHT_DEG = ((30.0, 50.0),)  # how high the light stands; between those of training, and never trained on

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from sim.camera import FAR_M, NEAR_M, NOTHING_DEPTH
-from sim.engine import pybullet
-from sim.light import LIT, Light, Part, State, color_of
-from sim.scene_backdrop import backdrop
-from sim.scene_plan import plan_scene, with_more_of_the_ball
-from sim.scenes import (
+from sightline.sim.camera import FAR_M, NEAR_M, NOTHING_DEPTH
+from sightline.sim.engine import pybullet
+from sightline.sim.light import LIT, Light, Part, State, color_of
+from sightline.sim.scene_backdrop import backdrop
+from sightline.sim.scene_plan import plan_scene, with_more_of_the_ball
+from sightline.sim.scenes import (
     HEIGHT_PX,
     MOST_HIDDEN,
     VALIDATED_FROM,
@@ -27,8 +27,8 @@ from sim.scenes import (
     ScenePlan,
     Solid,
 )
-from sim.thing_bodies import ball_visual
-from sim.things import Color, Legs
+from sightline.sim.thing_bodies import ball_visual
+from sightline.sim.things import Color, Legs
 
 Mask = npt.NDArray[Any]
 

@@ -10,10 +10,10 @@ from typing import Final
 import cv2
 import numpy as np
 
-from sim import scene_patterns
-from sim.camera import floor_tile
-from sim.scene_texture_parts import SIDE, Field, Random, Texture, grid, mixed, near, rgb, soft
-from sim.scenes import HARDER_FROM, JUDGED_FROM, LATER_FROM, VALIDATED_FROM
+from sightline.sim import scene_patterns
+from sightline.sim.camera import floor_tile
+from sightline.sim.scene_texture_parts import SIDE, Field, Random, Texture, grid, mixed, near, rgb, soft
+from sightline.sim.scenes import HARDER_FROM, JUDGED_FROM, LATER_FROM, VALIDATED_FROM
 
 _FLOORS = 16  # of the simulated room's own; each takes as long to make as a scene
 

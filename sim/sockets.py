@@ -12,8 +12,8 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from protocol.errors import ConfigError, HardwareError
-from sim.bus import CAMERA, MOTION, PICTURE_REQUEST, RANGE, TRUTH
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.sim.bus import CAMERA, MOTION, PICTURE_REQUEST, RANGE, TRUTH
 
 SEND_BYTES = {MOTION: 4096, RANGE: 16_384, CAMERA: 1 << 20, TRUTH: 1 << 17}
 """How much may wait for a client that does not read; little where only the newest is worth anything."""

@@ -5,12 +5,12 @@ from typing import Protocol
 
 import numpy as np
 
-from sim.engine import pybullet
-from sim.path import Place
-from sim.physics import Vector
-from sim.start import target_phase, thing_phase, thing_place
-from sim.thing_bodies import ThingBodies
-from sim.things import Forced, OnPath, Pushed, Static
+from sightline.sim.engine import pybullet
+from sightline.sim.path import Place
+from sightline.sim.physics import Vector
+from sightline.sim.start import target_phase, thing_phase, thing_place
+from sightline.sim.thing_bodies import ThingBodies
+from sightline.sim.things import Forced, OnPath, Pushed, Static
 
 PUSH_S = 0.4
 SOLID_BALL = 1.4  # a rolling solid ball resists a push at its centre as 7/5 of its mass would

@@ -3,10 +3,10 @@
 import math
 from functools import cache
 
-from sim.engine import pybullet
-from sim.path import Place
-from sim.physics import FLOOR, ROBOT, TARGET, WALL, Vector, group
-from sim.things import Color, Rolling, Thing
+from sightline.sim.engine import pybullet
+from sightline.sim.path import Place
+from sightline.sim.physics import FLOOR, ROBOT, TARGET, WALL, Vector, group
+from sightline.sim.things import Color, Rolling, Thing
 
 _NO_TURN = (0.0, 0.0, 0.0, 1.0)
 

@@ -8,8 +8,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from protocol.config import Config
-from sim.path import ClosedPath, Leg, Place
+from sightline.protocol.config import Config
+from sightline.sim.path import ClosedPath, Leg, Place
 
 Metres = Annotated[float, Field(ge=-100, le=100)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]

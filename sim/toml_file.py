@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
 

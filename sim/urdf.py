@@ -13,8 +13,8 @@ from typing import Literal, NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from protocol.errors import ConfigError
-from sim.frames import Transform, Vector, transform
+from sightline.protocol.errors import ConfigError
+from sightline.sim.frames import Transform, Vector, transform
 
 Front = Literal["+x", "-x"]
 

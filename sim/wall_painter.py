@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from protocol.messages import CameraModel
-from sim.scenario import Wall
+from sightline.protocol.messages import CameraModel
+from sightline.sim.scenario import Wall
 
 PoseMatrix = npt.NDArray[np.float64]
 SUBPIXEL_BITS = 4

@@ -11,7 +11,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from protocol.config import Config
+from sightline.protocol.config import Config
 
 IP_HEADER_BYTES: Final = 20
 MAX_WAITING: Final = 400

@@ -3,7 +3,7 @@
 For kernels without netem. Shapes are JSON lines on stdin (`{"ab": {...}, "ba": {...}}`); each is answered by a line of
 counts on stdout once it is in force.
 
-    python -m sim.wire_tun NAMESPACE_A NAMESPACE_B
+    python -m sightline.sim.wire_tun NAMESPACE_A NAMESPACE_B
 """
 
 import ctypes
@@ -21,9 +21,9 @@ from typing import Final
 
 from pydantic import ValidationError
 
-from protocol.clock import monotonic_us
-from protocol.errors import ConfigError, HardwareError
-from sim.wire import EmulatedLink, Leg, LinkShapes
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.sim.wire import EmulatedLink, Leg, LinkShapes
 
 ADDRESS_A: Final = "10.213.77.1"
 ADDRESS_B: Final = "10.213.77.2"

@@ -8,23 +8,23 @@ import math
 from types import TracebackType
 from typing import Any, Self
 
-from robot_side.ports import Ranges, WheelAngles
-from sim.body import outline
-from sim.camera import Defects, SceneCamera
-from sim.engine import pybullet
-from sim.label_bus import Label
-from sim.labels import leg_labels
-from sim.lidar import Lidar
-from sim.light_bodies import LightBodies
-from sim.motors import Motor
-from sim.path import Place
-from sim.physics import WALL, Vector, add_floor, add_robot, add_wall, open_client
-from sim.robot_model import RobotModel
-from sim.scenario import Scenario
-from sim.start import light_begin, robot_start
-from sim.target import Mover, begin, begin_thing
-from sim.thing_bodies import ThingBodies
-from sim.truth import Truth
+from sightline.robot_side.ports import Ranges, WheelAngles
+from sightline.sim.body import outline
+from sightline.sim.camera import Defects, SceneCamera
+from sightline.sim.engine import pybullet
+from sightline.sim.label_bus import Label
+from sightline.sim.labels import leg_labels
+from sightline.sim.lidar import Lidar
+from sightline.sim.light_bodies import LightBodies
+from sightline.sim.motors import Motor
+from sightline.sim.path import Place
+from sightline.sim.physics import WALL, Vector, add_floor, add_robot, add_wall, open_client
+from sightline.sim.robot_model import RobotModel
+from sightline.sim.scenario import Scenario
+from sightline.sim.start import light_begin, robot_start
+from sightline.sim.target import Mover, begin, begin_thing
+from sightline.sim.thing_bodies import ThingBodies
+from sightline.sim.truth import Truth
 
 STEP_US = 4000
 """250 Hz: every time in the world is a whole number of these."""

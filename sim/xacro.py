@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 
 
 def urdf_text(path: Path) -> str:

@@ -5,8 +5,8 @@ import math
 import cv2
 import numpy as np
 
-from operator_side.calibrate import Board
-from protocol.messages import CameraModel
+from sightline.operator_side.calibrate import Board
+from sightline.protocol.messages import CameraModel
 from tests.vision_rig import jpeg_of
 
 BOARD = Board(7, 5, 0.03)

@@ -3,9 +3,9 @@
 import time
 from collections.abc import Callable
 
-from protocol.jpeg import read_jpeg_size
-from protocol.messages import CameraModel
-from robot_side.ports import Adjustable, Camera, Picture, scaled_model
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.messages import CameraModel
+from sightline.robot_side.ports import Adjustable, Camera, Picture, scaled_model
 
 MAX_AGE_S = 0.15
 """From capture to the return of `read`: transfer and encoding, but no storing."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from protocol.errors import HardwareError
+from sightline.protocol.errors import HardwareError
 
 FPS = 60.0
 

@@ -24,7 +24,7 @@ IMAGES = {service["image"]: name for name, service in reversed(SERVICES.items())
 """Every image, and the first service that is made of it."""
 
 _TRUTH = """
-from sim.bus import TruthReader
+from sightline.sim.bus import TruthReader
 reader = TruthReader("/run/sightline")
 for _ in range(250):
     truth = reader.read(1.0)
@@ -140,7 +140,7 @@ class Containers:
 
     def sightline(self, command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         """A command of a person outside, through the published port."""
-        return ask(sys.executable, "-m", "operator_side.cli", command, *arguments, *self.reached)
+        return ask(sys.executable, "-m", "sightline.operator_side.cli", command, *arguments, *self.reached)
 
     def state(self, robot: str) -> str:
         """A robot's state; "" if it is not heard."""

@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from protocol.messages import STILL, FrameHeader, Pose, Twist
+from sightline.protocol.messages import STILL, FrameHeader, Pose, Twist
 from tests.vision_rig import camera
-from vision_side.decode import Picture
-from vision_side.detect.port import Detection
-from vision_side.missions.body import Footprint
-from vision_side.missions.port import Mission, Plan, RangeScan, View
-from vision_side.missions.ranging import about_robot
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.missions.body import Footprint
+from sightline.vision_side.missions.port import Mission, Plan, RangeScan, View
+from sightline.vision_side.missions.ranging import about_robot
 
 TICK_US = 10_000
 FRAME_US = 33_333

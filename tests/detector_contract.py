@@ -5,8 +5,8 @@ The promises themselves ship with vision (vision_side/detect/contract.py): `sigh
 
 from collections.abc import Callable
 
-from vision_side.detect.contract import check_detector
-from vision_side.detect.port import Detector
+from sightline.vision_side.detect.contract import check_detector
+from sightline.vision_side.detect.port import Detector
 
 
 def assert_kept(make: Callable[[], Detector], seed: int = 7) -> None:

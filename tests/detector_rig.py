@@ -2,15 +2,15 @@
 
 from collections.abc import Sequence
 
-from protocol.channels import ACK, CAMERA, FRAME, MISSION, REPORT, TWIST
-from protocol.codec import decode, encode
-from protocol.messages import Echo, FrameHeader, RequestHeader, Stamp
-from protocol.mission_messages import MissionReport, MissionRequest
-from protocol.transports.memory import MemoryNetwork
+from sightline.protocol.channels import ACK, CAMERA, FRAME, MISSION, REPORT, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import Echo, FrameHeader, RequestHeader, Stamp
+from sightline.protocol.mission_messages import MissionReport, MissionRequest
+from sightline.protocol.transports.memory import MemoryNetwork
 from tests.vision_rig import camera, jpeg_of, scene
-from vision_side.config import VisionConfig
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
-from vision_side.service import Service
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
+from sightline.vision_side.service import Service
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))

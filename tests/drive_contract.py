@@ -6,7 +6,7 @@ The wheels turn: lift the robot.
 import time
 from collections.abc import Callable
 
-from robot_side.ports import Drive, WheelAngles
+from sightline.robot_side.ports import Drive, WheelAngles
 
 QUICK_S = 0.05
 """For one call: the driver's period is 20 ms, and a call that takes longer delays every other duty of it."""

@@ -2,8 +2,8 @@
 
 import pytest
 
-from protocol.errors import WireError
-from protocol.messages import Holder, State, Twist, Verb
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import Holder, State, Twist, Verb
 from tests.safety_rig import HUMAN, VISION, Rig
 
 VISION_HOLDER, HUMAN_HOLDER = Holder(source="vision", session=VISION), Holder(source="teleop", session=HUMAN)

@@ -7,7 +7,7 @@ from pathlib import Path
 from gpiozero import Device
 from gpiozero.pins.mock import MockFactory, MockPWMPin
 
-from robot_side.hardware.gpio_drive import GpioDrive, GpioDriveConfig
+from sightline.robot_side.hardware.gpio_drive import GpioDrive, GpioDriveConfig
 
 BOARD = "CAR_TEST_BOARD"
 """Names the file of events: `t_us,what,value`, where what is a pin's number, or `gate` for what the driver told."""

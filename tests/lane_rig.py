@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from protocol.messages import Pose
-from sim.camera import Defects
-from sim.light import LIT, UNLIT
-from sim.look import Look, look_named
+from sightline.protocol.messages import Pose
+from sightline.sim.camera import Defects
+from sightline.sim.light import LIT, UNLIT
+from sightline.sim.look import Look, look_named
 from tests.vision_rig import camera
-from vision_side.decode import Decoder, Picture
-from vision_side.detect.port import Detection
-from vision_side.track import from_odometry
+from sightline.vision_side.decode import Decoder, Picture
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.track import from_odometry
 
 LENS = camera()
 BLUE, HOUSING, SKY, FLOOR = (20, 36, 190), (18, 18, 20), (196, 199, 204), (118, 116, 112)

@@ -12,12 +12,12 @@ import pytest
 import zenoh
 from websockets.sync.client import ClientConnection, connect
 
-from protocol.errors import LinkError
-from protocol.transports.link import Link
-from protocol.transports.memory import MemoryNetwork
-from protocol.transports.websocket import open_websocket
-from protocol.transports.zenoh import open_zenoh
-from protocol.transports.zenoh_session import open_session
+from sightline.protocol.errors import LinkError
+from sightline.protocol.transports.link import Link
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh_session import open_session
 
 
 def free_endpoint() -> str:

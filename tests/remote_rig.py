@@ -8,13 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from protocol.clock import monotonic_us
-from protocol.messages import FrameHeader
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.messages import FrameHeader
 from tests.vision_rig import camera, jpeg_of, scene
-from vision_side.decode import Decoder
-from vision_side.detect.port import DetectFrame
-from vision_side.detect.protobuf import put, put_integers
-from vision_side.detect.remote.oip import Slot
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.port import DetectFrame
+from sightline.vision_side.detect.protobuf import put, put_integers
+from sightline.vision_side.detect.remote.oip import Slot
 
 SESSION = "0000abcd"
 MODEL = camera()

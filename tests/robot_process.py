@@ -10,10 +10,10 @@ import sys
 import threading
 from pathlib import Path
 
-from protocol.channels import FRAME, STATUS, TWIST
-from protocol.codec import decode, encode
-from protocol.messages import AnswerHeader, Echo, FrameHeader, Status
-from protocol.transports.zenoh import open_zenoh
+from sightline.protocol.channels import FRAME, STATUS, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Status
+from sightline.protocol.transports.zenoh import open_zenoh
 from tests.link_rigs import free_endpoint, until
 
 # A 16 x 16 grey JPEG is enough: the robot never decodes.
@@ -28,9 +28,9 @@ JPEG = bytes.fromhex(
 )
 _RUN = """
 import sys
-from protocol.errors import SightlineError
-from robot_side.config import RobotConfig
-from robot_side.driver import run
+from sightline.protocol.errors import SightlineError
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.driver import run
 try:
     sys.exit(run(RobotConfig.model_validate_json(sys.argv[1])))
 except SightlineError as error:

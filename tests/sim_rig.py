@@ -2,10 +2,10 @@
 
 import math
 
-from sim.look import look_named
-from sim.robot_model import RobotModel, load_robot
-from sim.scenario import Scenario, Start, load_scenario
-from sim.world import World
+from sightline.sim.look import look_named
+from sightline.sim.robot_model import RobotModel, load_robot
+from sightline.sim.scenario import Scenario, Start, load_scenario
+from sightline.sim.world import World
 
 RADIUS_M, TRACK_M = 0.035, 0.174
 

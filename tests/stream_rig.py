@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from random import Random
 
-from protocol.messages import Holder
-from robot_side.stream import Stream, StreamConfig
+from sightline.protocol.messages import Holder
+from sightline.robot_side.stream import Stream, StreamConfig
 
 VISION = Holder(source="vision", session="0000bbbb")
 PACKET_BYTES = 1360

@@ -6,17 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.channels import CAMERA
-from protocol.codec import decode
-from protocol.errors import HardwareError
-from protocol.messages import MAX_CHANNELS_SHOWN, CameraModel, FrameHeader, StreamStatus
-from robot_side.adjusting import CameraAdaptation
-from robot_side.encoding import EncodingTarget
-from robot_side.ports import Picture, scaled_model, scaled_size
-from robot_side.sending import NetworkCore
-from robot_side.stream import StreamConfig
-from vision_side.config import VisionConfig
-from vision_side.pipeline import Frame, Pipeline
+from sightline.protocol.channels import CAMERA
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import HardwareError
+from sightline.protocol.messages import MAX_CHANNELS_SHOWN, CameraModel, FrameHeader, StreamStatus
+from sightline.robot_side.adjusting import CameraAdaptation
+from sightline.robot_side.encoding import EncodingTarget
+from sightline.robot_side.ports import Picture, scaled_model, scaled_size
+from sightline.robot_side.sending import NetworkCore
+from sightline.robot_side.stream import StreamConfig
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.pipeline import Frame, Pipeline
 
 MODEL = CameraModel(
     width_px=640, height_px=480, fx_px=381.0, fy_px=382.0, cx_px=322.0, cy_px=238.0, distortion=(0.1, -0.02, 0, 0, 0),

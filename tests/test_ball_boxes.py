@@ -11,11 +11,11 @@ import pytest
 pytest.importorskip("pybullet")
 
 from examples import older_range
-from operator_side.lockstep import Conditions, run_lockstep
-from operator_side.scenario_settings import robot_of, vision_config
-from operator_side.score import ACQUIRED_WITHIN_DEG, score
-from sim.scenario import load_scenario
-from vision_side.config import DetectorConfig, HsvConfig
+from sightline.operator_side.lockstep import Conditions, run_lockstep
+from sightline.operator_side.scenario_settings import robot_of, vision_config
+from sightline.operator_side.score import ACQUIRED_WITHIN_DEG, score
+from sightline.sim.scenario import load_scenario
+from sightline.vision_side.config import DetectorConfig, HsvConfig
 
 WAITING = load_scenario(str(Path(__file__).parent.parent / "examples" / "ball-boxes.toml"))
 SCENARIO = WAITING.model_copy(update={"target": WAITING.target.model_copy(update={"waits_s": 0.0})})

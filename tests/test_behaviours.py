@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import pytest
 
-from operator_side.behaviours import write_page
-from operator_side.behaviours_page import kept, page_lines, picture_name
-from operator_side.behaviours_rows import CHARACTER, LOOKS, ROWS, Row
-from operator_side.score import Score
-from operator_side.speed_runs import GOALS_M, LAWS, SpeedCase, free_way, speed_cases, speed_run, speeds_of
-from sim.scenario import load_scenario, scenario_names
+from sightline.operator_side.behaviours import write_page
+from sightline.operator_side.behaviours_page import kept, page_lines, picture_name
+from sightline.operator_side.behaviours_rows import CHARACTER, LOOKS, ROWS, Row
+from sightline.operator_side.score import Score
+from sightline.operator_side.speed_runs import GOALS_M, LAWS, SpeedCase, free_way, speed_cases, speed_run, speeds_of
+from sightline.sim.scenario import load_scenario, scenario_names
 from tests.test_score import truth
 
 SEEDS = (901, 902)

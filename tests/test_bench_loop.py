@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.loop import run_race
-from benchmarks.loop_course import Course, Sample, course_of_headers, course_of_tally, joined
-from benchmarks.loop_figures import figures_of, loop_checks, percentile
-from benchmarks.loop_machine import Reading, taken_percent
-from benchmarks.loop_overload import overloaded, with_overload
-from benchmarks.loop_pictures import write_pictures
-from benchmarks.loop_setting import (
+from sightline.benchmarks.loop import run_race
+from sightline.benchmarks.loop_course import Course, Sample, course_of_headers, course_of_tally, joined
+from sightline.benchmarks.loop_figures import figures_of, loop_checks, percentile
+from sightline.benchmarks.loop_machine import Reading, taken_percent
+from sightline.benchmarks.loop_overload import overloaded, with_overload
+from sightline.benchmarks.loop_pictures import write_pictures
+from sightline.benchmarks.loop_setting import (
     FLOOR,
     MAX_FPS,
     OUR_DETECTOR,
@@ -25,7 +25,7 @@ from benchmarks.loop_setting import (
     peers_of,
     size_of,
 )
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 
 SMALL = LoopSetting(Path(), 160, 120, fps=30.0, seconds=2.0, tries=1)
 MS = 1000

@@ -12,19 +12,19 @@ from pathlib import Path
 import pytest
 import typer
 
-from benchmarks.camera import measure_camera
-from benchmarks.loop import run_race
-from benchmarks.loop_crew import free_port
-from benchmarks.loop_eyes import PipelineVision
-from benchmarks.loop_machine import children_of
-from benchmarks.loop_pictures import COUNT, camera_of, write_pictures
-from benchmarks.loop_setting import FLOOR, OUR_DETECTOR, OURS, PEERS, TCP, WITH_OUR_DETECTOR, LoopSetting
-from benchmarks.loop_sockets import carried_between, carried_bytes
-from benchmarks.peers.classic_eyes import ClassicVision
-from benchmarks.watchers import measure_watchers
-from operator_side.cli_bench_loop import register_loop_benches
-from protocol.errors import HardwareError
-from robot_side.hardware.folder_camera import FolderCamera, FolderCameraConfig
+from sightline.benchmarks.camera import measure_camera
+from sightline.benchmarks.loop import run_race
+from sightline.benchmarks.loop_crew import free_port
+from sightline.benchmarks.loop_eyes import PipelineVision
+from sightline.benchmarks.loop_machine import children_of
+from sightline.benchmarks.loop_pictures import COUNT, camera_of, write_pictures
+from sightline.benchmarks.loop_setting import FLOOR, OUR_DETECTOR, OURS, PEERS, TCP, WITH_OUR_DETECTOR, LoopSetting
+from sightline.benchmarks.loop_sockets import carried_between, carried_bytes
+from sightline.benchmarks.peers.classic_eyes import ClassicVision
+from sightline.benchmarks.watchers import measure_watchers
+from sightline.operator_side.cli_bench_loop import register_loop_benches
+from sightline.protocol.errors import HardwareError
+from sightline.robot_side.hardware.folder_camera import FolderCamera, FolderCameraConfig
 from tests.link_rigs import until
 
 SMALL = LoopSetting(Path(), 160, 120, fps=30.0, seconds=2.0, tries=1)
@@ -115,7 +115,7 @@ def test_viewers_come_and_stall_and_the_loop_goes_on():
 def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkeypatch):
     app = typer.Typer()
     register_loop_benches(app)
-    monkeypatch.setattr("benchmarks.loop_sample.TAKEN_BOUND_PERCENT", 100.0)
+    monkeypatch.setattr("sightline.benchmarks.loop_sample.TAKEN_BOUND_PERCENT", 100.0)
     asked = ["--size", "160x120", "--seconds", "2", "--peers", "none", "--out", str(tmp_path / "new"), "--json"]
     code = app(["loop", *asked], standalone_mode=False)
     printed = json.loads(capsys.readouterr().out)
@@ -129,8 +129,8 @@ def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkey
 def test_terminated_it_leaves_no_process_and_no_folder(tmp_path):
     code = """
 from pathlib import Path
-from benchmarks.loop import run_race
-from benchmarks.loop_setting import LoopSetting
+from sightline.benchmarks.loop import run_race
+from sightline.benchmarks.loop_setting import LoopSetting
 run_race(LoopSetting(Path(), 160, 120, seconds=60.0, peers=(), tries=1), print)
 """
     bench = subprocess.Popen(
@@ -148,7 +148,7 @@ run_race(LoopSetting(Path(), 160, 120, seconds=60.0, peers=(), tries=1), print)
 
 
 def test_a_process_that_cannot_start_is_said_in_its_own_words(monkeypatch):
-    monkeypatch.setattr("benchmarks.loop_sample._MODULE", "benchmarks.no_such_module")
+    monkeypatch.setattr("sightline.benchmarks.loop_sample._MODULE", "benchmarks.no_such_module")
     with pytest.raises(HardwareError, match="No module named"):
         run_race(replace(SMALL, peers=()), lambda _: None)
 

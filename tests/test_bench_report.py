@@ -5,11 +5,11 @@ import subprocess
 
 import pytest
 
-from benchmarks import report
-from benchmarks.report import page_with, sections_named, write_report
-from benchmarks.report_sections import SECTIONS
-from operator_side.cli import app
-from protocol.errors import ConfigError
+from sightline.benchmarks import report
+from sightline.benchmarks.report import page_with, sections_named, write_report
+from sightline.benchmarks.report_sections import SECTIONS
+from sightline.operator_side.cli import app
+from sightline.protocol.errors import ConfigError
 
 NAMED = {section.name: section for section in SECTIONS}
 CHECKS = {"checks": [{"name": "offer and step", "value": 13.2, "unit": "us", "bound": 20, "ok": True}], "ok": True}

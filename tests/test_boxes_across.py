@@ -3,10 +3,10 @@
 import pytest
 from websockets.sync.client import connect
 
-from protocol.channels import DETECTIONS, MAX_HEADER_BYTES
-from protocol.codec import decode, encode
-from protocol.messages import Detections, DetectionsHeader
-from protocol.transports.zenoh import open_zenoh
+from sightline.protocol.channels import DETECTIONS, MAX_HEADER_BYTES
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import Detections, DetectionsHeader
+from sightline.protocol.transports.zenoh import open_zenoh
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, Vision
 

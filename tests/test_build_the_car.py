@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import typer
 
-from operator_side import cli
-from operator_side.service_settings import load_service
-from operator_side.teleop_text import KEYS
-from robot_side.hardware.gpio_drive import GpioDriveConfig
+from sightline.operator_side import cli
+from sightline.operator_side.service_settings import load_service
+from sightline.operator_side.teleop_text import KEYS
+from sightline.robot_side.hardware.gpio_drive import GpioDriveConfig
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"

@@ -9,18 +9,27 @@ import numpy as np
 import pytest
 import typer
 
-from operator_side import cli_calibrate
-from operator_side.calibrate import Ball, Board, Mounting, ball_finder, find_board, from_balls, from_boards, is_new_view
-from operator_side.calibrate_pictures import collect
-from protocol.errors import ConfigError
-from protocol.jpeg import JpegSize
-from robot_side.hardware.lens import guessed_model, read_model
-from robot_side.hardware.still_camera import StillCamera
+from sightline.operator_side import cli_calibrate
+from sightline.operator_side.calibrate import (
+    Ball,
+    Board,
+    Mounting,
+    ball_finder,
+    find_board,
+    from_balls,
+    from_boards,
+    is_new_view,
+)
+from sightline.operator_side.calibrate_pictures import collect
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.jpeg import JpegSize
+from sightline.robot_side.hardware.lens import guessed_model, read_model
+from sightline.robot_side.hardware.still_camera import StillCamera
 from tests.board_rig import BOARD, TRUTH, draw_board, rays, tilted_views, turned
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 from tests.vision_rig import camera, jpeg_of, scene
-from vision_side.config import HsvConfig
+from sightline.vision_side.config import HsvConfig
 
 SIZE = JpegSize(TRUTH.width_px, TRUTH.height_px, 3)
 EMPTY = jpeg_of(np.full((TRUTH.height_px, TRUTH.width_px, 3), 120, np.uint8))

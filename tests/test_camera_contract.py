@@ -2,11 +2,11 @@
 
 import pytest
 
-from protocol.errors import ConfigError
-from robot_side.config import PluginChoice
-from robot_side.hardware.picamera import PiCamera
-from robot_side.hardware.v4l2_camera import V4l2Camera
-from robot_side.plugins import build_device
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import PluginChoice
+from sightline.robot_side.hardware.picamera import PiCamera
+from sightline.robot_side.hardware.v4l2_camera import V4l2Camera
+from sightline.robot_side.plugins import build_device
 from tests.camera_contract import check_camera
 from tests.camera_rig import FakeDevice, install_fake_picamera2, jpeg, video
 
@@ -50,7 +50,7 @@ def test_picamera(monkeypatch):
 @pytest.mark.slow
 def test_simulation(tmp_path):
     pytest.importorskip("pybullet")
-    from sim.bus import SimCamera
+    from sightline.sim.bus import SimCamera
     from tests.test_sim_bus import started
 
     simulator = started(tmp_path)

@@ -2,19 +2,19 @@
 
 import pytest
 
-from operator_side.local_camera import local_camera
-from protocol.channels import ACK, CAMERA, FRAME, TWIST
-from protocol.codec import decode, encode
-from protocol.errors import ConfigError, HardwareError
-from protocol.messages import AnswerHeader, FrameHeader, Stamp, Twist
-from protocol.transports.memory import MemoryNetwork
-from robot_side.ports import Picture
+from sightline.operator_side.local_camera import local_camera
+from sightline.protocol.channels import ACK, CAMERA, FRAME, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.messages import AnswerHeader, FrameHeader, Stamp, Twist
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.robot_side.ports import Picture
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 from tests.vision_rig import camera, jpeg_of, scene
-from vision_side.config import VisionConfig
-from vision_side.dry_run import AckingService, ProgressPrinter, watch_camera, watch_robot
-from vision_side.pipeline import Observation, PipelineAnswer
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.dry_run import AckingService, ProgressPrinter, watch_camera, watch_robot
+from sightline.vision_side.pipeline import Observation, PipelineAnswer
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -72,7 +72,7 @@ def test_a_camera_needs_no_robot():
 
 
 def test_a_camera_that_is_unplugged_is_said_once_and_waited_for(monkeypatch):
-    monkeypatch.setattr("vision_side.dry_run._RETRY_S", 0.0)
+    monkeypatch.setattr("sightline.vision_side.dry_run._RETRY_S", 0.0)
     gone = HardwareError("camera /dev/video0 was unplugged; plug it in again")
     said = watch([BALL, gone, gone, None, BALL])
     assert said[2:] == ["camera: camera /dev/video0 was unplugged; plug it in again", "camera: back"]

@@ -2,9 +2,9 @@
 
 import pytest
 
-from operator_side.channel_inbox import MAX_WAITING, ChannelInbox
-from protocol.channels import CHANNELS, JPEG
-from protocol.transports.memory import MemoryNetwork
+from sightline.operator_side.channel_inbox import MAX_WAITING, ChannelInbox
+from sightline.protocol.channels import CHANNELS, JPEG
+from sightline.protocol.transports.memory import MemoryNetwork
 from tests.test_channel_text import usual
 
 PICTURES = [name for name, one in CHANNELS.items() if one.encoding == JPEG]

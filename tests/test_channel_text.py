@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from operator_side.channel_text import message_line, message_object
-from protocol.channels import CHANNELS, SCAN, STATUS, TWIST
-from protocol.golden_case import USUAL, packed
-from protocol.golden_cases import CASES
-from protocol.transports.link import Message
+from sightline.operator_side.channel_text import message_line, message_object
+from sightline.protocol.channels import CHANNELS, SCAN, STATUS, TWIST
+from sightline.protocol.golden_case import USUAL, packed
+from sightline.protocol.golden_cases import CASES
+from sightline.protocol.transports.link import Message
 
 
 def usual(name, **changed):

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from protocol.clock import monotonic_us
-from robot_side import ipc, plugins
-from robot_side.child import DriverEnd
-from robot_side.config import PluginChoice, RobotConfig
+from sightline.protocol.clock import monotonic_us
+from sightline.robot_side import ipc, plugins
+from sightline.robot_side.child import DriverEnd
+from sightline.robot_side.config import PluginChoice, RobotConfig
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import JPEG, RobotProcess
 
 ROOT = Path(__file__).parent.parent
 STRANGE = "raise SystemExit(7)"
 CAMERA = """
-from protocol.config import Config
-from robot_side.hardware.folder_camera import FolderCamera
+from sightline.protocol.config import Config
+from sightline.robot_side.hardware.folder_camera import FolderCamera
 class MyCamera(FolderCamera):
     pass
 """

@@ -12,12 +12,12 @@ import pytest
 
 from examples.compose.older_client import steer
 from examples.detector_service import boxes_of, look
-from protocol.channels import DETECTIONS
-from protocol.codec import decode
-from protocol.errors import WireError
-from protocol.messages import Detections, DetectionsHeader
-from protocol.transports.zenoh import open_zenoh
-from protocol.twist_text import parse_twist
+from sightline.protocol.channels import DETECTIONS
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import Detections, DetectionsHeader
+from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.twist_text import parse_twist
 from tests.compose_rig import ROOT
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess

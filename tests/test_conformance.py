@@ -5,11 +5,11 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from protocol.conformance.bench import KEPT_MESSAGES
-from protocol.conformance.case import GROUPS, Case, Level, Suite
-from protocol.conformance.robot import CASES, prepare
-from protocol.conformance.runner import Outcome, chosen, passed, run_case, run_cases
-from protocol.errors import ConfigError
+from sightline.protocol.conformance.bench import KEPT_MESSAGES
+from sightline.protocol.conformance.case import GROUPS, Case, Level, Suite
+from sightline.protocol.conformance.robot import CASES, prepare
+from sightline.protocol.conformance.runner import Outcome, chosen, passed, run_case, run_cases
+from sightline.protocol.errors import ConfigError
 from tests.conformance import (  # noqa: F401  (they fill BROKEN)
     broken_arming,
     broken_judging,

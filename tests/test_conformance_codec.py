@@ -10,13 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from protocol.conformance import codec_process
-from protocol.conformance.case import Level
-from protocol.conformance.codec import CASES, END, run_codec
-from protocol.conformance.codec_lines import MAX_ANSWER_BYTES, ProgramError, Question, read_answer, read_question, same
-from protocol.conformance.codec_questions import VECTORS, codec_cases
-from protocol.conformance.runner import Outcome
-from protocol.errors import ConfigError
+from sightline.protocol.conformance import codec_process
+from sightline.protocol.conformance.case import Level
+from sightline.protocol.conformance.codec import CASES, END, run_codec
+from sightline.protocol.conformance.codec_lines import (
+    MAX_ANSWER_BYTES,
+    ProgramError,
+    Question,
+    read_answer,
+    read_question,
+    same,
+)
+from sightline.protocol.conformance.codec_questions import VECTORS, codec_cases
+from sightline.protocol.conformance.runner import Outcome
+from sightline.protocol.errors import ConfigError
 from tests.conformance.codec_broken import WRONG
 
 ROOT = Path(__file__).parent.parent

@@ -6,14 +6,14 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from protocol.conformance.bench import Access
-from protocol.conformance.live import LiveBench
-from protocol.conformance.raw_websocket import LOST, PING, TEXT, RawWebSocket, split_url, xor
-from protocol.conformance.robot import CASES, prepare
-from protocol.conformance.runner import Outcome, run_cases
-from protocol.conformance.virtual import FROM_ROBOT
-from protocol.errors import ConfigError, LinkError
-from protocol.transports.opening import open_link
+from sightline.protocol.conformance.bench import Access
+from sightline.protocol.conformance.live import LiveBench
+from sightline.protocol.conformance.raw_websocket import LOST, PING, TEXT, RawWebSocket, split_url, xor
+from sightline.protocol.conformance.robot import CASES, prepare
+from sightline.protocol.conformance.runner import Outcome, run_cases
+from sightline.protocol.conformance.virtual import FROM_ROBOT
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.opening import open_link
 from tests.conformance.broken_sockets import BEHIND_TOKENS, DEFECTS
 from tests.conformance.small_server import SmallServer
 from tests.link_rigs import free_endpoint

@@ -7,9 +7,9 @@ import simplejpeg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.conformance import vision_pictures
-from protocol.conformance.vision_jpeg import encode_jpeg
-from protocol.conformance.vision_pictures import (
+from sightline.protocol.conformance import vision_pictures
+from sightline.protocol.conformance.vision_jpeg import encode_jpeg
+from sightline.protocol.conformance.vision_pictures import (
     CAMERA,
     DRAWINGS,
     HALF_CAMERA,
@@ -19,8 +19,8 @@ from protocol.conformance.vision_pictures import (
     picture,
     png,
 )
-from protocol.errors import WireError
-from protocol.jpeg import read_jpeg_size
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
 
 
 def decoded(jpeg):

@@ -8,16 +8,16 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from protocol.conformance.bench import Access
-from protocol.conformance.live import LiveBench
-from protocol.conformance.runner import Outcome, run_case
-from protocol.conformance.virtual import TO_ROBOT
-from protocol.conformance.vision import CASES
-from protocol.conformance.vision_socket_server import _take
-from protocol.transports.opening import open_link
+from sightline.protocol.conformance.bench import Access
+from sightline.protocol.conformance.live import LiveBench
+from sightline.protocol.conformance.runner import Outcome, run_case
+from sightline.protocol.conformance.virtual import TO_ROBOT
+from sightline.protocol.conformance.vision import CASES
+from sightline.protocol.conformance.vision_socket_server import _take
+from sightline.protocol.transports.opening import open_link
 from tests.conformance.vision_sockets import SOCKETS, SocketVision
-from vision_side.config import VisionConfig
-from vision_side.service_process import serve
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.service_process import serve
 
 REAL = [case for case in CASES if case.real]
 TOKEN = "0123456789abcdefABCDEF_-"

@@ -4,20 +4,20 @@ from dataclasses import replace
 
 import pytest
 
-from benchmarks.real_time import Kinds, _figures
-from operator_side import demo_report
-from operator_side.demo import RECORDING, DemoOptions, DemoRun
-from operator_side.lockstep import Conditions, Lockstep
-from operator_side.recording import Recorder
-from operator_side.replay import VISION_CONFIG
-from operator_side.scenario_settings import robot_config, robot_of, vision_config
-from operator_side.score import AT_LEAST
-from operator_side.score_bounds import EXACT
-from protocol.channels import CAMERA
-from protocol.codec import encode
-from protocol.messages import Stamp
-from sim.scenario import load_scenario
-from sim.world import World
+from sightline.benchmarks.real_time import Kinds, _figures
+from sightline.operator_side import demo_report
+from sightline.operator_side.demo import RECORDING, DemoOptions, DemoRun
+from sightline.operator_side.lockstep import Conditions, Lockstep
+from sightline.operator_side.recording import Recorder
+from sightline.operator_side.replay import VISION_CONFIG
+from sightline.operator_side.scenario_settings import robot_config, robot_of, vision_config
+from sightline.operator_side.score import AT_LEAST
+from sightline.operator_side.score_bounds import EXACT
+from sightline.protocol.channels import CAMERA
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import Stamp
+from sightline.sim.scenario import load_scenario
+from sightline.sim.world import World
 
 
 @pytest.fixture(scope="module")

@@ -4,13 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
-from vision_side.config import HsvConfig
-from vision_side.decode import Picture
-from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveTracker
-from vision_side.detect.chroma import ColorModel
-from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.pixel_track import PixelTrack
-from vision_side.detect.port import Circle
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.adaptive import AdaptiveConfig, AdaptiveTracker
+from sightline.vision_side.detect.chroma import ColorModel
+from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.pixel_track import PixelTrack
+from sightline.vision_side.detect.port import Circle
 
 YELLOW = (13, 199, 242)
 FRAME_US = 33_333

@@ -2,11 +2,11 @@
 
 import pytest
 
-from protocol.config import Config as Settings
-from protocol.errors import ConfigError, HardwareError
-from vision_side.config import VisionConfig
-from vision_side.detect import choice
-from vision_side.detect.around import attach_detector, close_detector, notices_of
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect import choice
+from sightline.vision_side.detect.around import attach_detector, close_detector, notices_of
 
 
 class Failing:

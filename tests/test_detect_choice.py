@@ -7,22 +7,29 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.clock import monotonic_us
-from protocol.config import Config as Settings
-from protocol.errors import ConfigError, HardwareError
-from protocol.messages import FrameHeader
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.messages import FrameHeader
 from tests.onnx_rig import brightness_model, without_gpu
-from vision_side import plugin_choice
-from vision_side.config import DetectorConfig, VisionConfig
-from vision_side.decode import Decoder
-from vision_side.detect.choice import GROUP, REGISTRY, build_detector, configured_detector, is_plain, split_kind
-from vision_side.detect.colour_filter import ColorFilter
-from vision_side.detect.label_filter import LabelFilter
-from vision_side.detect.local import Adaptive, Hsv
-from vision_side.detect.onnx_detector import OnnxDetector
-from vision_side.detect.port import DetectFrame, result_of
-from vision_side.detect.shadow import ShadowDetector
-from vision_side.detect.tracked import TrackIds
+from sightline.vision_side import plugin_choice
+from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.choice import (
+    GROUP,
+    REGISTRY,
+    build_detector,
+    configured_detector,
+    is_plain,
+    split_kind,
+)
+from sightline.vision_side.detect.colour_filter import ColorFilter
+from sightline.vision_side.detect.label_filter import LabelFilter
+from sightline.vision_side.detect.local import Adaptive, Hsv
+from sightline.vision_side.detect.onnx_detector import OnnxDetector
+from sightline.vision_side.detect.port import DetectFrame, result_of
+from sightline.vision_side.detect.shadow import ShadowDetector
+from sightline.vision_side.detect.tracked import TrackIds
 
 
 @pytest.fixture(autouse=True)

@@ -6,16 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.messages import FrameHeader
+from sightline.protocol.messages import FrameHeader
 from tests.detector_rig import Told, box
 from tests.vision_rig import YELLOW_BGR, jpeg_of
-from vision_side.config import HsvConfig
-from vision_side.decode import Decoder
-from vision_side.detect.colour_filter import ColorFilter
-from vision_side.detect.formats import foxglove_annotations, supervision_fields, vision_msgs_fields
-from vision_side.detect.label_filter import LabelFilter
-from vision_side.detect.overlap import corners, overlap
-from vision_side.detect.port import (
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.colour_filter import ColorFilter
+from sightline.vision_side.detect.formats import foxglove_annotations, supervision_fields, vision_msgs_fields
+from sightline.vision_side.detect.label_filter import LabelFilter
+from sightline.vision_side.detect.overlap import corners, overlap
+from sightline.vision_side.detect.port import (
     NO_DEADLINE,
     Circle,
     DetectFrame,
@@ -23,7 +23,7 @@ from vision_side.detect.port import (
     DetectionResult,
     clipped,
 )
-from vision_side.detect.tracked import KEPT_US, MAX_TRACKS, TrackIds
+from sightline.vision_side.detect.tracked import KEPT_US, MAX_TRACKS, TrackIds
 
 GREY = np.full((240, 320, 3), 140, np.uint8)
 

@@ -5,18 +5,18 @@ from dataclasses import replace
 
 import pytest
 
-from protocol.messages import MAX_DETECTED_BOXES
+from sightline.protocol.messages import MAX_DETECTED_BOXES
 from tests.detector_contract import assert_kept
-from vision_side.config import VisionConfig
-from vision_side.detect.choice import build_detector
-from vision_side.detect.colour_filter import ColorFilter
-from vision_side.detect.contract import check_detector
-from vision_side.detect.label_filter import LabelFilter
-from vision_side.detect.local import Hsv
-from vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Detection, DetectionResult
-from vision_side.detect.remote.fallback import Fallback
-from vision_side.detect.shadow import ShadowDetector
-from vision_side.detect.tracked import TrackIds
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.choice import build_detector
+from sightline.vision_side.detect.colour_filter import ColorFilter
+from sightline.vision_side.detect.contract import check_detector
+from sightline.vision_side.detect.label_filter import LabelFilter
+from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Detection, DetectionResult
+from sightline.vision_side.detect.remote.fallback import Fallback
+from sightline.vision_side.detect.shadow import ShadowDetector
+from sightline.vision_side.detect.tracked import TrackIds
 
 CONFIG = VisionConfig()
 

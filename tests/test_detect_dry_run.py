@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass
 
-from protocol.clock import monotonic_us
-from protocol.config import Config as Settings
-from protocol.transports.memory import MemoryNetwork
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.transports.memory import MemoryNetwork
 from tests.detector_rig import BALL, MODEL
 from tests.detector_rig import Bench as DrivingBench
-from vision_side.config import DetectorConfig, VisionConfig
-from vision_side.detect.port import Maker, result_of
-from vision_side.dry_run import AckingService, LocalRun
+from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.detect.port import Maker, result_of
+from sightline.vision_side.dry_run import AckingService, LocalRun
 
 STARTS, GONE = "m.onnx runs on cpu: no GPU runtime is installed", "detector far: no answer: LATE"
 

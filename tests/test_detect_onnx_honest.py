@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocol.errors import HardwareError
+from sightline.protocol.errors import HardwareError
 from tests.onnx_rig import brightness_model, yolo_model
 from tests.test_detect_onnx import NEEDS_RUNTIME, detector, engine, frame
-from vision_side.decode import Picture
-from vision_side.detect import onnx_detector
-from vision_side.detect.golden import golden_picture, golden_text
-from vision_side.detect.port import NO_DEADLINE, Detection
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect import onnx_detector
+from sightline.vision_side.detect.golden import golden_picture, golden_text
+from sightline.vision_side.detect.port import NO_DEADLINE, Detection
 
 __all__ = ["engine"]
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 300.0, 200.0]]

@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER, FrameHeader
+from sightline.protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER, FrameHeader
 from tests.detector_rig import Bench, Told, box
 from tests.vision_rig import camera, jpeg_of, scene
-from vision_side.config import DetectorConfig, TargetConfig, VisionConfig
-from vision_side.decode import Decoder
-from vision_side.detect.checking import checked_results, validated
-from vision_side.detect.local import Hsv
-from vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Maker, result_of
-from vision_side.pipeline import NO_ANSWER, Frame, Pipeline
+from sightline.vision_side.config import DetectorConfig, TargetConfig, VisionConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.checking import checked_results, validated
+from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Maker, result_of
+from sightline.vision_side.pipeline import NO_ANSWER, Frame, Pipeline
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))

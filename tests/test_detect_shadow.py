@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from protocol.clock import monotonic_us
-from protocol.errors import ConfigError
-from protocol.messages import FrameHeader
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import FrameHeader
 from tests.detector_rig import BALL, Bench
 from tests.link_rigs import until
-from vision_side.config import DetectorConfig, VisionConfig
-from vision_side.decode import Decoder
-from vision_side.detect.agreement import REPORT_EVERY_US, Agreement, disagreement
-from vision_side.detect.local import Hsv
-from vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Maker, result_of
-from vision_side.detect.shadow import ShadowDetector
-from vision_side.missions.choice import configured_mission
+from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.agreement import REPORT_EVERY_US, Agreement, disagreement
+from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Maker, result_of
+from sightline.vision_side.detect.shadow import ShadowDetector
+from sightline.vision_side.missions.choice import configured_mission
 
 
 def result(t_us: int, *boxes: tuple[float, float, float, float], name: str = "hsv") -> DetectionResult:
@@ -187,7 +187,7 @@ def test_in_a_large_fleet_the_last_look_at_a_robot_counts_however_long_ago(pair,
     both.detect([frame(2, "r2")], NO_DEADLINE)
     assert until(lambda: ("r2", 2) in shadow.seen)
     shadow.answers, now_us = True, monotonic_us() + 2_900_000
-    monkeypatch.setattr("vision_side.detect.shadow.monotonic_us", lambda: now_us)
+    monkeypatch.setattr("sightline.vision_side.detect.shadow.monotonic_us", lambda: now_us)
     both.detect([frame(2, "r3")], NO_DEADLINE)
     assert until(lambda: ("r3", 2) in shadow.seen)
     now_us += 2_900_000

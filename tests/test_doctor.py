@@ -8,11 +8,11 @@ import sys
 
 import pytest
 
-from operator_side import cli, keys
-from operator_side.doctor import between, cameras, machine
-from operator_side.doctor.finding import Finding, as_object, histogram
-from protocol.transports.port_owner import port_owner
-from protocol.transports.zenoh import open_zenoh
+from sightline.operator_side import cli, keys
+from sightline.operator_side.doctor import between, cameras, machine
+from sightline.operator_side.doctor.finding import Finding, as_object, histogram
+from sightline.protocol.transports.port_owner import port_owner
+from sightline.protocol.transports.zenoh import open_zenoh
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess
 

@@ -5,9 +5,9 @@ import time
 import pytest
 
 from examples.my_drive import MyDrive
-from operator_side.processes import Processes
-from robot_side.hardware.log_drive import LogDrive
-from robot_side.ports import WheelAngles
+from sightline.operator_side.processes import Processes
+from sightline.robot_side.hardware.log_drive import LogDrive
+from sightline.robot_side.ports import WheelAngles
 from tests.drive_contract import check_drive
 
 
@@ -22,7 +22,7 @@ def test_the_drive_to_copy(tmp_path):
 @pytest.mark.slow
 def test_the_simulated_drive(tmp_path):
     pytest.importorskip("pybullet")
-    from sim.bus import SimDrive
+    from sightline.sim.bus import SimDrive
 
     with Processes(tmp_path) as processes:
         processes.start("sim", ["sim", "--scenario", "static", "--socket-dir", str(tmp_path)])

@@ -8,16 +8,16 @@ import time
 
 import pytest
 
-from protocol.config import Config
-from protocol.messages import Twist
-from robot_side import ipc
-from robot_side.config import PluginChoice, RobotConfig
-from robot_side.driver import Driver, run
-from robot_side.ending import EXIT_SIGNALS, IGNORED_SIGNALS
-from robot_side.latch import StopLatch
-from robot_side.limits import SafetyConfig
-from robot_side.ports import WheelAngles
-from robot_side.scribe import BackgroundWriter
+from sightline.protocol.config import Config
+from sightline.protocol.messages import Twist
+from sightline.robot_side import ipc
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver import Driver, run
+from sightline.robot_side.ending import EXIT_SIGNALS, IGNORED_SIGNALS
+from sightline.robot_side.latch import StopLatch
+from sightline.robot_side.limits import SafetyConfig
+from sightline.robot_side.ports import WheelAngles
+from sightline.robot_side.scribe import BackgroundWriter
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, Vision, driving
 

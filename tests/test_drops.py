@@ -5,17 +5,17 @@ import threading
 import time
 from collections import Counter
 
-from operator_side.status_text import drops_text, encoding_text, status_lines
-from protocol.channels import FRAME
-from protocol.messages import CameraModel, State, Status, StreamStatus
-from protocol.transports.memory import MemoryNetwork
-from protocol.transports.opening import LinkGroup
-from robot_side.child import NetworkSetup
-from robot_side.config import RobotConfig
-from robot_side.hardware.newest import LatestPicture
-from robot_side.network import Network
-from robot_side.parent import NetworkEnd
-from robot_side.ports import Picture
+from sightline.operator_side.status_text import drops_text, encoding_text, status_lines
+from sightline.protocol.channels import FRAME
+from sightline.protocol.messages import CameraModel, State, Status, StreamStatus
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.transports.opening import LinkGroup
+from sightline.robot_side.child import NetworkSetup
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.hardware.newest import LatestPicture
+from sightline.robot_side.network import Network
+from sightline.robot_side.parent import NetworkEnd
+from sightline.robot_side.ports import Picture
 from tests.camera_rig import jpeg
 from tests.link_rigs import until
 

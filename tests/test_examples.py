@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from operator_side.service_settings import load_service
-from robot_side.plugins import build_device
-from robot_side.ports import WheelAngles
+from sightline.operator_side.service_settings import load_service
+from sightline.robot_side.plugins import build_device
+from sightline.robot_side.ports import WheelAngles
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, Vision
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 import typer
 
-from operator_side import cli_faults
-from operator_side.faults.judge import MotorRow
-from operator_side.faults.report import with_rows_of
-from operator_side.faults.rows_crowd import _tick_checks, permille_us, undisturbed_gaps_us
-from operator_side.faults.sampler import Hole
-from operator_side.faults.worst import page_with_summary
+from sightline.operator_side import cli_faults
+from sightline.operator_side.faults.judge import MotorRow
+from sightline.operator_side.faults.report import with_rows_of
+from sightline.operator_side.faults.rows_crowd import _tick_checks, permille_us, undisturbed_gaps_us
+from sightline.operator_side.faults.sampler import Hole
+from sightline.operator_side.faults.worst import page_with_summary
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGE = "before\n<!-- worst values: x -->\nold\n<!-- /worst values -->\nafter\n"
@@ -109,7 +109,7 @@ def test_the_page_of_promises_shows_the_report_that_is_committed():
 
 
 def test_the_command_writes_both_pages(tmp_path, monkeypatch):
-    from operator_side.faults import parallel
+    from sightline.operator_side.faults import parallel
 
     (tmp_path / "safety.md").write_text(PAGE)
     monkeypatch.setattr(parallel, "run_cases", lambda rows, *_: [[_measured(row)] for row in rows])
@@ -122,8 +122,8 @@ def test_the_command_writes_both_pages(tmp_path, monkeypatch):
 
 
 def _measured(row):
-    from operator_side.faults.judge import Stop, stop_checks
-    from operator_side.faults.row import Outcome
+    from sightline.operator_side.faults.judge import Stop, stop_checks
+    from sightline.operator_side.faults.row import Outcome
 
     return Outcome(row, tuple(stop_checks(Stop(150.0, 560.0, 0.19))))
 

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.channels import CHANNELS, MAX_HEADER_BYTES, SCAN, check_robot_id, key_for, parse_key
-from protocol.codec import decode, decode_ranges, encode, encode_ranges
-from protocol.errors import WireError
-from protocol.jpeg import read_jpeg_size
-from protocol.legacy import (
+from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, SCAN, check_robot_id, key_for, parse_key
+from sightline.protocol.codec import decode, decode_ranges, encode, encode_ranges
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.legacy import (
     MAX_BOXES,
     MAX_BOXES_BYTES,
     decode_picture,
@@ -25,10 +25,10 @@ from protocol.legacy import (
     parse_dashed,
     text_bound,
 )
-from protocol.messages import WireModel
-from protocol.refusals import RejectReason
-from protocol.transports.websocket_framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
-from protocol.twist_text import MAX_TWIST_BYTES, format_twist, parse_twist
+from sightline.protocol.messages import WireModel
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.websocket_framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
+from sightline.protocol.twist_text import MAX_TWIST_BYTES, format_twist, parse_twist
 
 CORPUS = Path(__file__).parent / "fuzz_corpus"
 MOST_PICTURE_BYTES = 120

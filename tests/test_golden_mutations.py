@@ -7,11 +7,11 @@ import math
 
 import pytest
 
-from protocol.golden import INEXACT_KEY, outcome
-from protocol.golden_cases import CASES
-from protocol.golden_wires import FRAMING_CASES, framing_outcome
-from protocol.messages import MAX_INTEGER
-from protocol.refusals import RejectReason
+from sightline.protocol.golden import INEXACT_KEY, outcome
+from sightline.protocol.golden_cases import CASES
+from sightline.protocol.golden_wires import FRAMING_CASES, framing_outcome
+from sightline.protocol.messages import MAX_INTEGER
+from sightline.protocol.refusals import RejectReason
 
 ACCEPTED = [case for case in CASES if case.refuse is None]
 WIRED = [case for case in FRAMING_CASES if case.refuse is None]

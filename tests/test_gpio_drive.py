@@ -12,13 +12,13 @@ pytest.importorskip("gpiozero")
 from gpiozero import Device
 from gpiozero.pins.mock import MockFactory
 
-from operator_side.service_settings import load_service
-from protocol.errors import ConfigError, HardwareError
-from protocol.messages import Twist
-from robot_side.hardware.gpio_drive import GpioDrive
-from robot_side.hardware.gpio_table import DutyTable, table_of, table_text
-from robot_side.kinematics import DiffDriveConfig, wheel_speeds
-from robot_side.plugins import load_device
+from sightline.operator_side.service_settings import load_service
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.messages import Twist
+from sightline.robot_side.hardware.gpio_drive import GpioDrive
+from sightline.robot_side.hardware.gpio_table import DutyTable, table_of, table_text
+from sightline.robot_side.kinematics import DiffDriveConfig, wheel_speeds
+from sightline.robot_side.plugins import load_device
 from tests.drive_contract import check_drive
 from tests.gpio_rig import LEFT, RIGHT, NotingPin, both_ways, config
 
@@ -265,7 +265,7 @@ def test_the_end_is_low_before_the_pins_are_given_back_whoever_gives_them():
 
 def test_the_expected_wheels_turn_as_the_table_says(drive, monkeypatch):
     clock = SimpleNamespace(us=1_000_000)
-    monkeypatch.setattr("robot_side.hardware.gpio_drive.monotonic_us", lambda: clock.us)
+    monkeypatch.setattr("sightline.robot_side.hardware.gpio_drive.monotonic_us", lambda: clock.us)
     drive.set(0.0, 0.0)
     start = drive.wheels()
     drive.set(0.05 / 0.0325, -1.0)  # less than the least duty gives: it turns at that

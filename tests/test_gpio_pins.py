@@ -12,11 +12,11 @@ pytest.importorskip("gpiozero")
 from gpiozero import Device
 from gpiozero.pins.mock import MockFactory
 
-from operator_side.service_settings import load_service
-from protocol.errors import ConfigError, HardwareError
-from robot_side.hardware import gpio_low, gpio_pins
-from robot_side.hardware.gpio_drive import GpioDrive
-from robot_side.plugins import load_device
+from sightline.operator_side.service_settings import load_service
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.robot_side.hardware import gpio_low, gpio_pins
+from sightline.robot_side.hardware.gpio_drive import GpioDrive
+from sightline.robot_side.plugins import load_device
 from tests.gpio_rig import NotingPin, config
 
 ROOT = Path(__file__).parent.parent
@@ -124,7 +124,7 @@ def test_lgpio_leaves_no_pipe_where_it_is_imported_and_nobody_is_moved(tmp_path)
     """The real one, in a process of its own: in a service's working directory it could not even be imported."""
     pytest.importorskip("lgpio")
     code = (
-        "import os; from robot_side.hardware.gpio_low import import_lgpio; import_lgpio();"
+        "import os; from sightline.robot_side.hardware.gpio_low import import_lgpio; import_lgpio();"
         "print(os.getcwd(), os.listdir(), 'LG_WD' in os.environ)"
     )
     path = os.pathsep.join([str(ROOT), *filter(None, sys.path)])

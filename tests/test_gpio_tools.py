@@ -7,14 +7,14 @@ import tomllib
 
 import pytest
 
-from operator_side import cli, cli_robot_tools, wheel_test
-from protocol.errors import ConfigError
-from robot_side.config import PluginChoice, RobotConfig
-from robot_side.ending import EXIT_SIGNALS
+from sightline.operator_side import cli, cli_robot_tools, wheel_test
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.ending import EXIT_SIGNALS
 from tests.link_rigs import until
 from tests.terminal_rig import Terminal
 
-GPIO = PluginChoice(kind="robot_side.hardware.gpio_drive:GpioDrive", options={"wheel_radius_m": 0.0325})
+GPIO = PluginChoice(kind="sightline.robot_side.hardware.gpio_drive:GpioDrive", options={"wheel_radius_m": 0.0325})
 
 
 class Person:

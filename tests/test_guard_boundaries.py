@@ -6,9 +6,9 @@ import math
 import pytest
 from pydantic import ValidationError
 
-from protocol.messages import STILL, Twist
-from robot_side.guard import GuardConfig, RangeGuard, _Near
-from robot_side.ports import Ranges
+from sightline.protocol.messages import STILL, Twist
+from sightline.robot_side.guard import GuardConfig, RangeGuard, _Near
+from sightline.robot_side.ports import Ranges
 
 DEFAULTS = {
     "front_m": 0.07,

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from operator_side import cli, install
-from protocol.errors import ConfigError
-from robot_side.config import PluginChoice, RobotConfig
+from sightline.operator_side import cli, install
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import PluginChoice, RobotConfig
 
 PROGRAM, CONFIG = Path("/home/pi/.venv/bin/sightline"), Path("/home/pi/robot.toml")
 CAR = """
@@ -116,7 +116,7 @@ def test_a_robot_on_pins_has_its_own_pins_put_low_first_and_then_its_own_command
     robot = RobotConfig(drive=PluginChoice(kind="gpio", options=options))
     planned = install.drop_in(robot, PROGRAM, CONFIG, tmp_path)
     pins = " ".join(map(str, (20, 9, 8, 21, *enable)))
-    first = f"-/home/pi/.venv/bin/python -P -m robot_side.hardware.gpio_low {pins}"
+    first = f"-/home/pi/.venv/bin/python -P -m sightline.robot_side.hardware.gpio_low {pins}"
     own = stops_with(install.plan("robot", PROGRAM, CONFIG, "pi", tmp_path).text)
     assert stops_with(planned.text) == ["", first, *own], "emptied, then in this order"
     assert planned.path == tmp_path / "sightline-robot.service.d" / "gpio-low.conf"

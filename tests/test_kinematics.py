@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.messages import Twist
-from robot_side.kinematics import DiffDriveConfig, Odometer, twist_of, wheel_speeds
-from robot_side.ports import WheelAngles
+from sightline.protocol.messages import Twist
+from sightline.robot_side.kinematics import DiffDriveConfig, Odometer, twist_of, wheel_speeds
+from sightline.robot_side.ports import WheelAngles
 
 DRIVE = DiffDriveConfig()
 

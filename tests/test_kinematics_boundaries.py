@@ -5,9 +5,9 @@ import math
 import pytest
 from pydantic import ValidationError
 
-from protocol.messages import Twist
-from robot_side.kinematics import DiffDriveConfig, Odometer, twist_of, wheel_speeds
-from robot_side.ports import WheelAngles
+from sightline.protocol.messages import Twist
+from sightline.robot_side.kinematics import DiffDriveConfig, Odometer, twist_of, wheel_speeds
+from sightline.robot_side.ports import WheelAngles
 
 # In binary fractions, so that every expected value is exact.
 DRIVE = DiffDriveConfig(wheel_radius_m=0.125, track_width_m=0.5, max_wheel_rad_s=8.0)

@@ -6,7 +6,7 @@ import stat
 
 import pytest
 
-from robot_side.latch import StopLatch
+from sightline.robot_side.latch import StopLatch
 
 
 @pytest.fixture

@@ -2,8 +2,8 @@
 
 import pytest
 
-from protocol.messages import Holder
-from robot_side.lease import HUMANS, RANKS, Lease
+from sightline.protocol.messages import Holder
+from sightline.robot_side.lease import HUMANS, RANKS, Lease
 
 ROBOT, OTHER = "0000aaaa", "0000cccc"
 VISION, OTHER_VISION = Holder(source="vision", session="0000bbbb"), Holder(source="vision", session="0000cccc")

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.errors import WireError
-from protocol.jpeg import JpegSize
-from protocol.legacy import (
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import JpegSize
+from sightline.protocol.legacy import (
     MAX_BOXES,
     LegacyBox,
     decode_picture,
@@ -19,8 +19,8 @@ from protocol.legacy import (
     parse_dashed,
     text_bound,
 )
-from protocol.refusals import RejectReason
-from protocol.twist_text import parse_twist
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.twist_text import parse_twist
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 UNIT = st.floats(0, 1)

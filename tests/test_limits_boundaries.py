@@ -5,8 +5,8 @@ import math
 import pytest
 from pydantic import ValidationError
 
-from protocol.messages import STILL
-from robot_side.limits import (
+from sightline.protocol.messages import STILL
+from sightline.robot_side.limits import (
     MIN_TICK_US,
     STOP_DISTANCE_BOUND_M,
     STOP_TIME_BOUND_US,

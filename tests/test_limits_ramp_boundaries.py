@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from protocol.messages import STILL
-from robot_side.limits import (
+from sightline.protocol.messages import STILL
+from sightline.robot_side.limits import (
     AxisRamp,
     Ramp,
     SafetyConfig,

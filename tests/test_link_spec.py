@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST
-from protocol.transports.link import Message
-from protocol.transports.link_rules import INEXACT_KEY, OVERSIZE, LinkRules
+from sightline.protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.link_rules import INEXACT_KEY, OVERSIZE, LinkRules
 from tests.link_rigs import RIGS, MemoryRig
 
 

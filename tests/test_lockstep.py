@@ -2,12 +2,12 @@
 
 import pytest
 
-from operator_side.lockstep import Conditions, run_lockstep
-from operator_side.score import score
-from operator_side.score_bounds import checks_of
-from protocol.messages import State
-from sim.robot_model import load_robot
-from sim.scenario import load_scenario
+from sightline.operator_side.lockstep import Conditions, run_lockstep
+from sightline.operator_side.score import score
+from sightline.operator_side.score_bounds import checks_of
+from sightline.protocol.messages import State
+from sightline.sim.robot_model import load_robot
+from sightline.sim.scenario import load_scenario
 
 ROBOT = load_robot("raspberry")
 

@@ -2,17 +2,17 @@
 
 import math
 
-from protocol.channels import FRAME, TWIST
-from protocol.codec import decode, encode
-from protocol.messages import AnswerHeader, Echo, FrameHeader, State, Twist
-from protocol.transports.link import Message
-from protocol.transports.memory import MemoryNetwork
-from protocol.twist_text import format_twist
-from robot_side.config import PluginChoice, RobotConfig
-from robot_side.driving import DriverCore
-from robot_side.limits import STOP_TIME_BOUND_US, SafetyConfig
-from robot_side.ports import Picture, WheelAngles
-from robot_side.sending import NetworkCore
+from sightline.protocol.channels import FRAME, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, State, Twist
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.twist_text import format_twist
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driving import DriverCore
+from sightline.robot_side.limits import STOP_TIME_BOUND_US, SafetyConfig
+from sightline.robot_side.ports import Picture, WheelAngles
+from sightline.robot_side.sending import NetworkCore
 
 TICK_US, FRAME_US = 20_000, 33_333
 OUTAGE_US = (300_000_000, 302_000_000)

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from operator_side.bounded_threads import MAX_CONNECTIONS
-from operator_side.loopback_page import MAX_BODY_BYTES, Answer, as_json, page, served
-from protocol.errors import ConfigError, LinkError
+from sightline.operator_side.bounded_threads import MAX_CONNECTIONS
+from sightline.operator_side.loopback_page import MAX_BODY_BYTES, Answer, as_json, page, served
+from sightline.protocol.errors import ConfigError, LinkError
 from tests.link_rigs import until
 
 

@@ -12,9 +12,9 @@ from pydantic import ValidationError
 
 from tests.course_rig import Course, Drive, Eyes, Lidar, Row, Segment
 from tests.vision_rig import camera
-from vision_side.missions.body import Footprint
-from vision_side.missions.goto import Goto
-from vision_side.missions.port import Plan
+from sightline.vision_side.missions.body import Footprint
+from sightline.vision_side.missions.goto import Goto
+from sightline.vision_side.missions.port import Plan
 
 THYMIO = Footprint(front_m=0.08, rear_m=0.03, half_width_m=0.0635)
 CLEAR_M = 0.10

@@ -7,15 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from protocol.messages import FrameHeader
+from sightline.protocol.messages import FrameHeader
 from tests.course_rig import Course, Drive, Lidar, Row
 from tests.vision_rig import camera
-from vision_side.detect.port import Detection
-from vision_side.missions.body import Footprint
-from vision_side.missions.legs import Legs, nearest_legs
-from vision_side.missions.legs_baseline import LegsBaseline
-from vision_side.missions.port import RangeScan, View
-from vision_side.track import from_odometry
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.missions.body import Footprint
+from sightline.vision_side.missions.legs import Legs, nearest_legs
+from sightline.vision_side.missions.legs_baseline import LegsBaseline
+from sightline.vision_side.missions.port import RangeScan, View
+from sightline.vision_side.track import from_odometry
 
 LENS = camera()
 LEG_M = 0.055

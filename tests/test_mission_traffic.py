@@ -6,17 +6,17 @@ import random
 import numpy as np
 import pytest
 
-from protocol.messages import FrameHeader
-from sim.look import look_named
+from sightline.protocol.messages import FrameHeader
+from sightline.sim.look import look_named
 from tests.course_rig import Course, Drive, Row
 from tests.lane_rig import BLOCK_M, LENS, LaneWorld
-from vision_side.decode import Picture
-from vision_side.missions.body import Footprint
-from vision_side.missions.lamp import COLOURS, UNKNOWN, BoxLightReader, HousingLightReader, LampConfig
-from vision_side.missions.lane import Lane, LaneConfig
-from vision_side.missions.port import View
-from vision_side.missions.stop_line import StopConfig, StopLine
-from vision_side.missions.traffic_light import TrafficLight, TrafficLightBoxes
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.missions.body import Footprint
+from sightline.vision_side.missions.lamp import COLOURS, UNKNOWN, BoxLightReader, HousingLightReader, LampConfig
+from sightline.vision_side.missions.lane import Lane, LaneConfig
+from sightline.vision_side.missions.port import View
+from sightline.vision_side.missions.stop_line import StopConfig, StopLine
+from sightline.vision_side.missions.traffic_light import TrafficLight, TrafficLightBoxes
 
 LOOKS = ("plain", "dim", "bright", "warm", "cold", "desaturated", "quality30")
 RASPBERRY = Footprint(front_m=0.07, rear_m=0.10, half_width_m=0.09)

@@ -73,7 +73,7 @@ print([file for file in gate.TABLES if module_name(file) in sys.modules])
 
 def test_a_mutant_whose_module_is_there_already_is_no_trial():
     code = """
-import protocol.jpeg
+import sightline.protocol.jpeg
 from pathlib import Path
 from tests.mutation.mutants import mutants
 from tests.mutation.trial import start

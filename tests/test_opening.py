@@ -2,9 +2,9 @@
 
 import pytest
 
-from protocol.channels import FRAME, STATUS, TWIST
-from protocol.errors import ConfigError, LinkError
-from protocol.transports.opening import LinkGroup, open_link
+from sightline.protocol.channels import FRAME, STATUS, TWIST
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.opening import LinkGroup, open_link
 from tests.link_rigs import free_endpoint, until
 
 

@@ -2,12 +2,12 @@
 
 import pytest
 
-from operator_side.cli_options import options_of
-from operator_side.mission_asking import request_of
-from operator_side.mission_text import cannot, mission_line, mission_lines
-from operator_side.waypoints import waypoints_of, waypoints_of_file
-from protocol.errors import ConfigError
-from protocol.mission_messages import MissionReport
+from sightline.operator_side.cli_options import options_of
+from sightline.operator_side.mission_asking import request_of
+from sightline.operator_side.mission_text import cannot, mission_line, mission_lines
+from sightline.operator_side.waypoints import waypoints_of, waypoints_of_file
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.mission_messages import MissionReport
 
 
 def test_waypoints_are_pairs_of_metres():

@@ -5,16 +5,16 @@ import time
 
 import pytest
 
-from operator_side.requests import Operator, read_report
-from operator_side.status_text import status_line, status_lines
-from protocol.channels import REQUEST, STATUS, TWIST
-from protocol.codec import encode
-from protocol.errors import LinkError
-from protocol.messages import AnswerHeader, Echo, Status, Verb
-from protocol.transports.link import Message
-from protocol.transports.memory import MemoryNetwork
-from robot_side.config import PluginChoice, RobotConfig
-from robot_side.driving import DriverCore
+from sightline.operator_side.requests import Operator, read_report
+from sightline.operator_side.status_text import status_line, status_lines
+from sightline.protocol.channels import REQUEST, STATUS, TWIST
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import LinkError
+from sightline.protocol.messages import AnswerHeader, Echo, Status, Verb
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driving import DriverCore
 
 
 class PumpedRobot:

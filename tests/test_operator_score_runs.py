@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from operator_side import cli
-from operator_side.score import Score
-from operator_side.score_runs import Case, ScoreReport, cases, run_case, run_cases, scored_figures
-from operator_side.score_table import score_text
-from protocol.errors import ConfigError
+from sightline.operator_side import cli
+from sightline.operator_side.score import Score
+from sightline.operator_side.score_runs import Case, ScoreReport, cases, run_case, run_cases, scored_figures
+from sightline.operator_side.score_table import score_text
+from sightline.protocol.errors import ConfigError
 
 GOOD = Score(
     acquired_s=1.0, found_s=0.0, bearing_rms_deg=0.2, distance_rms_m=0.01, lost_percent=0.0, wall_contacts=0,

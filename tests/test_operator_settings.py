@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from operator_side.service_settings import load_service
-from operator_side.settings import ENV_PREFIX, SERVICES, load, model_of
-from operator_side.settings_keys import is_known, known_keys
-from operator_side.toml_text import toml_text
-from protocol.errors import ConfigError
+from sightline.operator_side.service_settings import load_service
+from sightline.operator_side.settings import ENV_PREFIX, SERVICES, load, model_of
+from sightline.operator_side.settings_keys import is_known, known_keys
+from sightline.operator_side.toml_text import toml_text
+from sightline.protocol.errors import ConfigError
 
 KEY = "safety.max_linear_mps"
 ENV = "SIGHTLINE_ROBOT__SAFETY__MAX_LINEAR_MPS"

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from operator_side.shaped_link import MAX_WAITING, DelayLine, ShapedLink
-from operator_side.shaped_vision import Shape
-from protocol.channels import FRAME, TWIST
-from protocol.errors import ConfigError
-from protocol.transports.memory import Leg, MemoryNetwork
+from sightline.operator_side.shaped_link import MAX_WAITING, DelayLine, ShapedLink
+from sightline.operator_side.shaped_vision import Shape
+from sightline.protocol.channels import FRAME, TWIST
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.memory import Leg, MemoryNetwork
 
 TIMES_US = st.lists(st.integers(0, 50_000), min_size=1, max_size=200)
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from operator_side.out_file import check_out_file
-from protocol.errors import ConfigError
+from sightline.operator_side.out_file import check_out_file
+from sightline.protocol.errors import ConfigError
 
 
 def test_a_file_that_can_be_written_passes(tmp_path):

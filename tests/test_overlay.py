@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.messages import STILL, FrameHeader, Twist
+from sightline.protocol.messages import STILL, FrameHeader, Twist
 from tests.vision_rig import ball_about_lens, camera, scene
-from vision_side.detect.port import Circle, Detection
-from vision_side.overlay import (
+from sightline.vision_side.detect.port import Circle, Detection
+from sightline.vision_side.overlay import (
     AXES,
     FILTERED,
     OTHER,
@@ -23,7 +23,7 @@ from vision_side.overlay import (
     radius_px,
     raw_px,
 )
-from vision_side.pipeline import Observation
+from sightline.vision_side.pipeline import Observation
 
 MODEL = camera()
 HEADER = FrameHeader(session="0000abcd", seq=7, t_us=1_000, applied=(0.1, -0.2), latency_us=34_000)

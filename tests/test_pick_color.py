@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from operator_side.pick_color import (
+from sightline.operator_side.pick_color import (
     MOST_MARKED,
     Box,
     check_trial,
@@ -18,11 +18,11 @@ from operator_side.pick_color import (
     trial_text,
     try_out,
 )
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 from tests.vision_rig import camera, scene
-from vision_side.config import HsvConfig, HsvRange
-from vision_side.decode import Picture
-from vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.config import HsvConfig, HsvRange
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.hsv import HsvDetector
 
 MODEL = camera()
 

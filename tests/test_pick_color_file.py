@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from operator_side.cli import run
-from operator_side.film import Film
-from operator_side.pick_color_file import check_config, write_ranges
-from operator_side.pick_color_toml import ranges_toml, with_ranges
-from operator_side.service_settings import load_service
-from protocol.errors import ConfigError
+from sightline.operator_side.cli import run
+from sightline.operator_side.film import Film
+from sightline.operator_side.pick_color_file import check_config, write_ranges
+from sightline.operator_side.pick_color_toml import ranges_toml, with_ranges
+from sightline.operator_side.service_settings import load_service
+from sightline.protocol.errors import ConfigError
 from tests.test_pick_color import ball_picture
-from vision_side.config import HsvRange
+from sightline.vision_side.config import HsvRange
 
 YELLOW = (HsvRange(hue_low_deg=41, hue_high_deg=57, saturation_low=0.42, value_low=0.4),)
 RED = (HsvRange(hue_low_deg=352, hue_high_deg=360), HsvRange(hue_low_deg=0, hue_high_deg=11))

@@ -4,14 +4,14 @@ import time
 
 import pytest
 
-from operator_side import cli, keys
-from operator_side.around_text import as_object, lines
-from protocol.channels import STATUS
-from protocol.codec import encode
-from protocol.errors import ConfigError, LinkError
-from protocol.messages import Stamp, State, Status
-from protocol.transports.link import Message
-from protocol.transports.presence import (
+from sightline.operator_side import cli, keys
+from sightline.operator_side.around_text import as_object, lines
+from sightline.protocol.channels import STATUS
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.messages import Stamp, State, Status
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.presence import (
     MAX_PEERS,
     PeerInfo,
     Presence,
@@ -20,11 +20,11 @@ from protocol.transports.presence import (
     presence_key,
     robot_with_same_id,
 )
-from protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
-from protocol.transports.zenoh import open_zenoh
-from protocol.transports.zenoh_around import discover, peers_at
-from protocol.transports.zenoh_session import open_session
-from protocol.transports.zenoh_site import open_fleet
+from sightline.protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
+from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh_around import discover, peers_at
+from sightline.protocol.transports.zenoh_session import open_session
+from sightline.protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint
 
 ROBOT = Presence(role="robot", robot="r1", session="0000abcd", software="sightline 9", host="shed", up_us=5_000_000)
@@ -166,8 +166,8 @@ def test_a_robot_of_another_id_and_its_own_restarted_self_are_welcome(router):
 
 def test_a_robot_that_ends_while_its_successor_looks_is_no_namesake(router, monkeypatch):
     first = open_zenoh("r1", connect=[router], role="robot")
-    monkeypatch.setattr("protocol.transports.zenoh_presence._SECOND_LOOK_S", 0.0)
-    monkeypatch.setattr("protocol.transports.zenoh_presence.time.sleep", lambda _seconds: first.close())
+    monkeypatch.setattr("sightline.protocol.transports.zenoh_presence._SECOND_LOOK_S", 0.0)
+    monkeypatch.setattr("sightline.protocol.transports.zenoh_presence.time.sleep", lambda _seconds: first.close())
     with open_zenoh("r1", connect=[router], role="robot") as second:
         assert second.connected
 
@@ -192,7 +192,7 @@ def test_when_secured_nobody_is_believed_to_be_a_robot_by_another_certificate(tm
     folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
     keys.make(folder, [])
     with open_zenoh("r2", listen=[endpoint], role="robot", secure=str(folder)):
-        from protocol.transports.secured import load_role_keys
+        from sightline.protocol.transports.secured import load_role_keys
 
         rogue = open_session((), [endpoint], 5.0, load_role_keys(str(folder), "viewer"))
         try:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from protocol import schema
-from protocol.channels import CHANNELS, Direction
+from sightline.protocol import schema
+from sightline.protocol.channels import CHANNELS, Direction
 
 DOCUMENT = json.loads((Path(schema.__file__).parent / "asyncapi.json").read_text("utf-8"))
 ALLOWED = {

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.channels import FRAME, STATUS, TWIST, Direction
-from protocol.transports.memory import MAX_IN_FLIGHT, Leg, MemoryNetwork
+from sightline.protocol.channels import FRAME, STATUS, TWIST, Direction
+from sightline.protocol.transports.memory import MAX_IN_FLIGHT, Leg, MemoryNetwork
 
 FRAME_US = 33_333
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from protocol.channels import (
+from sightline.protocol.channels import (
     CHANNELS,
     FRAME,
     MAX_HEADER_BYTES,
@@ -19,11 +19,20 @@ from protocol.channels import (
     parse_key,
     pattern_for,
 )
-from protocol.codec import check_sizes, decode, decode_ranges, encode, encode_ranges
-from protocol.errors import ConfigError, WireError
-from protocol.golden_cases import CASES
-from protocol.messages import MAX_INTEGER, AnswerHeader, Echo, FrameHeader, RequestHeader, RequestId, ScanHeader, Stamp
-from protocol.refusals import RejectReason
+from sightline.protocol.codec import check_sizes, decode, decode_ranges, encode, encode_ranges
+from sightline.protocol.errors import ConfigError, WireError
+from sightline.protocol.golden_cases import CASES
+from sightline.protocol.messages import (
+    MAX_INTEGER,
+    AnswerHeader,
+    Echo,
+    FrameHeader,
+    RequestHeader,
+    RequestId,
+    ScanHeader,
+    Stamp,
+)
+from sightline.protocol.refusals import RejectReason
 
 MODELS = sorted(
     {channel.header for channel in CHANNELS.values()} | {c.payload for c in CHANNELS.values() if c.payload},

@@ -10,12 +10,12 @@ import simplejpeg
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from protocol.errors import WireError
-from protocol.golden_case import jpeg, segments
-from protocol.jpeg import MAX_SEGMENTS, JpegSize, read_jpeg_size
-from protocol.messages import Twist
-from protocol.refusals import RejectReason
-from protocol.twist_text import MAX_TWIST_BYTES, format_twist, parse_twist
+from sightline.protocol.errors import WireError
+from sightline.protocol.golden_case import jpeg, segments
+from sightline.protocol.jpeg import MAX_SEGMENTS, JpegSize, read_jpeg_size
+from sightline.protocol.messages import Twist
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.twist_text import MAX_TWIST_BYTES, format_twist, parse_twist
 
 ABNF_NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
 GRAMMAR = re.compile(rf"{ABNF_NUMBER}\|{ABNF_NUMBER}", re.ASCII)

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 from pydantic import TypeAdapter
 
-from protocol import golden, schema
-from protocol.channels import CHANNELS
-from protocol.field_words import doc_of, unit_of
-from protocol.golden_case import MessageCase
-from protocol.golden_cases import CASES
-from protocol.golden_wires import FRAMING_CASES, READERS
-from protocol.refusals import RejectReason
-from protocol.twist_text import MAX_TWIST_BYTES
+from sightline.protocol import golden, schema
+from sightline.protocol.channels import CHANNELS
+from sightline.protocol.field_words import doc_of, unit_of
+from sightline.protocol.golden_case import MessageCase
+from sightline.protocol.golden_cases import CASES
+from sightline.protocol.golden_wires import FRAMING_CASES, READERS
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.twist_text import MAX_TWIST_BYTES
 
 VECTORS = Path(schema.__file__).parent / "vectors"
 README = (Path(schema.__file__).parent / "README.md").read_text("utf-8")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from protocol.clock import monotonic_us
+from sightline.protocol.clock import monotonic_us
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess, Vision, driving
 from tests.test_vision_switching import FarSensor

@@ -4,10 +4,10 @@ import itertools
 
 import pytest
 
-from protocol.channels import ACK, TWIST, key_for
-from protocol.messages import LastRejection
-from protocol.transports.zenoh_session import open_session
-from robot_side.refusal_log import RejectionLog
+from sightline.protocol.channels import ACK, TWIST, key_for
+from sightline.protocol.messages import LastRejection
+from sightline.protocol.transports.zenoh_session import open_session
+from sightline.robot_side.refusal_log import RejectionLog
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess, Vision
 

@@ -6,16 +6,16 @@ import time
 
 import pytest
 
-from protocol.clock import monotonic_us
-from protocol.errors import ConfigError
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError
 from tests.link_rigs import until
 from tests.remote_rig import GREY_JPEG, frame, within
-from vision_side.config import HsvConfig
-from vision_side.detect.local import Hsv
-from vision_side.detect.own_decoders import MAX_DECODERS, DecoderPool
-from vision_side.detect.port import Detection, Maker, result_of
-from vision_side.detect.remote.by_deadline import FAILED, DeadlineDetector
-from vision_side.detect.remote.fallback import GOOD_ANSWERS, RESERVE_US, Fallback
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.own_decoders import MAX_DECODERS, DecoderPool
+from sightline.vision_side.detect.port import Detection, Maker, result_of
+from sightline.vision_side.detect.remote.by_deadline import FAILED, DeadlineDetector
+from sightline.vision_side.detect.remote.fallback import GOOD_ANSWERS, RESERVE_US, Fallback
 
 
 class Held:

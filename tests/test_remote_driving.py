@@ -10,15 +10,15 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from operator_side.processes import Processes
+from sightline.operator_side.processes import Processes
 from tests.link_rigs import until
 from tests.remote_rig import Server, box, grpc_answer, grpc_started, http_reply, said
 from tests.robot_process import RobotProcess
 from tests.vision_rig import camera, jpeg_of, scene
-from vision_side.config import HsvConfig
-from vision_side.decode import Decoder
-from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.protobuf import fields
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.protobuf import fields
 
 pytestmark = pytest.mark.slow
 FAR_BALL = jpeg_of(scene(camera(), 2.2, 0.0))
@@ -50,7 +50,7 @@ def _driving(tmp_path, detector, *options, beside=None):
     robot = RobotProcess(tmp_path)
     (tmp_path / "pictures" / "0.jpg").write_bytes(FAR_BALL)
     log = tmp_path / "vision.log"
-    command = [sys.executable, "-u", "-m", "operator_side.cli", "vision", "--connect", robot.endpoint, "--detector",
+    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli", "vision", "--connect", robot.endpoint, "--detector",
                detector, "--set", "boxes.height_m=0.2", *options]
     with robot, log.open("wb") as out:
         assert until(lambda: "on" in robot.output(), 10)

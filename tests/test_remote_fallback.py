@@ -4,18 +4,18 @@ import time
 
 import pytest
 
-from protocol.channels import DETECTIONS
-from protocol.codec import encode
-from protocol.errors import ConfigError
-from protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo
-from protocol.transports.link import Message
-from protocol.transports.zenoh_site import MAX_ROBOTS as MOST_AT_A_SITE
+from sightline.protocol.channels import DETECTIONS
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.zenoh_site import MAX_ROBOTS as MOST_AT_A_SITE
 from tests.remote_rig import frame, within
 from tests.test_remote_deadline import FakeRemote, Held, _who
-from vision_side.detect.by_session import MAX_ROBOTS, PerSession
-from vision_side.detect.port import Maker, result_of
-from vision_side.detect.remote.fallback import GOOD_ANSWERS, Fallback
-from vision_side.detect.remote.zenoh_detector import ROLE, ZenohDetector
+from sightline.vision_side.detect.by_session import MAX_ROBOTS, PerSession
+from sightline.vision_side.detect.port import Maker, result_of
+from sightline.vision_side.detect.remote.fallback import GOOD_ANSWERS, Fallback
+from sightline.vision_side.detect.remote.zenoh_detector import ROLE, ZenohDetector
 
 
 class Partly(FakeRemote):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tests.remote_rig import ASKED, BALL_JPEG, COLUMNS, JPEG_INPUT, OUTPUTS, frame, grpc_answer
-from vision_side.detect.protobuf import fields, put, put_integers, varint
-from vision_side.detect.remote.oip import (
+from sightline.vision_side.detect.protobuf import fields, put, put_integers, varint
+from sightline.vision_side.detect.remote.oip import (
     Inferred,
     OipModel,
     OutputOptions,
@@ -20,11 +20,11 @@ from vision_side.detect.remote.oip import (
     model_of,
     tensor_of,
 )
-from vision_side.detect.remote.oip_json import read_infer, read_metadata
-from vision_side.detect.remote.oip_messages import infer_request, metadata_request
-from vision_side.detect.remote.oip_messages import read_infer as read_grpc
-from vision_side.detect.remote.oip_messages import read_metadata as read_grpc_metadata
-from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.remote.oip_json import read_infer, read_metadata
+from sightline.vision_side.detect.remote.oip_messages import infer_request, metadata_request
+from sightline.vision_side.detect.remote.oip_messages import read_infer as read_grpc
+from sightline.vision_side.detect.remote.oip_messages import read_metadata as read_grpc_metadata
+from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 PIXELS = Slot("image", "UINT8", (-1, 240, 320, 3))
 SIZE = (320, 240)
@@ -195,7 +195,7 @@ def test_a_grpc_request_names_frame_tensor_and_outputs():
 
 @pytest.mark.parametrize("value", [0, 1, 127, 128, 300, 2**53, -1, -(2**63)])
 def test_integers_come_back_as_they_went(value):
-    from vision_side.detect.protobuf import integers
+    from sightline.vision_side.detect.protobuf import integers
 
     assert integers(varint(value)) == [value]
 

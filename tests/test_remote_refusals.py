@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from tests.remote_rig import COLUMNS, JPEG_INPUT, OUTPUTS, Server, frame, http_reply, within
-from vision_side.detect.remote.address import parse_address
-from vision_side.detect.remote.asking import ServerDetector
-from vision_side.detect.remote.oip import Inferred, OutputOptions, detections_of
-from vision_side.detect.remote.oip_http import HttpServer
-from vision_side.detect.remote.refusing import ErrorCounters, NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.remote.address import parse_address
+from sightline.vision_side.detect.remote.asking import ServerDetector
+from sightline.vision_side.detect.remote.oip import Inferred, OutputOptions, detections_of
+from sightline.vision_side.detect.remote.oip_http import HttpServer
+from sightline.vision_side.detect.remote.refusing import ErrorCounters, NoAnswerError, NoAnswerReason
 
 
 def _refuse(tally, count):

@@ -19,11 +19,11 @@ from tests.remote_rig import (
     grpc_started,
     within,
 )
-from vision_side.config import DetectorConfig, HsvConfig, VisionConfig
-from vision_side.detect.choice import build_detector
-from vision_side.detect.contract import check_detector
-from vision_side.detect.local import Hsv
-from vision_side.detect.remote.fallback import Fallback
+from sightline.vision_side.config import DetectorConfig, HsvConfig, VisionConfig
+from sightline.vision_side.detect.choice import build_detector
+from sightline.vision_side.detect.contract import check_detector
+from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.remote.fallback import Fallback
 
 ROOT = Path(__file__).parent.parent
 HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
@@ -176,7 +176,7 @@ def test_own_eyes_drive_on_while_a_grpc_server_is_gone_and_it_drives_again_withi
 
 
 def test_grpc_without_its_package_is_said_with_the_command(monkeypatch):
-    from protocol.errors import ConfigError
+    from sightline.protocol.errors import ConfigError
 
     monkeypatch.setitem(sys.modules, "grpc", None)
     with pytest.raises(ConfigError, match=r"pip install 'sightline\[grpc\]'"):

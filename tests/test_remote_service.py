@@ -4,17 +4,17 @@ from dataclasses import replace
 
 import pytest
 
-from protocol.channels import DETECTIONS, FRAME
-from protocol.clock import monotonic_us
-from protocol.codec import decode, encode
-from protocol.messages import Detections, FrameHeader
-from protocol.transports.memory import MemoryNetwork
+from sightline.protocol.channels import DETECTIONS, FRAME
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import Detections, FrameHeader
+from sightline.protocol.transports.memory import MemoryNetwork
 from tests.remote_rig import BALL_JPEG
-from vision_side.config import HsvConfig
-from vision_side.detect.label_filter import LabelFilter
-from vision_side.detect.local import Hsv
-from vision_side.detect.port import Circle, Detection, Maker, result_of
-from vision_side.detector_service import DetectorService, ServingOptions
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.detect.label_filter import LabelFilter
+from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.port import Circle, Detection, Maker, result_of
+from sightline.vision_side.detector_service import DetectorService, ServingOptions
 
 HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
 GOOD = Detection(10.0, 10.0, 50.0, 50.0, 0.9, "ball")

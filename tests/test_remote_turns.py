@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from vision_side.detector_turns import FairQueue
+from sightline.vision_side.detector_turns import FairQueue
 
 DEADLINE_US = 100_000
 

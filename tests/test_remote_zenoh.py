@@ -9,22 +9,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from operator_side.around_text import as_object, lines
-from protocol.channels import DETECTIONS, FRAME, STATUS
-from protocol.codec import encode
-from protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader, Stamp, State, Status
-from protocol.transports.zenoh import open_zenoh
-from protocol.transports.zenoh_around import peers_at
-from protocol.transports.zenoh_site import open_fleet
+from sightline.operator_side.around_text import as_object, lines
+from sightline.protocol.channels import DETECTIONS, FRAME, STATUS
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import (
+    DetectedBox,
+    Detections,
+    DetectionsHeader,
+    Echo,
+    FrameHeader,
+    Stamp,
+    State,
+    Status,
+)
+from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh_around import peers_at
+from sightline.protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 from tests.remote_rig import BALL_JPEG, GREY_JPEG, frame, within
 from tests.vision_rig import jpeg_of
-from vision_side.config import DetectorConfig, HsvConfig
-from vision_side.decode import Decoder
-from vision_side.detect.local import Hsv
-from vision_side.detect.port import DetectFrame
-from vision_side.detect.remote.zenoh_detector import ZenohDetector
-from vision_side.detector_service import ROLE, DetectorService, ServingOptions
+from sightline.vision_side.config import DetectorConfig, HsvConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.port import DetectFrame
+from sightline.vision_side.detect.remote.zenoh_detector import ZenohDetector
+from sightline.vision_side.detector_service import ROLE, DetectorService, ServingOptions
 
 CORNERS = ("x1_px", "y1_px", "x2_px", "y2_px")
 DEADLINE_S = DetectorConfig().deadline_s

@@ -2,14 +2,14 @@
 
 import pytest
 
-from protocol.errors import WireError
-from protocol.messages import STILL, Echo, Request, RequestHeader, State, Twist, Verb
-from protocol.refusals import RejectReason
-from robot_side.limits import (
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import STILL, Echo, Request, RequestHeader, State, Twist, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.robot_side.limits import (
     SafetyConfig,
     age_factor,
 )
-from robot_side.states import is_armed
+from sightline.robot_side.states import is_armed
 from tests.safety_rig import HUMAN, MS, OTHER, ROBOT, VISION, Rig
 
 

@@ -4,12 +4,12 @@ import math
 
 import pytest
 
-from protocol.errors import WireError
-from protocol.messages import STILL, Echo, LastRejection, State, Twist, Verb
-from protocol.refusals import RejectReason
-from robot_side.limits import SafetyConfig
-from robot_side.safety import Decision, SafetyGate
-from robot_side.states import TRANSITIONS, Event, is_armed, next_state
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import STILL, Echo, LastRejection, State, Twist, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.robot_side.limits import SafetyConfig
+from sightline.robot_side.safety import Decision, SafetyGate
+from sightline.robot_side.states import TRANSITIONS, Event, is_armed, next_state
 from tests.gate_rig import GUEST, VISION_HOLDER, A, D, F, G, H, S, driving, guest, guest_driving
 from tests.safety_rig import HUMAN, OTHER, ROBOT, VISION, Rig
 

@@ -2,11 +2,11 @@
 
 import pytest
 
-from protocol.errors import WireError
-from protocol.messages import STILL, AnswerHeader, Echo, Holder, Request, RequestHeader, Verb
-from protocol.refusals import RejectReason
-from robot_side.limits import SafetyConfig
-from robot_side.safety import Decision, SafetyGate
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import STILL, AnswerHeader, Echo, Holder, Request, RequestHeader, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.robot_side.limits import SafetyConfig
+from sightline.robot_side.safety import Decision, SafetyGate
 from tests.gate_rig import HUMAN_HOLDER, VISION_HOLDER, A, D, H, driving, refused
 from tests.safety_rig import HUMAN, OTHER, ROBOT, VISION, Rig
 

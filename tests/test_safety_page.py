@@ -3,9 +3,9 @@
 import re
 from pathlib import Path
 
-from protocol.messages import State
-from robot_side.limits import SafetyConfig
-from robot_side.states import TRANSITIONS, Event
+from sightline.protocol.messages import State
+from sightline.robot_side.limits import SafetyConfig
+from sightline.robot_side.states import TRANSITIONS, Event
 
 PAGE = Path(__file__).parent.parent / "docs" / "safety.md"
 MARKS = re.compile(r"(<!-- generated from robot_side/states.py[^\n]*-->\n).*?(<!-- /generated -->)", re.DOTALL)

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.errors import WireError
-from protocol.messages import STILL, State, Twist, Verb
-from protocol.refusals import RejectReason
-from robot_side.guard import GuardConfig, RangeGuard
-from robot_side.ports import Ranges
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import STILL, State, Twist, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.robot_side.guard import GuardConfig, RangeGuard
+from sightline.robot_side.ports import Ranges
 from tests.safety_rig import MS, Rig
 
 

@@ -4,11 +4,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
-from protocol.errors import WireError
-from protocol.messages import STILL, State, Verb
-from protocol.refusals import RejectReason
-from robot_side import safety
-from robot_side.states import TRANSITIONS
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import STILL, State, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.robot_side import safety
+from sightline.robot_side.states import TRANSITIONS
 from tests.safety_rig import HUMAN, MS, OTHER, VISION, Rig
 
 RANK = {"guest": 0, "vision": 1, "teleop": 2}

@@ -5,12 +5,12 @@ import math
 
 import pytest
 
-from protocol.messages import STILL, Verb
-from protocol.refusals import RejectReason
-from robot_side.guard import GuardConfig, RangeGuard
-from robot_side.limits import AxisRamp
-from robot_side.ports import Ranges
-from robot_side.safety import Decision
+from sightline.protocol.messages import STILL, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.robot_side.guard import GuardConfig, RangeGuard
+from sightline.robot_side.limits import AxisRamp
+from sightline.robot_side.ports import Ranges
+from sightline.robot_side.safety import Decision
 from tests.gate_rig import (
     A,
     D,

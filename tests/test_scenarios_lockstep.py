@@ -5,12 +5,12 @@ from statistics import fmean
 
 import pytest
 
-from operator_side.lockstep import Conditions, Run, run_lockstep
-from operator_side.scenario_settings import robot_of
-from operator_side.score_course import STEP_S
-from protocol.messages import State
-from sim.scenario import load_scenario, scenario_names
-from sim.truth import Truth
+from sightline.operator_side.lockstep import Conditions, Run, run_lockstep
+from sightline.operator_side.scenario_settings import robot_of
+from sightline.operator_side.score_course import STEP_S
+from sightline.protocol.messages import State
+from sightline.sim.scenario import load_scenario, scenario_names
+from sightline.sim.truth import Truth
 
 BASICS = {"static", "circle", "eight", "pushed", "behind", "walls"}
 """Those that test_lockstep.py holds against all their bounds."""

@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import pytest
 
-from operator_side.demo import MOTOR_LOG, RECORDING, DemoOptions, DemoRun, run_demo
-from operator_side.replay import replay
-from sim.scenario import Scenario, load_scenario, scenario_names
-from sim.truth import Truth
+from sightline.operator_side.demo import MOTOR_LOG, RECORDING, DemoOptions, DemoRun, run_demo
+from sightline.operator_side.replay import replay
+from sightline.sim.scenario import Scenario, load_scenario, scenario_names
+from sightline.sim.truth import Truth
 
 IN_EVERY_TEST_RUN = "legs"
 """It has all that `circle` of test_operator_demo.py has not: range scans, boxes that somebody else finds."""

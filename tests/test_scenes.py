@@ -10,13 +10,13 @@ pytest.importorskip("pybullet")
 
 import simplejpeg
 
-from sim import scene_backdrop
-from sim.scene_defects import as_seen, streak, with_defects
-from sim.scene_plan import plan_scene
-from sim.scene_render import SceneRenderer
-from sim.scene_texture_parts import SIDE
-from sim.scene_textures import FAMILIES, JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED, texture
-from sim.scenes import (
+from sightline.sim import scene_backdrop
+from sightline.sim.scene_defects import as_seen, streak, with_defects
+from sightline.sim.scene_plan import plan_scene
+from sightline.sim.scene_render import SceneRenderer
+from sightline.sim.scene_texture_parts import SIDE
+from sightline.sim.scene_textures import FAMILIES, JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED, texture
+from sightline.sim.scenes import (
     BALL_PX,
     COLUMNS,
     HARDER_FROM,
@@ -33,7 +33,7 @@ from sim.scenes import (
     Lens,
     trained_column,
 )
-from sim.scenes import TRAINED as TRAINED_COLUMN
+from sightline.sim.scenes import TRAINED as TRAINED_COLUMN
 from tests import judged_scenes
 
 ALL = [*COLUMNS.values(), THINGS, TRAINED_COLUMN]

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from operator_side.score import median_and_worst, score
-from operator_side.score_bounds import checks_of
-from sim.truth import Truth
+from sightline.operator_side.score import median_and_worst, score
+from sightline.operator_side.score_bounds import checks_of
+from sightline.sim.truth import Truth
 
 
 def truth(t_s, *, bearing_deg=0.0, distance_m=0.8, visible=True, walls=0, x_m=0.0):

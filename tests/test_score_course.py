@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from operator_side.score import median_and_worst, score
-from operator_side.score_bounds import BOUNDS, UNITS, checks_of
-from operator_side.score_course import figures_of, goal_figures, legs_figures, light_figures
-from sim.scenario import load_scenario, scenario_names
+from sightline.operator_side.score import median_and_worst, score
+from sightline.operator_side.score_bounds import BOUNDS, UNITS, checks_of
+from sightline.operator_side.score_course import figures_of, goal_figures, legs_figures, light_figures
+from sightline.sim.scenario import load_scenario, scenario_names
 from tests.test_score import samples, truth
 
 

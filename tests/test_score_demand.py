@@ -10,17 +10,17 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from operator_side import cli, cli_score_detectors
-from operator_side import score_scenes as score_scenes_file
-from operator_side.score_detectors import Figures
-from operator_side.score_detectors_bounds import LEAST_HITS, all_detector_checks, detector_checks
-from operator_side.score_detectors_text import check_lines
-from operator_side.score_scenes import LABELLED, Report, close_subjects, score_scenes, subjects
-from protocol.config import Config as Settings
-from protocol.errors import ConfigError
-from sim.scenes import COLUMNS
+from sightline.operator_side import cli, cli_score_detectors
+from sightline.operator_side import score_scenes as score_scenes_file
+from sightline.operator_side.score_detectors import Figures
+from sightline.operator_side.score_detectors_bounds import LEAST_HITS, all_detector_checks, detector_checks
+from sightline.operator_side.score_detectors_text import check_lines
+from sightline.operator_side.score_scenes import LABELLED, Report, close_subjects, score_scenes, subjects
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.errors import ConfigError
+from sightline.sim.scenes import COLUMNS
 from tests.remote_rig import frame
-from vision_side.detect.port import Detection, Maker, result_of
+from sightline.vision_side.detect.port import Detection, Maker, result_of
 
 GOOD = Figures(500, 400, 0.85, 0.1, 0.05, 0.05, 1.0, 3.0, 900.0)
 EVERY = dict.fromkeys(LABELLED, (300, 0.8))
@@ -173,7 +173,7 @@ def test_the_sheet_says_the_same_as_the_table(capsys, eyes, monkeypatch, tmp_pat
     monkeypatch.setattr(eyes.Eyes, "answer", staticmethod(
         lambda frame: result_of(frame, [Detection(1, 1, 9, 9, 0.9, "cup")], Maker("eyes"))))
     said = []
-    monkeypatch.setattr("operator_side.score_sheet.cv2.putText", lambda _picture, text, *_rest: said.append(text))
+    monkeypatch.setattr("sightline.operator_side.score_sheet.cv2.putText", lambda _picture, text, *_rest: said.append(text))
     _, out, _ = told(capsys, NAME, "--json", "--set", "target.label=cup", "--sheet", str(tmp_path / "sheet.png"))
     table = json.loads(out)["columns"]["nominal"][NAME]
     assert table["missed"] == 0 and said and f"{NAME}: none" not in said and f"{NAME}: missed" not in said

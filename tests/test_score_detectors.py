@@ -10,16 +10,16 @@ pytest.importorskip("pybullet")
 
 import cv2
 
-from operator_side import cli, cli_score_detectors
-from operator_side.score_detectors import FrameResult, LabelMatches, figures, frame_result, precisions
-from operator_side.score_detectors_text import markdown, text
-from operator_side.score_scenes import score_scenes, subjects
-from operator_side.score_sheet import Sheet
-from operator_side.train_choice import ball_threshold, label_threshold
-from sim.scene_plan import plan_scene
-from sim.scenes import COLUMNS, JUDGED_FROM, LabelledBox, Scene
-from vision_side.detect.overlap import overlap
-from vision_side.detect.port import Circle, Detection
+from sightline.operator_side import cli, cli_score_detectors
+from sightline.operator_side.score_detectors import FrameResult, LabelMatches, figures, frame_result, precisions
+from sightline.operator_side.score_detectors_text import markdown, text
+from sightline.operator_side.score_scenes import score_scenes, subjects
+from sightline.operator_side.score_sheet import Sheet
+from sightline.operator_side.train_choice import ball_threshold, label_threshold
+from sightline.sim.scene_plan import plan_scene
+from sightline.sim.scenes import COLUMNS, JUDGED_FROM, LabelledBox, Scene
+from sightline.vision_side.detect.overlap import overlap
+from sightline.vision_side.detect.port import Circle, Detection
 
 BALL = LabelledBox("ball", (100.0, 100.0, 140.0, 140.0), 1.0, (100.0, 100.0, 140.0, 140.0))
 OTHER = (200.0, 100.0, 240.0, 160.0)

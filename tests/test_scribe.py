@@ -8,9 +8,9 @@ import threading
 
 import pytest
 
-from protocol.log_lines import JsonLineStream
-from robot_side.latch import StopLatch
-from robot_side.scribe import BackgroundWriter
+from sightline.protocol.log_lines import JsonLineStream
+from sightline.robot_side.latch import StopLatch
+from sightline.robot_side.scribe import BackgroundWriter
 from tests.link_rigs import until
 
 

@@ -7,8 +7,8 @@ from itertools import product
 
 import pytest
 
-from operator_side import keys
-from protocol.channels import (
+from sightline.operator_side import keys
+from sightline.protocol.channels import (
     ACK,
     CHANNELS,
     FRAME,
@@ -20,8 +20,8 @@ from protocol.channels import (
     TWIST,
     Direction,
 )
-from protocol.errors import ConfigError, LinkError
-from protocol.transports.secured import (
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.secured import (
     ROLES,
     SOURCES_OF_ROLE,
     certificate_role,
@@ -29,10 +29,10 @@ from protocol.transports.secured import (
     may_publish,
     may_subscribe,
 )
-from protocol.transports.websocket_keys import read_tokens
-from protocol.transports.zenoh import open_zenoh
-from protocol.transports.zenoh_around import list_robots
-from protocol.transports.zenoh_session import MAX_MESSAGE_BYTES, open_session
+from sightline.protocol.transports.websocket_keys import read_tokens
+from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh_around import list_robots
+from sightline.protocol.transports.zenoh_session import MAX_MESSAGE_BYTES, open_session
 from tests.link_rigs import free_endpoint, until
 
 SAID = (TWIST, ACK, REQUEST, MISSION, REPORT)

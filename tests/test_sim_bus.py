@@ -15,19 +15,19 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from protocol.errors import ConfigError, HardwareError
-from protocol.jpeg import read_jpeg_size
-from robot_side.ports import Camera, Drive, RangeSensor
-from sim.bus import MOTION, MOTION_SET, SimCamera, SimDrive, SimRange, TruthReader
-from sim.robot_model import load_robot
-from sim.service import SimConfig, run
-from sim.sockets import SocketFolder
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.robot_side.ports import Camera, Drive, RangeSensor
+from sightline.sim.bus import MOTION, MOTION_SET, SimCamera, SimDrive, SimRange, TruthReader
+from sightline.sim.robot_model import load_robot
+from sightline.sim.service import SimConfig, run
+from sightline.sim.sockets import SocketFolder
 
 pytestmark = pytest.mark.slow
 
-SERVE = "import sys; from sim.service import SimConfig, run; sys.exit(run(SimConfig.model_validate_json(sys.argv[1])))"
+SERVE = "import sys; from sightline.sim.service import SimConfig, run; sys.exit(run(SimConfig.model_validate_json(sys.argv[1])))"
 DRIVE = (
-    "import sys, time; from sim.bus import SimDrive; drive = SimDrive(SimDrive.Config(socket_dir=sys.argv[1]))\n"
+    "import sys, time; from sightline.sim.bus import SimDrive; drive = SimDrive(SimDrive.Config(socket_dir=sys.argv[1]))\n"
     "drive.set(6.0, 8.0); print('driving', flush=True); time.sleep(60)"
 )
 
@@ -213,5 +213,5 @@ def test_bad_settings_are_one_line(tmp_path):
 
 
 def test_the_robots_plug_ins_import_no_numpy_and_no_pybullet():
-    code = "import sys, sim.bus; print(sorted({'numpy', 'pybullet', 'cv2', 'simplejpeg'} & set(sys.modules)))"
+    code = "import sys, sightline.sim.bus; print(sorted({'numpy', 'pybullet', 'cv2', 'simplejpeg'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

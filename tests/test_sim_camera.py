@@ -9,10 +9,10 @@ pytest.importorskip("pybullet")
 
 import simplejpeg
 
-from protocol.jpeg import read_jpeg_size
-from sim.look import look_named
-from sim.scenario import Wall, load_scenario
-from sim.world import World
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.sim.look import look_named
+from sightline.sim.scenario import Wall, load_scenario
+from sightline.sim.world import World
 from tests.sim_rig import robot_with, seen_at
 
 BALL_RADIUS_M = 0.10

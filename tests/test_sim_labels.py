@@ -10,19 +10,19 @@ pytest.importorskip("pybullet")
 import numpy as np
 import simplejpeg
 
-from operator_side.labels import Labels, boxes_message
-from operator_side.labels_service import LabelPublisher
-from protocol.channels import DETECTIONS, FRAME
-from protocol.codec import decode, encode
-from protocol.messages import Detections, DetectionsHeader, FrameHeader
-from protocol.transports.memory import MemoryNetwork
-from sim.bus import SimCamera, TruthReader
-from sim.label_bus import Label, LabelReader, to_json
-from sim.scenario import Wall, load_scenario
-from sim.world import World
+from sightline.operator_side.labels import Labels, boxes_message
+from sightline.operator_side.labels_service import LabelPublisher
+from sightline.protocol.channels import DETECTIONS, FRAME
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import Detections, DetectionsHeader, FrameHeader
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.sim.bus import SimCamera, TruthReader
+from sightline.sim.label_bus import Label, LabelReader, to_json
+from sightline.sim.scenario import Wall, load_scenario
+from sightline.sim.world import World
 from tests.sim_rig import robot_with, seen_at
 from tests.test_sim_bus import eventually, started
-from vision_side.config import BoxesConfig
+from sightline.vision_side.config import BoxesConfig
 
 
 def world_of(distance_m=1.2, bearing_deg=0.0, walls=(), seed=1) -> World:

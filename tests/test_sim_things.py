@@ -12,15 +12,15 @@ pytest.importorskip("pybullet")
 import numpy as np
 import simplejpeg
 
-from protocol.errors import ConfigError
-from sim.light import LIT, Light, Phase, color_of
-from sim.robot_model import load_robot
-from sim.scenario import load_scenario
-from sim.start import goals_seen
-from sim.target import PathMover
-from sim.things import Legs
-from sim.toml_file import laid_over
-from sim.world import World
+from sightline.protocol.errors import ConfigError
+from sightline.sim.light import LIT, Light, Phase, color_of
+from sightline.sim.robot_model import load_robot
+from sightline.sim.scenario import load_scenario
+from sightline.sim.start import goals_seen
+from sightline.sim.target import PathMover
+from sightline.sim.things import Legs
+from sightline.sim.toml_file import laid_over
+from sightline.sim.world import World
 from tests.sim_rig import robot_with
 
 # --- legs --------------------------------------------------------------------------------------------------------
@@ -170,7 +170,7 @@ def test_waypoints_are_told_as_the_robot_counts(seed):
 
 @pytest.mark.parametrize(("look", "least", "most"), [("plain", 0.8, 1.0), ("desaturated", 0.3, 0.6)])
 def test_a_desaturated_picture_is_paler(look, least, most):
-    from sim.look import look_named
+    from sightline.sim.look import look_named
 
     with World(load_scenario("ball").model_copy(update={"look": look_named(look)}), robot_with(), 3) as world:
         rgb = simplejpeg.decode_jpeg(world.render(), "RGB").astype(float)

@@ -6,10 +6,10 @@ from xml.etree import ElementTree
 
 import pytest
 
-from protocol.errors import ConfigError
-from sim.body import outline, urdf_body, urdf_from_model
-from sim.robot_model import ROBOTS, load_robot, robot_names
-from sim.urdf import Urdf
+from sightline.protocol.errors import ConfigError
+from sightline.sim.body import outline, urdf_body, urdf_from_model
+from sightline.sim.robot_model import ROBOTS, load_robot, robot_names
+from sightline.sim.urdf import Urdf
 
 WHEELS = ("left_wheel_joint", "right_wheel_joint")
 

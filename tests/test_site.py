@@ -12,11 +12,11 @@ from contextlib import ExitStack, contextmanager
 import pytest
 import zenoh
 
-from operator_side import keys
-from protocol.channels import ACK, FRAME, REQUEST, STATUS, TWIST
-from protocol.errors import ConfigError, LinkError
-from protocol.transports.zenoh import open_zenoh
-from protocol.transports.zenoh_site import open_fleet
+from sightline.operator_side import keys
+from sightline.protocol.channels import ACK, FRAME, REQUEST, STATUS, TWIST
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, Vision, driving
 
@@ -117,7 +117,7 @@ def test_a_stock_zenoh_router_does_as_well_as_ours():
 
 @contextmanager
 def _router(endpoint):
-    command = [sys.executable, "-m", "operator_side.cli", "router", "--listen", endpoint]
+    command = [sys.executable, "-m", "sightline.operator_side.cli", "router", "--listen", endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout.readline().startswith("router: on ")

@@ -6,14 +6,14 @@ import time
 
 import pytest
 
-from protocol.channels import REQUEST, STATUS, TWIST
-from protocol.codec import encode
-from protocol.messages import Request, RequestHeader, Verb
-from protocol.transports.link import Message
-from protocol.transports.zenoh import open_zenoh
-from robot_side.child import DriverEnd
-from robot_side.config import RobotConfig
-from robot_side.held import MAX_PENDING, PendingRequests
+from sightline.protocol.channels import REQUEST, STATUS, TWIST
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import Request, RequestHeader, Verb
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.robot_side.child import DriverEnd
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.held import MAX_PENDING, PendingRequests
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess, Vision, driving
 

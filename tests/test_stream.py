@@ -5,8 +5,8 @@ import random
 
 import pytest
 
-from protocol.messages import Holder
-from robot_side.stream import Stream, StreamConfig
+from sightline.protocol.messages import Holder
+from sightline.robot_side.stream import Stream, StreamConfig
 
 VISION, VIEWER = Holder(source="vision", session="0000bbbb"), Holder(source="viewer", session="0000cccc")
 FRAME_US = 33_333

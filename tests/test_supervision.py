@@ -5,9 +5,9 @@ import os
 import socket
 from pathlib import Path
 
-from robot_side.config import PluginChoice, RobotConfig
-from robot_side.driver import zero_motors
-from robot_side.supervision import SystemdNotifier
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver import zero_motors
+from sightline.robot_side.supervision import SystemdNotifier
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from operator_side.teleop import Mode
-from operator_side.teleop_keys import MOVES
-from protocol.messages import STILL, State, Twist, Verb
+from sightline.operator_side.teleop import Mode
+from sightline.operator_side.teleop_keys import MOVES
+from sightline.protocol.messages import STILL, State, Twist, Verb
 from tests.teleop_rig import PERSON, VISION, TeleopRig, vision_drives
 
 MOVING_MS, ZERO_MS = 120, 150

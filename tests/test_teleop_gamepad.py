@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from operator_side.teleop_evdev import Gamepad
-from operator_side.teleop_pad import (
+from sightline.operator_side.teleop_evdev import Gamepad
+from sightline.operator_side.teleop_pad import (
     ABS_X,
     ABS_Y,
     BTN_EAST,
@@ -20,7 +20,7 @@ from operator_side.teleop_pad import (
     Pad,
     PadKey,
 )
-from protocol.errors import ConfigError, HardwareError
+from sightline.protocol.errors import ConfigError, HardwareError
 
 
 class Device:

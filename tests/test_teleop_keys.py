@@ -4,10 +4,10 @@ import itertools
 
 import pytest
 
-from operator_side.teleop_keys import LONGEST_HOLD_US, MOVES, Hold, split_keys
-from operator_side.teleop_pad import ABS_RX, ABS_X, ABS_Y, BTN_EAST, BTN_SOUTH, BTN_TL, BTN_TR, Pad, PadKey
-from operator_side.teleop_speed import Speeds, SpeedUp
-from protocol.messages import STILL, State, Status, Twist
+from sightline.operator_side.teleop_keys import LONGEST_HOLD_US, MOVES, Hold, split_keys
+from sightline.operator_side.teleop_pad import ABS_RX, ABS_X, ABS_Y, BTN_EAST, BTN_SOUTH, BTN_TL, BTN_TR, Pad, PadKey
+from sightline.operator_side.teleop_speed import Speeds, SpeedUp
+from sightline.protocol.messages import STILL, State, Status, Twist
 
 # --- keys ------------------------------------------------------------------------------------------------------------
 

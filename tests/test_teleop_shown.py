@@ -2,12 +2,12 @@
 
 import pytest
 
-from operator_side.teleop import Teleop
-from operator_side.teleop_speed import Speeds
-from operator_side.teleop_text import live_line
-from protocol.channels import STATUS
-from protocol.messages import STILL, State, Twist, Verb
-from protocol.transports.link import Message
+from sightline.operator_side.teleop import Teleop
+from sightline.operator_side.teleop_speed import Speeds
+from sightline.operator_side.teleop_text import live_line
+from sightline.protocol.channels import STATUS
+from sightline.protocol.messages import STILL, State, Twist, Verb
+from sightline.protocol.transports.link import Message
 from tests.teleop_rig import PERSON, TeleopRig, vision_drives
 
 

@@ -8,9 +8,9 @@ import time
 
 import pytest
 
-from operator_side import cli
-from protocol.messages import State
-from protocol.transports.zenoh_session import open_session
+from sightline.operator_side import cli
+from sightline.protocol.messages import State
+from sightline.protocol.transports.zenoh_session import open_session
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, Vision
 from tests.terminal_rig import Terminal

@@ -13,18 +13,18 @@ import cv2
 import onnx
 import torch
 
-from operator_side import cli, train_export, train_run
-from operator_side.train_export import onnx_bytes, weights_in
-from operator_side.train_loop import train
-from operator_side.train_module import Network, begin_from, folded
-from operator_side.train_network import AGAINST, OUTPUTS, Layer, network
-from operator_side.train_rounds import Training
-from operator_side.train_samples import CUT_PX
-from operator_side.train_scenes import DrawnScenes
-from protocol.errors import ConfigError, HardwareError
-from sim.scenes import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED_FROM, WIDTH_PX, LabelledBox
+from sightline.operator_side import cli, train_export, train_run
+from sightline.operator_side.train_export import onnx_bytes, weights_in
+from sightline.operator_side.train_loop import train
+from sightline.operator_side.train_module import Network, begin_from, folded
+from sightline.operator_side.train_network import AGAINST, OUTPUTS, Layer, network
+from sightline.operator_side.train_rounds import Training
+from sightline.operator_side.train_samples import CUT_PX
+from sightline.operator_side.train_scenes import DrawnScenes
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.sim.scenes import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED_FROM, WIDTH_PX, LabelledBox
 from tests.train_rig import weights
-from vision_side.detect.onnx_detector import SHIPPED
+from sightline.vision_side.detect.onnx_detector import SHIPPED
 
 
 def scenes(count=4):
@@ -49,17 +49,17 @@ def test_a_training_that_was_cut_ends_as_if_it_had_not_been(tmp_path, monkeypatc
     training = Training((2, 2), batch=2, seed=4)
     (tmp_path / "whole").mkdir()
     whole = train(scenes(), training, "cpu", tmp_path / "whole", lambda _: None)
-    monkeypatch.setattr("operator_side.train_loop._CHECKPOINT_EVERY", 2)
+    monkeypatch.setattr("sightline.operator_side.train_loop._CHECKPOINT_EVERY", 2)
     cut = tmp_path / "cut"
     cut.mkdir()
 
     def fall(line):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("operator_side.train_loop._SAY_EVERY", 3)
+    monkeypatch.setattr("sightline.operator_side.train_loop._SAY_EVERY", 3)
     with pytest.raises(KeyboardInterrupt):
         train(scenes(), training, "cpu", cut, fall)
-    monkeypatch.setattr("operator_side.train_loop._SAY_EVERY", 100)
+    monkeypatch.setattr("sightline.operator_side.train_loop._SAY_EVERY", 100)
     said = []
     resumed = train(scenes(), training, "cpu", cut, said.append)
     assert said == ["goes on at step 2 of 4"]

@@ -9,15 +9,15 @@ import pytest
 pytest.importorskip("pybullet")
 pytest.importorskip("onnx")
 
-from operator_side.train_card import Card, card_text
-from operator_side.train_export import shifted
-from operator_side.train_rounds import Training
-from operator_side.train_shipping import chosen_thresholds, final_report, written
-from sim.scenes import COLUMNS, LABELS
+from sightline.operator_side.train_card import Card, card_text
+from sightline.operator_side.train_export import shifted
+from sightline.operator_side.train_rounds import Training
+from sightline.operator_side.train_shipping import chosen_thresholds, final_report, written
+from sightline.sim.scenes import COLUMNS, LABELS
 from tests.train_rig import weights
-from vision_side.config import VisionConfig
-from vision_side.detect.choice import build_detector
-from vision_side.detect.onnx_header import read_onnx_header
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.choice import build_detector
+from sightline.vision_side.detect.onnx_header import read_onnx_header
 
 
 @contextmanager

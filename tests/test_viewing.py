@@ -7,17 +7,17 @@ import cv2
 import numpy as np
 import pytest
 
-from operator_side import keys
-from protocol.channels import CAMERA, DETECTIONS, FRAME, OVERLAY, PREVIEW, TWIST
-from protocol.codec import decode, encode
-from protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader, Stamp
-from protocol.transports.opening import open_link
-from protocol.transports.zenoh_session import open_session
+from sightline.operator_side import keys
+from sightline.protocol.channels import CAMERA, DETECTIONS, FRAME, OVERLAY, PREVIEW, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader, Stamp
+from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.zenoh_session import open_session
 from tests.link_rigs import free_endpoint, until
 from tests.vision_rig import camera, jpeg_of, scene
-from vision_side import viewing
-from vision_side.config import VisionConfig
-from vision_side.service import open_service
+from sightline.vision_side import viewing
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.service import open_service
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))

@@ -5,9 +5,9 @@ import struct
 
 import pytest
 
-from protocol.channels import CAMERA, FRAME, MISSION, REPORT, SCAN, TWIST
-from protocol.codec import decode, encode, encode_ranges
-from protocol.messages import (
+from sightline.protocol.channels import CAMERA, FRAME, MISSION, REPORT, SCAN, TWIST
+from sightline.protocol.codec import decode, encode, encode_ranges
+from sightline.protocol.messages import (
     AnswerHeader,
     DetectionsHeader,
     Echo,
@@ -17,14 +17,14 @@ from protocol.messages import (
     ScanHeader,
     Stamp,
 )
-from protocol.mission_messages import MissionReport, MissionRequest
-from protocol.transports.memory import MemoryNetwork
+from sightline.protocol.mission_messages import MissionReport, MissionRequest
+from sightline.protocol.transports.memory import MemoryNetwork
 from tests.vision_rig import camera, jpeg_of, scene
-from vision_side.config import DetectorConfig, VisionConfig
-from vision_side.dry_run import AckingService
-from vision_side.pipeline import Observation
-from vision_side.reporting import LEAST_GAP_S, PERIOD_S, Reporter
-from vision_side.service import Service
+from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.dry_run import AckingService
+from sightline.vision_side.pipeline import Observation
+from sightline.vision_side.reporting import LEAST_GAP_S, PERIOD_S, Reporter
+from sightline.vision_side.service import Service
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import pytest
 
-from protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, STATUS, TWIST
-from protocol.codec import decode, encode
-from protocol.messages import (
+from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, STATUS, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import (
     AnswerHeader,
     DetectedBox,
     Detections,
@@ -18,18 +18,18 @@ from protocol.messages import (
     Stamp,
     Status,
 )
-from protocol.transports.link import LatestSlot, Link, Message
-from protocol.transports.memory import MemoryNetwork
-from protocol.transports.zenoh import open_zenoh
-from protocol.twist_text import parse_twist
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.twist_text import parse_twist
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 from tests.vision_rig import Rig, acquired_at, ball_about_lens, camera, circle, errors_after, still
-from vision_side.boxes_service import BoxesService
-from vision_side.config import VisionConfig
-from vision_side.detect.boxes import REMEMBERED, locate_box
-from vision_side.detect.port import Detection
-from vision_side.service_process import serve
+from sightline.vision_side.boxes_service import BoxesService
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.boxes import REMEMBERED, locate_box
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.service_process import serve
 
 MODEL = camera()
 FRAME_US = 33_333

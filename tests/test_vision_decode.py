@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.errors import WireError
+from sightline.protocol.errors import WireError
 from tests.vision_rig import camera, jpeg_of, scene
-from vision_side.decode import MAX_SCANS, Decoder
+from sightline.vision_side.decode import MAX_SCANS, Decoder
 
 GOOD = jpeg_of(scene(camera(), 0.855, 0.1))
 

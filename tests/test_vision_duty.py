@@ -2,15 +2,15 @@
 
 import pytest
 
-from protocol.errors import ConfigError
-from protocol.messages import STILL, FrameHeader, RequestId, Twist
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import STILL, FrameHeader, RequestId, Twist
 from tests.mission_contract import CAMERA
 from tests.vision_rig import jpeg_of, scene
-from vision_side.config import MissionConfig, VisionConfig
-from vision_side.missions.choice import mission_spec
-from vision_side.missions.duty import SETTLE_S, MissionSwitch
-from vision_side.missions.port import Plan, View
-from vision_side.pipeline import Frame, Pipeline
+from sightline.vision_side.config import MissionConfig, VisionConfig
+from sightline.vision_side.missions.choice import mission_spec
+from sightline.vision_side.missions.duty import SETTLE_S, MissionSwitch
+from sightline.vision_side.missions.port import Plan, View
+from sightline.vision_side.pipeline import Frame, Pipeline
 
 CONFIG = VisionConfig()
 FRAME_US = 33_333

@@ -6,17 +6,17 @@ from contextlib import ExitStack
 
 import pytest
 
-from protocol.channels import ACK, FRAME, STATUS, TWIST
-from protocol.codec import decode, encode
-from protocol.errors import ConfigError
-from protocol.messages import AnswerHeader, FrameHeader, Stamp, State, Status
-from protocol.transports.link import LatestSlot
-from protocol.transports.zenoh import open_zenoh
-from protocol.transports.zenoh_site import open_fleet
+from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import AnswerHeader, FrameHeader, Stamp, State, Status
+from sightline.protocol.transports.link import LatestSlot
+from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import JPEG
-from vision_side.config import VisionConfig
-from vision_side.fleet import Fleet
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.fleet import Fleet
 
 
 class Robot:

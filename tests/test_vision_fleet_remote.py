@@ -6,22 +6,22 @@ from contextlib import ExitStack
 
 import pytest
 
-from protocol.channels import ACK, FRAME, STATUS, TWIST
-from protocol.codec import encode
-from protocol.config import Config
-from protocol.messages import FrameHeader, Stamp, State, Status
-from protocol.transports.memory import MemoryNetwork
-from protocol.transports.zenoh import open_zenoh
-from protocol.transports.zenoh_site import open_fleet
+from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST
+from sightline.protocol.codec import encode
+from sightline.protocol.config import Config
+from sightline.protocol.messages import FrameHeader, Stamp, State, Status
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 from tests.remote_rig import BALL_JPEG, MODEL, Server, box, http_reply, said
-from vision_side.config import DetectorConfig, HsvConfig, VisionConfig
-from vision_side.detect.around import close_detector
-from vision_side.detect.choice import configured_detector
-from vision_side.detect.local import Hsv
-from vision_side.detector_service import DetectorService, ServingOptions
-from vision_side.fleet import Fleet
-from vision_side.service import Service
+from sightline.vision_side.config import DetectorConfig, HsvConfig, VisionConfig
+from sightline.vision_side.detect.around import close_detector
+from sightline.vision_side.detect.choice import configured_detector
+from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detector_service import DetectorService, ServingOptions
+from sightline.vision_side.fleet import Fleet
+from sightline.vision_side.service import Service
 
 DEADLINE_S = 0.5
 ROBOTS = {"ra1": "00000001", "rb": "00000002", "ra2": "00000003", "ra3": "00000004"}

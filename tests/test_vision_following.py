@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from tests.vision_rig import Path, Rig, acquired_at, circle, eight, errors_after, still
-from vision_side.config import SearchConfig, VisionConfig
+from sightline.vision_side.config import SearchConfig, VisionConfig
 
 SEEDS = (1, 2, 3, 4, 5, 6)
 

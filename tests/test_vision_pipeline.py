@@ -7,14 +7,14 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import vision_side
-from protocol.channels import MAX_HEADER_BYTES
-from protocol.codec import decode, encode
-from protocol.messages import STILL, AnswerHeader, FrameHeader, RequestId
-from protocol.twist_text import format_twist
+import sightline.vision_side
+from sightline.protocol.channels import MAX_HEADER_BYTES
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import STILL, AnswerHeader, FrameHeader, RequestId
+from sightline.protocol.twist_text import format_twist
 from tests.vision_rig import Rig, camera, eight, jpeg_of, scene
-from vision_side.config import VisionConfig
-from vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header, encode_answer
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header, encode_answer
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -124,7 +124,7 @@ ALWAYS_PURE = ("pipeline.py", "decode.py", "port.py", "hsv.py", "checking.py", "
 
 def test_only_the_shells_know_of_clocks_and_links() -> None:
     forbidden = {"time", "threading", "socket", "asyncio", "logging", "zenoh", "random"}
-    for path in Path(vision_side.__file__).parent.rglob("*.py"):
+    for path in Path(sightline.vision_side.__file__).parent.rglob("*.py"):
         tree = ast.parse(path.read_text())
         names = {alias.name.split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import)
                  for alias in node.names}

@@ -10,16 +10,16 @@ import time
 import numpy as np
 import pytest
 
-from protocol.channels import ACK, CAMERA, FRAME, TWIST
-from protocol.codec import decode, encode
-from protocol.messages import AnswerHeader, CameraModel, FrameHeader, Stamp
-from protocol.transports.link import LatestSlot, Message
-from protocol.transports.memory import MemoryNetwork
-from protocol.twist_text import parse_twist
+from sightline.protocol.channels import ACK, CAMERA, FRAME, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import AnswerHeader, CameraModel, FrameHeader, Stamp
+from sightline.protocol.transports.link import LatestSlot, Message
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.twist_text import parse_twist
 from tests.vision_rig import camera, jpeg_of, scene
-from vision_side.config import VisionConfig
-from vision_side.service import Service
-from vision_side.service_process import serve
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.service import Service
+from sightline.vision_side.service_process import serve
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -140,7 +140,7 @@ def test_the_process_ends_within_a_second_of_a_signal(number: signal.Signals) ->
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    code = (f"from vision_side.config import VisionConfig; from vision_side.service_process import run; "
+    code = (f"from sightline.vision_side.config import VisionConfig; from sightline.vision_side.service_process import run; "
             f"raise SystemExit(run(VisionConfig(connect=(), listen=('{endpoint}',))))")
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -165,7 +165,7 @@ def test_serve_ends_when_asked(bench: Bench) -> None:
 def test_frames_that_come_again_after_a_silence_are_told_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.camera()
     bench.frame(BALL, 1)
-    monkeypatch.setattr("vision_side.service._SILENCE_S", -1.0)
+    monkeypatch.setattr("sightline.vision_side.service._SILENCE_S", -1.0)
     bench.turn()
     bench.frame(BALL, 2)
     bench.frame(BALL, 3)
@@ -202,7 +202,7 @@ def test_frames_of_a_session_that_is_over_are_left_out_and_said_once(bench):
 
 def test_of_two_robots_with_one_id_the_second_is_refused_and_that_is_said(bench, monkeypatch):
     """Where they cannot meet, nobody but vision can see that they are two."""
-    monkeypatch.setattr("vision_side.service.monotonic_us", lambda: bench.now_us)
+    monkeypatch.setattr("sightline.vision_side.service.monotonic_us", lambda: bench.now_us)
     bench.camera()
     answers = {"0000abcd": 0, "0000beef": 0}
     for seq in range(1, 10):

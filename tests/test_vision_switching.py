@@ -11,14 +11,14 @@ import time
 import numpy as np
 import pytest
 
-from protocol.config import Config as Settings
-from protocol.transports.opening import open_link
-from robot_side.ports import Ranges
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.transports.opening import open_link
+from sightline.robot_side.ports import Ranges
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess
 from tests.vision_rig import jpeg_of
-from vision_side.config import VisionConfig
-from vision_side.service_process import serve
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.service_process import serve
 
 pytestmark = pytest.mark.slow
 QUIET = VisionConfig.model_validate({"search": {"enabled": False}})
@@ -54,7 +54,7 @@ def grey_camera(folder):
 
 def sightline(*arguments):
     """One command as a person gives it."""
-    return subprocess.run([sys.executable, "-m", "operator_side.cli", *arguments], capture_output=True, text=True,
+    return subprocess.run([sys.executable, "-m", "sightline.operator_side.cli", *arguments], capture_output=True, text=True,
                           timeout=30, check=False)
 
 

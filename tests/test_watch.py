@@ -13,8 +13,8 @@ import av
 import cv2
 import pytest
 
-from operator_side.cli import run
-from operator_side.film import Film
+from sightline.operator_side.cli import run
+from sightline.operator_side.film import Film
 from tests.javascript_browser import Browser, chromium
 from tests.link_rigs import free_endpoint, until
 from tests.test_javascript_browser import LEVELS, PATIENCE_S, Started

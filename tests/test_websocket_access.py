@@ -9,10 +9,10 @@ from pydantic import ValidationError
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from protocol.channels import ACK, DETECTIONS, FRAME, REQUEST, STATUS, TWIST
-from protocol.errors import ConfigError, LinkError
-from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_access import (
+from sightline.protocol.channels import ACK, DETECTIONS, FRAME, REQUEST, STATUS, TWIST
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket_access import (
     NO_TOKEN,
     NOT_LISTED,
     check_listening,
@@ -20,12 +20,12 @@ from protocol.transports.websocket_access import (
     grants_of_role,
     role_of_token,
 )
-from protocol.transports.websocket_doorlog import BurstLimiter
-from protocol.transports.websocket_endpoints import parse_websocket_endpoint, with_allowed
-from protocol.transports.websocket_keys import own_token, read_tokens
-from protocol.transports.websocket_peer import NOT_GRANTED
-from protocol.transports.websocket_seat import DRIVER_SLOT_US, DriverSlot
-from robot_side.config import RobotConfig
+from sightline.protocol.transports.websocket_doorlog import BurstLimiter
+from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint, with_allowed
+from sightline.protocol.transports.websocket_keys import own_token, read_tokens
+from sightline.protocol.transports.websocket_peer import NOT_GRANTED
+from sightline.protocol.transports.websocket_seat import DRIVER_SLOT_US, DriverSlot
+from sightline.robot_side.config import RobotConfig
 from tests.link_rigs import claim, until
 from tests.websocket_rig import V1, free_ws
 

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.channels import CHANNELS, MAX_HEADER_BYTES, TWIST, key_for
-from protocol.errors import WireError
-from protocol.refusals import RejectReason
-from protocol.transports.websocket_framing import MAX_BLOCK_BYTES, IncomingMessage, pack, parse_hello, unpack
+from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, TWIST, key_for
+from sightline.protocol.errors import WireError
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.websocket_framing import MAX_BLOCK_BYTES, IncomingMessage, pack, parse_hello, unpack
 
 ROLES = st.from_regex(r"[a-z][a-z0-9_]{0,15}", fullmatch=True)
 HEADERS = st.one_of(

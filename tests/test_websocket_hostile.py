@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from protocol.channels import STATUS, TWIST
-from protocol.refusals import RejectReason
-from protocol.transports.link_rules import INEXACT_KEY, OVERSIZE
-from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
-from protocol.transports.websocket_listen import CROSS_SITE, TOO_MANY_CLIENTS, WRONG_SUBPROTOCOL
-from protocol.transports.websocket_peer import SILENT
+from sightline.protocol.channels import STATUS, TWIST
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link_rules import INEXACT_KEY, OVERSIZE
+from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
+from sightline.protocol.transports.websocket_listen import CROSS_SITE, TOO_MANY_CLIENTS, WRONG_SUBPROTOCOL
+from sightline.protocol.transports.websocket_peer import SILENT
 from tests.link_rigs import until
 from tests.websocket_rig import address_of, free_ws
 

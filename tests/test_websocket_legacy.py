@@ -10,15 +10,15 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from protocol.channels import ACK, DETECTIONS, FRAME, STATUS, TWIST
-from protocol.codec import decode, encode
-from protocol.messages import AnswerHeader, Detections, DetectionsHeader, FrameHeader
-from protocol.refusals import RejectReason
-from protocol.transports.link import Message
-from protocol.transports.link_rules import OVERSIZE
-from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_dialects import BAD_FRAMING
-from protocol.transports.websocket_listen import CROSS_SITE
+from sightline.protocol.channels import ACK, DETECTIONS, FRAME, STATUS, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import AnswerHeader, Detections, DetectionsHeader, FrameHeader
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.link_rules import OVERSIZE
+from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket_dialects import BAD_FRAMING
+from sightline.protocol.transports.websocket_listen import CROSS_SITE
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import JPEG as SMALL_JPEG
 from tests.websocket_rig import address_of, received, upgrade

@@ -9,14 +9,14 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import serve
 
-from protocol.channels import ACK, CAMERA, FRAME, TWIST
-from protocol.codec import decode
-from protocol.messages import FrameHeader
-from protocol.refusals import RejectReason
-from protocol.transports.link_rules import OVERSIZE
-from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_dialects import BAD_FRAMING
-from protocol.transports.websocket_endpoints import parse_websocket_endpoint
+from sightline.protocol.channels import ACK, CAMERA, FRAME, TWIST
+from sightline.protocol.codec import decode
+from sightline.protocol.messages import FrameHeader
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link_rules import OVERSIZE
+from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket_dialects import BAD_FRAMING
+from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint
 from tests.link_rigs import until
 from tests.test_websocket_legacy import JPEG, TEXT, free_legacy
 

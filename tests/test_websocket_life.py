@@ -2,7 +2,13 @@
 
 import pytest
 
-from protocol.transports.websocket_life import PING_EVERY_US, SILENCE_US, STALLED_LIMIT_US, Keepalive, SendPath
+from sightline.protocol.transports.websocket_life import (
+    PING_EVERY_US,
+    SILENCE_US,
+    STALLED_LIMIT_US,
+    Keepalive,
+    SendPath,
+)
 
 CLEAR = SendPath(full=False, taken_bytes=7, lost=False)
 FULL = SendPath(full=True, taken_bytes=7, lost=False)

@@ -9,13 +9,13 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from protocol.channels import ACK, FRAME, SCAN, STATUS, TWIST
-from protocol.codec import encode
-from protocol.messages import FrameHeader
-from protocol.transports.link import Message
-from protocol.transports.link_rules import OVERSIZE
-from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
+from sightline.protocol.channels import ACK, FRAME, SCAN, STATUS, TWIST
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import FrameHeader
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.link_rules import OVERSIZE
+from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
 from tests.link_rigs import claim, hail, until
 from tests.websocket_rig import HELLO, TWIST_KEY, V1, Robot, bare_client, closed_with, received
 

@@ -5,18 +5,18 @@ import threading
 
 import pytest
 
-from protocol.channels import CHANNELS, DETECTIONS, FRAME, REPLY, REQUEST, SCAN, STATUS, TWIST
-from protocol.codec import encode
-from protocol.legacy import encode_picture
-from protocol.messages import Request
-from protocol.transports.link import Message
-from protocol.transports.secured import KNOWN_SOURCES
-from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_dialects import SightlineV1
-from protocol.transports.websocket_endpoints import LegacyOptions
-from protocol.transports.websocket_legacy import LegacyClient, LegacyToVision
-from protocol.transports.websocket_outbox import MAX_UNKNOWN_SOURCES, Outbox, Publication
-from protocol.transports.websocket_seat import DriverSlot
+from sightline.protocol.channels import CHANNELS, DETECTIONS, FRAME, REPLY, REQUEST, SCAN, STATUS, TWIST
+from sightline.protocol.codec import encode
+from sightline.protocol.legacy import encode_picture
+from sightline.protocol.messages import Request
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.secured import KNOWN_SOURCES
+from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket_dialects import SightlineV1
+from sightline.protocol.transports.websocket_endpoints import LegacyOptions
+from sightline.protocol.transports.websocket_legacy import LegacyClient, LegacyToVision
+from sightline.protocol.transports.websocket_outbox import MAX_UNKNOWN_SOURCES, Outbox, Publication
+from sightline.protocol.transports.websocket_seat import DriverSlot
 from tests.link_rigs import until
 from tests.websocket_rig import free_ws
 

@@ -10,15 +10,15 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from protocol.channels import REQUEST
-from protocol.codec import encode
-from protocol.errors import LinkError
-from protocol.messages import Request
-from protocol.transports.secured import ROLES
-from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_access import grants_of_role
-from protocol.transports.websocket_listen import TOO_MANY_CLIENTS
-from protocol.transports.websocket_places import (
+from sightline.protocol.channels import REQUEST
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import LinkError
+from sightline.protocol.messages import Request
+from sightline.protocol.transports.secured import ROLES
+from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket_access import grants_of_role
+from sightline.protocol.transports.websocket_listen import TOO_MANY_CLIENTS
+from sightline.protocol.transports.websocket_places import (
     MAX_CLIENTS,
     MAX_HANDSHAKES,
     MAX_HANDSHAKES_PER_ADDRESS,

@@ -7,10 +7,10 @@ from contextlib import suppress
 
 import pytest
 
-from protocol.channels import FRAME, STATUS
-from protocol.transports.link_rules import OVERSIZE
-from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_peer import SILENT
+from sightline.protocol.channels import FRAME, STATUS
+from sightline.protocol.transports.link_rules import OVERSIZE
+from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket_peer import SILENT
 from tests.link_rigs import claim, until
 from tests.websocket_rig import Robot, bare_client, free_ws, never_reads, pause_until, resident_kib
 

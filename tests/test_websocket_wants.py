@@ -5,8 +5,8 @@ from contextlib import ExitStack
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from protocol.channels import DETECTIONS, OVERLAY, PREVIEW, STATUS, TWIST
-from protocol.transports.websocket import open_websocket
+from sightline.protocol.channels import DETECTIONS, OVERLAY, PREVIEW, STATUS, TWIST
+from sightline.protocol.transports.websocket import open_websocket
 from tests.link_rigs import claim, free_endpoint, hail, until
 
 

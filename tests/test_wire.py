@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from operator_side.faults.wires import BenchWire
-from protocol.errors import ConfigError
-from sim.wire import IP_HEADER_BYTES, MAX_WAITING, EmulatedLink, Leg, LinkShape, LinkShapes, Medium
-from sim.wire_tun import ADDRESS_A, _read_shapes, why_impossible
+from sightline.operator_side.faults.wires import BenchWire
+from sightline.protocol.errors import ConfigError
+from sightline.sim.wire import IP_HEADER_BYTES, MAX_WAITING, EmulatedLink, Leg, LinkShape, LinkShapes, Medium
+from sightline.sim.wire_tun import ADDRESS_A, _read_shapes, why_impossible
 
 PACKET = bytes(range(100))
 LONG_US = 10**9

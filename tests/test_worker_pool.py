@@ -6,8 +6,8 @@ from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 
-from operator_side.worker_pool import worker_pool
-from protocol.errors import HardwareError
+from sightline.operator_side.worker_pool import worker_pool
+from sightline.protocol.errors import HardwareError
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])

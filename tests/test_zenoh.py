@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from protocol.channels import DETECTIONS, FRAME, STATUS, TWIST
-from protocol.codec import encode
-from protocol.errors import ConfigError, LinkError
-from protocol.messages import FrameHeader
-from protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
-from protocol.transports.link_rules import NOT_A_PUT
-from protocol.transports.port_owner import port_owner
-from protocol.transports.zenoh import MAX_KEPT_PUBLISHERS, ZenohLink, open_zenoh
-from protocol.transports.zenoh_around import list_robots
-from protocol.transports.zenoh_session import open_session
-from protocol.transports.zenoh_site import open_fleet
+from sightline.protocol.channels import DETECTIONS, FRAME, STATUS, TWIST
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.messages import FrameHeader
+from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
+from sightline.protocol.transports.link_rules import NOT_A_PUT
+from sightline.protocol.transports.port_owner import port_owner
+from sightline.protocol.transports.zenoh import MAX_KEPT_PUBLISHERS, ZenohLink, open_zenoh
+from sightline.protocol.transports.zenoh_around import list_robots
+from sightline.protocol.transports.zenoh_session import open_session
+from sightline.protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 
 NO_ENDPOINTS = (

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from protocol.channels import FRAME, TWIST
-from protocol.errors import LinkError
-from protocol.transports.zenoh import open_zenoh
+from sightline.protocol.channels import FRAME, TWIST
+from sightline.protocol.errors import LinkError
+from sightline.protocol.transports.zenoh import open_zenoh
 from tests.link_rigs import free_endpoint, until
 
 PRELUDE = """
 import sys, time
-from protocol.channels import *
-from protocol.transports.zenoh import open_zenoh
+from sightline.protocol.channels import *
+from sightline.protocol.transports.zenoh import open_zenoh
 endpoint = sys.argv[1]
 """
 ROBOT = """
@@ -147,7 +147,7 @@ def test_a_process_ends_by_itself_after_with(start):
 
 def test_nothing_of_zenoh_reaches_the_terminal(start):
     code = """
-    from protocol.errors import LinkError
+    from sightline.protocol.errors import LinkError
     with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as peer:
         peer.subscribe(FRAME, lambda message: 1 / 0)
         while not robot.has_listener(FRAME):

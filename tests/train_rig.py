@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from operator_side.train_network import network
+from sightline.operator_side.train_network import network
 
 _HEAD = np.float32(0.02)
 

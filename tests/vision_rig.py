@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from protocol.messages import CameraModel, FrameHeader, Twist
-from vision_side.config import VisionConfig
-from vision_side.detect.port import Circle, Detection
-from vision_side.pipeline import Frame, Observation, Pipeline
+from sightline.protocol.messages import CameraModel, FrameHeader, Twist
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.port import Circle, Detection
+from sightline.vision_side.pipeline import Frame, Observation, Pipeline
 
 TICK_US = 4_000
 FRAME_US = 33_333

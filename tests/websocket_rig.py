@@ -11,9 +11,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from protocol.channels import FRAME, TWIST
-from protocol.transports.websocket import open_websocket
-from protocol.transports.websocket_endpoints import parse_websocket_endpoint
+from sightline.protocol.channels import FRAME, TWIST
+from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint
 from tests.link_rigs import free_endpoint, until
 
 V1 = {"subprotocols": ["sightline.v1"], "compression": None, "legacy": True}

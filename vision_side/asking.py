@@ -7,15 +7,15 @@ a network kept back does not start anything.
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.channels import MISSION
-from protocol.codec import decode
-from protocol.errors import ConfigError, WireError
-from protocol.messages import FrameHeader, RequestHeader, RequestId
-from protocol.mission_messages import MissionRequest
-from protocol.refusals import RejectReason
-from protocol.transports.link import Message
-from vision_side.config import VisionConfig
-from vision_side.missions.choice import MissionSpec, requested_mission
+from sightline.protocol.channels import MISSION
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import ConfigError, WireError
+from sightline.protocol.messages import FrameHeader, RequestHeader, RequestId
+from sightline.protocol.mission_messages import MissionRequest
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.missions.choice import MissionSpec, requested_mission
 
 MAX_AGE_US: Final = 2_000_000
 """As old as the status that a request to a robot may cite."""

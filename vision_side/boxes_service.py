@@ -8,14 +8,14 @@ import threading
 import time
 from collections import deque
 
-from protocol.channels import DETECTIONS, FRAME, MAX_HEADER_BYTES
-from protocol.errors import WireError
-from protocol.messages import FrameHeader
-from protocol.transports.link import LatestSlot, Link, Message
-from vision_side.config import VisionConfig
-from vision_side.detect.boxes import REMEMBERED, BoxReader
-from vision_side.pipeline import Observation, PipelineAnswer
-from vision_side.service import LogLine, Service
+from sightline.protocol.channels import DETECTIONS, FRAME, MAX_HEADER_BYTES
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import FrameHeader
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.boxes import REMEMBERED, BoxReader
+from sightline.vision_side.pipeline import Observation, PipelineAnswer
+from sightline.vision_side.service import LogLine, Service
 
 _BOXES_SILENCE_S = 2.0
 _NO_BOXES = Observation("no boxes")

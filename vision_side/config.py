@@ -4,9 +4,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from protocol.channels import FRAME
-from protocol.config import Config
-from protocol.messages import CameraModel, Source
+from sightline.protocol.channels import FRAME
+from sightline.protocol.config import Config
+from sightline.protocol.messages import CameraModel, Source
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 HueDeg = Annotated[float, Field(ge=0, le=360)]

@@ -16,12 +16,12 @@ from typing import Final, Protocol
 
 from pydantic import ValidationError
 
-from protocol.channels import DETECTIONS, FRAME
-from protocol.clock import monotonic_us
-from protocol.codec import decode, encode
-from protocol.errors import WireError
-from protocol.jpeg import read_jpeg_size
-from protocol.messages import (
+from sightline.protocol.channels import DETECTIONS, FRAME
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.messages import (
     LEAST_SIDE_PX,
     MOST_SIDE_PX,
     DetectedBox,
@@ -31,14 +31,14 @@ from protocol.messages import (
     Echo,
     FrameHeader,
 )
-from protocol.transports.link import LatestSlot, Link, Message
-from vision_side.config import VisionConfig
-from vision_side.detect.around import maker_of, notices_of
-from vision_side.detect.checking import checked_results
-from vision_side.detect.own_decoders import DecoderPool
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
-from vision_side.detector_turns import FairQueue, FrameCounters, QueuedFrame
-from vision_side.service_process import ends_on_signal
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.around import maker_of, notices_of
+from sightline.vision_side.detect.checking import checked_results
+from sightline.vision_side.detect.own_decoders import DecoderPool
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
+from sightline.vision_side.detector_turns import FairQueue, FrameCounters, QueuedFrame
+from sightline.vision_side.service_process import ends_on_signal
 
 ROLE: Final = "detector"
 _WAIT_S: Final = 0.2
@@ -82,8 +82,8 @@ class FleetLink(Protocol):
 
 def run(config: VisionConfig, detector: Detector, serving: ServingOptions) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code 0. Raises ConfigError, LinkError as `open_site` does."""
-    from protocol.transports.zenoh_log import log_rejected_peers
-    from protocol.transports.zenoh_site import open_fleet
+    from sightline.protocol.transports.zenoh_log import log_rejected_peers
+    from sightline.protocol.transports.zenoh_site import open_fleet
 
     ending, services = threading.Event(), list[DetectorService]()
     with log_rejected_peers(config.listen, config.secure, lambda line: _say(f"detector: {line}")):

@@ -3,21 +3,21 @@
 import secrets
 from collections.abc import Callable
 
-from protocol.channels import MISSION, REPORT, SCAN
-from protocol.codec import encode
-from protocol.errors import WireError
-from protocol.messages import DetectionsHeader, Echo, FrameHeader, RequestId
-from protocol.transports.link import LatestSlot, Link, Message
-from vision_side.asking import DetectorSwap, MissionRequests
-from vision_side.config import VisionConfig
-from vision_side.detect.around import notices_of
-from vision_side.detect.port import Detector
-from vision_side.detect.shadow import ShadowDetector
-from vision_side.detect.timing import TimedDetector
-from vision_side.missions.choice import configured_mission
-from vision_side.pipeline import SOURCE, Observation, Pipeline
-from vision_side.reporting import Reporter
-from vision_side.scan import decode_scan
+from sightline.protocol.channels import MISSION, REPORT, SCAN
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import DetectionsHeader, Echo, FrameHeader, RequestId
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.vision_side.asking import DetectorSwap, MissionRequests
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.around import notices_of
+from sightline.vision_side.detect.port import Detector
+from sightline.vision_side.detect.shadow import ShadowDetector
+from sightline.vision_side.detect.timing import TimedDetector
+from sightline.vision_side.missions.choice import configured_mission
+from sightline.vision_side.pipeline import SOURCE, Observation, Pipeline
+from sightline.vision_side.reporting import Reporter
+from sightline.vision_side.scan import decode_scan
 
 NO_FRAMES = Observation("no frames")
 _ENDED = "the robot started anew, which ended it: say it again"

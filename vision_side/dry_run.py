@@ -8,16 +8,16 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from protocol.clock import monotonic_us
-from protocol.errors import HardwareError
-from protocol.messages import CameraModel, FrameHeader
-from protocol.transports.link import Link
-from vision_side.config import VisionConfig
-from vision_side.detect.around import notices_of
-from vision_side.detect.choice import configured_detector
-from vision_side.dispatch import MissionChannel
-from vision_side.pipeline import SOURCE, Frame, Observation, Pipeline, PipelineAnswer
-from vision_side.service import Service
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import HardwareError
+from sightline.protocol.messages import CameraModel, FrameHeader
+from sightline.protocol.transports.link import Link
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.around import notices_of
+from sightline.vision_side.detect.choice import configured_detector
+from sightline.vision_side.dispatch import MissionChannel
+from sightline.vision_side.pipeline import SOURCE, Frame, Observation, Pipeline, PipelineAnswer
+from sightline.vision_side.service import Service
 
 _TELL_EVERY_S = 0.5
 _WAIT_S = 0.2
@@ -51,7 +51,7 @@ def watch_robot(config: VisionConfig, say: LogLine, seconds: float | None = None
 
     Raises ConfigError for an endpoint that is none, LinkError if the link cannot be opened.
     """
-    from protocol.transports.opening import open_link
+    from sightline.protocol.transports.opening import open_link
 
     opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                        max_frame_bytes=config.max_frame_bytes, secure=config.secure)

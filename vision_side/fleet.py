@@ -12,14 +12,14 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Protocol, Self
 
-from protocol.channels import Channel
-from protocol.transports.link import LatestSlot, Link, Message
-from vision_side.config import VisionConfig
-from vision_side.counts import Counts
-from vision_side.detect.around import close_detector
-from vision_side.detect.choice import configured_detector, waits_for_service
-from vision_side.detect.port import Detector
-from vision_side.service import LogLine, Service, open_service
+from sightline.protocol.channels import Channel
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.counts import Counts
+from sightline.vision_side.detect.around import close_detector
+from sightline.vision_side.detect.choice import configured_detector, waits_for_service
+from sightline.vision_side.detect.port import Detector
+from sightline.vision_side.service import LogLine, Service, open_service
 
 _LONGEST_WAIT_S = 0.2
 

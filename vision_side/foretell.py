@@ -8,8 +8,8 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from protocol.messages import Pose, Twist
-from vision_side.config import LatencyConfig
+from sightline.protocol.messages import Pose, Twist
+from sightline.vision_side.config import LatencyConfig
 
 _STEP_S = 0.015
 _STILL = 1e-6

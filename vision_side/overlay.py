@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import CameraModel, FrameHeader, Twist
-from vision_side.detect.port import Detection
-from vision_side.pipeline import Observation
+from sightline.protocol.messages import CameraModel, FrameHeader, Twist
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.pipeline import Observation
 
 Image = NDArray[np.uint8]
 Point = tuple[float, float]

@@ -3,14 +3,14 @@
 from collections import Counter
 from dataclasses import dataclass
 
-from protocol import VERSION
-from protocol.errors import WireError
-from protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, RequestId, ScanHeader, Twist
-from vision_side.config import VisionConfig
-from vision_side.decode import Decoder, Picture
-from vision_side.detect.checking import checked_results
-from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.port import (
+from sightline.protocol import VERSION
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, RequestId, ScanHeader, Twist
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.decode import Decoder, Picture
+from sightline.vision_side.detect.checking import checked_results
+from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.port import (
     NO_DEADLINE,
     DetectFrame,
     Detection,
@@ -18,10 +18,10 @@ from vision_side.detect.port import (
     Detector,
     PictureDetector,
 )
-from vision_side.foretell import LatencyEstimator
-from vision_side.missions.choice import MissionSpec, configured_mission
-from vision_side.missions.duty import MissionSwitch
-from vision_side.missions.port import Plan, RangeScan, View
+from sightline.vision_side.foretell import LatencyEstimator
+from sightline.vision_side.missions.choice import MissionSpec, configured_mission
+from sightline.vision_side.missions.duty import MissionSwitch
+from sightline.vision_side.missions.port import Plan, RangeScan, View
 
 Detections = tuple[Detection, ...]
 SOURCE = "vision"

@@ -17,9 +17,9 @@ from typing import Any, Final
 
 from pydantic import BaseModel, ValidationError
 
-from protocol.errors import ConfigError
-from vision_side.config import VisionConfig
-from vision_side.detect.around import PLUGIN_ERRORS
+from sightline.protocol.errors import ConfigError
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.around import PLUGIN_ERRORS
 
 LONGEST_DETAIL: Final = 160
 _CLASS: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")

@@ -2,11 +2,11 @@
 
 from typing import Any, Final
 
-from protocol.messages import RequestId
-from protocol.mission_messages import MissionReport
-from vision_side.config import DetectorConfig
-from vision_side.detect.port import DetectionResult
-from vision_side.pipeline import Observation
+from sightline.protocol.messages import RequestId
+from sightline.protocol.mission_messages import MissionReport
+from sightline.vision_side.config import DetectorConfig
+from sightline.vision_side.detect.port import DetectionResult
+from sightline.vision_side.pipeline import Observation
 
 PERIOD_S: Final = 0.5
 LEAST_GAP_S: Final = 0.1

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from protocol.channels import SCAN
-from protocol.codec import check_sizes, decode
-from protocol.errors import WireError
-from protocol.messages import ScanHeader
-from protocol.refusals import RejectReason
-from vision_side.missions.port import RangeScan
+from sightline.protocol.channels import SCAN
+from sightline.protocol.codec import check_sizes, decode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import ScanHeader
+from sightline.protocol.refusals import RejectReason
+from sightline.vision_side.missions.port import RangeScan
 
 
 def decode_scan(header: bytes, payload: bytes) -> tuple[ScanHeader, RangeScan]:

@@ -6,8 +6,8 @@ turning, as odometry shows it: a disarmed robot keeps its whole search for when 
 
 import math
 
-from protocol.messages import Planar, Pose, Twist
-from vision_side.config import SearchConfig
+from sightline.protocol.messages import Planar, Pose, Twist
+from sightline.vision_side.config import SearchConfig
 
 
 class Search:

@@ -9,25 +9,25 @@ from collections import Counter
 from collections.abc import Callable
 from typing import TypeVar
 
-from protocol.channels import ACK, CAMERA, FRAME, MAX_HEADER_BYTES, TWIST
-from protocol.clock import monotonic_us
-from protocol.codec import decode
-from protocol.errors import WireError
-from protocol.messages import CameraModel, FrameHeader, Stamp
-from protocol.refusals import RejectReason
-from protocol.transports.link import LatestSlot, Link, Message
-from protocol.twist_text import format_twist
-from vision_side.config import VisionConfig
-from vision_side.counts import Counts
-from vision_side.detect.around import attach_detector
-from vision_side.detect.choice import configured_detector
-from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.port import Detector
-from vision_side.detect.timing import TimedDetector
-from vision_side.dispatch import NO_FRAMES, MissionChannel
-from vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, encode_answer
-from vision_side.sessions import SessionSelector
-from vision_side.viewing import ViewPublisher
+from sightline.protocol.channels import ACK, CAMERA, FRAME, MAX_HEADER_BYTES, TWIST
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import CameraModel, FrameHeader, Stamp
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.twist_text import format_twist
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.counts import Counts
+from sightline.vision_side.detect.around import attach_detector
+from sightline.vision_side.detect.choice import configured_detector
+from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.port import Detector
+from sightline.vision_side.detect.timing import TimedDetector
+from sightline.vision_side.dispatch import NO_FRAMES, MissionChannel
+from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, encode_answer
+from sightline.vision_side.sessions import SessionSelector
+from sightline.vision_side.viewing import ViewPublisher
 
 _SILENCE_S = 3.0
 _NO_FRAMES_S = 1.0  # twice what the slowest stream takes between two frames
@@ -41,7 +41,7 @@ Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
 def open_service(config: VisionConfig, link: Link, say: LogLine, eyes: Detector | None = None) -> "Service":
     """The service that fits the configured detector, for one robot. `eyes` are that detector, if it is built."""
     if config.detector.kind == "boxes":
-        from vision_side.boxes_service import BoxesService
+        from sightline.vision_side.boxes_service import BoxesService
 
         return BoxesService(config, link, say)
     return Service(config, link, say, eyes)

@@ -6,15 +6,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from protocol.transports.link import Link
-from vision_side.config import VisionConfig
-from vision_side.counts import Observe
-from vision_side.detect.around import close_detector
-from vision_side.detect.choice import configured_detector
-from vision_side.detect.port import Detector
-from vision_side.missions.choice import configured_mission
-from vision_side.pipeline import SOURCE
-from vision_side.service import LogLine, endpoints_text, open_service
+from sightline.protocol.transports.link import Link
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.counts import Observe
+from sightline.vision_side.detect.around import close_detector
+from sightline.vision_side.detect.choice import configured_detector
+from sightline.vision_side.detect.port import Detector
+from sightline.vision_side.missions.choice import configured_mission
+from sightline.vision_side.pipeline import SOURCE
+from sightline.vision_side.service import LogLine, endpoints_text, open_service
 
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 
@@ -43,7 +43,7 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
 
     Raises ConfigError for an endpoint or a mission that is none, LinkError if the link cannot be opened.
     """
-    from protocol.transports.zenoh_log import log_rejected_peers
+    from sightline.protocol.transports.zenoh_log import log_rejected_peers
 
     configured_mission(config)  # a mission that there is not is said before anything is opened
     ending, eyes = threading.Event(), configured_detector(config)
@@ -56,7 +56,7 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
 
 
 def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | None, eyes: Detector | None) -> int:
-    from protocol.transports.opening import open_link
+    from sightline.protocol.transports.opening import open_link
 
     opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                         max_frame_bytes=config.max_frame_bytes, secure=config.secure)
@@ -68,8 +68,8 @@ def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | N
 
 
 def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe | None, eyes: Detector | None) -> int:
-    from protocol.transports.zenoh_site import open_fleet
-    from vision_side.fleet import Fleet
+    from sightline.protocol.transports.zenoh_site import open_fleet
+    from sightline.vision_side.fleet import Fleet
 
     opened = open_fleet(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                        max_frame_bytes=config.max_frame_bytes, secure=config.secure)

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import CameraModel
-from vision_side.detect.port import Detection
+from sightline.protocol.messages import CameraModel
+from sightline.vision_side.detect.port import Detection
 
 Column = NDArray[np.float64]
 

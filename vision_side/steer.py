@@ -7,8 +7,8 @@ capture times, gains shrink as latency grows, and integrals give way to whatever
 import math
 from dataclasses import dataclass
 
-from protocol.messages import Twist
-from vision_side.config import SteerConfig
+from sightline.protocol.messages import Twist
+from sightline.vision_side.config import SteerConfig
 
 
 @dataclass(frozen=True, slots=True)

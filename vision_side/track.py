@@ -8,9 +8,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from protocol.messages import Pose
-from vision_side.config import TrackConfig
-from vision_side.sphere import Sighting
+from sightline.protocol.messages import Pose
+from sightline.vision_side.config import TrackConfig
+from sightline.vision_side.sphere import Sighting
 
 _FIRST_SPEED_MPS = 0.3  # 1 sigma of a target's speed before anything is known of it
 _SURPRISE = 9.0  # a sighting three sigma off means that the target was pushed ...

@@ -18,17 +18,17 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from protocol.channels import OVERLAY, PREVIEW, Channel
-from protocol.clock import monotonic_us
-from protocol.codec import encode
-from protocol.messages import CameraModel, DetectionsHeader, Echo, FrameHeader
-from protocol.robot_clock import RobotClock
-from protocol.transports.link import LatestSlot, Link
-from vision_side.config import VisionConfig
-from vision_side.decode import Decoder
-from vision_side.overlay import OverlayData, draw_overlay, draw_preview
-from vision_side.pace import RateLimiter
-from vision_side.pipeline import SOURCE, PipelineAnswer
+from sightline.protocol.channels import OVERLAY, PREVIEW, Channel
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import CameraModel, DetectionsHeader, Echo, FrameHeader
+from sightline.protocol.robot_clock import RobotClock
+from sightline.protocol.transports.link import LatestSlot, Link
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.overlay import OverlayData, draw_overlay, draw_preview
+from sightline.vision_side.pace import RateLimiter
+from sightline.vision_side.pipeline import SOURCE, PipelineAnswer
 
 IDLE_S: Final = 2.0
 """Without anything to show for this long the thread ends; the next frame that is watched starts another."""

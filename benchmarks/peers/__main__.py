@@ -1,4 +1,4 @@
-"""One process of one peer: `python -m benchmarks.peers NAME ROLE SETTINGS`. Shell.
+"""One process of one peer: `python -m sightline.benchmarks.peers NAME ROLE SETTINGS`. Shell.
 
 ROLE is robot, vision or (the floor) alone; SETTINGS is JSON. It runs until SIGTERM and then writes its tally.
 """
@@ -15,16 +15,16 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from benchmarks.loop_tally import Tally
-from benchmarks.peers.eyes import Vision
-from benchmarks.peers.film import Film
+from sightline.benchmarks.loop_tally import Tally
+from sightline.benchmarks.peers.eyes import Vision
+from sightline.benchmarks.peers.film import Film
 
 _RETRY_S: Final = 0.1
 
 
 def main(name: str, role: str, settings: dict[str, Any]) -> None:
     """Play `role` of peer `name`."""
-    play = _part(importlib.import_module(f"benchmarks.peers.{name}"), role, settings)
+    play = _part(importlib.import_module(f"sightline.benchmarks.peers.{name}"), role, settings)
     while True:
         try:
             play()
@@ -47,10 +47,10 @@ def _part(peer: ModuleType, role: str, settings: dict[str, Any]) -> Callable[[],
 def _vision(settings: dict[str, Any]) -> Vision:
     """A robot has no use for any, and they are large; nor has a peer with its own for what ours import and set."""
     if settings["eyes"] == "classic":
-        from benchmarks.peers.classic_eyes import ClassicVision
+        from sightline.benchmarks.peers.classic_eyes import ClassicVision
 
         return ClassicVision(settings["delay_ms"], settings["busy_ms"])
-    from benchmarks.loop_eyes import PipelineVision as OurEyes
+    from sightline.benchmarks.loop_eyes import PipelineVision as OurEyes
 
     return OurEyes(settings["width_px"], settings["height_px"], settings["delay_ms"], settings["busy_ms"])
 

@@ -6,12 +6,12 @@ import statistics
 import time
 from typing import TYPE_CHECKING, Final
 
-from protocol.twist_text import parse_twist
+from sightline.protocol.twist_text import parse_twist
 
 if TYPE_CHECKING:
-    from benchmarks.loop_tally import Tally
-    from benchmarks.peers.eyes import Vision
-    from benchmarks.peers.film import Film
+    from sightline.benchmarks.loop_tally import Tally
+    from sightline.benchmarks.peers.eyes import Vision
+    from sightline.benchmarks.peers.film import Film
 
 _HOT_STEPS: Final = 150
 

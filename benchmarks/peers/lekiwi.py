@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import zmq
 
 if TYPE_CHECKING:
-    from benchmarks.loop_tally import Tally
-    from benchmarks.peers.eyes import Vision
-    from benchmarks.peers.film import Film
+    from sightline.benchmarks.loop_tally import Tally
+    from sightline.benchmarks.peers.eyes import Vision
+    from sightline.benchmarks.peers.film import Film
 
 Socket = zmq.Socket[bytes]
 

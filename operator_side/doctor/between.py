@@ -9,22 +9,22 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median, quantiles
 
-from operator_side.acknowledge import Viewer
-from operator_side.doctor.finding import Finding, histogram, trouble
-from operator_side.pictures import viewer_role
-from operator_side.requests import Operator
-from operator_side.status_text import encoding_text, stream_is_whole
-from protocol.channels import FRAME
-from protocol.errors import SightlineError
-from protocol.messages import Status
-from protocol.transports import endpoints, websocket_endpoints
-from protocol.transports.link import Link
-from protocol.transports.opening import open_link
-from protocol.transports.presence import QUERY_ROUNDS, PeerInfo, best_round_trips
-from protocol.transports.secured import ROBOT_ROLE
-from protocol.transports.zenoh_around import find_listeners
-from protocol.transports.zenoh_discovery import LOOPBACK
-from protocol.transports.zenoh_presence import software_version
+from sightline.operator_side.acknowledge import Viewer
+from sightline.operator_side.doctor.finding import Finding, histogram, trouble
+from sightline.operator_side.pictures import viewer_role
+from sightline.operator_side.requests import Operator
+from sightline.operator_side.status_text import encoding_text, stream_is_whole
+from sightline.protocol.channels import FRAME
+from sightline.protocol.errors import SightlineError
+from sightline.protocol.messages import Status
+from sightline.protocol.transports import endpoints, websocket_endpoints
+from sightline.protocol.transports.link import Link
+from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.presence import QUERY_ROUNDS, PeerInfo, best_round_trips
+from sightline.protocol.transports.secured import ROBOT_ROLE
+from sightline.protocol.transports.zenoh_around import find_listeners
+from sightline.protocol.transports.zenoh_discovery import LOOPBACK
+from sightline.protocol.transports.zenoh_presence import software_version
 
 ROLE = "doctor"
 ARP_TABLE = Path("/proc/net/arp")

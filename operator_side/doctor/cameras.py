@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from operator_side.doctor.finding import Finding, trouble
-from protocol.errors import SightlineError
+from sightline.operator_side.doctor.finding import Finding, trouble
+from sightline.protocol.errors import SightlineError
 
 DEVICES: Final = Path("/dev")
 _MEASURED_S: Final = 3.0
@@ -79,7 +79,7 @@ def read_format(answer: bytes) -> str:
 
 def delivered(kind: str, sets: list[str]) -> Finding:
     """The rate that a camera really delivers; what it cannot do at all, it says itself."""
-    from operator_side.local_camera import local_camera
+    from sightline.operator_side.local_camera import local_camera
 
     try:
         with local_camera(kind, sets) as opened:

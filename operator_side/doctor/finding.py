@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from protocol.errors import SightlineError
+from sightline.protocol.errors import SightlineError
 
 
 @dataclass(frozen=True)

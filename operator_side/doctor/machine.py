@@ -13,12 +13,12 @@ from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
-from operator_side.doctor.finding import Finding, trouble
-from operator_side.extras import needs
-from protocol import VERSION
-from protocol.errors import SightlineError
-from protocol.transports.port_owner import port_owner
-from protocol.transports.zenoh_discovery import MULTICAST_GROUP
+from sightline.operator_side.doctor.finding import Finding, trouble
+from sightline.operator_side.extras import needs
+from sightline.protocol import VERSION
+from sightline.protocol.errors import SightlineError
+from sightline.protocol.transports.port_owner import port_owner
+from sightline.protocol.transports.zenoh_discovery import MULTICAST_GROUP
 
 PORTS = {7447: "Zenoh", 9090: "sightline.v1", 9091: "the older dialect"}
 _HOT_C = 80.0
@@ -172,7 +172,7 @@ def _clock() -> Finding:
 def _certificates(folder: str) -> Iterator[Finding]:
     try:
         with needs("secure"):
-            from operator_side import keys
+            from sightline.operator_side import keys
 
             certificates = keys.look(Path(folder))
     except SightlineError as error:

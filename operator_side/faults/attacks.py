@@ -5,11 +5,11 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from operator_side.faults.driver import Script
-from protocol.channels import ACK, MAX_HEADER_BYTES
-from protocol.codec import encode
-from protocol.messages import MAX_INTEGER, FrameHeader, Twist
-from protocol.transports.zenoh_session import open_session
+from sightline.operator_side.faults.driver import Script
+from sightline.protocol.channels import ACK, MAX_HEADER_BYTES
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import MAX_INTEGER, FrameHeader, Twist
+from sightline.protocol.transports.zenoh_session import open_session
 
 LATE_S: Final = 0.5
 FLOOD_HZ: Final = 10_000

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
-from operator_side.check_text import Check, at_least, at_most
-from operator_side.faults.judge import (
+from sightline.operator_side.check_text import Check, at_least, at_most
+from sightline.operator_side.faults.judge import (
     MEMORY_MB,
     Blind,
     Stop,
@@ -15,11 +15,11 @@ from operator_side.faults.judge import (
     moved_on_old_sight,
     stop_checks,
 )
-from operator_side.faults.rig import RobotFixture
-from operator_side.faults.row import Case, Injected, Outcome
-from operator_side.faults.sampler import STALL_US
-from protocol.errors import SightlineError
-from sim.wire_tun import why_impossible
+from sightline.operator_side.faults.rig import RobotFixture
+from sightline.operator_side.faults.row import Case, Injected, Outcome
+from sightline.operator_side.faults.sampler import STALL_US
+from sightline.protocol.errors import SightlineError
+from sightline.sim.wire_tun import why_impossible
 
 MOST_TRIES: Final = 3
 _TO_THE_END_US: Final = 10**9

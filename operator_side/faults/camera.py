@@ -9,10 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from operator_side.faults.ledger import INJECTED, EventLog
-from protocol.errors import HardwareError
-from robot_side.ports import Picture
-from sim.bus import SimCamera, SimSocketConfig
+from sightline.operator_side.faults.ledger import INJECTED, EventLog
+from sightline.protocol.errors import HardwareError
+from sightline.robot_side.ports import Picture
+from sightline.sim.bus import SimCamera, SimSocketConfig
 
 MODE: Final = "camera.mode"
 EVENTS: Final = "camera.ledger"

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from operator_side.faults.ledger import INJECTED
+from sightline.operator_side.faults.ledger import INJECTED
 
 
 def write_wrong_clock(folder: Path, offset_s: str) -> None:

@@ -1,6 +1,6 @@
 """A hundred viewers by WebSocket of whom one never reads, or five hundred handshakes begun and left. Shell.
 
-    python -m operator_side.faults.crowd viewers|handshakes ENDPOINT LEDGER
+    python -m sightline.operator_side.faults.crowd viewers|handshakes ENDPOINT LEDGER
 
 It stands for other people's machines, so it takes little of this one's processor. Whoever is turned away or dropped
 comes again, for ever. The first of the viewers watch with an operator's role, for whom places are kept.
@@ -16,17 +16,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from operator_side.faults.ledger import INJECTED, EventLog
-from protocol.channels import FRAME
-from protocol.codec import encode
-from protocol.transports.websocket_dial import Client
-from protocol.transports.websocket_endpoints import parse_websocket_endpoint
-from protocol.transports.websocket_framing import MAX_BLOCK_BYTES, Hello
-from protocol.transports.websocket_peer import OPEN_S
-from protocol.transports.websocket_places import RESERVED_SLOTS
+from sightline.operator_side.faults.ledger import INJECTED, EventLog
+from sightline.protocol.channels import FRAME
+from sightline.protocol.codec import encode
+from sightline.protocol.transports.websocket_dial import Client
+from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint
+from sightline.protocol.transports.websocket_framing import MAX_BLOCK_BYTES, Hello
+from sightline.protocol.transports.websocket_peer import OPEN_S
+from sightline.protocol.transports.websocket_places import RESERVED_SLOTS
 
 if TYPE_CHECKING:
-    from protocol.transports.websocket_wire import Connection
+    from sightline.protocol.transports.websocket_wire import Connection
 
 ADMITTED: Final = "admitted"
 SEEN: Final = "seen"

@@ -6,16 +6,16 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from operator_side.faults.ledger import GOOD, INJECTED, EventLog
-from protocol.channels import FRAME, TWIST, key_for
-from protocol.codec import decode, encode
-from protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
-from protocol.transports.link import LatestSlot, Message
-from protocol.transports.zenoh import ZenohLink, open_zenoh
-from protocol.twist_text import format_twist
+from sightline.operator_side.faults.ledger import GOOD, INJECTED, EventLog
+from sightline.protocol.channels import FRAME, TWIST, key_for
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
+from sightline.protocol.transports.link import LatestSlot, Message
+from sightline.protocol.transports.zenoh import ZenohLink, open_zenoh
+from sightline.protocol.twist_text import format_twist
 
 if TYPE_CHECKING:
-    from operator_side.faults.peer import PeerOptions
+    from sightline.operator_side.faults.peer import PeerOptions
 
 KEPT: Final = 256
 WAIT_S: Final = 0.05
@@ -74,7 +74,7 @@ class Script:
 
 def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
     """Drive, then do what `options.fault` names, for ever or for `options.seconds`."""
-    from operator_side.faults.attacks import ATTACKS
+    from sightline.operator_side.faults.attacks import ATTACKS
 
     end_s = time.monotonic() + options.seconds if options.seconds else float("inf")
     with open_zenoh(options.robot, connect=[options.endpoint], role=options.source, timeout_s=15) as link:

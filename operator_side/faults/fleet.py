@@ -9,9 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from operator_side.processes import END_S, Processes
+from sightline.operator_side.processes import END_S, Processes
 
-COMMAND_LINE: Final = "operator_side.cli"
+COMMAND_LINE: Final = "sightline.operator_side.cli"
 _RESIDENT: Final = "RssAnon:"
 
 

@@ -8,9 +8,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from operator_side.check_text import Check, at_most
-from robot_side.kinematics import DiffDriveConfig
-from robot_side.limits import TICK_US, SafetyConfig, stop_bound
+from sightline.operator_side.check_text import Check, at_most
+from sightline.robot_side.kinematics import DiffDriveConfig
+from sightline.robot_side.limits import TICK_US, SafetyConfig, stop_bound
 
 FALLS_MS: Final = 340.0
 ZERO_MS: Final = 700.0

@@ -9,8 +9,8 @@ import os
 from pathlib import Path
 from typing import Final
 
-from operator_side.faults.judge import SentCommand
-from protocol.clock import monotonic_us
+from sightline.operator_side.faults.judge import SentCommand
+from sightline.protocol.clock import monotonic_us
 
 GOOD: Final = "good"
 INJECTED: Final = "injected"

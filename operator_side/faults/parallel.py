@@ -10,9 +10,9 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from benchmarks.interrupted import terminated_like_interrupted
-from operator_side.faults.bench import run_case
-from operator_side.faults.row import Case, Outcome
+from sightline.benchmarks.interrupted import terminated_like_interrupted
+from sightline.operator_side.faults.bench import run_case
+from sightline.operator_side.faults.row import Case, Outcome
 
 _FORK: Final = multiprocessing.get_context("fork")  # nothing is open here that a copy could spoil: no link, no thread
 _END_S: Final = 30.0

@@ -1,6 +1,6 @@
 """A process of the bench that speaks to the robot: vision itself, a driver by script, or a person. Shell.
 
-    python -m operator_side.faults.peer OPTIONS_AS_JSON
+    python -m sightline.operator_side.faults.peer OPTIONS_AS_JSON
 
 It does its part until SIGUSR1, and from then on what `fault` names.
 """
@@ -13,8 +13,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Literal
 
-from operator_side.faults.ledger import EventLog
-from protocol.config import Config
+from sightline.operator_side.faults.ledger import EventLog
+from sightline.protocol.config import Config
 
 Role = Literal["vision", "driver", "operator"]
 
@@ -60,14 +60,14 @@ def main() -> int:
 def _entry(role: Role) -> Callable[[PeerOptions, threading.Event, EventLog], int]:
     """Imported late: only vision needs OpenCV."""
     if role == "vision":
-        from operator_side.faults.vision import run_vision
+        from sightline.operator_side.faults.vision import run_vision
 
         return run_vision
     if role == "driver":
-        from operator_side.faults.driver import run_driver
+        from sightline.operator_side.faults.driver import run_driver
 
         return run_driver
-    from operator_side.faults.person import run_operator
+    from sightline.operator_side.faults.person import run_operator
 
     return run_operator
 

@@ -12,20 +12,20 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from operator_side.faults import camera, judge
-from operator_side.faults.clock import write_wrong_clock
-from operator_side.faults.fleet import COMMAND_LINE, Fleet, raise_priority
-from operator_side.faults.judge import MotorRow, SentCommand, wheel_mps
-from operator_side.faults.ledger import GOOD, INJECTED, read_events
-from operator_side.faults.peer import PeerOptions, Role
-from operator_side.faults.sampler import Hole, read_holes, stalled_us
-from operator_side.faults.wires import BenchWire
-from operator_side.toml_text import toml_text
-from protocol.clock import monotonic_us
-from protocol.errors import SightlineError
-from robot_side.limits import TICK_US
-from sim.bus import SimDrive, SimSocketConfig
-from sim.wire_tun import ADDRESS_A
+from sightline.operator_side.faults import camera, judge
+from sightline.operator_side.faults.clock import write_wrong_clock
+from sightline.operator_side.faults.fleet import COMMAND_LINE, Fleet, raise_priority
+from sightline.operator_side.faults.judge import MotorRow, SentCommand, wheel_mps
+from sightline.operator_side.faults.ledger import GOOD, INJECTED, read_events
+from sightline.operator_side.faults.peer import PeerOptions, Role
+from sightline.operator_side.faults.sampler import Hole, read_holes, stalled_us
+from sightline.operator_side.faults.wires import BenchWire
+from sightline.operator_side.toml_text import toml_text
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import SightlineError
+from sightline.robot_side.limits import TICK_US
+from sightline.sim.bus import SimDrive, SimSocketConfig
+from sightline.sim.wire_tun import ADDRESS_A
 
 ROBOT: Final = "r1"
 READY_S: Final = 30.0
@@ -101,7 +101,7 @@ class RobotFixture:
         self.web_endpoint = f"ws://127.0.0.1:{_free_port()}" if self.setup.web else ""
         self._write_files(self._sockets)
         self.fleet.run("sim", COMMAND_LINE, ["sim", "--config", str(self.folder / "sim.toml")])
-        self.fleet.run("sampler", "operator_side.faults.sampler", [str(self.folder / "holes.csv")])
+        self.fleet.run("sampler", "sightline.operator_side.faults.sampler", [str(self.folder / "holes.csv")])
         self.fleet.wait_line("sim", "simulation ready", READY_S)
         self.fleet.wait_line("sampler", "sampling", READY_S)
         for name in ("sim", "sampler"):
@@ -113,7 +113,7 @@ class RobotFixture:
 
     def _write_files(self, sockets: str) -> None:
         device = {"kind": "sim", "options": {"socket_dir": sockets}}
-        eye = {"kind": "operator_side.faults.camera:FaultyCamera",
+        eye = {"kind": "sightline.operator_side.faults.camera:FaultyCamera",
                "options": {"socket_dir": sockets, "folder": str(self.folder)}}
         camera.write_spares(self.folder)
         self.camera_mode(self.setup.camera)
@@ -148,13 +148,13 @@ class RobotFixture:
             config=self.folder / "vision.toml" if role == "vision" else None, **changes,
         )
         self._peers.append(name)
-        self.fleet.run(name, "operator_side.faults.peer", [options.model_dump_json()],
+        self.fleet.run(name, "sightline.operator_side.faults.peer", [options.model_dump_json()],
                        namespace=self.wire.far_side if self.wire else "", environment=self._environment())
 
     def start_crowd(self, kind: str) -> None:
         """Let many WebSocket clients come; what they do is noted as by a peer called `crowd`."""
         arguments = [kind, self.web_endpoint, str(self.folder / "crowd.ledger")]
-        self.fleet.run("crowd", "operator_side.faults.crowd", arguments)
+        self.fleet.run("crowd", "sightline.operator_side.faults.crowd", arguments)
 
     def _environment(self) -> dict[str, str]:
         return {"PYTHONPATH": str(self.folder)} if self.setup.clock else {}

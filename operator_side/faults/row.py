@@ -4,11 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from operator_side.check_text import Check
-from operator_side.faults.judge import DISTANCE_M, FALLS_MS, OLD_US, ZERO_MS
+from sightline.operator_side.check_text import Check
+from sightline.operator_side.faults.judge import DISTANCE_M, FALLS_MS, OLD_US, ZERO_MS
 
 if TYPE_CHECKING:
-    from operator_side.faults.rig import RobotFixture, Setup
+    from sightline.operator_side.faults.rig import RobotFixture, Setup
 
 
 @dataclass(frozen=True, slots=True)

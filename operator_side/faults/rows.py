@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import Final
 
-from operator_side.faults import rows_commands, rows_crowd, rows_network, rows_people, rows_processes
-from operator_side.faults.row import Case
-from operator_side.settings_errors import no_such_name
-from protocol.errors import ConfigError
+from sightline.operator_side.faults import rows_commands, rows_crowd, rows_network, rows_people, rows_processes
+from sightline.operator_side.faults.row import Case
+from sightline.operator_side.settings_errors import no_such_name
+from sightline.protocol.errors import ConfigError
 
 CASES: Final[tuple[Case, ...]] = (
     *rows_processes.PROCESS_CASES, *rows_network.NETWORK_CASES, *rows_commands.COMMAND_CASES, *rows_crowd.CLIENT_CASES, *rows_people.OPERATOR_CASES,

@@ -3,11 +3,11 @@
 from functools import partial
 from typing import Final
 
-from operator_side.faults.rig import RobotFixture, Setup
-from operator_side.faults.row import Case, Injected
-from operator_side.faults.rows_processes import drives_again
-from protocol.clock import monotonic_us
-from sim.wire import LinkShape, LinkShapes
+from sightline.operator_side.faults.rig import RobotFixture, Setup
+from sightline.operator_side.faults.row import Case, Injected
+from sightline.operator_side.faults.rows_processes import drives_again
+from sightline.protocol.clock import monotonic_us
+from sightline.sim.wire import LinkShape, LinkShapes
 
 DISTURBED_S: Final = 6.0
 CUT: Final = LinkShape(cut=True)

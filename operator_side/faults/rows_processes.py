@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Final
 
-from operator_side.check_text import at_most
-from operator_side.faults.rig import RobotFixture, Setup
-from operator_side.faults.row import Case, Injected
-from protocol.clock import monotonic_us
+from sightline.operator_side.check_text import at_most
+from sightline.operator_side.faults.rig import RobotFixture, Setup
+from sightline.operator_side.faults.row import Case, Injected
+from sightline.protocol.clock import monotonic_us
 
 STOPPED_S: Final = 3.0
 SETTLED_S: Final = 1.5

@@ -1,6 +1,6 @@
 """Notes when this machine did not run what should run: the stamps of such a moment cannot be trusted. Shell.
 
-    python -m operator_side.faults.sampler FILE
+    python -m sightline.operator_side.faults.sampler FILE
 
 A process of its own beside the simulation's receiving thread and at its priority. One line per hole: `from_us,to_us`.
 """
@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from protocol.clock import monotonic_us
+from sightline.protocol.clock import monotonic_us
 
 PERIOD_S: Final = 0.005
 STALL_US: Final = 20_000

@@ -7,20 +7,20 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from operator_side.faults.ledger import GOOD, INJECTED, EventLog
-from operator_side.service_settings import load_service
-from protocol.channels import TWIST, Channel
-from protocol.codec import decode
-from protocol.messages import AnswerHeader
-from protocol.transports.link import LatestSlot, Link, Message
-from protocol.transports.zenoh import open_zenoh
-from vision_side.config import VisionConfig
-from vision_side.detect.hsv import HsvDetector
-from vision_side.pipeline import SOURCE as VISION_SOURCE
-from vision_side.service_process import serve
+from sightline.operator_side.faults.ledger import GOOD, INJECTED, EventLog
+from sightline.operator_side.service_settings import load_service
+from sightline.protocol.channels import TWIST, Channel
+from sightline.protocol.codec import decode
+from sightline.protocol.messages import AnswerHeader
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.pipeline import SOURCE as VISION_SOURCE
+from sightline.vision_side.service_process import serve
 
 if TYPE_CHECKING:
-    from operator_side.faults.peer import PeerOptions
+    from sightline.operator_side.faults.peer import PeerOptions
 
 SLOW_S: Final = 0.33
 """Ten frame intervals at 30 fps."""

@@ -12,13 +12,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
-from protocol.channels import Channel
-from protocol.codec import decode, encode
-from protocol.conformance.case import ConformanceError, NotApplicableError
-from protocol.errors import WireError
-from protocol.messages import WireModel
-from protocol.transports.link import Message
-from protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
+from sightline.protocol.channels import Channel
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.conformance.case import ConformanceError, NotApplicableError
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import WireModel
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
 
 KEPT_MESSAGES: Final = 600
 """Per channel; 20 s of frames at 30 fps, longer than any case lasts."""

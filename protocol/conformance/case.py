@@ -20,7 +20,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from protocol.conformance.bench import Bench
+    from sightline.protocol.conformance.bench import Bench
 
 GROUPS: Final = {
     "FRAM": "framing",

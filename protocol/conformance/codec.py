@@ -7,12 +7,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Case, Level, NotApplicableError, Suite
-from protocol.conformance.codec_lines import ProgramError, same
-from protocol.conformance.codec_process import CodecProgram
-from protocol.conformance.codec_questions import CodecCase, codec_cases
-from protocol.conformance.runner import Outcome, Result
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Case, Level, NotApplicableError, Suite
+from sightline.protocol.conformance.codec_lines import ProgramError, same
+from sightline.protocol.conformance.codec_process import CodecProgram
+from sightline.protocol.conformance.codec_questions import CodecCase, codec_cases
+from sightline.protocol.conformance.runner import Outcome, Result
 
 END: Final = "C-CODEC-9001"
 

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from types import TracebackType
 from typing import IO, Any, Final, Self
 
-from protocol.conformance.codec_lines import MAX_ANSWER_BYTES, ProgramError, Question, read_answer, shown
-from protocol.errors import ConfigError
+from sightline.protocol.conformance.codec_lines import MAX_ANSWER_BYTES, ProgramError, Question, read_answer, shown
+from sightline.protocol.errors import ConfigError
 
 START_S: Final = 10.0
 """Until the first answer: an interpreter may have to start and compile."""

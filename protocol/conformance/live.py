@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Final, Self
 
-from protocol.channels import Channel
-from protocol.clock import monotonic_us
-from protocol.conformance.bench import Access, Bench
-from protocol.conformance.case import NotApplicableError
-from protocol.transports.link import Link, Message
-from protocol.transports.secured import certificate_role
+from sightline.protocol.channels import Channel
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.conformance.bench import Access, Bench
+from sightline.protocol.conformance.case import NotApplicableError
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.secured import certificate_role
 
 _WAITING: Final = 1024  # messages that a case has not yet looked at; it looks every few milliseconds
 _NAP_S: Final = 0.005

@@ -15,8 +15,8 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Final, NamedTuple, Self
 
-from protocol.errors import ConfigError, LinkError
-from protocol.transports.websocket_framing import SUBPROTOCOL
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.websocket_framing import SUBPROTOCOL
 
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 CONTINUED: Final = 0

@@ -5,8 +5,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from protocol.conformance.case import Level
-from protocol.conformance.runner import Outcome, Result, passed, printable
+from sightline.protocol.conformance.case import Level
+from sightline.protocol.conformance.runner import Outcome, Result, passed, printable
 
 _MARKS: Final = {Outcome.PASSED: "ok", Outcome.FAILED: "FAIL", Outcome.SKIPPED: "n/a"}
 

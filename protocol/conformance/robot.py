@@ -2,8 +2,8 @@
 
 from typing import Final
 
-from protocol.channels import STATUS
-from protocol.conformance import (
+from sightline.protocol.channels import STATUS
+from sightline.protocol.conformance import (
     robot_arming,
     robot_asking,
     robot_commands,
@@ -22,10 +22,10 @@ from protocol.conformance import (
     robot_stop,
     robot_tokens,
 )
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import GROUPS, Case, ConformanceError
-from protocol.conformance.robot_rig import Robot, Sender
-from protocol.messages import State, Status
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import GROUPS, Case, ConformanceError
+from sightline.protocol.conformance.robot_rig import Robot, Sender
+from sightline.protocol.messages import State, Status
 
 _SUITES: Final = (
     robot_framing.SUITE,

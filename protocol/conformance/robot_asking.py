@@ -2,11 +2,11 @@
 
 from typing import Final
 
-from protocol.channels import REPLY, REQUEST
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.robot_rig import GOOD, Robot, Sender, armed
-from protocol.messages import Reply, Stamp, State
+from sightline.protocol.channels import REPLY, REQUEST
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.robot_rig import GOOD, Robot, Sender, armed
+from sightline.protocol.messages import Reply, Stamp, State
 
 SUITE: Final = Suite("R")
 

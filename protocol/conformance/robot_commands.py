@@ -6,11 +6,11 @@ A robot that is not armed judges every command all the same and counts a good on
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
-from protocol.channels import MAX_HEADER_BYTES, TWIST
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Case, Level, Suite
-from protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, as_json
-from protocol.messages import MAX_INTEGER, FrameHeader
+from sightline.protocol.channels import MAX_HEADER_BYTES, TWIST
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Case, Level, Suite
+from sightline.protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, as_json
+from sightline.protocol.messages import MAX_INTEGER, FrameHeader
 
 SUITE: Final = Suite("R")
 

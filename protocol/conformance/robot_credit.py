@@ -2,12 +2,21 @@
 
 from typing import Final
 
-from protocol.channels import STATUS
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.robot_flow import OWNED_US, QUICK_FPS, SLOW_US, TAUGHT, again, fps_of, silent_fps, taught
-from protocol.conformance.robot_rig import Robot, Sender
-from protocol.messages import Status
+from sightline.protocol.channels import STATUS
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.robot_flow import (
+    OWNED_US,
+    QUICK_FPS,
+    SLOW_US,
+    TAUGHT,
+    again,
+    fps_of,
+    silent_fps,
+    taught,
+)
+from sightline.protocol.conformance.robot_rig import Robot, Sender
+from sightline.protocol.messages import Status
 
 SUITE: Final = Suite("R")
 _ALONE_US: Final = 6_000_000

@@ -7,11 +7,11 @@ that they compute (which widens no window), and then look at what comes while th
 from itertools import pairwise
 from typing import Final
 
-from protocol.channels import FRAME, STATUS
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.robot_rig import Robot, Sender
-from protocol.messages import Stamp
+from sightline.protocol.channels import FRAME, STATUS
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.robot_rig import Robot, Sender
+from sightline.protocol.messages import Stamp
 
 SUITE: Final = Suite("R")
 SLOW_US: Final = 90_000

@@ -4,15 +4,25 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import Final
 
-from protocol.channels import CAMERA, CHANNELS, FRAME, KEY_PREFIX, MAX_HEADER_BYTES, ODOMETRY, SCAN, STATUS, Direction
-from protocol.codec import decode_ranges
-from protocol.conformance.bench import Bench, Heard
-from protocol.conformance.case import Suite
-from protocol.conformance.robot_rig import Robot, Sender, armed
-from protocol.errors import WireError
-from protocol.jpeg import read_jpeg_size
-from protocol.messages import CameraModel, FrameHeader, Odometry, ScanHeader, Stamp, Status
-from protocol.transports.link_rules import INEXACT_KEY, OVERSIZE
+from sightline.protocol.channels import (
+    CAMERA,
+    CHANNELS,
+    FRAME,
+    KEY_PREFIX,
+    MAX_HEADER_BYTES,
+    ODOMETRY,
+    SCAN,
+    STATUS,
+    Direction,
+)
+from sightline.protocol.codec import decode_ranges
+from sightline.protocol.conformance.bench import Bench, Heard
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.robot_rig import Robot, Sender, armed
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.messages import CameraModel, FrameHeader, Odometry, ScanHeader, Stamp, Status
+from sightline.protocol.transports.link_rules import INEXACT_KEY, OVERSIZE
 
 SUITE: Final = Suite("R")
 _WATCHED_US: Final = 2_000_000

@@ -2,11 +2,11 @@
 
 from typing import Final
 
-from protocol.channels import FRAME, REQUEST, STATUS, TWIST, key_for
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, arm, armed, as_json
-from protocol.messages import Holder, Stamp, State
+from sightline.protocol.channels import FRAME, REQUEST, STATUS, TWIST, key_for
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, arm, armed, as_json
+from sightline.protocol.messages import Holder, Stamp, State
 
 SUITE: Final = Suite("R")
 _GUEST_MPS: Final = 0.2

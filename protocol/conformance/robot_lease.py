@@ -2,10 +2,10 @@
 
 from typing import Final
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.robot_rig import GOOD, Robot, Sender, armed
-from protocol.messages import Holder, State
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.robot_rig import GOOD, Robot, Sender, armed
+from sightline.protocol.messages import Holder, State
 
 SUITE: Final = Suite("R")
 _LEASE_US: Final = 1_000_000

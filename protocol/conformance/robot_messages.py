@@ -5,12 +5,12 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
-from protocol.channels import CHANNELS, MAX_HEADER_BYTES, REPLY, STATUS
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.raw_websocket import BINARY, CONTINUED, PING, PONG, TEXT, Frame, RawWebSocket
-from protocol.conformance.robot_rig import Robot, Sender, as_json
-from protocol.conformance.robot_sockets import (
+from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, REPLY, STATUS
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.raw_websocket import BINARY, CONTINUED, PING, PONG, TEXT, Frame, RawWebSocket
+from sightline.protocol.conformance.robot_rig import Robot, Sender, as_json
+from sightline.protocol.conformance.robot_sockets import (
     PASSING_S,
     SESSION,
     SOON_S,
@@ -25,7 +25,7 @@ from protocol.conformance.robot_sockets import (
     packets_of,
     spoken,
 )
-from protocol.transports.websocket_framing import MAX_BLOCK_BYTES
+from sightline.protocol.transports.websocket_framing import MAX_BLOCK_BYTES
 
 SUITE: Final = Suite("R")
 

@@ -6,12 +6,12 @@ How long a stop takes is the time between two arrivals at the kit, so that the l
 import math
 from typing import Final
 
-from protocol.channels import STATUS
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.robot_rig import CRAWL, Robot, Sender, armed
-from protocol.messages import FrameHeader, Planar, State, Status
-from protocol.refusals import CLAMPED
+from sightline.protocol.channels import STATUS
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.robot_rig import CRAWL, Robot, Sender, armed
+from sightline.protocol.messages import FrameHeader, Planar, State, Status
+from sightline.protocol.refusals import CLAMPED
 
 SUITE: Final = Suite("R")
 _STOPS_WITHIN_US: Final = 700_000

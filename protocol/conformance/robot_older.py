@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.raw_websocket import BINARY, TEXT, RawWebSocket, split_url
-from protocol.conformance.robot_rig import GOOD, Robot, Sender
-from protocol.errors import WireError
-from protocol.jpeg import read_jpeg_size
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.raw_websocket import BINARY, TEXT, RawWebSocket, split_url
+from sightline.protocol.conformance.robot_rig import GOOD, Robot, Sender
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
 
 SUITE: Final = Suite("R")
 _LINE: Final = 76

@@ -2,11 +2,11 @@
 
 from typing import Final
 
-from protocol.channels import TWIST
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.robot_rig import CRAWL, Robot, Sender, as_json
-from protocol.messages import MAX_INTEGER, Status
+from sightline.protocol.channels import TWIST
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.robot_rig import CRAWL, Robot, Sender, as_json
+from sightline.protocol.messages import MAX_INTEGER, Status
 
 SUITE: Final = Suite("R")
 _REMEMBERED_FRAMES: Final = 256

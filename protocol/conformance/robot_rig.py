@@ -9,10 +9,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
-from protocol.channels import ACK, CAMERA, FRAME, REPLY, REQUEST, STATUS, TWIST
-from protocol.conformance.bench import Bench, Heard
-from protocol.messages import CameraModel, FrameHeader, Reply, Stamp, State, Status
-from protocol.refusals import CLAMPED, RejectReason
+from sightline.protocol.channels import ACK, CAMERA, FRAME, REPLY, REQUEST, STATUS, TWIST
+from sightline.protocol.conformance.bench import Bench, Heard
+from sightline.protocol.messages import CameraModel, FrameHeader, Reply, Stamp, State, Status
+from sightline.protocol.refusals import CLAMPED, RejectReason
 
 GOOD: Final = "GOOD"
 """The verdict on a command that the robot judged good: obeyed, or counted as DISARMED."""

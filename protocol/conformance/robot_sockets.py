@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import NotApplicableError, Suite
-from protocol.conformance.raw_websocket import BINARY, CONTINUED, TEXT, RawWebSocket, split_url
-from protocol.conformance.robot_rig import as_json
-from protocol.errors import WireError
-from protocol.transports.websocket_framing import SUBPROTOCOL, IncomingMessage, parse_hello, unpack
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import NotApplicableError, Suite
+from sightline.protocol.conformance.raw_websocket import BINARY, CONTINUED, TEXT, RawWebSocket, split_url
+from sightline.protocol.conformance.robot_rig import as_json
+from sightline.protocol.errors import WireError
+from sightline.protocol.transports.websocket_framing import SUBPROTOCOL, IncomingMessage, parse_hello, unpack
 
 SUITE: Final = Suite("R")
 SWITCHED: Final = 101

@@ -2,11 +2,11 @@
 
 from typing import Final
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.robot_arming import expect_arm_rejected, is_soon
-from protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, arm, armed
-from protocol.messages import State, Status
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.robot_arming import expect_arm_rejected, is_soon
+from sightline.protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, arm, armed
+from sightline.protocol.messages import State, Status
 
 SUITE: Final = Suite("R")
 _DRIVEN = (State.HOLD, State.ACTIVE, State.DEGRADED)

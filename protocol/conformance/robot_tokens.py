@@ -2,10 +2,10 @@
 
 from typing import Any, Final
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.raw_websocket import BINARY, TEXT, RawWebSocket
-from protocol.conformance.robot_sockets import (
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.raw_websocket import BINARY, TEXT, RawWebSocket
+from sightline.protocol.conformance.robot_sockets import (
     SOON_S,
     SWITCHED,
     block,
@@ -16,7 +16,7 @@ from protocol.conformance.robot_sockets import (
     is_answered,
     offered,
 )
-from protocol.transports.websocket_framing import SUBPROTOCOL
+from sightline.protocol.transports.websocket_framing import SUBPROTOCOL
 
 SUITE: Final = Suite("R")
 _CLAUSE: Final = "14.3 Token"

@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import GROUPS, Case, ConformanceError, Level, NotApplicableError
-from protocol.errors import ConfigError, LinkError
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import GROUPS, Case, ConformanceError, Level, NotApplicableError
+from sightline.protocol.errors import ConfigError, LinkError
 
 
 class Outcome(StrEnum):

@@ -5,8 +5,8 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Final, Self
 
-from protocol.transports.secured import load_role_keys
-from protocol.transports.zenoh_session import open_session
+from sightline.protocol.transports.secured import load_role_keys
+from sightline.protocol.transports.zenoh_session import open_session
 
 _OPEN_S: Final = 5.0
 

@@ -10,9 +10,9 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Final, Protocol
 
-from protocol.channels import CHANNELS, Channel, Direction
-from protocol.conformance.bench import Bench
-from protocol.transports.memory import MemoryLink, MemoryNetwork
+from sightline.protocol.channels import CHANNELS, Channel, Direction
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.transports.memory import MemoryLink, MemoryNetwork
 
 STEP_US: Final = 5_000
 """Fine enough for ticks of 20 ms and frames of 33 ms, coarse enough that a second costs 200 steps."""

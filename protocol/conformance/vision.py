@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from protocol.conformance import (
+from sightline.protocol.conformance import (
     vision_answers,
     vision_causality,
     vision_doors,
@@ -13,9 +13,9 @@ from protocol.conformance import (
     vision_sockets,
     vision_steering,
 )
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Case
-from protocol.conformance.vision_robot import RobotPlayed
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Case
+from sightline.protocol.conformance.vision_robot import RobotPlayed
 
 _FIRST_US: Final = 20_000_000
 """A vision may still be starting, or be started now."""

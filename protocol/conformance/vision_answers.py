@@ -6,17 +6,17 @@ import re
 from collections.abc import Callable
 from typing import Any, Final
 
-from protocol.channels import MAX_HEADER_BYTES
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Case, Level, Suite
-from protocol.conformance.vision_pictures import png
-from protocol.conformance.vision_robot import Answer, RobotPlayed
-from protocol.errors import WireError
-from protocol.golden_case import packed
-from protocol.messages import MAX_INTEGER
-from protocol.refusals import RejectReason
-from protocol.transports.link_rules import INEXACT_KEY, OVERSIZE
-from protocol.twist_text import parse_twist
+from sightline.protocol.channels import MAX_HEADER_BYTES
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Case, Level, Suite
+from sightline.protocol.conformance.vision_pictures import png
+from sightline.protocol.conformance.vision_robot import Answer, RobotPlayed
+from sightline.protocol.errors import WireError
+from sightline.protocol.golden_case import packed
+from sightline.protocol.messages import MAX_INTEGER
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link_rules import INEXACT_KEY, OVERSIZE
+from sightline.protocol.twist_text import parse_twist
 
 SUITE = Suite("V")
 _SESSION: Final = re.compile(r"[0-9a-f]{8}")

@@ -4,10 +4,10 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.vision_pictures import png
-from protocol.conformance.vision_robot import ANSWER_US, FRAME_US, Answer, RobotPlayed, Sent
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.vision_pictures import png
+from sightline.protocol.conformance.vision_robot import ANSWER_US, FRAME_US, Answer, RobotPlayed, Sent
 
 SUITE = Suite("V")
 _BURST = 20

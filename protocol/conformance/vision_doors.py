@@ -2,10 +2,10 @@
 
 from typing import Final
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.vision_socket_server import RawClient
-from protocol.conformance.vision_sockets import BACK_S, client_of, ends, met, need_websocket, server_of
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.vision_socket_server import RawClient
+from sightline.protocol.conformance.vision_sockets import BACK_S, client_of, ends, met, need_websocket, server_of
 
 SUITE = Suite("V")
 _ENTRY: Final = "sightline.token."

@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from typing import Final
 
-from protocol.channels import REQUEST
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Case, Level, Suite
-from protocol.conformance.vision_pictures import CAMERA as LENS
-from protocol.conformance.vision_pictures import HALF_CAMERA
-from protocol.conformance.vision_robot import ANSWER_US, FRAME_US, RobotPlayed
-from protocol.golden_case import packed
-from protocol.messages import Holder, LastRejection, State, Status
+from sightline.protocol.channels import REQUEST
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Case, Level, Suite
+from sightline.protocol.conformance.vision_pictures import CAMERA as LENS
+from sightline.protocol.conformance.vision_pictures import HALF_CAMERA
+from sightline.protocol.conformance.vision_robot import ANSWER_US, FRAME_US, RobotPlayed
+from sightline.protocol.golden_case import packed
+from sightline.protocol.messages import Holder, LastRejection, State, Status
 
 SUITE = Suite("V")
 _BURST: Final = 20

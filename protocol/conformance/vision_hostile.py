@@ -4,14 +4,14 @@ from collections.abc import Callable
 from random import Random
 from typing import Any, Final
 
-from protocol.channels import CAMERA, FRAME, MAX_HEADER_BYTES, STATUS
-from protocol.codec import encode
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Case, Level, Suite
-from protocol.conformance.vision_pictures import CAMERA as LENS
-from protocol.conformance.vision_pictures import HALF_CAMERA, picture
-from protocol.conformance.vision_robot import ANSWER_US, RobotPlayed
-from protocol.golden_case import packed
+from sightline.protocol.channels import CAMERA, FRAME, MAX_HEADER_BYTES, STATUS
+from sightline.protocol.codec import encode
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Case, Level, Suite
+from sightline.protocol.conformance.vision_pictures import CAMERA as LENS
+from sightline.protocol.conformance.vision_pictures import HALF_CAMERA, picture
+from sightline.protocol.conformance.vision_robot import ANSWER_US, RobotPlayed
+from sightline.protocol.golden_case import packed
 
 SUITE = Suite("V")
 _JSON, _NUMBERS, _VERSION, _FIELDS = "2.1 JSON", "2.2 Numbers", "2.4 Version", "2.8 Fields"

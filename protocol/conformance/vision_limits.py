@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from typing import Final
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Case, Level, Suite
-from protocol.conformance.vision_pictures import claiming, commented, many_scans, picture, png
-from protocol.conformance.vision_robot import RobotPlayed
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Case, Level, Suite
+from sightline.protocol.conformance.vision_pictures import claiming, commented, many_scans, picture, png
+from sightline.protocol.conformance.vision_robot import RobotPlayed
 
 SUITE = Suite("V")
 _CHECK: Final = "3.2 Bounds check"

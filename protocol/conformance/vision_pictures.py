@@ -1,7 +1,7 @@
 """The pictures that the kit's robot sends: a yellow ball in a plain room, and what is no picture at all. Pure.
 
-    python -m protocol.conformance.vision_pictures --verify     the files are what this code draws
-    python -m protocol.conformance.vision_pictures --write
+    python -m sightline.protocol.conformance.vision_pictures --verify     the files are what this code draws
+    python -m sightline.protocol.conformance.vision_pictures --write
 
 They are made with integers alone and kept as files, so that a person can look at them, and a peer in another language
 can be tried on them without the kit. `CAMERA` is the lens that they were drawn for.
@@ -15,8 +15,8 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from protocol.conformance.vision_jpeg import Pixel, Scene, encode_jpeg
-from protocol.messages import CameraModel
+from sightline.protocol.conformance.vision_jpeg import Pixel, Scene, encode_jpeg
+from sightline.protocol.messages import CameraModel
 
 HERE = Path(__file__).parent / "pictures"
 CAMERA: Final = CameraModel(width_px=320, height_px=240, fx_px=190.7, fy_px=190.7, cx_px=160.0, cy_px=120.0,
@@ -138,7 +138,7 @@ def main(arguments: Sequence[str]) -> int:
     if list(arguments) == ["--write"]:
         write()
     elif list(arguments) != ["--verify"]:
-        print("usage: python -m protocol.conformance.vision_pictures --write | --verify", file=sys.stderr)
+        print("usage: python -m sightline.protocol.conformance.vision_pictures --write | --verify", file=sys.stderr)
         return 2
     names = differing()
     if names:

@@ -2,9 +2,9 @@
 
 from typing import Final
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.vision_robot import RobotPlayed
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.vision_robot import RobotPlayed
 
 SUITE = Suite("V")
 _BACK_US: Final = 5_000_000

@@ -15,12 +15,12 @@ import zlib
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
-from protocol.channels import ACK, CAMERA, FRAME, STATUS, TWIST, Channel
-from protocol.codec import encode
-from protocol.conformance.bench import Bench, Heard
-from protocol.conformance.vision_pictures import CAMERA as LENS
-from protocol.conformance.vision_pictures import picture
-from protocol.messages import CameraModel, FrameHeader, Stamp, State, Status
+from sightline.protocol.channels import ACK, CAMERA, FRAME, STATUS, TWIST, Channel
+from sightline.protocol.codec import encode
+from sightline.protocol.conformance.bench import Bench, Heard
+from sightline.protocol.conformance.vision_pictures import CAMERA as LENS
+from sightline.protocol.conformance.vision_pictures import picture
+from sightline.protocol.messages import CameraModel, FrameHeader, Stamp, State, Status
 
 ANSWER_US: Final = 500_000
 """Credit that is not returned times out within this: later is as good as never."""

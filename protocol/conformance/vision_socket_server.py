@@ -15,7 +15,7 @@ import time
 from types import TracebackType
 from typing import Final, Self
 
-from protocol.errors import LinkError
+from sightline.protocol.errors import LinkError
 
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 SESSION_BEGINS: Final = "5ca1"

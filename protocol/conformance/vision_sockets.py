@@ -6,18 +6,26 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from protocol.channels import CAMERA, FRAME, Channel
-from protocol.codec import encode
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.vision_pictures import CAMERA as LENS
-from protocol.conformance.vision_pictures import picture
-from protocol.conformance.vision_socket_server import BINARY, PING, PONG, TEXT, GoneError, RawClient, RawServer
-from protocol.errors import WireError
-from protocol.messages import FrameHeader, Stamp
-from protocol.transports.websocket_endpoints import parse_websocket_endpoint
-from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL, pack, parse_hello
-from protocol.transports.websocket_tls import server_tls_context
+from sightline.protocol.channels import CAMERA, FRAME, Channel
+from sightline.protocol.codec import encode
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.vision_pictures import CAMERA as LENS
+from sightline.protocol.conformance.vision_pictures import picture
+from sightline.protocol.conformance.vision_socket_server import (
+    BINARY,
+    PING,
+    PONG,
+    TEXT,
+    GoneError,
+    RawClient,
+    RawServer,
+)
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import FrameHeader, Stamp
+from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint
+from sightline.protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL, pack, parse_hello
+from sightline.protocol.transports.websocket_tls import server_tls_context
 
 SUITE = Suite("V")
 BACK_S: Final = 5.0

@@ -6,9 +6,9 @@ follows a yellow ball, which is what ours do unless told otherwise.
 
 from typing import Final
 
-from protocol.conformance.bench import Bench
-from protocol.conformance.case import Suite
-from protocol.conformance.vision_robot import Answer, RobotPlayed
+from sightline.protocol.conformance.bench import Bench
+from sightline.protocol.conformance.case import Suite
+from sightline.protocol.conformance.vision_robot import Answer, RobotPlayed
 
 SUITE = Suite("V")
 _SECOND: Final = 20

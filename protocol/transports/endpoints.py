@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from typing import Final
 
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 
 SEND_BUFFER_BYTES: Final = 262_144
 """A bounded socket buffer keeps frames young: what waits in the socket can no longer be dropped, and credit bounds it.

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Generic, Protocol, Self, TypeVar
 
-from protocol.channels import Channel
+from sightline.protocol.channels import Channel
 
 Item = TypeVar("Item")
 

@@ -7,9 +7,9 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 
-from protocol.channels import FRAME, MAX_HEADER_BYTES, Channel, check_robot_id, key_for, parse_key
-from protocol.errors import ConfigError
-from protocol.transports.link import Message
+from sightline.protocol.channels import FRAME, MAX_HEADER_BYTES, Channel, check_robot_id, key_for, parse_key
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.link import Message
 
 INEXACT_KEY = "INEXACT_KEY"
 """Counted for a key that is not exactly that of the robot and channel: a wildcard, another robot, a bad role."""

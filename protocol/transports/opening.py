@@ -11,10 +11,10 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, Self
 
-from protocol.channels import FRAME, Channel
-from protocol.errors import ConfigError
-from protocol.transports import endpoints, websocket_endpoints
-from protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.channels import FRAME, Channel
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports import endpoints, websocket_endpoints
+from sightline.protocol.transports.link import LatestSlot, Link, Message
 
 
 def check_endpoint(endpoint: str) -> None:
@@ -46,12 +46,12 @@ def open_link(
     links: list[Link] = []
     with ExitStack() as undo:
         if any(zenoh) or not any(web):
-            from protocol.transports.zenoh import open_zenoh
+            from sightline.protocol.transports.zenoh import open_zenoh
 
             of_zenoh = open_zenoh(robot, listen=zenoh[0], connect=zenoh[1], secure=secure, session=session, **options)
             links.append(undo.enter_context(of_zenoh))
         if any(web):
-            from protocol.transports.websocket import open_websocket
+            from sightline.protocol.transports.websocket import open_websocket
 
             of_web = open_websocket(robot, listen=web[0], connect=web[1], secure=secure, **options)
             links.append(undo.enter_context(of_web))

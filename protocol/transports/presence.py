@@ -12,10 +12,10 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from protocol.codec import decode
-from protocol.errors import WireError
-from protocol.messages import Microseconds, SessionId, Source, WireModel
-from protocol.transports.secured import PRESENCE_PREFIX, ROBOT_ROLE, certificate_role
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import Microseconds, SessionId, Source, WireModel
+from sightline.protocol.transports.secured import PRESENCE_PREFIX, ROBOT_ROLE, certificate_role
 
 PRESENCE_PATTERN: Final = f"{PRESENCE_PREFIX}/**"
 MAX_BYTES: Final = 512

@@ -7,9 +7,9 @@ passes on itself.
 from collections.abc import Sequence
 from functools import partial
 
-from protocol.channels import CHANNELS, Channel
-from protocol.transports.link import Link, Message
-from protocol.transports.opening import LinkGroup
+from sightline.protocol.channels import CHANNELS, Channel
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.opening import LinkGroup
 
 
 class Relay:

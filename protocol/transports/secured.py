@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REQUEST, Channel, Direction
-from protocol.errors import ConfigError
-from protocol.transports.endpoints import parse_zenoh_endpoint
+from sightline.protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REQUEST, Channel, Direction
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
 
 ROBOT_ROLE: Final = "robot"
 SOURCES_OF_ROLE: Final[dict[str, tuple[str, ...]]] = {
@@ -28,7 +28,7 @@ KNOWN_SOURCES: Final = frozenset(source for sources in SOURCES_OF_ROLE.values() 
 """The sources that a role speaks as; any other is made up by its peer, and possible only on a link without keys."""
 ROLES: Final = (ROBOT_ROLE, *SOURCES_OF_ROLE)
 PRESENCE_PREFIX: Final = "sightline-presence"
-"""Where peers say that they are there (`protocol.transports.presence`): beside `sightline/`, the keys of channels."""
+"""Where peers say that they are there (`sightline.protocol.transports.presence`): beside `sightline/`, the keys of channels."""
 _TLS: Final = ("tls", "quic")
 
 

@@ -18,24 +18,24 @@ from functools import partial
 from types import TracebackType
 from typing import Final, Self
 
-from protocol.channels import FRAME, TWIST, Channel, parse_key
-from protocol.clock import monotonic_us
-from protocol.errors import ConfigError, LinkError
-from protocol.log_lines import log_line
-from protocol.transports.link import LatestSlot, Message
-from protocol.transports.link_rules import INEXACT_KEY, LinkRules
-from protocol.transports.websocket_dial import Client as Dialer
-from protocol.transports.websocket_dialects import PeerCodec, SightlineV1
-from protocol.transports.websocket_doorlog import BurstLimiter
-from protocol.transports.websocket_endpoints import WebSocketEndpoint, parse_websocket_endpoint
-from protocol.transports.websocket_framing import IncomingMessage
-from protocol.transports.websocket_legacy import LegacyClient, LegacyToRobot, LegacyToVision
-from protocol.transports.websocket_listen import KeyFolder, Server
-from protocol.transports.websocket_outbox import Publication
-from protocol.transports.websocket_peer import Peer, Promote, exchange_hellos
-from protocol.transports.websocket_seat import DriverSlot
-from protocol.transports.websocket_wants import Subscriptions
-from protocol.transports.websocket_wire import Connection
+from sightline.protocol.channels import FRAME, TWIST, Channel, parse_key
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.log_lines import log_line
+from sightline.protocol.transports.link import LatestSlot, Message
+from sightline.protocol.transports.link_rules import INEXACT_KEY, LinkRules
+from sightline.protocol.transports.websocket_dial import Client as Dialer
+from sightline.protocol.transports.websocket_dialects import PeerCodec, SightlineV1
+from sightline.protocol.transports.websocket_doorlog import BurstLimiter
+from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint, parse_websocket_endpoint
+from sightline.protocol.transports.websocket_framing import IncomingMessage
+from sightline.protocol.transports.websocket_legacy import LegacyClient, LegacyToRobot, LegacyToVision
+from sightline.protocol.transports.websocket_listen import KeyFolder, Server
+from sightline.protocol.transports.websocket_outbox import Publication
+from sightline.protocol.transports.websocket_peer import Peer, Promote, exchange_hellos
+from sightline.protocol.transports.websocket_seat import DriverSlot
+from sightline.protocol.transports.websocket_wants import Subscriptions
+from sightline.protocol.transports.websocket_wire import Connection
 
 CLOSE_S: Final = 1.5
 """A close that takes longer is left to daemon threads, so that no process hangs on a dead peer."""
@@ -53,7 +53,7 @@ def open_websocket(
 ) -> WebSocketLink:
     """Open a link to `robot`; use it in a `with`.
 
-    Endpoints are `ws://host:port`, `wss://` and `ws-legacy://` (`protocol.transports.websocket_endpoints`). Who listens
+    Endpoints are `ws://host:port`, `wss://` and `ws-legacy://` (`sightline.protocol.transports.websocket_endpoints`). Who listens
     reaches `connect` in the background; a lost connection is made again by itself. `role` is the default source of what
     is published towards the robot. `secure` is a folder of tokens and certificates (`websocket_keys`, `websocket_tls`).
     Raises ConfigError for a robot id, endpoint, limit or folder that is none, for an endpoint open to anybody, and for
@@ -105,7 +105,7 @@ class WebSocketLink:
 
     @property
     def refused(self) -> Counter[str]:
-        """Messages and peers turned away, by reason (`protocol.transports.link_rules`, `websocket_*`)."""
+        """Messages and peers turned away, by reason (`sightline.protocol.transports.link_rules`, `websocket_*`)."""
         return self._rules.refused
 
     @property

@@ -5,9 +5,9 @@ import ipaddress
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from protocol.errors import ConfigError
-from protocol.transports.secured import may_publish
-from protocol.transports.websocket_endpoints import WebSocketEndpoint, with_allowed
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.secured import may_publish
+from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint, with_allowed
 
 NOT_LISTED: Final = "NOT_LISTED"
 """Counted for a client of the older dialect from an address that its owner did not list."""

@@ -9,15 +9,15 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
-from protocol.transports.endpoints import SEND_BUFFER_BYTES
-from protocol.transports.websocket_access import bearer_header
-from protocol.transports.websocket_dialects import PeerError
-from protocol.transports.websocket_endpoints import WebSocketEndpoint
-from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
-from protocol.transports.websocket_keys import own_token
-from protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS
-from protocol.transports.websocket_tls import client_tls_context, tls_handshake
-from protocol.transports.websocket_wire import Connection
+from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES
+from sightline.protocol.transports.websocket_access import bearer_header
+from sightline.protocol.transports.websocket_dialects import PeerError
+from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint
+from sightline.protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
+from sightline.protocol.transports.websocket_keys import own_token
+from sightline.protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS
+from sightline.protocol.transports.websocket_tls import client_tls_context, tls_handshake
+from sightline.protocol.transports.websocket_wire import Connection
 
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed

@@ -6,10 +6,10 @@ A dialect turns publications into messages and messages into packets; whose turn
 from collections.abc import Hashable
 from typing import Final, Protocol
 
-from protocol.channels import Channel
-from protocol.errors import WireError
-from protocol.transports.link import Message
-from protocol.transports.websocket_framing import (
+from sightline.protocol.channels import Channel
+from sightline.protocol.errors import WireError
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.websocket_framing import (
     MAX_BLOCK_BYTES,
     MAX_HELLO_BYTES,
     IncomingMessage,

@@ -4,10 +4,10 @@ import errno
 import os
 import socket
 
-from protocol.errors import LinkError
-from protocol.transports.endpoints import SEND_BUFFER_BYTES
-from protocol.transports.port_owner import port_owner
-from protocol.transports.websocket_endpoints import WebSocketEndpoint
+from sightline.protocol.errors import LinkError
+from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES
+from sightline.protocol.transports.port_owner import port_owner
+from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint
 
 
 def listening_socket(endpoint: WebSocketEndpoint) -> socket.socket:

@@ -3,7 +3,7 @@
     ws://127.0.0.1:9090           `sightline.v1`; wss:// with TLS
     ws-legacy://127.0.0.1:9091    the older text dialect, with options after a `?`, joined by `&`:
         dashed     linear-angular instead of the bar        swapped    angular-linear, with dashed
-        oneline    base64 without newlines                  boxes      takes boxes beside twists, see `protocol.legacy`
+        oneline    base64 without newlines                  boxes      takes boxes beside twists, see `sightline.protocol.legacy`
         from=192.168.1.7,10.0.0.0/24                        who may come in
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 
 _WEBSOCKET_ENDPOINT: Final = re.compile(
     r"(ws|wss|ws-legacy)://(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]@]+):([0-9]{1,5})/?(?:\?([^\s?#]*))?", re.ASCII

@@ -12,12 +12,12 @@ from typing import Annotated, Any, Final, NamedTuple
 
 from pydantic import Field
 
-from protocol import VERSION
-from protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, Channel
-from protocol.codec import decode
-from protocol.errors import WireError
-from protocol.messages import RobotId, SessionId, Version, WireModel
-from protocol.refusals import RejectReason
+from sightline.protocol import VERSION
+from sightline.protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, Channel
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import RobotId, SessionId, Version, WireModel
+from sightline.protocol.refusals import RejectReason
 
 SUBPROTOCOL: Final = "sightline.v1"
 MAX_BLOCK_BYTES: Final = MAX_HEADER_BYTES + 64

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from protocol.errors import ConfigError
-from protocol.transports.secured import ROLES, certificate_role
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.secured import ROLES, certificate_role
 
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{16,128}")
 

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Hashable
 from typing import Final, NamedTuple
 
-from protocol.channels import ACK, DETECTIONS, FRAME, KEY_PREFIX, TWIST, Channel, key_for
-from protocol.codec import decode, encode
-from protocol.errors import WireError
-from protocol.jpeg import read_jpeg_size
-from protocol.legacy import (
+from sightline.protocol.channels import ACK, DETECTIONS, FRAME, KEY_PREFIX, TWIST, Channel, key_for
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.legacy import (
     MAX_BOXES_BYTES,
     decode_picture,
     detections_from_boxes,
@@ -16,14 +16,14 @@ from protocol.legacy import (
     parse_dashed,
     text_bound,
 )
-from protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader
-from protocol.refusals import RejectReason
-from protocol.transports.link import Message
-from protocol.transports.websocket_dialects import BAD_FRAMING, PeerError
-from protocol.transports.websocket_endpoints import LegacyOptions
-from protocol.transports.websocket_framing import IncomingMessage
-from protocol.transports.websocket_seat import DriverSlot
-from protocol.twist_text import format_twist, parse_twist
+from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.websocket_dialects import BAD_FRAMING, PeerError
+from sightline.protocol.transports.websocket_endpoints import LegacyOptions
+from sightline.protocol.transports.websocket_framing import IncomingMessage
+from sightline.protocol.transports.websocket_seat import DriverSlot
+from sightline.protocol.twist_text import format_twist, parse_twist
 
 GUEST: Final = "guest"
 GUEST_SESSION: Final = "00000000"

@@ -11,8 +11,8 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
-from protocol.transports.secured import certificate_role
-from protocol.transports.websocket_access import (
+from sightline.protocol.transports.secured import certificate_role
+from sightline.protocol.transports.websocket_access import (
     NO_TOKEN,
     NOT_LISTED,
     check_listening,
@@ -20,15 +20,15 @@ from protocol.transports.websocket_access import (
     grants_of_role,
     role_of_token,
 )
-from protocol.transports.websocket_dialects import BAD_FRAMING, PeerError
-from protocol.transports.websocket_door import listening_socket
-from protocol.transports.websocket_endpoints import WebSocketEndpoint, host_problem, origin_problem
-from protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
-from protocol.transports.websocket_keys import read_tokens
-from protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS, Promote, count_close
-from protocol.transports.websocket_places import ConnectionLimits, Slot, may_control
-from protocol.transports.websocket_tls import server_tls_context, tls_handshake
-from protocol.transports.websocket_wire import CLOSE_S, Connection
+from sightline.protocol.transports.websocket_dialects import BAD_FRAMING, PeerError
+from sightline.protocol.transports.websocket_door import listening_socket
+from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint, host_problem, origin_problem
+from sightline.protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
+from sightline.protocol.transports.websocket_keys import read_tokens
+from sightline.protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS, Promote, count_close
+from sightline.protocol.transports.websocket_places import ConnectionLimits, Slot, may_control
+from sightline.protocol.transports.websocket_tls import server_tls_context, tls_handshake
+from sightline.protocol.transports.websocket_wire import CLOSE_S, Connection
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response

@@ -7,12 +7,12 @@ from collections import Counter
 from collections.abc import Hashable
 from typing import Final, Protocol
 
-from protocol.channels import CHANNELS, REQUEST, Channel, Priority
-from protocol.codec import decode
-from protocol.errors import WireError
-from protocol.messages import Request
-from protocol.transports.link import Message
-from protocol.transports.secured import KNOWN_SOURCES
+from sightline.protocol.channels import CHANNELS, REQUEST, Channel, Priority
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import Request
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.secured import KNOWN_SOURCES
 
 MAX_UNKNOWN_SOURCES: Final = 16
 """Security limit: places of one channel for sources that are no role's."""

@@ -8,7 +8,7 @@ import threading
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.channels import FRAME, REQUEST, TWIST
+from sightline.protocol.channels import FRAME, REQUEST, TWIST
 
 MAX_CLIENTS: Final = 16
 """Security limit: open connections of one endpoint that have said what they are."""

@@ -12,8 +12,8 @@ import ssl
 import time
 from pathlib import Path
 
-from protocol.errors import ConfigError
-from protocol.transports.secured import certificate_role
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.secured import certificate_role
 
 
 def server_tls_context(folder: str, source: str) -> ssl.SSLContext:

@@ -6,11 +6,11 @@ That is what it subscribed to; and where all connect, what is said only while wa
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from protocol.channels import CHANNELS, Channel
-from protocol.codec import encode
-from protocol.transports.link import Message
-from protocol.transports.link_rules import LinkRules
-from protocol.transports.websocket_framing import Hello
+from sightline.protocol.channels import CHANNELS, Channel
+from sightline.protocol.codec import encode
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.link_rules import LinkRules
+from sightline.protocol.transports.websocket_framing import Hello
 
 Callback = Callable[[Message], None]
 _WATCHED = tuple(one for one in CHANNELS.values() if one.while_watched)

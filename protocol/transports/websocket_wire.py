@@ -17,15 +17,15 @@ from contextlib import suppress
 from itertools import takewhile
 from typing import TYPE_CHECKING, Final
 
-from protocol.clock import monotonic_us
-from protocol.transports.websocket_kernel import send_path
-from protocol.transports.websocket_life import SendPath
-from protocol.transports.websocket_messages import MessageReader, unmasked_head
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.transports.websocket_kernel import send_path
+from sightline.protocol.transports.websocket_life import SendPath
+from sightline.protocol.transports.websocket_messages import MessageReader, unmasked_head
 
 if TYPE_CHECKING:
     from websockets.protocol import Protocol
 
-    from protocol.transports.websocket_messages import Received
+    from sightline.protocol.transports.websocket_messages import Received
 
 CLOSE_S: Final = 1.0
 """Security limit: a connection that is closing is cut off after this."""

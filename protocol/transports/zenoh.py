@@ -16,14 +16,14 @@ from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from protocol.channels import FRAME, Channel, pattern_for
-from protocol.transports.endpoints import check_zenoh_endpoints
-from protocol.transports.link import LatestSlot, Message
-from protocol.transports.link_rules import NOT_A_PUT, LinkRules
-from protocol.transports.presence import PeerInfo
-from protocol.transports.secured import KNOWN_SOURCES, ROBOT_ROLE, load_role_keys
-from protocol.transports.zenoh_presence import PresenceAnnouncer, query_presence
-from protocol.transports.zenoh_session import CLOSED_SESSION, open_session
+from sightline.protocol.channels import FRAME, Channel, pattern_for
+from sightline.protocol.transports.endpoints import check_zenoh_endpoints
+from sightline.protocol.transports.link import LatestSlot, Message
+from sightline.protocol.transports.link_rules import NOT_A_PUT, LinkRules
+from sightline.protocol.transports.presence import PeerInfo
+from sightline.protocol.transports.secured import KNOWN_SOURCES, ROBOT_ROLE, load_role_keys
+from sightline.protocol.transports.zenoh_presence import PresenceAnnouncer, query_presence
+from sightline.protocol.transports.zenoh_session import CLOSED_SESSION, open_session
 
 if TYPE_CHECKING:
     import zenoh
@@ -93,7 +93,7 @@ class ZenohLink:
 
     @property
     def refused(self) -> Counter[str]:
-        """Messages turned away, by reason (see `protocol.transports.link_rules`)."""
+        """Messages turned away, by reason (see `sightline.protocol.transports.link_rules`)."""
         return self._rules.refused
 
     @property

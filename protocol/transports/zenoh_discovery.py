@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from protocol.transports.endpoints import parse_zenoh_endpoint
+from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
 
 MULTICAST_GROUP: Final = ("224.0.0.224", 7449)
 """Zenoh's own group, three ports above Zenoh's own port."""

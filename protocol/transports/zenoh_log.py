@@ -14,12 +14,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
-from protocol.clock import monotonic_us
-from protocol.log_lines import JsonLineStream, RepeatLimiter
-from protocol.transports import denied
-from protocol.transports.endpoints import parse_zenoh_endpoint
-from protocol.transports.tcp_table import Visitors
-from protocol.transports.tls_refusals import TLS_LOG_FILTER, refusal_cause
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.log_lines import JsonLineStream, RepeatLimiter
+from sightline.protocol.transports import denied
+from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
+from sightline.protocol.transports.tcp_table import Visitors
+from sightline.protocol.transports.tls_refusals import TLS_LOG_FILTER, refusal_cause
 
 _STDOUT = 1
 _GULP_BYTES = 1_048_576  # what an unprivileged pipe can hold; one that is full costs lines

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Final
 
 from pydantic import ValidationError
 
-from protocol.clock import monotonic_us
-from protocol.codec import encode
-from protocol.errors import ConfigError, LinkError
-from protocol.transports.presence import (
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.presence import (
     MAX_ABOUT,
     MAX_PEERS,
     PRESENCE_PATTERN,

@@ -14,12 +14,12 @@ import socket
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from protocol.errors import ConfigError, LinkError, SightlineError
-from protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
-from protocol.transports.port_owner import port_owner
-from protocol.transports.secured import RoleKeys, size_limit_section
-from protocol.transports.tls_trouble import diagnose_tls
-from protocol.transports.zenoh_discovery import MULTICAST_OFF, multicast_section
+from sightline.protocol.errors import ConfigError, LinkError, SightlineError
+from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
+from sightline.protocol.transports.port_owner import port_owner
+from sightline.protocol.transports.secured import RoleKeys, size_limit_section
+from sightline.protocol.transports.tls_trouble import diagnose_tls
+from sightline.protocol.transports.zenoh_discovery import MULTICAST_OFF, multicast_section
 
 if TYPE_CHECKING:
     import zenoh

@@ -13,15 +13,15 @@ from fnmatch import fnmatchcase
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
-from protocol.channels import FRAME, KEY_PREFIX, STATUS, parse_key
-from protocol.errors import ConfigError
-from protocol.transports.endpoints import check_zenoh_endpoints
-from protocol.transports.link import Link
-from protocol.transports.link_rules import LinkRules
-from protocol.transports.secured import load_role_keys
-from protocol.transports.zenoh import ZenohLink
-from protocol.transports.zenoh_presence import PresenceAnnouncer
-from protocol.transports.zenoh_session import CLOSED_SESSION, open_session
+from sightline.protocol.channels import FRAME, KEY_PREFIX, STATUS, parse_key
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.endpoints import check_zenoh_endpoints
+from sightline.protocol.transports.link import Link
+from sightline.protocol.transports.link_rules import LinkRules
+from sightline.protocol.transports.secured import load_role_keys
+from sightline.protocol.transports.zenoh import ZenohLink
+from sightline.protocol.transports.zenoh_presence import PresenceAnnouncer
+from sightline.protocol.transports.zenoh_session import CLOSED_SESSION, open_session
 
 if TYPE_CHECKING:
     import zenoh

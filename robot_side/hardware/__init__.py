@@ -1,1 +1,1 @@
-"""Robot hardware behind the ports of `robot_side.ports`."""
+"""Robot hardware behind the ports of `sightline.robot_side.ports`."""

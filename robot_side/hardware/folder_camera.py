@@ -5,12 +5,12 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.clock import monotonic_us
-from protocol.errors import HardwareError, WireError
-from protocol.jpeg import JpegSize, read_jpeg_size
-from robot_side.hardware.lens import LensConfig, camera_model
-from robot_side.hardware.pace import FrameTimer
-from robot_side.ports import Picture
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import HardwareError, WireError
+from sightline.protocol.jpeg import JpegSize, read_jpeg_size
+from sightline.robot_side.hardware.lens import LensConfig, camera_model
+from sightline.robot_side.hardware.pace import FrameTimer
+from sightline.robot_side.ports import Picture
 
 
 class FolderCameraConfig(LensConfig):

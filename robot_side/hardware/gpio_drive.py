@@ -12,11 +12,11 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from protocol.clock import monotonic_us
-from protocol.errors import ConfigError, HardwareError
-from robot_side.hardware.gpio_pins import Pins, open_pins
-from robot_side.hardware.gpio_table import DutyTable, TableConfig, table_of
-from robot_side.ports import WheelAngles
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.robot_side.hardware.gpio_pins import Pins, open_pins
+from sightline.robot_side.hardware.gpio_table import DutyTable, TableConfig, table_of
+from sightline.robot_side.ports import WheelAngles
 
 BcmPin = Annotated[int, Field(ge=2, le=27)]
 """Broadcom's number, not the position on the header. 0 and 1 belong to the memory of add-on boards."""

@@ -1,6 +1,6 @@
 """Pins driven low and left so, by lgpio alone: for the end of a drive, and for after a driver that was killed. Shell.
 
-    python -m robot_side.hardware.gpio_low 10 9 8 7
+    python -m sightline.robot_side.hardware.gpio_low 10 9 8 7
 
 Needs neither gpiozero nor a configuration. The internal pull-down (about 50 kilohms) stays when the program has gone,
 where the kernel makes an input of a pin that nobody holds.

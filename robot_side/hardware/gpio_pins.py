@@ -12,8 +12,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from protocol.errors import ConfigError, HardwareError
-from robot_side.hardware.gpio_low import import_lgpio, leave_low
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.robot_side.hardware.gpio_low import import_lgpio, leave_low
 
 _SPI_DEVICE: Final = Path("/dev/spidev0.0")
 _SPI_PINS: Final = frozenset(range(7, 12))

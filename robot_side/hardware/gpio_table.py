@@ -10,8 +10,8 @@ from typing import Annotated
 
 from pydantic import Field, ValidationError, field_validator
 
-from protocol.config import Config
-from protocol.errors import ConfigError
+from sightline.protocol.config import Config
+from sightline.protocol.errors import ConfigError
 
 Duty = Annotated[float, Field(gt=0, le=1)]
 RimSpeed = Annotated[float, Field(gt=0, le=3)]

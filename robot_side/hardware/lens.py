@@ -1,6 +1,6 @@
 """The lens of a camera plug-in: a calibrated model from a file or from options, else a guess from its angle. Shell.
 
-The file is what `sightline calibrate camera` writes: the fields of `protocol.messages.CameraModel` as TOML.
+The file is what `sightline calibrate camera` writes: the fields of `sightline.protocol.messages.CameraModel` as TOML.
 """
 
 import json
@@ -11,10 +11,10 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
-from protocol.config import Config
-from protocol.errors import ConfigError
-from protocol.jpeg import JpegSize
-from protocol.messages import CameraModel
+from sightline.protocol.config import Config
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.jpeg import JpegSize
+from sightline.protocol.messages import CameraModel
 
 
 class LensConfig(Config):

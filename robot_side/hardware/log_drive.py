@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from protocol.clock import monotonic_us
-from protocol.config import Config
-from protocol.errors import HardwareError
-from robot_side.ports import WheelAngles
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.config import Config
+from sightline.protocol.errors import HardwareError
+from sightline.robot_side.ports import WheelAngles
 
 
 class LogDriveConfig(Config):

@@ -2,8 +2,8 @@
 
 import time
 
-from protocol.transports.link import LatestSlot
-from robot_side.ports import Picture
+from sightline.protocol.transports.link import LatestSlot
+from sightline.robot_side.ports import Picture
 
 _JUST_NOW_S = 0.008
 """A picture that arrived this long ago may still be handed over. Longer, and it is better to wait for the next: a

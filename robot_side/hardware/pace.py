@@ -2,8 +2,8 @@
 
 import time
 
-from protocol.clock import monotonic_us
-from robot_side.hardware.buffer_time import Clocks
+from sightline.protocol.clock import monotonic_us
+from sightline.robot_side.hardware.buffer_time import Clocks
 
 
 class FrameTimer:

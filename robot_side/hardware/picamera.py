@@ -8,13 +8,13 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from protocol.errors import ConfigError, HardwareError
-from protocol.jpeg import JpegSize
-from robot_side.hardware.buffer_time import CaptureClock
-from robot_side.hardware.lens import LensConfig, camera_model
-from robot_side.hardware.newest import LatestPicture
-from robot_side.hardware.pace import read_clocks
-from robot_side.ports import Picture
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.jpeg import JpegSize
+from sightline.robot_side.hardware.buffer_time import CaptureClock
+from sightline.robot_side.hardware.lens import LensConfig, camera_model
+from sightline.robot_side.hardware.newest import LatestPicture
+from sightline.robot_side.hardware.pace import read_clocks
+from sightline.robot_side.ports import Picture
 
 _LIST = "`rpicam-hello --list-cameras` lists what is connected"
 

@@ -8,12 +8,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from protocol.errors import HardwareError
-from protocol.messages import CameraModel
-from robot_side.hardware.lens import camera_model
-from robot_side.hardware.newest import LatestPicture
-from robot_side.hardware.v4l2_device import Capture, V4l2CameraConfig, V4l2Device, open_capture
-from robot_side.ports import Picture
+from sightline.protocol.errors import HardwareError
+from sightline.protocol.messages import CameraModel
+from sightline.robot_side.hardware.lens import camera_model
+from sightline.robot_side.hardware.newest import LatestPicture
+from sightline.robot_side.hardware.v4l2_device import Capture, V4l2CameraConfig, V4l2Device, open_capture
+from sightline.robot_side.ports import Picture
 
 _RETRY_S = 0.5
 _INTEREST_S = 1.0  # after the last `read`, captures are copied for this long

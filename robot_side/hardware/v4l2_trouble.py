@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from protocol.errors import HardwareError
+from sightline.protocol.errors import HardwareError
 
 
 def check_device(path: Path) -> None:

@@ -10,12 +10,12 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from protocol.clock import monotonic_us
-from protocol.errors import ConfigError, HardwareError
-from protocol.jpeg import JpegSize
-from robot_side.hardware.lens import LensConfig, camera_model
-from robot_side.hardware.pace import FrameTimer
-from robot_side.ports import Picture, scaled_quality, scaled_size
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.jpeg import JpegSize
+from sightline.robot_side.hardware.lens import LensConfig, camera_model
+from sightline.robot_side.hardware.pace import FrameTimer
+from sightline.robot_side.ports import Picture, scaled_quality, scaled_size
 
 _USUAL_FPS = 30.0
 _CATCH_UP_S = 1.0  # after a longer pause the video goes on where it was, as if paused

@@ -2,7 +2,7 @@
 
 import json
 
-from protocol.transports.link import Message
+from sightline.protocol.transports.link import Message
 
 BROKEN = {}
 """Case id -> `break_it(robot)`, whose name says what is wrong. Exactly that case must fail."""

@@ -1,10 +1,10 @@
 """Robots that arm, disarm, stop or reset wrongly. Pure."""
 
-from protocol.errors import WireError
-from protocol.messages import State, Twist, Verb
-from protocol.refusals import RejectReason
-from robot_side.judge import AcceptedCommand, CommandResult
-from robot_side.lease import RANKS
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import State, Twist, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.robot_side.judge import AcceptedCommand, CommandResult
+from sightline.robot_side.lease import RANKS
 from tests.conformance.breaking import breaks, wrap
 
 

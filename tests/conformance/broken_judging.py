@@ -3,10 +3,10 @@
 import json
 import re
 
-from protocol.errors import WireError
-from protocol.messages import MAX_INTEGER
-from protocol.refusals import RejectReason
-from protocol.transports.link import Message
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import MAX_INTEGER
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
 from tests.conformance.breaking import as_json, bend_twists, breaks, fields_of, wrap
 
 HEX = re.compile(r"[0-9a-f]{8}")

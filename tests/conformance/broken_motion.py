@@ -1,9 +1,9 @@
 """Robots whose wheels do something wrong: limits and silence. Pure."""
 
-from protocol.errors import WireError
-from protocol.messages import State, Twist
-from protocol.refusals import CLAMPED, RejectReason
-from robot_side.judge import AcceptedCommand
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import State, Twist
+from sightline.protocol.refusals import CLAMPED, RejectReason
+from sightline.robot_side.judge import AcceptedCommand
 from tests.conformance.breaking import bend_out, breaks, fields_of, wrap
 from tests.conformance.broken_lease import who_sends
 

@@ -2,11 +2,11 @@
 
 import re
 
-from protocol.channels import ACK, REPLY
-from protocol.errors import WireError
-from protocol.messages import MAX_INTEGER, Reply, State, Verb
-from protocol.refusals import RejectReason
-from protocol.transports.link import Message
+from sightline.protocol.channels import ACK, REPLY
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import MAX_INTEGER, Reply, State, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
 from tests.conformance.breaking import bend_out, bend_twists, breaks, fields_of, wrap
 from tests.conformance.broken_arming import absent, forgives
 from tests.conformance.broken_judging import refuse, refuses

@@ -1,9 +1,9 @@
 """Robots that read, grant or answer requests wrongly. Pure."""
 
-from protocol.errors import WireError
-from protocol.messages import Verb
-from protocol.refusals import RejectReason
-from protocol.transports.link import Message
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
 from tests.conformance.breaking import as_json, bend_out, bend_requests, breaks, fields_of, wrap
 
 

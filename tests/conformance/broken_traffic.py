@@ -1,13 +1,13 @@
 """Robots that are wrong about credit, guests, hostile peers and reconnects. Pure."""
 
-from protocol.channels import CHANNELS
-from protocol.errors import WireError
-from protocol.messages import Twist
-from protocol.refusals import RejectReason
-from protocol.transports.link import Message
-from robot_side.judge import AcceptedCommand
-from robot_side.lease import Lease
-from robot_side.ports import Picture
+from sightline.protocol.channels import CHANNELS
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import Twist
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
+from sightline.robot_side.judge import AcceptedCommand
+from sightline.robot_side.lease import Lease
+from sightline.robot_side.ports import Picture
 from tests.conformance.breaking import as_json, bend_acks, bend_out, breaks, fields_of, wrap
 from tests.conformance.broken_lease import lease_of
 from tests.robot_process import JPEG

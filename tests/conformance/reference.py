@@ -4,17 +4,17 @@ import array
 import functools
 import math
 
-from protocol.channels import ACK, FRAME, REQUEST, TWIST, key_for
-from protocol.conformance.virtual import FROM_ROBOT, VirtualBench
-from protocol.errors import WireError
-from protocol.messages import CameraModel
-from protocol.transports import link_rules, memory
-from protocol.transports.memory import MemoryNetwork
-from robot_side.config import RobotConfig
-from robot_side.driving import DriverCore
-from robot_side.limits import TICK_US, SafetyConfig
-from robot_side.ports import Picture, Ranges, WheelAngles
-from robot_side.sending import NetworkCore
+from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST, key_for
+from sightline.protocol.conformance.virtual import FROM_ROBOT, VirtualBench
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import CameraModel
+from sightline.protocol.transports import link_rules, memory
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.driving import DriverCore
+from sightline.robot_side.limits import TICK_US, SafetyConfig
+from sightline.robot_side.ports import Picture, Ranges, WheelAngles
+from sightline.robot_side.sending import NetworkCore
 from tests.robot_process import JPEG
 
 MODEL = CameraModel(width_px=16, height_px=16, fx_px=20.0, fy_px=20.0, cx_px=8.0, cy_px=8.0)

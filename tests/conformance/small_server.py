@@ -15,11 +15,11 @@ import socket
 import threading
 import time
 
-from protocol.channels import CHANNELS, Direction, key_for
-from protocol.conformance.raw_websocket import xor
-from protocol.errors import WireError
-from protocol.refusals import RejectReason
-from protocol.transports.memory import MemoryNetwork
+from sightline.protocol.channels import CHANNELS, Direction, key_for
+from sightline.protocol.conformance.raw_websocket import xor
+from sightline.protocol.errors import WireError
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.memory import MemoryNetwork
 from tests.conformance.reference import ReferenceRobot
 
 ENTRY = "sightline.token."

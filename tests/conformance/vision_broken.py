@@ -4,14 +4,14 @@
 and no other. The steps that a broken one may change, in the order of a frame's way, are the methods of `BrokenVision`.
 """
 
-from protocol.channels import ACK, FRAME, STATUS, TWIST, key_for
-from protocol.conformance.vision_pictures import HALF_CAMERA
-from protocol.golden_case import packed
-from protocol.messages import STILL, FrameHeader
-from protocol.transports.link import Message
-from protocol.twist_text import format_twist
+from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST, key_for
+from sightline.protocol.conformance.vision_pictures import HALF_CAMERA
+from sightline.protocol.golden_case import packed
+from sightline.protocol.messages import STILL, FrameHeader
+from sightline.protocol.transports.link import Message
+from sightline.protocol.twist_text import format_twist
 from tests.conformance.vision_rig import COMPUTE_US, VirtualVision
-from vision_side.pipeline import Observation, PipelineAnswer, answer_header
+from sightline.vision_side.pipeline import Observation, PipelineAnswer, answer_header
 
 BROKEN = {}
 STANDING = PipelineAnswer(STILL, Observation("broken"))

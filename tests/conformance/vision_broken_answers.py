@@ -1,11 +1,11 @@
 """Broken visions: wrong headers, wrong twists, wrong echoes, wrong counts. Pure."""
 
-from protocol.channels import REQUEST, key_for
-from protocol.conformance.vision_pictures import picture
-from protocol.golden_case import packed
-from protocol.messages import Stamp
+from sightline.protocol.channels import REQUEST, key_for
+from sightline.protocol.conformance.vision_pictures import picture
+from sightline.protocol.golden_case import packed
+from sightline.protocol.messages import Stamp
 from tests.conformance.vision_broken import STANDING, BrokenVision, breaks, frame_header
-from vision_side.pipeline import Observation, PipelineAnswer
+from sightline.vision_side.pipeline import Observation, PipelineAnswer
 
 
 def rewriting(case, wrong, change=lambda fields: {}, text=lambda text: text, **how):

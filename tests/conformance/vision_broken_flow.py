@@ -3,11 +3,11 @@
 import json
 from collections import deque
 
-from protocol.channels import FRAME
-from protocol.conformance.vision_flow import BROKEN_STATUS
+from sightline.protocol.channels import FRAME
+from sightline.protocol.conformance.vision_flow import BROKEN_STATUS
 from tests.conformance.vision_broken import STANDING, BrokenVision, breaks
 from tests.conformance.vision_broken_answers import PerSession
-from vision_side.pipeline import Observation, PipelineAnswer
+from sightline.vision_side.pipeline import Observation, PipelineAnswer
 
 
 class Queueing(BrokenVision):

@@ -1,9 +1,9 @@
 """Broken visions: those that steer where they should not. Pure."""
 
-from protocol.messages import Twist
+from sightline.protocol.messages import Twist
 from tests.conformance.vision_broken import breaks
 from tests.conformance.vision_broken_answers import PerSession
-from vision_side.pipeline import PipelineAnswer
+from sightline.vision_side.pipeline import PipelineAnswer
 
 
 class Steering(PerSession):

@@ -9,8 +9,8 @@ import copy
 import re
 from collections.abc import Callable, Iterator
 
-from protocol.messages import State, Verb
-from protocol.refusals import RejectReason
+from sightline.protocol.messages import State, Verb
+from sightline.protocol.refusals import RejectReason
 
 _COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),

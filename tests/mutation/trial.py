@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 # Loaded once here, shared by all children; it imports no judged file, or no mutant of that file would ever run.
-import protocol.messages  # noqa: F401
+import sightline.protocol.messages  # noqa: F401
 from tests.mutation.mutants import Mutant
 
 _CPU_SECONDS = 5  # a table takes well under one; a mutant that loops for ever is ended here

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from protocol.config import Config as Settings
-from vision_side.config import HsvConfig
-from vision_side.decode import Picture
-from vision_side.detect.chroma import ColorModel
-from vision_side.detect.colour import Region
-from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.labels import Label
-from vision_side.detect.pixel_track import PixelTrack
-from vision_side.detect.port import Circle, Detection
+from sightline.protocol.config import Config as Settings
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.chroma import ColorModel
+from sightline.vision_side.detect.colour import Region
+from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.labels import Label
+from sightline.vision_side.detect.pixel_track import PixelTrack
+from sightline.vision_side.detect.port import Circle, Detection
 
 _CLEAR: Final = 0.8  # of the outline in view: of a thing more hidden than this, no colour is learned
 _SAMPLES: Final = 400  # pixels: enough for a middle and a spread

@@ -8,8 +8,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from vision_side.detect.overlap import corners, overlap
-from vision_side.detect.port import Detection, DetectionResult
+from sightline.vision_side.detect.overlap import corners, overlap
+from sightline.vision_side.detect.port import Detection, DetectionResult
 
 WINDOW: Final = 300
 """Frames: ten seconds at 30 a second."""

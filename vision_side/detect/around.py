@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from protocol.errors import ConfigError, SightlineError
-from protocol.transports.link import Link
-from vision_side.detect.port import Detector, Maker
+from sightline.protocol.errors import ConfigError, SightlineError
+from sightline.protocol.transports.link import Link
+from sightline.vision_side.detect.port import Detector, Maker
 
 PLUGIN_ERRORS: Final = (Exception, SystemExit)
 """What a plug-in's own code may raise: `sys.exit` in it is to end itself, not the service around it."""

@@ -9,14 +9,14 @@ from collections import OrderedDict
 
 import numpy as np
 
-from protocol.channels import DETECTIONS
-from protocol.codec import decode
-from protocol.errors import WireError
-from protocol.messages import CameraModel, DetectedBox, Detections, DetectionsHeader, FrameHeader
-from protocol.refusals import RejectReason
-from vision_side.config import BoxesConfig
-from vision_side.detect.port import Circle, Detection
-from vision_side.sphere import Sighting, points_ahead
+from sightline.protocol.channels import DETECTIONS
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import CameraModel, DetectedBox, Detections, DetectionsHeader, FrameHeader
+from sightline.protocol.refusals import RejectReason
+from sightline.vision_side.config import BoxesConfig
+from sightline.vision_side.detect.port import Circle, Detection
+from sightline.vision_side.sphere import Sighting, points_ahead
 
 REMEMBERED = 128
 """Frames; at 60 per second twice what any robot would still move for."""

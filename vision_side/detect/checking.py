@@ -9,10 +9,10 @@ from dataclasses import replace
 from numbers import Real
 from typing import Any, Final
 
-from protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER
-from vision_side.detect.around import PLUGIN_ERRORS
-from vision_side.detect.labels import LONGEST_LABEL, is_label
-from vision_side.detect.port import Circle, DetectFrame, Detection, DetectionResult, Detector, clipped
+from sightline.protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER
+from sightline.vision_side.detect.around import PLUGIN_ERRORS
+from sightline.vision_side.detect.labels import LONGEST_LABEL, is_label
+from sightline.vision_side.detect.port import Circle, DetectFrame, Detection, DetectionResult, Detector, clipped
 
 _LONGEST_WHY: Final = 160
 NO_ANSWER_IN_TIME: Final = "the detector gave no answer in time"

@@ -9,25 +9,25 @@ import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from protocol.errors import ConfigError
-from vision_side.config import VisionConfig
-from vision_side.detect.around import plugin_guard
-from vision_side.detect.colour_filter import ColorFilter
-from vision_side.detect.label_filter import LabelFilter
-from vision_side.detect.port import Detector
-from vision_side.detect.remote.address import EXAMPLES
-from vision_side.detect.tracked import TrackIds
-from vision_side.missions.choice import check_missions, configured_mission
-from vision_side.plugin_choice import PluginRegistry, config_model
+from sightline.protocol.errors import ConfigError
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.around import plugin_guard
+from sightline.vision_side.detect.colour_filter import ColorFilter
+from sightline.vision_side.detect.label_filter import LabelFilter
+from sightline.vision_side.detect.port import Detector
+from sightline.vision_side.detect.remote.address import EXAMPLES
+from sightline.vision_side.detect.tracked import TrackIds
+from sightline.vision_side.missions.choice import check_missions, configured_mission
+from sightline.vision_side.plugin_choice import PluginRegistry, config_model
 
 BUILT_IN: Final = {
-    "hsv": "vision_side.detect.local:Hsv",
-    "adaptive": "vision_side.detect.local:Adaptive",
-    "onnx": "vision_side.detect.onnx_detector:OnnxDetector",
-    "zenoh": "vision_side.detect.remote.zenoh_detector:ZenohDetector",
-    "oip+http": "vision_side.detect.remote.oip_http:OipHttp",
-    "oip+grpc": "vision_side.detect.remote.oip_grpc:OipGrpc",
-    "http+jpeg": "vision_side.detect.remote.http_jpeg:HttpJpeg",
+    "hsv": "sightline.vision_side.detect.local:Hsv",
+    "adaptive": "sightline.vision_side.detect.local:Adaptive",
+    "onnx": "sightline.vision_side.detect.onnx_detector:OnnxDetector",
+    "zenoh": "sightline.vision_side.detect.remote.zenoh_detector:ZenohDetector",
+    "oip+http": "sightline.vision_side.detect.remote.oip_http:OipHttp",
+    "oip+grpc": "sightline.vision_side.detect.remote.oip_grpc:OipGrpc",
+    "http+jpeg": "sightline.vision_side.detect.remote.http_jpeg:HttpJpeg",
 }
 """Here and not as entry points, so that a checkout that nobody installed has them too."""
 GROUP: Final = "sightline.detectors"
@@ -61,12 +61,12 @@ def configured_detector(config: VisionConfig) -> Detector | None:
         return None
     detector = build_detector(one.kind, one.options, config)
     if one.fallback:
-        from vision_side.detect.remote.fallback import Fallback
+        from sightline.vision_side.detect.remote.fallback import Fallback
 
         detector = Fallback(detector, build_detector(one.fallback, {}, config), max_pixels=config.max_pixels)
     detector = _narrowed(detector, config)
     if one.shadow:
-        from vision_side.detect.shadow import ShadowDetector
+        from sightline.vision_side.detect.shadow import ShadowDetector
 
         second = _narrowed(build_detector(one.shadow, one.shadow_options, config), config)
         detector = ShadowDetector(detector, second, one.shadow, config.max_pixels, configured_mission(config).goes_by)
@@ -177,7 +177,7 @@ def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) ->
     """Raise ConfigError for what can be known to be wrong before the detector is built: its name, options, model."""
     _, settings = _checked(kind, options, config)
     if split_kind(kind)[0] == "onnx":
-        from vision_side.detect.onnx_detector import read_onnx_model
+        from sightline.vision_side.detect.onnx_detector import read_onnx_model
 
         read_onnx_model(settings)
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision_side.detect.colour import codes_565, colors_565
+from sightline.vision_side.detect.colour import codes_565, colors_565
 
 Shares = NDArray[np.float32]
 """(..., 2): red and green shares."""

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision_side.config import HsvRange
+from sightline.vision_side.config import HsvRange
 
 COARSE = 4
 """Where to look is decided on every fourth pixel of every fourth row, which no disc worth measuring slips between."""

@@ -7,12 +7,12 @@ from typing import Final
 import cv2
 import numpy as np
 
-from protocol.errors import WireError
-from vision_side.config import HsvRange
-from vision_side.decode import Picture
-from vision_side.detect.around import DetectorWrapper
-from vision_side.detect.colour import color_table
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
+from sightline.protocol.errors import WireError
+from sightline.vision_side.config import HsvRange
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.around import DetectorWrapper
+from sightline.vision_side.detect.colour import color_table
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
 
 LEAST_SHARE: Final = 0.3
 """Of the pixels in the box's middle: shade and shine take some of a ball's colour, another ball has none of it."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vision_side.detect.port import Detection, DetectionResult
+from sightline.vision_side.detect.port import Detection, DetectionResult
 
 _RGBA = {"r": 0.95, "g": 0.78, "b": 0.05, "a": 1.0}
 _LINE_LOOP, _LINE_PX, _FONT_PX = 2, 2.0, 12.0  # of foxglove.PointsAnnotation.Type: closed

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vision_side.detect.overlap import corners, overlap
-from vision_side.detect.port import Detection
+from sightline.vision_side.detect.overlap import corners, overlap
+from sightline.vision_side.detect.port import Detection
 
 KEY: Final = "golden"
 SIZE_PX: Final = (320, 240)

@@ -5,12 +5,12 @@ from typing import Any
 import cv2
 from numpy.typing import NDArray
 
-from vision_side.config import HsvConfig
-from vision_side.decode import Picture
-from vision_side.detect.colour import ColorMask, Region
-from vision_side.detect.disc import Fit, Outline, fit_round_part
-from vision_side.detect.edge import Box, sharp_outline
-from vision_side.detect.port import Circle, Detection
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.colour import ColorMask, Region
+from sightline.vision_side.detect.disc import Fit, Outline, fit_round_part
+from sightline.vision_side.detect.edge import Box, sharp_outline
+from sightline.vision_side.detect.port import Circle, Detection
 
 Pixels = NDArray[Any]
 """Outline as OpenCV gives it: (N, 1, 2), integers."""

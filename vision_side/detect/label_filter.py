@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from vision_side.detect.around import DetectorWrapper
-from vision_side.detect.labels import COLOR_LABEL
-from vision_side.detect.port import DetectFrame, DetectionResult, Detector
+from sightline.vision_side.detect.around import DetectorWrapper
+from sightline.vision_side.detect.labels import COLOR_LABEL
+from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
 
 
 class LabelFilter(DetectorWrapper):

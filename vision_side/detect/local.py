@@ -3,16 +3,16 @@
 from collections.abc import Sequence
 from typing import Final
 
-from protocol.config import Config as Settings
-from protocol.messages import MAX_DETECTED_BOXES
-from vision_side.config import HsvConfig
-from vision_side.decode import Picture
-from vision_side.detect.adaptive import AdaptiveConfig, AdaptiveTracker
-from vision_side.detect.by_session import PerSession
-from vision_side.detect.hsv import HsvDetector
-from vision_side.detect.labels import Label
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
-from vision_side.detect.timing import timed
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.messages import MAX_DETECTED_BOXES
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.adaptive import AdaptiveConfig, AdaptiveTracker
+from sightline.vision_side.detect.by_session import PerSession
+from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.labels import Label
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
+from sightline.vision_side.detect.timing import timed
 
 _CPU: Final = "cpu"
 

@@ -13,15 +13,15 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from protocol.clock import monotonic_us
-from protocol.config import Config as Settings
-from protocol.errors import ConfigError, HardwareError
-from vision_side.config import Device
-from vision_side.decode import Picture
-from vision_side.detect.golden import KEY, difference, golden_picture, read_golden
-from vision_side.detect.onnx_engine import Engine, open_engine
-from vision_side.detect.onnx_header import OnnxHeader, read_onnx_header
-from vision_side.detect.onnx_reading import (
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.vision_side.config import Device
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.golden import KEY, difference, golden_picture, read_golden
+from sightline.vision_side.detect.onnx_engine import Engine, open_engine
+from sightline.vision_side.detect.onnx_header import OnnxHeader, read_onnx_header
+from sightline.vision_side.detect.onnx_reading import (
     ModelFormat,
     fit_picture,
     model_format,
@@ -29,9 +29,9 @@ from vision_side.detect.onnx_reading import (
     read_outputs,
     split_batch,
 )
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
-from vision_side.detect.refine import refined
-from vision_side.detect.timing import timed_together
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
+from sightline.vision_side.detect.refine import refined
+from sightline.vision_side.detect.timing import timed_together
 
 SHIPPED: Final = Path(__file__).parent.parent / "models" / "sightline.onnx"
 HASH_DIGITS: Final = 16

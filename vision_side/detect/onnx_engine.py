@@ -11,9 +11,9 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.errors import ConfigError, HardwareError
-from vision_side.config import Device
-from vision_side.detect.onnx_header import OnnxHeader
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.vision_side.config import Device
+from sightline.vision_side.detect.onnx_header import OnnxHeader
 
 Arrays = dict[str, NDArray[Any]]
 PROVIDERS: Final = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider",

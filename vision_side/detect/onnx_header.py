@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
-from vision_side.detect.protobuf import Bytes, Field, as_bytes, fields, text
+from sightline.vision_side.detect.protobuf import Bytes, Field, as_bytes, fields, text
 
 _GRAPH, _METADATA = 7, 14  # of a model
 _INITIALIZER, _INPUT, _OUTPUT = 5, 11, 12  # of a graph

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import MAX_DETECTED_BOXES
-from vision_side.decode import Picture
-from vision_side.detect.labels import clean_label
-from vision_side.detect.onnx_header import OnnxHeader, Tensor
-from vision_side.detect.port import Detection, clipped
+from sightline.protocol.messages import MAX_DETECTED_BOXES
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.labels import clean_label
+from sightline.vision_side.detect.onnx_header import OnnxHeader, Tensor
+from sightline.vision_side.detect.port import Detection, clipped
 
 Arrays = Mapping[str, NDArray[Any]]
 _MAX_ROWS: Final = 100_000

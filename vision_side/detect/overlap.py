@@ -1,6 +1,6 @@
 """How much two boxes have in common. Pure."""
 
-from vision_side.detect.port import Detection
+from sightline.vision_side.detect.port import Detection
 
 Corners = tuple[float, float, float, float]
 """x1, y1, x2, y2."""

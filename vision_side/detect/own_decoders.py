@@ -3,9 +3,9 @@
 from collections import OrderedDict
 from typing import Final
 
-from protocol.messages import FrameHeader
-from vision_side.decode import Decoder
-from vision_side.detect.port import DetectFrame
+from sightline.protocol.messages import FrameHeader
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.port import DetectFrame
 
 MAX_DECODERS: Final = 64
 """Security limit: of decoders kept, one for each robot and place in a batch; the longest unused goes first.

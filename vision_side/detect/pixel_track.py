@@ -3,7 +3,7 @@
 import math
 from typing import Final
 
-from vision_side.detect.port import Circle
+from sightline.vision_side.detect.port import Circle
 
 _ACCELERATION: Final = 6.0  # picture widths per s^2: a robot that begins to turn as hard as it may
 _FIRST_SPEED: Final = 1.5  # picture widths per s: a robot that turns as fast as it may

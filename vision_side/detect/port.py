@@ -11,8 +11,8 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import FrameHeader
-from vision_side.decode import Decoder, Picture
+from sightline.protocol.messages import FrameHeader
+from sightline.vision_side.decode import Decoder, Picture
 
 NO_DEADLINE: Final = 2**63 - 1
 """For who has all the time there is: replays, judges, tests."""

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision_side.decode import Picture
-from vision_side.detect.disc import Fit, Outline, fit_round_part
-from vision_side.detect.edge import Box, blob_between
-from vision_side.detect.hsv import disc_detection, own_edge
-from vision_side.detect.port import Circle, Detection
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.disc import Fit, Outline, fit_round_part
+from sightline.vision_side.detect.edge import Box, blob_between
+from sightline.vision_side.detect.hsv import disc_detection, own_edge
+from sightline.vision_side.detect.port import Circle, Detection
 
 _WITHIN: Final = 0.7  # of the box: surely the ball, even where the box is a little off
 _BEYOND: Final = 1.2  # of the box: surely not

@@ -12,15 +12,15 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Final
 
-from protocol.clock import monotonic_us
-from protocol.transports.link import Link
-from vision_side.detect.agreement import Agreement, LabelTest
-from vision_side.detect.around import attach_detector, close_detector, notices_of
-from vision_side.detect.by_session import MAX_ROBOTS
-from vision_side.detect.checking import validated
-from vision_side.detect.news import Notices
-from vision_side.detect.own_decoders import DecoderPool
-from vision_side.detect.port import DetectFrame, DetectionResult, Detector
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.transports.link import Link
+from sightline.vision_side.detect.agreement import Agreement, LabelTest
+from sightline.vision_side.detect.around import attach_detector, close_detector, notices_of
+from sightline.vision_side.detect.by_session import MAX_ROBOTS
+from sightline.vision_side.detect.checking import validated
+from sightline.vision_side.detect.news import Notices
+from sightline.vision_side.detect.own_decoders import DecoderPool
+from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
 
 _PATIENCE_US: Final = 1_000_000
 """The shadow's own deadline: it holds nobody up."""

@@ -3,9 +3,17 @@
 import time
 from collections.abc import Callable, Sequence
 
-from protocol.errors import WireError
-from vision_side.decode import Picture
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, PictureDetector, clipped, result_of
+from sightline.protocol.errors import WireError
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.port import (
+    DetectFrame,
+    Detection,
+    DetectionResult,
+    Maker,
+    PictureDetector,
+    clipped,
+    result_of,
+)
 
 
 def _picture_of(frame: DetectFrame) -> Picture | None:

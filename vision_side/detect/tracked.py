@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from vision_side.detect.around import DetectorWrapper
-from vision_side.detect.by_session import PerSession
-from vision_side.detect.overlap import corners, overlap
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
+from sightline.vision_side.detect.around import DetectorWrapper
+from sightline.vision_side.detect.by_session import PerSession
+from sightline.vision_side.detect.overlap import corners, overlap
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
 
 KEPT_US: Final = 1_000_000
 LEAST_OVERLAP: Final = 0.2

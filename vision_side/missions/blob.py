@@ -3,8 +3,8 @@
 import math
 from dataclasses import dataclass
 
-from vision_side.detect.port import Detection
-from vision_side.missions.port import View
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.missions.port import View
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from protocol.config import Config
-from vision_side.missions.ranging import Points
+from sightline.protocol.config import Config
+from sightline.vision_side.missions.ranging import Points
 
 _STILL_MPS = 1e-6
 

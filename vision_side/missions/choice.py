@@ -9,25 +9,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from protocol.errors import ConfigError
-from protocol.messages import CameraModel
-from protocol.mission_messages import MissionRequest
-from vision_side.config import TargetConfig, VisionConfig
-from vision_side.detect.labels import is_followable
-from vision_side.missions.port import Mission
-from vision_side.plugin_choice import PluginRegistry, config_model
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import CameraModel
+from sightline.protocol.mission_messages import MissionRequest
+from sightline.vision_side.config import TargetConfig, VisionConfig
+from sightline.vision_side.detect.labels import is_followable
+from sightline.vision_side.missions.port import Mission
+from sightline.vision_side.plugin_choice import PluginRegistry, config_model
 
 BUILT_IN: Final = {
-    "follow": "vision_side.missions.follow:Follow",
-    "band": "vision_side.missions.band:Band",
-    "pixel-pi": "vision_side.missions.pixel_pi:PixelPi",
-    "pixel-p": "vision_side.missions.pixel_p:PixelP",
-    "legs": "vision_side.missions.legs:Legs",
-    "legs-baseline": "vision_side.missions.legs_baseline:LegsBaseline",
-    "traffic-light": "vision_side.missions.traffic_light:TrafficLight",
-    "traffic-light-boxes": "vision_side.missions.traffic_light:TrafficLightBoxes",
-    "goto": "vision_side.missions.goto:Goto",
-    "goto-baseline": "vision_side.missions.goto_baseline:GotoBaseline",
+    "follow": "sightline.vision_side.missions.follow:Follow",
+    "band": "sightline.vision_side.missions.band:Band",
+    "pixel-pi": "sightline.vision_side.missions.pixel_pi:PixelPi",
+    "pixel-p": "sightline.vision_side.missions.pixel_p:PixelP",
+    "legs": "sightline.vision_side.missions.legs:Legs",
+    "legs-baseline": "sightline.vision_side.missions.legs_baseline:LegsBaseline",
+    "traffic-light": "sightline.vision_side.missions.traffic_light:TrafficLight",
+    "traffic-light-boxes": "sightline.vision_side.missions.traffic_light:TrafficLightBoxes",
+    "goto": "sightline.vision_side.missions.goto:Goto",
+    "goto-baseline": "sightline.vision_side.missions.goto_baseline:GotoBaseline",
 }
 """Here and not as entry points, so that a checkout that nobody installed has them too."""
 GROUP: Final = "sightline.missions"

@@ -6,10 +6,10 @@ A mission is somebody's plug-in: one that raises, or asks for what no robot does
 from dataclasses import replace
 from typing import Final
 
-from protocol.messages import STILL, CameraModel
-from vision_side.detect.around import PLUGIN_ERRORS
-from vision_side.missions.choice import MissionSpec
-from vision_side.missions.port import Plan, View
+from sightline.protocol.messages import STILL, CameraModel
+from sightline.vision_side.detect.around import PLUGIN_ERRORS
+from sightline.vision_side.missions.choice import MissionSpec
+from sightline.vision_side.missions.port import Plan, View
 
 SETTLE_S: Final = 1.0
 """A robot that still moves after this long is not moved by us; the new mission begins all the same."""

@@ -6,18 +6,25 @@ boxes that somebody else found are located by their height or width.
 
 import math
 
-from protocol.config import Config as Settings
-from protocol.messages import STILL, CameraModel, FrameHeader, Pose, Twist
-from vision_side.config import BoxesConfig, LatencyConfig, SearchConfig, SteerConfig, TargetConfig, TrackConfig
-from vision_side.detect.boxes import locate_box
-from vision_side.detect.labels import is_followable
-from vision_side.detect.port import Detection
-from vision_side.foretell import Motion, MotionPredictor
-from vision_side.missions.port import Plan, View
-from vision_side.search import Search
-from vision_side.sphere import Sighting, locate_sphere
-from vision_side.steer import Aim, Steer
-from vision_side.track import Target, Track, from_odometry
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.messages import STILL, CameraModel, FrameHeader, Pose, Twist
+from sightline.vision_side.config import (
+    BoxesConfig,
+    LatencyConfig,
+    SearchConfig,
+    SteerConfig,
+    TargetConfig,
+    TrackConfig,
+)
+from sightline.vision_side.detect.boxes import locate_box
+from sightline.vision_side.detect.labels import is_followable
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.foretell import Motion, MotionPredictor
+from sightline.vision_side.missions.port import Plan, View
+from sightline.vision_side.search import Search
+from sightline.vision_side.sphere import Sighting, locate_sphere
+from sightline.vision_side.steer import Aim, Steer
+from sightline.vision_side.track import Target, Track, from_odometry
 
 
 class Follow:

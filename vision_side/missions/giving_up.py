@@ -5,8 +5,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.config import Config
-from vision_side.missions.port import View
+from sightline.protocol.config import Config
+from sightline.vision_side.missions.port import View
 
 _GAIN_M = 0.1
 _DETOUR_M, _MAX_DETOURS = 0.3, 8

@@ -11,17 +11,17 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from protocol.config import Config
-from protocol.messages import STILL, CameraModel, Pose, Twist
-from vision_side.config import LatencyConfig
-from vision_side.foretell import Motion, MotionPredictor
-from vision_side.missions.body import Footprint, braking_mps, clear_of
-from vision_side.missions.giving_up import ProgressChecker, ProgressCheckerConfig
-from vision_side.missions.ground import CELL_M, Costmap
-from vision_side.missions.port import Plan, RangeScan, View
-from vision_side.missions.ranging import PoseMemory, about_robot, echoes, in_odometry
-from vision_side.missions.route import Planner, Point
-from vision_side.track import to_odometry
+from sightline.protocol.config import Config
+from sightline.protocol.messages import STILL, CameraModel, Pose, Twist
+from sightline.vision_side.config import LatencyConfig
+from sightline.vision_side.foretell import Motion, MotionPredictor
+from sightline.vision_side.missions.body import Footprint, braking_mps, clear_of
+from sightline.vision_side.missions.giving_up import ProgressChecker, ProgressCheckerConfig
+from sightline.vision_side.missions.ground import CELL_M, Costmap
+from sightline.vision_side.missions.port import Plan, RangeScan, View
+from sightline.vision_side.missions.ranging import PoseMemory, about_robot, echoes, in_odometry
+from sightline.vision_side.missions.route import Planner, Point
+from sightline.vision_side.track import to_odometry
 
 Metres = Annotated[float, Field(ge=-100, le=100)]
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from protocol.config import Config
-from protocol.messages import STILL, CameraModel, FrameHeader, Pose, Twist
-from vision_side.missions.goto import Metres
-from vision_side.missions.port import Plan, RangeScan, View
+from sightline.protocol.config import Config
+from sightline.protocol.messages import STILL, CameraModel, FrameHeader, Pose, Twist
+from sightline.vision_side.missions.goto import Metres
+from sightline.vision_side.missions.port import Plan, RangeScan, View
 
 _STEP_US = 100_000  # it ran at 10 Hz
 _REACH_M = 0.2

@@ -7,7 +7,7 @@ given up again when rays pass where it was: after a drift of the odometry, or wh
 import numpy as np
 from numpy.typing import NDArray
 
-from vision_side.missions.ranging import Points
+from sightline.vision_side.missions.ranging import Points
 
 Cells = NDArray[np.int64]
 """(N, 2), whole numbers of cells."""

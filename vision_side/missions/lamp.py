@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from protocol.config import Config
-from vision_side.config import Fraction, HsvRange
-from vision_side.decode import Picture
-from vision_side.detect.colour import color_table
-from vision_side.detect.edge import sharp_outline
-from vision_side.detect.port import Detection
+from sightline.protocol.config import Config
+from sightline.vision_side.config import Fraction, HsvRange
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.colour import color_table
+from sightline.vision_side.detect.edge import sharp_outline
+from sightline.vision_side.detect.port import Detection
 
 Box = tuple[float, float, float, float]
 """left, top, right, bottom, in pixels of the decoded picture."""

@@ -11,8 +11,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.config import Config
-from protocol.messages import Pose
+from sightline.protocol.config import Config
+from sightline.protocol.messages import Pose
 
 _MAX_BLOCKS = 64
 _SAME_M = 0.20  # two blocks are never this near; one's measured place is off by this much where it is far away

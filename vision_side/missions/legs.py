@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from protocol.messages import CameraModel
-from vision_side.config import TrackConfig
-from vision_side.detect.port import Detection
-from vision_side.missions.follow import Follow
-from vision_side.missions.port import Plan, View
-from vision_side.missions.ranging import Points, PoseMemory, about_robot, echoes, in_odometry
-from vision_side.sphere import Sighting, points_ahead
-from vision_side.track import from_odometry
+from sightline.protocol.messages import CameraModel
+from sightline.vision_side.config import TrackConfig
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.missions.follow import Follow
+from sightline.vision_side.missions.port import Plan, View
+from sightline.vision_side.missions.ranging import Points, PoseMemory, about_robot, echoes, in_odometry
+from sightline.vision_side.sphere import Sighting, points_ahead
+from sightline.vision_side.track import from_odometry
 
 _SPAN_MARGIN_RAD = math.radians(1.5)  # a lidar's rays stand 1 degree apart, and the person walks on meanwhile
 _GAP_M = 0.10  # echoes further apart than this, one after the other, are of two legs

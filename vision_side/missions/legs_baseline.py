@@ -11,10 +11,10 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from protocol.config import Config as Settings
-from protocol.messages import STILL, CameraModel, Twist
-from vision_side.detect.port import Detection
-from vision_side.missions.port import Plan, RangeScan, View
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.messages import STILL, CameraModel, Twist
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.missions.port import Plan, RangeScan, View
 
 _RAYS = 70
 _FIRST_DEG = 39.0  # the leftmost ray; each next one is a degree further right

@@ -8,10 +8,10 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.config import Config
-from protocol.messages import STILL, CameraModel, Twist
-from vision_side.missions.blob import Blob, largest
-from vision_side.missions.port import Plan, View
+from sightline.protocol.config import Config
+from sightline.protocol.messages import STILL, CameraModel, Twist
+from sightline.vision_side.missions.blob import Blob, largest
+from sightline.vision_side.missions.port import Plan, View
 
 Pixels = Annotated[float, Field(ge=0, le=1e4)]
 

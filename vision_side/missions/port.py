@@ -10,9 +10,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import CameraModel, FrameHeader, Twist
-from vision_side.decode import Picture
-from vision_side.detect.port import Detection
+from sightline.protocol.messages import CameraModel, FrameHeader, Twist
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.port import Detection
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,8 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import FrameHeader, Pose
-from vision_side.missions.port import RangeScan
+from sightline.protocol.messages import FrameHeader, Pose
+from sightline.vision_side.missions.port import RangeScan
 
 Points = NDArray[np.float64]
 """(N, 2), metres."""

@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError
 
 DEFAULT_PORTS: Final = {"oip+http": 8000, "oip+grpc": 8001, "http+jpeg": 80}
 """Those of Triton, and of HTTP."""

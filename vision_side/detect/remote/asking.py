@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from protocol.clock import monotonic_us
-from protocol.errors import WireError
-from protocol.jpeg import read_jpeg_size
-from vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
-from vision_side.detect.remote.refusing import ErrorCounters, NoAnswerError, NoAnswerReason
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
+from sightline.vision_side.detect.remote.refusing import ErrorCounters, NoAnswerError, NoAnswerReason
 
 REMOTE: Final = "remote"
 """What a result was made on, where the server does not say."""

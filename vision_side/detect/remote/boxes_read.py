@@ -7,10 +7,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import MAX_DETECTED_BOXES, DetectedBox
-from vision_side.detect.labels import clean_label
-from vision_side.detect.port import Circle, Detection, clipped
-from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.protocol.messages import MAX_DETECTED_BOXES, DetectedBox
+from sightline.vision_side.detect.labels import clean_label
+from sightline.vision_side.detect.port import Circle, Detection, clipped
+from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 MAX_ROWS: Final = 1024
 """Security limit: a model with a fixed number of rows fills up with scores of 0; more than this is no detector's."""

@@ -12,9 +12,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
-from protocol.clock import monotonic_us
-from vision_side.detect.remote.asking import seconds_left
-from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.protocol.clock import monotonic_us
+from sightline.vision_side.detect.remote.asking import seconds_left
+from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 MAX_ANSWER_BYTES: Final = 1 << 20
 """Security limit: 1024 rows of boxes as JSON are a tenth of it."""

@@ -9,20 +9,20 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from protocol.codec import decode
-from protocol.config import Config as Settings
-from protocol.errors import WireError
-from protocol.messages import Counter, Detections, SessionId
-from protocol.refusals import RejectReason
-from vision_side.config import Fraction
-from vision_side.detect.labels import clean_label
-from vision_side.detect.port import DetectFrame, Maker
-from vision_side.detect.remote.address import Address, parse_address
-from vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector
-from vision_side.detect.remote.boxes_read import MIN_SCORE, hash_of, read_boxes
-from vision_side.detect.remote.by_deadline import MAX_PIXELS, DeadlineDetector, PixelBound
-from vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES, HttpExchange
-from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.protocol.codec import decode
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import Counter, Detections, SessionId
+from sightline.protocol.refusals import RejectReason
+from sightline.vision_side.config import Fraction
+from sightline.vision_side.detect.labels import clean_label
+from sightline.vision_side.detect.port import DetectFrame, Maker
+from sightline.vision_side.detect.remote.address import Address, parse_address
+from sightline.vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector
+from sightline.vision_side.detect.remote.boxes_read import MIN_SCORE, hash_of, read_boxes
+from sightline.vision_side.detect.remote.by_deadline import MAX_PIXELS, DeadlineDetector, PixelBound
+from sightline.vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES, HttpExchange
+from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 SESSION, SEQ = "X-Sightline-Session", "X-Sightline-Seq"
 """Headers that name the frame, for servers that log or that answer out of order."""

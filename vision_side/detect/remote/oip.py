@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision_side.detect.port import DetectFrame, Detection
-from vision_side.detect.remote.boxes_read import MIN_SCORE, read_columns
-from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.port import DetectFrame, Detection
+from sightline.vision_side.detect.remote.boxes_read import MIN_SCORE, read_columns
+from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 NUMBERS: Final = {"FP16": "<f2", "FP32": "<f4", "FP64": "<f8", "UINT8": "u1", "INT8": "i1", "INT16": "<i2",
                   "UINT16": "<u2", "INT32": "<i4", "UINT32": "<u4", "INT64": "<i8", "UINT64": "<u8", "BOOL": "?"}

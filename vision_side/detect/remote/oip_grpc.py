@@ -3,14 +3,14 @@
 from importlib.util import find_spec
 from typing import Any, Final
 
-from protocol.errors import ConfigError
-from vision_side.detect.port import DetectFrame, Maker
-from vision_side.detect.remote.address import Address, parse_address
-from vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector, seconds_left
-from vision_side.detect.remote.by_deadline import DeadlineDetector
-from vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES
-from vision_side.detect.remote.oip import OipModel, OutputOptions, detections_of, tensor_of
-from vision_side.detect.remote.oip_messages import (
+from sightline.protocol.errors import ConfigError
+from sightline.vision_side.detect.port import DetectFrame, Maker
+from sightline.vision_side.detect.remote.address import Address, parse_address
+from sightline.vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector, seconds_left
+from sightline.vision_side.detect.remote.by_deadline import DeadlineDetector
+from sightline.vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES
+from sightline.vision_side.detect.remote.oip import OipModel, OutputOptions, detections_of, tensor_of
+from sightline.vision_side.detect.remote.oip_messages import (
     INFER,
     METADATA,
     infer_request,
@@ -18,8 +18,8 @@ from vision_side.detect.remote.oip_messages import (
     read_infer,
     read_metadata,
 )
-from vision_side.detect.remote.oip_settings import OipSettings
-from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.remote.oip_settings import OipSettings
+from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 _OPTIONS: Final = (
     ("grpc.max_receive_message_length", MAX_ANSWER_BYTES),  # security limit, of what is unpacked too

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from vision_side.detect.remote.oip import (
+from sightline.vision_side.detect.remote.oip import (
     MAX_DIMENSIONS,
     MAX_TENSORS,
     NUMBERS,
@@ -20,7 +20,7 @@ from vision_side.detect.remote.oip import (
     read_number_tensor,
     read_text_tensor,
 )
-from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 HEADER_LENGTH: Final = "Inference-Header-Content-Length"
 """How many bytes of a body are JSON; tensors follow."""

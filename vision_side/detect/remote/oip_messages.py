@@ -10,8 +10,8 @@ from typing import Any, Final
 
 from numpy.typing import NDArray
 
-from vision_side.detect.protobuf import Bytes, as_bytes, fields, integers, put, put_integers, text
-from vision_side.detect.remote.oip import (
+from sightline.vision_side.detect.protobuf import Bytes, as_bytes, fields, integers, put, put_integers, text
+from sightline.vision_side.detect.remote.oip import (
     MAX_TENSORS,
     Inferred,
     OipModel,
@@ -21,7 +21,7 @@ from vision_side.detect.remote.oip import (
     read_number_tensor,
     read_text_tensor,
 )
-from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 METADATA: Final = "/inference.GRPCInferenceService/ModelMetadata"
 INFER: Final = "/inference.GRPCInferenceService/ModelInfer"

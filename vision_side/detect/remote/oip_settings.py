@@ -4,12 +4,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from protocol.config import Config as Settings
-from vision_side.config import Fraction
-from vision_side.detect.labels import Label
-from vision_side.detect.remote.boxes_read import MIN_SCORE
-from vision_side.detect.remote.by_deadline import MAX_PIXELS, PixelBound
-from vision_side.detect.remote.oip import OutputOptions
+from sightline.protocol.config import Config as Settings
+from sightline.vision_side.config import Fraction
+from sightline.vision_side.detect.labels import Label
+from sightline.vision_side.detect.remote.boxes_read import MIN_SCORE
+from sightline.vision_side.detect.remote.by_deadline import MAX_PIXELS, PixelBound
+from sightline.vision_side.detect.remote.oip import OutputOptions
 
 
 class OipSettings(Settings):

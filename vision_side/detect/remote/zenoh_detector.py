@@ -8,19 +8,19 @@ Nothing is sent: robot and service meet by themselves. Here it is waited, by the
 
 from typing import ClassVar, Final
 
-from protocol.channels import DETECTIONS, FRAME
-from protocol.clock import monotonic_us
-from protocol.codec import decode
-from protocol.config import Config as Settings
-from protocol.errors import WireError
-from protocol.messages import Detections, DetectionsHeader, Source
-from protocol.transports.link import LatestSlot, Link, Message
-from vision_side.config import Fraction
-from vision_side.detect.labels import clean_label
-from vision_side.detect.port import DetectFrame, DetectionResult, Maker, result_of
-from vision_side.detect.remote.asking import REMOTE, FrameByFrame, seconds_left
-from vision_side.detect.remote.boxes_read import MIN_SCORE, hash_of, read_boxes
-from vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.protocol.channels import DETECTIONS, FRAME
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import Detections, DetectionsHeader, Source
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.vision_side.config import Fraction
+from sightline.vision_side.detect.labels import clean_label
+from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Maker, result_of
+from sightline.vision_side.detect.remote.asking import REMOTE, FrameByFrame, seconds_left
+from sightline.vision_side.detect.remote.boxes_read import MIN_SCORE, hash_of, read_boxes
+from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 ROLE: Final = "detector"
 """The source under which a detector service speaks."""

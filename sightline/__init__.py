@@ -1,0 +1,1 @@
+"""Sightline: the public API."""
