@@ -16,15 +16,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-from sightline.benchmarks.loop_pictures import write_pictures
+from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import Holder
 from sightline.robot_side.hardware.v4l2_camera import V4l2Camera
 from sightline.robot_side.hardware.v4l2_device import V4l2CameraConfig
-from sightline.robot_side.ipc import CommandAck
+from sightline.robot_side.pipe import CommandAck
 from sightline.robot_side.sending import NetworkCore
-from sightline.robot_side.stream import StreamConfig
+from sightline.robot_side.network.stream import StreamConfig
 
 BOUND_MS: Final = 0.1
 MISSED_BOUND: Final = 3

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from sightline.benchmarks.loop_pictures import write_pictures
+from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.protocol.channels import DETECTIONS, FRAME, STATUS
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
@@ -21,7 +21,7 @@ from sightline.protocol.errors import SightlineError, WireError
 from sightline.protocol.messages import DetectionsHeader, FrameHeader, Stamp, State, Status
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.link_rules import LinkRules
-from sightline.protocol.transports.zenoh import ZenohLink
+from sightline.protocol.transports.zenoh.link import ZenohLink
 from sightline.protocol.transports.zenoh_session import open_session
 
 DEADLINE_MS: Final = 100.0
@@ -125,7 +125,7 @@ def measure_streams(endpoint: str, folder: Path, streams: int = 40, seconds: flo
 
 
 def _service(endpoint: str, each_us: int, log: Path) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli", "detector", "--serve", "sightline.benchmarks.slow_eyes:SlowDetector",
+    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli.app", "detector", "--serve", "sightline.benchmarks.detector:SlowDetector",
                "--connect", endpoint, "--set", f"detector.options.each_us={each_us}"]
     with log.open("wb") as out:
         return subprocess.Popen(command, stdout=out, stderr=out)

@@ -5,8 +5,8 @@ from statistics import median
 from typing import Final
 
 from sightline.protocol.messages import AnswerHeader, Echo, Twist
-from sightline.robot_side.limits import SafetyConfig
-from sightline.robot_side.safety import SafetyGate
+from sightline.robot_side.safety.limits import SafetyConfig
+from sightline.robot_side.safety.gate import SafetyGate
 
 GATE_BOUND_US: Final = 20.0
 _SESSION: Final = "0000aaaa"

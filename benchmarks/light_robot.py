@@ -21,7 +21,7 @@ from sightline.protocol.codec import decode
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import State, Status
 from sightline.protocol.transports.link import LatestSlot, Message
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 
 ROOT: Final = Path(__file__).parent.parent
 ENDPOINT: Final = "tcp/127.0.0.1:17461"
@@ -89,7 +89,7 @@ def _service(python: str, arguments: list[str], folder: Path, ready: str) -> Ite
     log = folder / f"{arguments[0]}.log"
     with log.open("wb") as out:
         # Not from the checkout, so that a bare environment finds nothing but what it has installed.
-        command = [python, "-m", "sightline.operator_side.cli", *arguments]
+        command = [python, "-m", "sightline.operator_side.cli.app", *arguments]
         process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=folder)
     try:
         _wait_for(log, ready, process)

@@ -6,7 +6,7 @@ from statistics import median
 from typing import Final
 
 from sightline.benchmarks.loop_course import Sample
-from sightline.benchmarks.loop_setting import FLOOR, OURS, PEERS, TAKEN_BOUND_PERCENT, TCP, LoopSetting
+from sightline.benchmarks.loop.figures import FLOOR, OURS, PEERS, TAKEN_BOUND_PERCENT, TCP, LoopSetting
 
 P50_OVER_FLOOR_MS: Final = 1.5
 P95_OVER_FLOOR_MS: Final = 5.0

@@ -11,8 +11,8 @@ from pathlib import Path
 from statistics import median
 from typing import Final
 
-from sightline.benchmarks.loop_eyes import PipelineVision
-from sightline.benchmarks.loop_setting import MAX_FPS, LoopSetting
+from sightline.benchmarks.loop.vision import PipelineVision
+from sightline.benchmarks.loop.figures import MAX_FPS, LoopSetting
 
 _STEPS: Final = 60
 _FRAME_US: Final = 33_333

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from sightline.benchmarks.loop_course import Course, Sample, course_of_tally
-from sightline.benchmarks.loop_crew import BenchProcesses, free_port
-from sightline.benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
-from sightline.benchmarks.loop_ours import running_services
-from sightline.benchmarks.loop_setting import FLOOR, OUR_DETECTOR, OURS, OWN_DETECTOR, TAKEN_BOUND_PERCENT, LoopSetting
+from sightline.benchmarks.loop.processes import BenchProcesses, free_port
+from sightline.benchmarks.loop.counters import high_water_mb, read_machine, taken_percent
+from sightline.benchmarks.loop.ours import running_services
+from sightline.benchmarks.loop.figures import FLOOR, OUR_DETECTOR, OURS, OWN_DETECTOR, TAKEN_BOUND_PERCENT, LoopSetting
 from sightline.benchmarks.loop_sockets import carried_between, carried_bytes
 from sightline.protocol.clock import monotonic_us
 

@@ -10,12 +10,12 @@ import sys
 import threading
 from pathlib import Path
 
-from sightline.benchmarks.loop_eyes import build_pipeline
+from sightline.benchmarks.loop.vision import build_pipeline
 from sightline.protocol.channels import MAX_HEADER_BYTES
 from sightline.protocol.codec import decode
 from sightline.protocol.messages import CameraModel, FrameHeader
 from sightline.protocol.transports.link import Link, Message
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.pipeline import SOURCE
 from sightline.vision_side.service import Service

@@ -6,8 +6,8 @@ from itertools import pairwise
 from typing import Any, Final
 
 from sightline.benchmarks.loop_figures import LoopCheck, at_most, percentile
-from sightline.benchmarks.network_rows import HOLD_AGE_MS, Case
-from sightline.benchmarks.network_watch import NOTED
+from sightline.benchmarks.network.cases import HOLD_AGE_MS, Case
+from sightline.benchmarks.network.watch import NOTED
 
 DRIVING: Final = ("ACTIVE", "DEGRADED")
 _GAP_US: Final = 300_000

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from sightline.benchmarks.loop_figures import LoopCheck, at_most, percentile
-from sightline.benchmarks.loop_pictures import write_pictures
-from sightline.benchmarks.network_robots import Settings
-from sightline.benchmarks.network_rows import Case
-from sightline.benchmarks.network_stage import EVERYWHERE, NetworkRun, Stage
+from sightline.benchmarks.loop.pictures import write_pictures
+from sightline.benchmarks.network.robots import Settings
+from sightline.benchmarks.network.cases import Case
+from sightline.benchmarks.network.stage import EVERYWHERE, NetworkRun, Stage
 from sightline.protocol.clock import monotonic_us
-from sightline.sim.wire import LinkShapes
-from sightline.sim.wire_tun import ADDRESS_B
+from sightline.sim.network_emulator import LinkShapes
+from sightline.sim.tun_emulator import ADDRESS_B
 
 ROBOTS: Final = 20
 WIDTH_PX, HEIGHT_PX, FPS = 320, 240, 15.0
@@ -30,10 +30,10 @@ def fleet(row: Case, stage: Stage) -> NetworkRun:
                         notes=stage.folder / "notes.json", seed=stage.seed)
     with stage.wire() as wire, stage.crew("crew") as crew:
         before = wire.shape(stage.seeded(row.phases[0].shapes))
-        crew.start("vision", "sightline.operator_side.cli", "vision", "--robot", "r*", "--listen", f"tcp/{EVERYWHERE}:7447",
+        crew.start("vision", "sightline.operator_side.cli.app", "vision", "--robot", "r*", "--listen", f"tcp/{EVERYWHERE}:7447",
                    namespace=wire.far_side)
         crew.wait_line("vision", "looking for robots")
-        crew.start("robots", "sightline.benchmarks.network_robots", settings.model_dump_json(), namespace=wire.robot_side)
+        crew.start("robots", "sightline.benchmarks.network.robots", settings.model_dump_json(), namespace=wire.robot_side)
         crew.wait_line("robots", f"playing {ROBOTS} robots")
         time.sleep(_FLEET_SETTLE_S)
         begin_us = monotonic_us()

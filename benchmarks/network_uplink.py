@@ -10,15 +10,15 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, Final
 
-from sightline.benchmarks.loop_crew import BenchProcesses
+from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.loop_figures import LoopCheck, at_most
 from sightline.benchmarks.network_figures import sent_between
-from sightline.benchmarks.network_rows import Case
-from sightline.benchmarks.network_stage import BenchWire, NetworkRun, Stage, start_robot, start_vision
-from sightline.benchmarks.network_takeover import start_router
+from sightline.benchmarks.network.cases import Case
+from sightline.benchmarks.network.stage import BenchWire, NetworkRun, Stage, start_robot, start_vision
+from sightline.benchmarks.network.scenes import start_router
 from sightline.protocol.clock import monotonic_us
-from sightline.sim.wire import LinkShapes
-from sightline.sim.wire_tun import ADDRESS_B
+from sightline.sim.network_emulator import LinkShapes
+from sightline.sim.tun_emulator import ADDRESS_B
 
 MOST_SHARE: Final = 1.05
 UPLINK_LEAST_FPS: Final = 25.0
@@ -41,7 +41,7 @@ def uplink(row: Case, stage: Stage) -> NetworkRun:
         _start_notes(crews["site"], wire, stage)
         alone = _stretch(wire, shapes, stage.setting.seconds / 2)
         start_vision(stage, crews["standby"], wire.far_side, _AT_ROUTER)
-        crews["site"].start("watcher", "sightline.benchmarks.watcher", _AT_ROUTER, str(READERS), "0", namespace=wire.far_side)
+        crews["site"].start("watcher", "sightline.benchmarks.loop.viewers", _AT_ROUTER, str(READERS), "0", namespace=wire.far_side)
         crews["site"].wait_line("watcher", "watching")
         crowded = _stretch(wire, shapes, stage.setting.seconds / 2)
         for crew in crews.values():
@@ -53,7 +53,7 @@ def uplink(row: Case, stage: Stage) -> NetworkRun:
 
 
 def _start_notes(crew: BenchProcesses, wire: BenchWire, stage: Stage) -> None:
-    crew.start("notes", "sightline.benchmarks.network_watch", _AT_ROUTER, str(stage.folder / "notes.json"), "statuses",
+    crew.start("notes", "sightline.benchmarks.network.watch", _AT_ROUTER, str(stage.folder / "notes.json"), "statuses",
                namespace=wire.far_side)
     crew.wait_line("notes", "watching")
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from sightline.protocol.messages import Twist
 from sightline.robot_side.kinematics import DiffDriveConfig, Odometer, wheel_speeds
-from sightline.sim.robot_model import RobotModel, load_robot, robot_names
+from sightline.sim.robot import RobotModel, load_robot, robot_names
 from sightline.sim.scenario import Start, load_scenario
-from sightline.sim.world import STEP_US, World
+from sightline.sim.world.world import STEP_US, World
 
 _TICK_STEPS = 5  # 50 Hz, as the driver reads its encoders
 _SHARE = 2 / 3

@@ -76,7 +76,7 @@ def _measured(section: Section, pictures: Path) -> dict[str, Any]:
 
 def _run(arguments: Sequence[str]) -> dict[str, Any]:
     """The command's JSON object. Raises RuntimeError with its error line if it printed none."""
-    command = [sys.executable, "-m", "sightline.operator_side.cli", *arguments, "--json"]
+    command = [sys.executable, "-m", "sightline.operator_side.cli.app", *arguments, "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode not in (0, CHECK_FAILED):
         raise RuntimeError(f"{' '.join(arguments)}: {done.stderr.strip()}")

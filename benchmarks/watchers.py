@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from sightline.benchmarks.interrupted import terminated_like_interrupted
+from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.benchmarks.loop_course import Course
-from sightline.benchmarks.loop_crew import BenchProcesses
+from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.loop_figures import ANSWERED_PERCENT, LoopCheck, at_most, percentile
-from sightline.benchmarks.loop_machine import high_water_mb, read_machine, taken_percent
-from sightline.benchmarks.loop_ours import Ours, running_services
-from sightline.benchmarks.loop_pictures import write_pictures
-from sightline.benchmarks.loop_setting import TAKEN_BOUND_PERCENT, LoopSetting
+from sightline.benchmarks.loop.counters import high_water_mb, read_machine, taken_percent
+from sightline.benchmarks.loop.ours import Ours, running_services
+from sightline.benchmarks.loop.pictures import write_pictures
+from sightline.benchmarks.loop.figures import TAKEN_BOUND_PERCENT, LoopSetting
 
 P95_GROWTH_MS: Final = 3.0
 MEMORY_GROWTH_MB: Final = 5.0
@@ -83,7 +83,7 @@ def start_viewers(crew: BenchProcesses, endpoint: str, viewers: int) -> dict[str
     pids = {}
     for name, (count, nap_s) in parts.items():
         if count:
-            pids[name] = crew.start(name, "sightline.benchmarks.watcher", endpoint, str(count), str(nap_s))
+            pids[name] = crew.start(name, "sightline.benchmarks.loop.viewers", endpoint, str(count), str(nap_s))
             crew.wait_line(name, "watching")
     os.kill(pids["stalled"], signal.SIGSTOP)
     return pids

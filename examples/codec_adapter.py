@@ -9,10 +9,10 @@ import json
 import sys
 from typing import Any
 
-from sightline.protocol.golden import outcome
-from sightline.protocol.golden_wires import READERS, framing_outcome
+from sightline.protocol.spec.golden import outcome
+from sightline.protocol.spec.framing_cases import READERS, framing_outcome
 from sightline.protocol.messages import Twist
-from sightline.protocol.twist_text import format_twist
+from sightline.protocol.text import format_twist
 
 
 def answer(question: dict[str, Any]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader
 from sightline.protocol.refusals import RejectReason
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 
 SOURCE, SESSION = "detector", secrets.token_hex(4)
 YELLOW = (18, 128, 40), (34, 255, 255)

@@ -7,7 +7,7 @@ test for round things too, which the write-up did not have.
 """
 
 from sightline.vision_side.config import HsvRange
-from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.color.detectors import Hsv
 
 RANGE = HsvRange(hue_low_deg=40, hue_high_deg=128, saturation_low=0.098, value_low=0.098)
 

@@ -8,10 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sightline.operator_side import around_text
+from sightline.operator_side.client import discovery as around_text
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
-from sightline.protocol.transports.zenoh_around import Discovered, discover, find_listeners
+from sightline.protocol.transports.zenoh.discovery import Discovered, discover, find_listeners
 from sightline.robot_side.config import DEFAULT_ENDPOINT
 
 SCOUT_S: Final = 0.4

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from sightline.operator_side.behaviours_page import SPEEDS, kept, page_lines, picture_name
-from sightline.operator_side.behaviours_rows import ROWS, Row
-from sightline.operator_side.extras import needs
-from sightline.operator_side.score import Score, score
+from sightline.evaluation.score.behaviours import ROWS, Row
+from sightline.operator_side.preflight import needs
+from sightline.evaluation.score.figures import Score, score
 from sightline.operator_side.score_course import figures_of
-from sightline.operator_side.score_runs import Case, run_of
+from sightline.evaluation.score.runs import Case, run_of
 from sightline.operator_side.speed_runs import SpeedRun, speed_cases, speed_run
 from sightline.operator_side.worker_pool import worker_pool
 
@@ -48,7 +48,7 @@ def _picture(folder: Path, case: Case, seeds: Sequence[int]) -> Path | None:
 
 def _run(case: Case, picture: Path | None) -> Score:
     with needs("report"):
-        from sightline.operator_side.plot import plot_run
+        from sightline.evaluation.plots import plot_run
     scenario, run = run_of(case)
     if picture is not None:
         whose = f" on {case.robot}" if case.robot else ""

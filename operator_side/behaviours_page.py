@@ -3,12 +3,12 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
-from sightline.operator_side.behaviours_rows import CHARACTER, LATENCY_MS, LOSS, Row
-from sightline.operator_side.check_text import Check, number
-from sightline.operator_side.score import Score, median_and_worst
+from sightline.evaluation.score.behaviours import CHARACTER, LATENCY_MS, LOSS, Row
+from sightline.evaluation.checks import Check, number
+from sightline.evaluation.score.figures import Score, median_and_worst
 from sightline.operator_side.score_bounds import BOUNDS, EXACT, UNITS, checks_of
 from sightline.operator_side.score_course import HARDEST_MPS2, READ_WITHIN_M, SETTLED_S
-from sightline.operator_side.score_runs import Case
+from sightline.evaluation.score.runs import Case
 from sightline.operator_side.speed_runs import SpeedRun
 from sightline.sim.scenario import load_scenario
 

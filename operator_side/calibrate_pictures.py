@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from sightline.operator_side.acknowledge import Viewer
+from sightline.operator_side.client.pictures import Viewer
 from sightline.protocol.channels import CAMERA, FRAME
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import ConfigError, LinkError, WireError
 from sightline.protocol.jpeg import JpegSize, read_jpeg_size
 from sightline.protocol.messages import CameraModel
 from sightline.protocol.transports.link import Link
-from sightline.robot_side.hardware.folder_camera import jpegs_in
+from sightline.robot_side.hardware.cameras.files import jpegs_in
 from sightline.robot_side.ports import Camera
 
 ROLE = "calibrate"

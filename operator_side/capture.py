@@ -9,7 +9,7 @@ from typing import Final
 import cv2
 
 from sightline.operator_side.film import Film
-from sightline.operator_side.jpeg_pixels import jpeg_pixels
+from sightline.operator_side.recording.film import jpeg_pixels
 from sightline.operator_side.out_file import check_out_file
 from sightline.operator_side.pictures import Pictures, Shot
 from sightline.protocol.channels import OVERLAY, Channel

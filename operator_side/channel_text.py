@@ -10,7 +10,7 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import WireModel
 from sightline.protocol.transports.link import Message
-from sightline.protocol.twist_text import parse_twist
+from sightline.protocol.text import parse_twist
 
 _LEFT_OUT: Final = ("v",)
 _EMPTY: Final[tuple[Any, ...]] = (None, "", {}, [], ())

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sightline.operator_side.cli_options import Json
-from sightline.operator_side.extras import needs
+from sightline.operator_side.cli.options import Json
+from sightline.operator_side.preflight import needs
 
 if TYPE_CHECKING:
-    from sightline.operator_side.check_text import Check
+    from sightline.evaluation.checks import Check
 
 _READY_S = 30.0
 _BOUND_US = {"zenoh": 1_000.0, "oip+http": 2_000.0}
@@ -39,10 +39,10 @@ def detector(
 
     with needs("vision"):
         from sightline.benchmarks.detector_remote import HOT_S, PACED_S, measure_cost
-        from sightline.operator_side.check_text import Check
+        from sightline.evaluation.checks import Check
         from sightline.vision_side.config import VisionConfig
         from sightline.vision_side.detect.around import attach_detector, close_detector
-        from sightline.vision_side.detect.choice import build_detector
+        from sightline.vision_side.detect.registry import build_detector
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder, _service(name, Path(folder)) as robot:
         here = build_detector("hsv", {}, VisionConfig())
         there = build_detector(name, own_options(sets or ()), VisionConfig())
@@ -72,7 +72,7 @@ def streams(
     """Many robots at one detector service that can look at half of their frames: age, fairness, memory."""
     with needs("vision"):
         from sightline.benchmarks import detector_streams as bench
-        from sightline.operator_side.check_text import Check
+        from sightline.evaluation.checks import Check
 
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
         load = bench.measure_streams(_free_endpoint(), Path(folder), streams, seconds)
@@ -92,7 +92,7 @@ def streams(
 def _service(name: str, folder: Path) -> "Iterator[Any]":
     """For `zenoh` a service, and a link that is both the robot's and vision's, where they meet; else None."""
     from sightline.operator_side.processes import Processes
-    from sightline.protocol.transports.opening import open_link
+    from sightline.protocol.transports.open import open_link
 
     if name != "zenoh":
         yield None
@@ -120,7 +120,7 @@ def _publish_status(robot: Any, processes: Any) -> None:
 
 
 def _picture(folder: Path) -> bytes:
-    from sightline.benchmarks.loop_pictures import write_pictures
+    from sightline.benchmarks.loop.pictures import write_pictures
 
     write_pictures(folder, 320, 240)
     return min(folder.glob("*.jpg")).read_bytes()
@@ -135,6 +135,6 @@ def _free_endpoint() -> str:
 
 
 def _print(checks: "list[Check]", as_json: bool) -> int:
-    from sightline.operator_side.cli_bench import print_checks
+    from sightline.operator_side.cli.bench import print_checks
 
     return print_checks(checks, as_json)

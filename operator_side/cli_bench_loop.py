@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from sightline.operator_side.cli_options import CHECK_FAILED, Json
-from sightline.operator_side.extras import needs
+from sightline.operator_side.cli.options import CHECK_FAILED, Json
+from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from sightline.benchmarks.loop import Race
+    from sightline.benchmarks.loop.race import Race
     from sightline.benchmarks.loop_figures import LoopCheck
 
 _ALONE = (
@@ -76,8 +76,8 @@ def loop(
 ) -> int:
     """Capture to the driver's verdict, beside the in-process floor, bare TCP and what others build."""
     with needs("bench"):
-        from sightline.benchmarks.loop import run_race
-        from sightline.benchmarks.loop_setting import LoopSetting, peers_of, size_of
+        from sightline.benchmarks.loop.race import run_race
+        from sightline.benchmarks.loop.figures import LoopSetting, peers_of, size_of
 
         if peers != "none":
             import zmq  # noqa: F401  # a peer's need; said here, not by a process that dies
@@ -105,7 +105,7 @@ def watchers(
 ) -> int:
     """What viewers of the robot's pictures cost whoever drives: age of the commands, memory of the robot."""
     with needs("all"):
-        from sightline.benchmarks.loop_setting import LoopSetting
+        from sightline.benchmarks.loop.figures import LoopSetting
         from sightline.benchmarks.watchers import measure_watchers
 
     setting = LoopSetting(Path(), transport=transport, seconds=seconds)
@@ -151,7 +151,7 @@ def _race_result(race: "Race") -> dict[str, Any]:
 
 def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
     with needs("report"):
-        from sightline.benchmarks.loop_picture import draw_race
+        from sightline.benchmarks.loop.plot import draw_race
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "loop.json").write_text(json.dumps(result, indent=1), "utf-8")
@@ -161,7 +161,7 @@ def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
 
 
 def _table(race: "Race") -> list[str]:
-    from sightline.benchmarks.loop_setting import OUR_DETECTOR
+    from sightline.benchmarks.loop.figures import OUR_DETECTOR
 
     names = f"{'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'bytes':>8} {'others':>7}"
     head = f"{'':18} {names}  CPU ms a picture; MB"
@@ -179,6 +179,6 @@ def _row(name: str, race: "Race") -> str:
 
 
 def _check_lines(checks: "Sequence[AnyCheck]") -> list[str]:
-    from sightline.operator_side.check_text import Check, check_line
+    from sightline.evaluation.checks import Check, check_line
 
     return [check_line(Check(one.name, one.value, one.unit, one.bound, one.ok)) for one in checks]

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sightline.operator_side.cli_options import CHECK_FAILED, Json, numbers
-from sightline.operator_side.extras import needs
+from sightline.operator_side.cli.options import CHECK_FAILED, Json, numbers
+from sightline.operator_side.preflight import needs
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from sightline.benchmarks.loop_figures import LoopCheck
-    from sightline.benchmarks.network_stage import NetworkRun
+    from sightline.benchmarks.network.stage import NetworkRun
 
 
 def register_network_bench(group: typer.Typer) -> None:
@@ -31,9 +31,9 @@ def network(
 ) -> int:
     """Robots, visions and people in two network namespaces: what slow, lossy, far, broken and shared wires cost."""
     with needs("all"):
-        from sightline.benchmarks.network import Progress, run_network
-        from sightline.benchmarks.network_rows import chosen
-        from sightline.benchmarks.network_stage import NetworkSetting
+        from sightline.benchmarks.network.run import Progress, run_network
+        from sightline.benchmarks.network.cases import chosen
+        from sightline.benchmarks.network.stage import NetworkSetting
         from sightline.operator_side.faults.wires import BenchWire
         from sightline.operator_side.network_medium import medium
     setting = NetworkSetting(transport, seconds, tuple(numbers("--seeds", seeds, int)))
@@ -67,7 +67,7 @@ def _worst(runs: "Sequence[NetworkRun]") -> "Iterator[LoopCheck]":
 
 
 def _print_run(run: "NetworkRun", *, as_json: bool) -> None:
-    from sightline.operator_side.check_text import number
+    from sightline.evaluation.checks import number
 
     typer.echo(f"{run.row.name} ({run.row.what}), seed {run.seed}", err=as_json)
     for last in run.figures[-1:]:
@@ -88,7 +88,7 @@ def _print_worst(runs: "Sequence[NetworkRun]") -> None:
 
 
 def _print_network_checks(checks: "Sequence[LoopCheck]", *, as_json: bool) -> None:
-    from sightline.operator_side.check_text import Check, check_line
+    from sightline.evaluation.checks import Check, check_line
 
     for check in checks:
         typer.echo("  " + check_line(Check(check.name, check.value, check.unit, check.bound, check.ok)), err=as_json)

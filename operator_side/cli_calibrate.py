@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sightline.operator_side.cli_options import Json, RobotName, Secure, ServiceConnect
-from sightline.operator_side.cli_robot_tools import drive
-from sightline.operator_side.extras import needs
+from sightline.operator_side.cli.options import Json, RobotName, Secure, ServiceConnect
+from sightline.operator_side.cli.calibrate import drive
+from sightline.operator_side.preflight import needs
 from sightline.operator_side.out_file import check_out_file
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
-    from sightline.operator_side.calibrate import Ball, Board, Calibration, Mounting
+    from sightline.operator_side.calibrate.camera import Ball, Board, Calibration, Mounting
 
 _BOARD = re.compile(r"([0-9]{1,2})x([0-9]{1,2})")
 _BALL_PICTURES = 20
@@ -89,7 +89,7 @@ def camera(
 
 def _subject(board: str, square_m: float, radius_m: float | None, distance_m: float | None) -> "Board | Ball":
     with needs("vision"):
-        from sightline.operator_side.calibrate import Ball, Board
+        from sightline.operator_side.calibrate.camera import Ball, Board
     if radius_m is not None and distance_m is not None:
         return Ball(radius_m, distance_m)
     if radius_m is not None or distance_m is not None:
@@ -115,12 +115,12 @@ def _source(
     if folder is not None:
         return sources.folder_pictures(folder), {}
     if plugin[0] is not None:
-        from sightline.operator_side.local_camera import local_camera
+        from sightline.operator_side.calibrate.local_camera import local_camera
 
         opened = ending.enter_context(local_camera(plugin[0], plugin[1]))
         return sources.camera_pictures(opened, seconds), {}
     from sightline.operator_side.pictures import viewer_role
-    from sightline.protocol.transports.opening import open_link
+    from sightline.protocol.transports.open import open_link
 
     name, connect, secure = robot
     role = viewer_role(secure) if secure else sources.ROLE
@@ -132,7 +132,7 @@ def _source(
 
 
 def _mounting(known: dict[str, float], given: dict[str, float | None]) -> "Mounting":
-    from sightline.operator_side.calibrate import Mounting
+    from sightline.operator_side.calibrate.camera import Mounting
 
     return Mounting(**{**known, **{name: value for name, value in given.items() if value is not None}})
 
@@ -146,7 +146,7 @@ def _measure(
     config: str | None,
     say: Callable[[str], None],
 ) -> "Calibration":
-    from sightline.operator_side import calibrate
+    from sightline.operator_side.calibrate import camera as calibrate
     from sightline.operator_side.calibrate_pictures import collect
 
     if isinstance(wanted, calibrate.Board):
@@ -165,7 +165,7 @@ def _vision_config(file: str | None) -> Any:
 
 
 def _write(path: Path, made: "Calibration") -> None:
-    from sightline.operator_side.toml_text import toml_text
+    from sightline.operator_side.config.toml_text import toml_text
 
     head = f"# {made.used} of {made.given} pictures, {made.error:.2f} {made.error_unit}\n"
     try:

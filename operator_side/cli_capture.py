@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from sightline.operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Robot, Secure
-from sightline.operator_side.extras import needs
+from sightline.operator_side.cli.options import DEFAULT_CONNECT, Connect, Json, Robot, Secure
+from sightline.operator_side.preflight import needs
 from sightline.operator_side.pictures import Pictures, viewer_role
 from sightline.protocol.channels import FRAME, OVERLAY
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 
 _SECONDS = 5.0
 

@@ -7,14 +7,14 @@ from typing import Annotated
 import typer
 from pydantic import BaseModel
 
-from sightline.operator_side.cli_options import Sets
-from sightline.operator_side.extras import needs
+from sightline.operator_side.cli.options import Sets
+from sightline.operator_side.preflight import needs
 from sightline.operator_side.service_settings import load_service
-from sightline.operator_side.settings import model_of
-from sightline.operator_side.toml_text import toml_text
+from sightline.operator_side.config.loading import model_of
+from sightline.operator_side.config.toml_text import toml_text
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.plugins import load_device
-from sightline.sim.robot_model import load_robot
+from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
 from sightline.sim.service import SimConfig
 from sightline.vision_side.config import VisionConfig
@@ -54,7 +54,7 @@ def _check_names(config: BaseModel) -> None:
         load_robot(config.robot or load_scenario(config.scenario).robot)
     if isinstance(config, VisionConfig):
         with needs("vision"):
-            from sightline.vision_side.detect.choice import check_vision
+            from sightline.vision_side.detect.registry import check_vision
         check_vision(config)
 
 

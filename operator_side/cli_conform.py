@@ -8,14 +8,14 @@ from typing import Annotated, Any
 
 import typer
 
-from sightline.operator_side.cli_options import CHECK_FAILED
-from sightline.operator_side.conform_access import access_for
+from sightline.operator_side.cli.options import CHECK_FAILED
+from sightline.operator_side.cli.conform import access_for
 from sightline.operator_side.conform_table import listing, print_results, progress
 from sightline.operator_side.out_file import check_out_file
 from sightline.protocol.conformance.html_report import to_html
-from sightline.protocol.conformance.live import LiveBench
-from sightline.protocol.conformance.report import to_dict, to_junit, to_page
-from sightline.protocol.conformance.runner import Result, chosen, passed, run_cases
+from sightline.conformance.benches import LiveBench
+from sightline.conformance.report import to_dict, to_junit, to_page
+from sightline.conformance.runner import Result, chosen, passed, run_cases
 from sightline.protocol.errors import ConfigError, LinkError
 
 _ROLES = ("vision", "operator")
@@ -81,11 +81,11 @@ def robot(
     as_json: Json = False,
 ) -> int:
     """Test a robot as its driver, its watcher and its enemy. It is armed and its wheels turn: lift it off the floor."""
-    from sightline.protocol.conformance import robot as side
-    from sightline.protocol.conformance.robot_sockets import put_over_websocket
+    from sightline.conformance.robot import cases as side
+    from sightline.conformance.robot.websocket import put_over_websocket
     from sightline.protocol.conformance.strangers import RawZenoh
     from sightline.protocol.conformance.virtual import FROM_ROBOT
-    from sightline.protocol.transports.opening import open_link
+    from sightline.protocol.transports.open import open_link
 
     cases = chosen(side.CASES, only or (), groups or ())
     if list_cases:
@@ -131,10 +131,10 @@ def vision(
     as_json: Json = False,
 ) -> int:
     """Test a vision: the kit plays its robot at ENDPOINT; start the vision against it, before or after."""
-    from sightline.protocol.conformance import vision as side
+    from sightline.conformance.vision import cases as side
     from sightline.protocol.conformance.strangers import RawZenoh
     from sightline.protocol.conformance.virtual import TO_ROBOT
-    from sightline.protocol.transports.opening import open_link
+    from sightline.protocol.transports.open import open_link
 
     cases = chosen(side.CASES, only or (), groups or ())
     if list_cases:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sightline.operator_side import cli_detector_serve as serving
-from sightline.operator_side.cli_options import (
+from sightline.operator_side.cli import detector as serving
+from sightline.operator_side.cli.options import (
     CHECK_FAILED,
     DEFAULT_CONNECT,
     REJECTED_EXIT,
@@ -23,9 +23,9 @@ from sightline.operator_side.cli_options import (
     Secure,
     Sets,
 )
-from sightline.operator_side.cli_options import Listen as MaybeListen
-from sightline.operator_side.cli_options import ServiceConnect as MaybeConnect
-from sightline.operator_side.extras import needs
+from sightline.operator_side.cli.options import Listen as MaybeListen
+from sightline.operator_side.cli.options import ServiceConnect as MaybeConnect
+from sightline.operator_side.preflight import needs
 from sightline.operator_side.service_settings import load_service
 from sightline.protocol.errors import ConfigError
 
@@ -75,7 +75,7 @@ def _serve(
 def list_detectors(as_json: Json = False) -> int:
     """Name every detector, and say whether it can be used here."""
     with needs("vision"):
-        from sightline.vision_side.detect.choice import REGISTRY
+        from sightline.vision_side.detect.registry import REGISTRY
     rows = [(name, _problem(lambda name=name: REGISTRY.load(name))) for name in REGISTRY.names()]  # type: ignore[misc]
     model = _shipped_model()
     if as_json:
@@ -91,7 +91,7 @@ def list_detectors(as_json: Json = False) -> int:
 
 def _shipped_model() -> str:
     try:
-        from sightline.vision_side.detect.onnx_detector import shipped_digest
+        from sightline.vision_side.detect.onnx.detector import shipped_digest
     except ImportError:  # the list says itself what is missing
         return ""
     return shipped_digest()
@@ -121,7 +121,7 @@ def check(
     given: Any = load_service("vision", file=config, sets=(), options=options, environ=os.environ).config
     with needs("vision"):
         from sightline.vision_side.detect.around import notices_of
-        from sightline.vision_side.detect.choice import build_detector, check_device, check_takes_pictures
+        from sightline.vision_side.detect.registry import build_detector, check_device, check_takes_pictures
         from sightline.vision_side.detect.contract import check_detector, time_detector
     settings = given.model_copy(update={"detector": given.detector.model_copy(update={"kind": name})})
     check_device(settings)
@@ -143,7 +143,7 @@ def check(
 
 def own_options(texts: Sequence[str]) -> dict[str, Any]:
     """What `--set KEY=VALUE` gives a detector's own `Config`; a dot is for a section. Raises ConfigError."""
-    from sightline.operator_side.cli_options import options_of
+    from sightline.operator_side.cli.options import options_of
 
     return _nested(options_of(texts))
 
@@ -175,8 +175,8 @@ def promote(
     """Let the detector of `vision --shadow NAME` drive from the next frame on, and the other one look on."""
     from sightline.operator_side.mission_asking import MissionClient
     from sightline.operator_side.mission_text import detector_line
-    from sightline.operator_side.requests import SOURCE
-    from sightline.protocol.transports.opening import open_link
+    from sightline.operator_side.client.requests import SOURCE
+    from sightline.protocol.transports.open import open_link
 
     with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
         report = MissionClient(link).ask("detector", options={"shadow": not back})

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from sightline.operator_side.doctor.finding import Finding, as_object
-from sightline.protocol.transports.opening import check_endpoint
+from sightline.protocol.transports.open import check_endpoint
 
 
 def register_doctor(app: typer.Typer) -> None:
@@ -48,7 +48,7 @@ def doctor(
 
 
 def _findings(robot: str, peer: str | None, camera: str | None, sets: list[str], secure: str) -> Iterator[Finding]:
-    from sightline.operator_side.doctor import between, cameras, machine
+    from sightline.operator_side.doctor import network as between, cameras, machine
 
     yield from machine.findings(secure)
     yield from cameras.modes()

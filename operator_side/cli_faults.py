@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sightline.operator_side.cli_options import CHECK_FAILED
-from sightline.operator_side.extras import needs
+from sightline.operator_side.cli.options import CHECK_FAILED
+from sightline.operator_side.preflight import needs
 from sightline.operator_side.out_file import check_out_file
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def faults(
 ) -> int:
     """Start real processes, break one thing at a time, and judge from the simulated motors' own log."""
     with needs("all"):
-        from sightline.operator_side.faults.machine import describe_machine
+        from sightline.evaluation.faults.report import describe_machine
         from sightline.operator_side.faults.parallel import run_cases
         from sightline.operator_side.faults.report import markdown, passed, progress_line, to_dict, with_rows_of
         from sightline.operator_side.faults.rows import chosen

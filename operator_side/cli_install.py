@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from sightline.operator_side import install as units
+from sightline.operator_side.setup import install as units
 from sightline.operator_side.service_settings import load_service
 from sightline.robot_side.config import RobotConfig
 

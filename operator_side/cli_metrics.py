@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from sightline.operator_side.cli_options import DEFAULT_CONNECT, Connect, Robot, Secure
-from sightline.operator_side.extras import needs
-from sightline.protocol.transports.opening import open_link
+from sightline.operator_side.cli.options import DEFAULT_CONNECT, Connect, Robot, Secure
+from sightline.operator_side.preflight import needs
+from sightline.protocol.transports.open import open_link
 
 ROLE = "metrics"
 
@@ -30,7 +30,7 @@ def metrics(
     with needs("metrics"):
         import_module("prometheus_client")
     from sightline.operator_side.metrics import Watched
-    from sightline.operator_side.metrics_server import serving
+    from sightline.operator_side.cockpit.metrics import serving
 
     ending = threading.Event()
     with open_link(robot, connect=connect, role=ROLE, secure=secure) as link, serving(Watched(link), host, port) as at:

@@ -8,14 +8,14 @@ from typing import Annotated
 
 import typer
 
-from sightline.operator_side.cli_options import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure, options_of
+from sightline.operator_side.cli.options import DEFAULT_CONNECT, REJECTED_EXIT, Connect, Json, Robot, Secure, options_of
 from sightline.operator_side.mission_asking import MissionClient, request_of
 from sightline.operator_side.mission_text import cannot, detector_line, mission_line
-from sightline.operator_side.requests import SOURCE
-from sightline.operator_side.waypoints import Waypoints, waypoints_of, waypoints_of_file
+from sightline.operator_side.client.requests import SOURCE
+from sightline.operator_side.client.missions import Waypoints, waypoints_of, waypoints_of_file
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.mission_messages import MissionReport
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 
 Sets = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option of the mission, e.g. linear_mps=0.2.")

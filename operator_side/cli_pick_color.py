@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sightline.operator_side.cli_options import DEFAULT_CONNECT, Connect, Json, Port, Secure
-from sightline.operator_side.extras import needs
+from sightline.operator_side.cli.options import DEFAULT_CONNECT, Connect, Json, Port, Secure
+from sightline.operator_side.preflight import needs
 from sightline.operator_side.pictures import Pictures, viewer_role
 from sightline.protocol.channels import FRAME
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 
 if TYPE_CHECKING:
-    from sightline.operator_side.pick_color import Box, Image, Ranges
-    from sightline.operator_side.pick_color_pictures import Gallery
+    from sightline.operator_side.calibrate.color import Box, Image, Ranges
+    from sightline.operator_side.calibrate.color_page import Gallery
 
 _MASK = Path("pick-color-mask.png")
 _WAIT_S = 0.2
@@ -76,7 +76,7 @@ def pick_color(
 def place_of(at: str | None, box: str | None) -> "Box | None":
     """The place of `--at` or `--box`; None for neither. Raises ConfigError for what is no place."""
     with needs("vision"):
-        from sightline.operator_side.pick_color import Box
+        from sightline.operator_side.calibrate.color import Box
     if at and box:
         raise ConfigError("--at is one pixel and --box a part of the picture; give one of them")
     for option, text, form in (("--at", at, "X,Y"), ("--box", box, "X,Y,W,H")):
@@ -99,7 +99,7 @@ class _Source:
 
     def pictures(self, frames: int) -> "list[Image]":
         """At most `frames`, the newest last."""
-        from sightline.operator_side.pick_color_pictures import of_robot
+        from sightline.operator_side.calibrate.color_page import of_robot
 
         still = self._of_file(frames)
         if still is not None:
@@ -111,8 +111,8 @@ class _Source:
     @contextmanager
     def gallery(self, frames: int) -> "Iterator[Gallery]":
         """For a page."""
-        from sightline.operator_side.pick_color_pictures import LiveGallery, StillGallery
-        from sightline.operator_side.reel import FrameBuffer, fill
+        from sightline.operator_side.calibrate.color_page import LiveGallery, StillGallery
+        from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
 
         still = self._of_file(frames)
         if still is not None:
@@ -135,7 +135,7 @@ class _Source:
         return str(self._picture or self._video or f"robot {self._robot}")
 
     def _of_file(self, frames: int) -> "list[Image] | None":
-        from sightline.operator_side.pick_color_pictures import of_picture, of_video
+        from sightline.operator_side.calibrate.color_page import of_picture, of_video
 
         if self._picture is not None:
             return of_picture(self._picture.expanduser())
@@ -143,7 +143,7 @@ class _Source:
 
 
 def _at_once(pictures: "list[Image]", place: "Box", config: Path | None, mask: Path, as_json: bool) -> None:
-    from sightline.operator_side.pick_color import check_trial, pick, ranges_text, trial_text, try_out
+    from sightline.operator_side.calibrate.color import check_trial, pick, ranges_text, trial_text, try_out
     from sightline.operator_side.pick_color_file import write_mask
 
     ranges = pick(pictures[-1], place)
@@ -181,7 +181,7 @@ def _on_page(source: _Source, frames: int, config: Path | None, port: int) -> No
 def _use(ranges: "Ranges", config: Path | None) -> str:
     """Write the ranges where told, and say what was done, or what a person can paste."""
     from sightline.operator_side.pick_color_file import write_ranges
-    from sightline.operator_side.pick_color_toml import ranges_toml
+    from sightline.operator_side.calibrate.color_file import ranges_toml
 
     if config is None:
         return f"for vision's configuration:\n[hsv]\nranges = {ranges_toml(ranges)}"

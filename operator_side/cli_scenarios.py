@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from sightline.operator_side.extras import needs
-from sightline.operator_side.toml_text import toml_text
+from sightline.operator_side.preflight import needs
+from sightline.operator_side.config.toml_text import toml_text
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import DEFAULT_ENDPOINT
 
@@ -54,7 +54,7 @@ def _list(as_json: bool) -> None:
 
 def _files(name: str, seed: int) -> dict[str, dict[str, Any]]:
     with needs("vision"):
-        from sightline.operator_side.scenario_settings import (
+        from sightline.evaluation.scenario_config import (
             robot_config,
             robot_of,
             robot_table,
@@ -62,7 +62,7 @@ def _files(name: str, seed: int) -> dict[str, dict[str, Any]]:
             vision_table,
         )
         from sightline.sim.scenario import load_scenario
-        from sightline.vision_side.missions.choice import configured_mission
+        from sightline.vision_side.missions.registry import configured_mission
     scenario = load_scenario(name)
     model = robot_of(scenario)
     robot_config(model)

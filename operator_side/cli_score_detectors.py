@@ -9,22 +9,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sightline.operator_side.cli_options import ConfigFile, Device, Sets
-from sightline.operator_side.extras import needs
+from sightline.operator_side.cli.options import ConfigFile, Device, Sets
+from sightline.operator_side.preflight import needs
 from sightline.operator_side.out_file import check_out_file
 from sightline.operator_side.service_settings import load_service
 from sightline.protocol.errors import ConfigError
 
 if TYPE_CHECKING:
-    from sightline.operator_side.check_text import Check
-    from sightline.operator_side.score_scenes import Report, ScoredScene, Subject
+    from sightline.evaluation.checks import Check
+    from sightline.evaluation.score.detector_report import Report, ScoredScene, Subject
     from sightline.operator_side.score_sheet import Sheet
-    from sightline.operator_side.settings import Loaded
+    from sightline.operator_side.config.loading import Loaded
 
 COMPARED = ("hsv", "onnx")
 FRAMES = 100
 FROM = 900_000
-"""As sim/scenes.py has it; that file needs more than the command line may at its start. A test compares them."""
+"""As sim/scenes/model.py has it; that file needs more than the command line may at its start. A test compares them."""
 
 
 def detectors(
@@ -53,7 +53,7 @@ def detectors(
     with needs("all"):
         from sightline.operator_side.score_detectors_bounds import FRAMES as DEMANDED_FRAMES
         from sightline.operator_side.score_detectors_bounds import all_detector_checks
-        from sightline.operator_side.score_scenes import LIGHT_SHARE, close_subjects, score_scenes
+        from sightline.evaluation.score.detector_report import LIGHT_SHARE, close_subjects, score_scenes
         from sightline.operator_side.score_sheet import Sheet
         from sightline.operator_side.score_table import progress
     if demand and seeds < FROM:
@@ -78,7 +78,7 @@ def _subjects(
     names: Sequence[str], file: str | None, sets: Sequence[str], device: str | None
 ) -> "list[Subject]":
     """As `sightline vision` with the same options would build them; only the detectors, nothing that goes around."""
-    from sightline.operator_side.score_scenes import subjects
+    from sightline.evaluation.score.detector_report import subjects
 
     loaded = load_service("vision", file=file, sets=sets, options={"detector.device": device}, environ=os.environ)
     settings: Any = loaded.config
@@ -98,7 +98,7 @@ def _whose_options(names: Sequence[str], loaded: "Loaded") -> str:
 
 def _check_device(names: Sequence[str], settings: Any) -> None:
     """Raise ConfigError where none of them has a device to choose."""
-    from sightline.vision_side.detect.choice import check_device
+    from sightline.vision_side.detect.registry import check_device
 
     alone = {"fallback": "", "shadow": ""}
     errors = []
@@ -113,7 +113,7 @@ def _check_device(names: Sequence[str], settings: Any) -> None:
 
 
 def _print_report(report: "Report", checks: "list[Check] | None", as_json: bool) -> int:
-    from sightline.operator_side.cli_options import CHECK_FAILED
+    from sightline.operator_side.cli.options import CHECK_FAILED
     from sightline.operator_side.score_detectors_text import check_lines, silence_lines, text
 
     ok = all(check.ok for check in checks or ())
@@ -129,7 +129,7 @@ def _print_report(report: "Report", checks: "list[Check] | None", as_json: bool)
 
 def _columns(asked: str) -> list[str]:
     from sightline.operator_side.settings_errors import no_such_name
-    from sightline.sim.scenes import COLUMNS
+    from sightline.sim.scenes.model import COLUMNS
 
     names = list(COLUMNS) if asked == "all" else [one.strip() for one in asked.split(",")]
     for one in names:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from sightline.operator_side.cli_options import DEFAULT_CONNECT, Connect, Robot, Secure
+from sightline.operator_side.cli.options import DEFAULT_CONNECT, Connect, Robot, Secure
 
 _Gamepad = Annotated[
     str | None,
@@ -34,11 +34,11 @@ def teleop(
 
     The first press arms the robot. STOP is another command (`sightline stop`), and no key starts a stopped robot.
     """
-    from sightline.operator_side.teleop import SOURCE, Teleop
+    from sightline.operator_side.teleop.control import SOURCE, Teleop
     from sightline.operator_side.teleop_evdev import Gamepad
     from sightline.operator_side.teleop_speed import Speeds
     from sightline.operator_side.teleop_terminal import Cockpit, check_terminal
-    from sightline.protocol.transports.opening import open_link
+    from sightline.protocol.transports.open import open_link
 
     check_terminal()
     session = secrets.token_hex(4)

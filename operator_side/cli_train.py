@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from sightline.operator_side.extras import needs
-from sightline.operator_side.train_rounds import Training
+from sightline.operator_side.preflight import needs
+from sightline.training.schedule import Training
 from sightline.protocol.errors import ConfigError, HardwareError
 
 if TYPE_CHECKING:  # it needs the extra
-    from sightline.operator_side.train_network import Weights
+    from sightline.training.network import Weights
 
 STEPS = [15_000, 14_000, 13_000, 14_000, 20_000, 20_000]
 SCENES = 100_000
@@ -70,7 +70,7 @@ def train(
 
 def _begun(model: Path) -> "tuple[Weights, str]":
     """The model's weights, and its SHA-256."""
-    from sightline.operator_side.train_export import weights_in
+    from sightline.training.export import weights_in
 
     try:
         data = model.read_bytes()

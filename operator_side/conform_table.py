@@ -10,9 +10,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
-from sightline.protocol.conformance.case import Case, Level
-from sightline.protocol.conformance.report import summary
-from sightline.protocol.conformance.runner import Outcome, Result
+from sightline.conformance.case import Case, Level
+from sightline.conformance.report import summary
+from sightline.conformance.runner import Outcome, Result
 
 _FEW: Final = 3
 """So many that lack the same and more are one line."""

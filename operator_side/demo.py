@@ -14,24 +14,24 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from sightline.benchmarks.interrupted import terminated_like_interrupted
-from sightline.operator_side.live_block import Display, display
+from sightline.evaluation.processes import terminated_like_interrupted
+from sightline.evaluation.demo.run import Display, display
 from sightline.operator_side.processes import Processes
-from sightline.operator_side.recording import Recorder
-from sightline.operator_side.replay import VISION_CONFIG
-from sightline.operator_side.requests import SOURCE, Operator
-from sightline.operator_side.scenario_settings import robot_of, robot_table, vision_config, vision_table
+from sightline.operator_side.recording.recorder import Recorder
+from sightline.operator_side.recording.replay import VISION_CONFIG
+from sightline.operator_side.client.requests import SOURCE, Operator
+from sightline.evaluation.scenario_config import robot_of, robot_table, vision_config, vision_table
 from sightline.operator_side.service_settings import load_service
 from sightline.operator_side.shaped_vision import Shape
-from sightline.operator_side.toml_text import toml_text
+from sightline.operator_side.config.toml_text import toml_text
 from sightline.protocol.errors import ConfigError, HardwareError, SightlineError
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 from sightline.sim.bus import TruthReader
 from sightline.sim.scenario import Scenario, load_scenario
 from sightline.sim.toml_file import laid_over
 from sightline.sim.truth import Truth
-from sightline.vision_side.detect.choice import BOXES, check_choice
-from sightline.vision_side.missions.choice import configured_mission
+from sightline.vision_side.detect.registry import BOXES, check_choice
+from sightline.vision_side.missions.registry import configured_mission
 
 ROBOT: Final = "r1"
 READY_S: Final = 30.0

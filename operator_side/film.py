@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sightline.operator_side.extras import needs
+from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError
 
 Image = NDArray[np.uint8]

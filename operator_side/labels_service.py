@@ -6,14 +6,14 @@ It looks at no picture: the simulation says what is in each, by the time it was 
 import secrets
 from collections.abc import Callable
 
-from sightline.operator_side.labels import SOURCE, boxes_message
+from sightline.evaluation.labels import SOURCE, boxes_message
 from sightline.protocol.channels import DETECTIONS, FRAME
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import FrameHeader
 from sightline.protocol.transports.link import LatestSlot, Link, Message
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 from sightline.sim.label_bus import LabelReader
 
 _WAIT_S = 0.03

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import parse_qsl, urlsplit
 
-from sightline.operator_side.bounded_threads import BoundedThreads
+from sightline.operator_side.cockpit.http_server import BoundedThreads
 from sightline.protocol.errors import LinkError, SightlineError
-from sightline.protocol.transports.port_owner import port_owner
+from sightline.protocol.transports.diagnosis import port_owner
 
 HOST: Final = "127.0.0.1"
 MAX_BODY_BYTES: Final = 4096
@@ -51,7 +51,7 @@ def as_json(value: Any, status: int = 200) -> Answer:
 
 
 def page(name: str, **words: str) -> Answer:
-    """A file of `operator_side/pages`, with `{{word}}` filled in; what the words say is text, never HTML."""
+    """A file of `operator_side/cockpit/pages`, with `{{word}}` filled in; what the words say is text, never HTML."""
     text = files("sightline.operator_side").joinpath("pages", name).read_text("utf-8")
     for word, value in words.items():
         text = text.replace("{{" + word + "}}", escape(value))

@@ -7,17 +7,17 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Final
 
-from sightline.operator_side.metrics_server import counter, gauge
-from sightline.operator_side.requests import read_report
+from sightline.operator_side.cockpit.metrics import counter, gauge
+from sightline.operator_side.client.requests import read_report
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import State, Status, StreamStatus
 from sightline.protocol.transports.link import Link, Message
-from sightline.protocol.transports.presence import PeerInfo
-from sightline.protocol.transports.secured import ROBOT_ROLE
+from sightline.protocol.transports.zenoh.presence import PeerInfo
+from sightline.protocol.transports.security import ROBOT_ROLE
 
 if TYPE_CHECKING:
-    from sightline.operator_side.metrics_server import Family
+    from sightline.operator_side.cockpit.metrics import Family
 
 FRESH_S: Final = 2.0
 """A robot that was not heard for longer is down."""

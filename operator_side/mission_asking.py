@@ -12,8 +12,8 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from sightline.operator_side.requests import SOURCE, Operator
-from sightline.operator_side.waypoints import Waypoints
+from sightline.operator_side.client.requests import SOURCE, Operator
+from sightline.operator_side.client.missions import Waypoints
 from sightline.protocol.channels import MISSION, REPORT
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError, LinkError, WireError

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from typing import Final
 
 from sightline.benchmarks.loop_figures import LoopCheck, at_most, percentile
-from sightline.benchmarks.network_rows import Case
-from sightline.benchmarks.network_stage import NetworkRun, Stage
-from sightline.operator_side.faults.judge import MotorRow, measure_stop, moved_on_old_sight, wheel_mps
+from sightline.benchmarks.network.cases import Case
+from sightline.benchmarks.network.stage import NetworkRun, Stage
+from sightline.evaluation.faults.evidence import MotorRow, measure_stop, moved_on_old_sight, wheel_mps
 from sightline.operator_side.faults.ledger import REQUESTED
 from sightline.operator_side.faults.rig import ROBOT, RobotFixture, Setup
-from sightline.operator_side.network_person import RESET, STOPPED
+from sightline.benchmarks.network.stop_client import RESET, STOPPED
 from sightline.protocol.errors import HardwareError, SightlineError
-from sightline.sim.wire import LinkShapes
+from sightline.sim.network_emulator import LinkShapes
 
 REACHES_MS: Final = 300.0
 REPORTED_MS: Final = REACHES_MS + 100.0
@@ -39,7 +39,7 @@ def _medium_run(row: Case, stage: Stage, rig: RobotFixture) -> NetworkRun:
     before = rig.wire.shape(stage.seeded(row.phases[0].shapes))
     ledger = rig.folder / "person.ledger"
     arguments = [rig.endpoint, ROBOT, str(ledger), str(stage.setting.seconds), str(stage.seed)]
-    rig.fleet.run("person", "sightline.operator_side.network_person", arguments, namespace=rig.wire.far_side)
+    rig.fleet.run("person", "sightline.benchmarks.network.stop_client", arguments, namespace=rig.wire.far_side)
     rig.fleet.wait_line("person", "person ready", _READY_S)
     if rig.fleet.exit_code("person", stage.setting.seconds + _BESIDE_S) != 0:
         raise HardwareError(f"the person gave up: {rig.fleet.log('person').read_text('utf-8').strip()[-200:]}")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import cv2
 
-from sightline.operator_side.pick_color import Image, Ranges, mask_picture
-from sightline.operator_side.pick_color_toml import with_ranges
+from sightline.operator_side.calibrate.color import Image, Ranges, mask_picture
+from sightline.operator_side.calibrate.color_file import with_ranges
 from sightline.operator_side.service_settings import load_service
 from sightline.protocol.errors import ConfigError
 

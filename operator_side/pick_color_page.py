@@ -7,10 +7,19 @@ from dataclasses import asdict
 from typing import Any
 
 from sightline.operator_side.loopback_page import Answer, PageRequest, Route, as_json, page
-from sightline.operator_side.pick_color import Box, Image, Ranges, check_trial, pick, ranges_text, trial_text, try_out
+from sightline.operator_side.calibrate.color import (
+    Box,
+    Image,
+    Ranges,
+    check_trial,
+    pick,
+    ranges_text,
+    trial_text,
+    try_out,
+)
 from sightline.operator_side.pick_color_file import mask_png
-from sightline.operator_side.pick_color_pictures import Gallery
-from sightline.operator_side.pick_color_toml import ranges_toml
+from sightline.operator_side.calibrate.color_page import Gallery
+from sightline.operator_side.calibrate.color_file import ranges_toml
 from sightline.protocol.errors import ConfigError
 
 _FIELDS = ("x_px", "y_px", "width_px", "height_px")

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from sightline.operator_side.acknowledge import Viewer
-from sightline.operator_side.requests import SOURCE as OPERATOR
+from sightline.operator_side.client.pictures import Viewer
+from sightline.operator_side.client.requests import SOURCE as OPERATOR
 from sightline.protocol.channels import FRAME, OVERLAY, STATUS, Channel
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode

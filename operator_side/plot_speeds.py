@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sightline.operator_side.extras import needs
-from sightline.operator_side.plot import ROBOT_COLOUR
+from sightline.operator_side.preflight import needs
+from sightline.evaluation.plots import ROBOT_COLOUR
 from sightline.operator_side.speed_runs import GOALS_M, LAWS, SpeedRun
 
 if TYPE_CHECKING:

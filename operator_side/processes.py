@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from sightline.protocol.errors import SightlineError
-from sightline.protocol.log_lines import LOG_FORMAT_VARIABLE, LOG_FORMATS
+from sightline.protocol.log import LOG_FORMAT_VARIABLE, LOG_FORMATS
 
 END_S: Final = 4.0
 """A process that has not ended this long after SIGTERM is killed; the robot takes up to 2 s to bring wheels to zero."""
@@ -37,7 +37,7 @@ class Processes:
 
     def start(self, name: str, arguments: Sequence[str]) -> None:
         """Run `sightline ARGUMENTS`, its output going to `<name>.log`, as text: who starts them reads it."""
-        command = [sys.executable, "-u", "-m", "sightline.operator_side.cli", *arguments]
+        command = [sys.executable, "-u", "-m", "sightline.operator_side.cli.app", *arguments]
         with self.log(name).open("wb") as log:
             self._running[name] = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,

@@ -3,8 +3,8 @@
 For 0 to 200 ms added latency and 10 % loss on each leg. No contact is demanded everywhere but where it says how much.
 """
 
-from sightline.operator_side.check_text import Check
-from sightline.operator_side.score import AT_LEAST, Score
+from sightline.evaluation.checks import Check
+from sightline.evaluation.score.figures import AT_LEAST, Score
 
 UNITS = {
     "acquired_s": "s", "found_s": "s", "bearing_rms_deg": "deg", "distance_rms_m": "m", "lost_percent": "%",

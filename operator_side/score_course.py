@@ -8,7 +8,7 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
-from sightline.operator_side.score import score
+from sightline.evaluation.score.figures import score
 from sightline.sim.scenario import Scenario
 from sightline.sim.truth import Truth
 

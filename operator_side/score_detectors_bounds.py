@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
-from sightline.operator_side.check_text import Check
-from sightline.operator_side.score_detectors import Figures
-from sightline.operator_side.score_scenes import LABELLED, Report
+from sightline.evaluation.checks import Check
+from sightline.evaluation.score.detectors import Figures
+from sightline.evaluation.score.detector_report import LABELLED, Report
 
 FRAMES: Final = 500
 LEAST_HITS: Final = {

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from sightline.operator_side.check_text import Check
-from sightline.operator_side.score_detectors import BALL_LABELS, Figures
-from sightline.operator_side.score_scenes import Report
+from sightline.evaluation.checks import Check
+from sightline.evaluation.score.detectors import BALL_LABELS, Figures
+from sightline.evaluation.score.detector_report import Report
 
 _HEAD = ("column", "detector", "hits", "missed", "wrong object", "false alarms", "centre p50 / p95 px", "ms p50")
 _MOST_LABELS = 3

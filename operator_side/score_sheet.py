@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import simplejpeg
 
-from sightline.operator_side.score_scenes import ScoredScene, Subject, detections, scene_result
+from sightline.evaluation.score.detector_report import ScoredScene, Subject, detections, scene_result
 
 _ACROSS: Final = 6
 _TRUE_BGR: Final = (255, 255, 255)

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sightline.operator_side.check_text import number
-from sightline.operator_side.score_runs import ScoredFigure, ScoreReport
+from sightline.evaluation.checks import number
+from sightline.evaluation.score.runs import ScoredFigure, ScoreReport
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from sightline.operator_side.settings import Given, Loaded, load
+from sightline.operator_side.config.loading import Given, Loaded, load
 
 
 def load_service(

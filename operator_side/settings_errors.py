@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from sightline.operator_side.settings_keys import Key, allowed, known_keys
+from sightline.operator_side.config.errors import Key, allowed, known_keys
 
 _LONGEST_VALUE = 60
 _MOST_NAMES = 12

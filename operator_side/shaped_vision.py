@@ -6,12 +6,12 @@ import threading
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
-from sightline.operator_side.shaped_link import ShapedLink
+from sightline.evaluation.demo.shaped_vision import ShapedLink
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.pipeline import SOURCE
-from sightline.vision_side.service_process import serve
+from sightline.vision_side.serving.process import serve
 
 INJECTED = "injected: "
 """How the line begins that says, at the end, what the legs did."""

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from sightline.operator_side.behaviours_rows import LATENCY_MS, LOSS
-from sightline.operator_side.lockstep import Conditions, run_lockstep
-from sightline.operator_side.scenario_settings import robot_of
+from sightline.evaluation.score.behaviours import LATENCY_MS, LOSS
+from sightline.evaluation.lockstep import Conditions, run_lockstep
+from sightline.evaluation.scenario_config import robot_of
 from sightline.operator_side.score_course import REACHED_WITHIN_M
 from sightline.sim.scenario import Scenario, Start, load_scenario
 from sightline.sim.truth import Truth

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from sightline.operator_side.extras import needs
-from sightline.operator_side.teleop_pad import ABS_RX, ABS_X, ABS_Y, BTN_SOUTH, BTN_TL, EV_ABS, EV_KEY, Pad, PadKey
+from sightline.operator_side.preflight import needs
+from sightline.operator_side.teleop.gamepad import ABS_RX, ABS_X, ABS_Y, BTN_SOUTH, BTN_TL, EV_ABS, EV_KEY, Pad, PadKey
 from sightline.protocol.errors import HardwareError
 
 _ANY: Final = "auto"

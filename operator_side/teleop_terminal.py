@@ -16,10 +16,10 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Final
 
-from sightline.operator_side.teleop import Teleop
+from sightline.operator_side.teleop.control import Teleop
 from sightline.operator_side.teleop_evdev import Gamepad
-from sightline.operator_side.teleop_pad import PadKey
-from sightline.operator_side.teleop_text import KEYS, live_line
+from sightline.operator_side.teleop.gamepad import PadKey
+from sightline.operator_side.teleop.terminal import KEYS, live_line
 from sightline.protocol.channels import FRAME, REPLY, STATUS, Channel
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError

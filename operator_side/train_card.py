@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 from sightline.operator_side.score_detectors_bounds import detector_checks
 from sightline.operator_side.score_detectors_text import check_lines, markdown
-from sightline.operator_side.score_scenes import Report
-from sightline.operator_side.train_export import MOST_BOXES, OPSET
-from sightline.operator_side.train_rounds import LEAST_SHARE, WHOLE_FROM, Training
+from sightline.evaluation.score.detector_report import Report
+from sightline.training.export import MOST_BOXES, OPSET
+from sightline.training.schedule import LEAST_SHARE, WHOLE_FROM, Training
 from sightline.sim.scene_textures import JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED
-from sightline.sim.scenes import HARDER_FROM, HEIGHT_PX, LABELS, LATER_FROM, VALIDATED_FROM, WIDTH_PX
+from sightline.sim.scenes.model import HARDER_FROM, HEIGHT_PX, LABELS, LATER_FROM, VALIDATED_FROM, WIDTH_PX
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,13 +16,13 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from sightline.operator_side.train_module import Network, begin_from, folded
-from sightline.operator_side.train_network import OUTPUTS, TAUGHT, Weights
-from sightline.operator_side.train_rounds import Training
+from sightline.training.loop import Network, begin_from, folded
+from sightline.training.network import OUTPUTS, TAUGHT, Weights
+from sightline.training.schedule import Training
 from sightline.operator_side.train_samples import CUT_PX, WHOLE_PX, Sample, sample
-from sightline.operator_side.train_scenes import DrawnScenes
+from sightline.training.scenes import DrawnScenes
 from sightline.protocol.errors import ConfigError, HardwareError
-from sightline.sim.scenes import LABELS
+from sightline.sim.scenes.model import LABELS
 
 _PREPARED: Final = 3  # batches that wait
 _AVERAGED: Final = 0.998

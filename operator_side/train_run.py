@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sightline.operator_side.train_card import Card, card_text
-from sightline.operator_side.train_export import shifted
+from sightline.training.export import shifted
 from sightline.operator_side.train_loop import start_from, train
-from sightline.operator_side.train_network import Weights
-from sightline.operator_side.train_rounds import Training
-from sightline.operator_side.train_scenes import drawn_scenes
+from sightline.training.network import Weights
+from sightline.training.schedule import Training
+from sightline.training.scenes import drawn_scenes
 from sightline.operator_side.train_shipping import Progress, chosen_thresholds, final_report, written
 
 MODEL, CARD = "sightline.onnx", "sightline.md"

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import simplejpeg
 
-from sightline.operator_side.train_network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
-from sightline.operator_side.train_rounds import SceneRange
-from sightline.operator_side.train_scenes import DrawnScenes
+from sightline.training.network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
+from sightline.training.schedule import SceneRange
+from sightline.training.scenes import DrawnScenes
 from sightline.sim.scene_defects import with_defects
-from sightline.sim.scenes import DEFECTS, HEIGHT_PX, LABELS, TRAINED, WIDTH_PX, Box, Column, LabelledBox, Random
+from sightline.sim.scenes.model import DEFECTS, HEIGHT_PX, LABELS, TRAINED, WIDTH_PX, Box, Column, LabelledBox, Random
 
 CUT_PX: Final = (192, 160)
 """Width and height of the cut-outs that most of the training sees: less than half the time of a whole picture."""

@@ -6,8 +6,8 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
-from sightline.operator_side.score_detectors import FrameResult, LabelMatches
-from sightline.operator_side.score_scenes import (
+from sightline.evaluation.score.detectors import FrameResult, LabelMatches
+from sightline.evaluation.score.detector_report import (
     LABELLED,
     LIGHT_SHARE,
     Report,
@@ -17,18 +17,18 @@ from sightline.operator_side.score_scenes import (
     score_scenes,
     shown,
 )
-from sightline.operator_side.train_choice import ball_threshold, label_threshold
-from sightline.operator_side.train_export import onnx_bytes
-from sightline.operator_side.train_network import Weights
+from sightline.training.shipping import ball_threshold, label_threshold
+from sightline.training.export import onnx_bytes
+from sightline.training.network import Weights
 from sightline.operator_side.worker_pool import worker_pool
-from sightline.sim.scenes import COLUMNS, LABELS, THINGS, VALIDATED_FROM, Column
+from sightline.sim.scenes.model import COLUMNS, LABELS, THINGS, VALIDATED_FROM, Column
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.choice import build_detector
-from sightline.vision_side.detect.golden import KEY, golden_picture, golden_text
+from sightline.vision_side.detect.registry import build_detector
+from sightline.vision_side.detect.onnx.self_test import KEY, golden_picture, golden_text
 from sightline.vision_side.detect.onnx_engine import open_engine
-from sightline.vision_side.detect.onnx_header import read_onnx_header
-from sightline.vision_side.detect.onnx_reading import fit_picture, model_format, read_outputs
+from sightline.vision_side.detect.onnx.engine import read_onnx_header
+from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
 
 COUNTS_FROM: Final = 0.5
 """The score from which a detection counts, once each label's threshold has been worked into the model."""

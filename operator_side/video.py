@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sightline.operator_side.film import Film
-from sightline.operator_side.replay import Step, replay_steps
-from sightline.operator_side.top_view import TopView
+from sightline.operator_side.recording.replay import Step, replay_steps
+from sightline.evaluation.demo.video import TopView
 from sightline.sim.scenario import Scenario
 from sightline.sim.truth import Truth
 

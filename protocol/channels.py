@@ -26,7 +26,7 @@ from sightline.protocol.messages import (
     WireModel,
 )
 from sightline.protocol.mission_messages import MissionReport, MissionRequest
-from sightline.protocol.twist_text import MAX_TWIST_BYTES
+from sightline.protocol.text import MAX_TWIST_BYTES
 
 MAX_HEADER_BYTES = 512
 KEY_PREFIX = "sightline"

@@ -1,6 +1,6 @@
 """Golden cases of twists and acknowledgements. Pure."""
 
-from sightline.protocol.golden_case import (
+from sightline.protocol.spec.message_cases import (
     ANSWER,
     ECHO,
     INEXACT,

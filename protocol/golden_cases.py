@@ -4,7 +4,7 @@ from typing import Any
 
 from sightline.protocol.channels import CHANNELS
 from sightline.protocol.golden_answers import answers, twists
-from sightline.protocol.golden_case import MALFORMED, USUAL, VERSION, MessageCase, case, packed, without
+from sightline.protocol.spec.message_cases import MALFORMED, USUAL, VERSION, MessageCase, case, packed, without
 from sightline.protocol.golden_frames import frames, pictures, views
 from sightline.protocol.golden_payloads import detections, missions, payloads, reports
 

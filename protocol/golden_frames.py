@@ -1,6 +1,6 @@
 """Golden cases of frames: headers and pictures. Pure."""
 
-from sightline.protocol.golden_case import (
+from sightline.protocol.spec.message_cases import (
     ANSWER,
     FRAME_HEADER,
     INEXACT,

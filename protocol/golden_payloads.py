@@ -3,7 +3,7 @@
 import struct
 from typing import Any
 
-from sightline.protocol.golden_case import (
+from sightline.protocol.spec.message_cases import (
     ANSWER,
     ASK,
     BOX,

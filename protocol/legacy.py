@@ -1,7 +1,7 @@
 """The older write-up's text dialects: base64 pictures, `linear|angular`, and two that must be asked for. Pure.
 
     picture   base64 of the JPEG, a newline after every 76 characters and at the end
-    twist     `linear|angular`, as in `sightline.protocol.twist_text`
+    twist     `linear|angular`, as in `sightline.protocol.text`
     dashed    `linear-angular`, opt-in; swapped, another option, `angular-linear`: as the older robot took the two
     boxes     `y_min,x_min,y_max,x_max` or `class,x_min,y_min,x_max,y_max`, joined by `-`, opt-in: fractions of the
               picture's height and width; either way a reader of the older write-up finds x in the 2nd and 4th field
@@ -17,7 +17,7 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import DetectedBox, Detections, Twist
 from sightline.protocol.refusals import RejectReason
-from sightline.protocol.twist_text import MAX_TWIST_BYTES, parse_twist
+from sightline.protocol.text import MAX_TWIST_BYTES, parse_twist
 
 LINE_CHARACTERS: Final = 76
 MAX_BOXES: Final = 16

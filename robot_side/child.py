@@ -11,7 +11,7 @@ from typing import Final
 
 from sightline.protocol.config import Config
 from sightline.protocol.messages import SessionId
-from sightline.robot_side import ipc
+from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
 
 _PACKETS_PER_WAKE = 64  # a flood is drained in portions, so that no tick waits for its end
@@ -23,7 +23,7 @@ _WEDGED_US = 2_000_000
 _STARTS_WITHIN_US = 30_000_000  # a first start reads its packages from a slow card
 _END_S = 1.0
 _CHILD: Final = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from sightline.robot_side.network import main; main()"
+    "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from sightline.robot_side.network.process import main; main()"
 )
 """It looks for modules where the driver does: neither first in the folder that it starts in, where a file of the user's
 may be called as one of Python's, nor in another copy of this package than the driver's."""

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 
 from sightline.protocol.errors import ConfigError
-from sightline.robot_side.guard import GuardConfig
+from sightline.robot_side.safety.guard import GuardConfig
 from sightline.robot_side.ports import Ranges
 
 

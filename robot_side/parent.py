@@ -6,7 +6,7 @@ from contextlib import suppress
 
 from sightline.protocol.channels import REQUEST
 from sightline.protocol.transports.link import Message
-from sightline.robot_side import ipc
+from sightline.robot_side import pipe as ipc
 from sightline.robot_side.held import PendingRequests
 
 

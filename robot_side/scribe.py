@@ -11,7 +11,7 @@ import time
 from contextlib import suppress
 from typing import Final
 
-from sightline.robot_side.latch import StopLatch
+from sightline.robot_side.driver.persistence import StopLatch
 
 _LINES_WAITING: Final = 32
 _RETRY_S: Final = 0.5

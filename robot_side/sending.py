@@ -13,10 +13,10 @@ from sightline.protocol.messages import (
     StreamStatus,
 )
 from sightline.protocol.transports.link import Message
-from sightline.robot_side.encoding import EncodingTarget
-from sightline.robot_side.ipc import CommandAck, Motion
+from sightline.robot_side.network.bitrate_control import EncodingTarget
+from sightline.robot_side.pipe import CommandAck, Motion
 from sightline.robot_side.ports import Picture
-from sightline.robot_side.stream import Stream, StreamConfig
+from sightline.robot_side.network.stream import Stream, StreamConfig
 
 _CAMERA_PERIOD_US = 500_000
 

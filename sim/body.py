@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sightline.sim.frames import Transform
-from sightline.sim.robot_model import Caster, Chassis, RobotModel
+from sightline.sim.robot import Caster, Chassis, RobotModel
 from sightline.sim.urdf import Outline, Urdf
 from sightline.sim.xacro import urdf_text
 

@@ -14,10 +14,10 @@ import simplejpeg
 
 from sightline.protocol.messages import CameraModel
 from sightline.robot_side.ports import scaled_quality, scaled_size
-from sightline.sim.engine import pybullet
+from sightline.sim.world.engine import pybullet
 from sightline.sim.look import Look
 from sightline.sim.scenario import Wall
-from sightline.sim.wall_painter import WallPainter
+from sightline.sim.world.camera import WallPainter
 
 NEAR_M, FAR_M = 0.02, 20.0
 NOTHING_DEPTH = 0.99999  # TinyRenderer leaves 1 where it drew nothing

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sightline.protocol.messages import CameraModel
-from sightline.sim.engine import pybullet
+from sightline.sim.world.engine import pybullet
 from sightline.sim.label_bus import Label
-from sightline.sim.physics import TARGET, WALL, Vector
-from sightline.sim.thing_bodies import ThingBodies
+from sightline.sim.world.physics import TARGET, WALL, Vector
+from sightline.sim.world.bodies import ThingBodies
 
 _NEAR_M = 0.1
 _SEEN_AT = (0.15, 0.4, 0.65, 0.9)  # of a leg's height: where it is looked for

@@ -2,10 +2,10 @@
 
 import math
 
-from sightline.sim.engine import pybullet
+from sightline.sim.world.engine import pybullet
 from sightline.sim.light import Light, Part, color_of
-from sightline.sim.physics import FLOOR, ROBOT, TARGET, WALL, group
-from sightline.sim.thing_bodies import ball_visual
+from sightline.sim.world.physics import FLOOR, ROBOT, TARGET, WALL, group
+from sightline.sim.world.bodies import ball_visual
 
 LINE_RGB = (0.92, 0.92, 0.92)
 LINE_WIDE_M = 1.2

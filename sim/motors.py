@@ -3,7 +3,7 @@
 import math
 from random import Random
 
-from sightline.sim.robot_model import Wheels
+from sightline.sim.robot import Wheels
 
 SLIP_EVERY_STEPS = 25  # 0.1 s of 4 ms steps
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import simplejpeg
 
-from sightline.sim.scenes import Column, Random, Scene
+from sightline.sim.scenes.model import Column, Random, Scene
 
 Picture = npt.NDArray[np.uint8]
 _SOFT_PX = (0.3, 0.7)  # standard deviation of any lens's own softness

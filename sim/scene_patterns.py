@@ -5,7 +5,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from sightline.sim.scene_texture_parts import SIDE, Field, Random, grid, mixed, near, rgb
+from sightline.sim.scenes.textures import SIDE, Field, Random, grid, mixed, near, rgb
 
 _TEXT: Final = "abcdefghijkmnoprstuvwxyzABCDEFGHKLMNRSTXY0123456789 "
 

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from sightline.sim.camera import FAR_M, NEAR_M, NOTHING_DEPTH
-from sightline.sim.engine import pybullet
+from sightline.sim.world.engine import pybullet
 from sightline.sim.light import LIT, Light, Part, State, color_of
-from sightline.sim.scene_backdrop import backdrop
-from sightline.sim.scene_plan import plan_scene, with_more_of_the_ball
-from sightline.sim.scenes import (
+from sightline.sim.scenes.render import backdrop
+from sightline.sim.scenes.plan import plan_scene, with_more_of_the_ball
+from sightline.sim.scenes.model import (
     HEIGHT_PX,
     MOST_HIDDEN,
     VALIDATED_FROM,
@@ -27,7 +27,7 @@ from sightline.sim.scenes import (
     ScenePlan,
     Solid,
 )
-from sightline.sim.thing_bodies import ball_visual
+from sightline.sim.world.bodies import ball_visual
 from sightline.sim.things import Color, Legs
 
 Mask = npt.NDArray[Any]

@@ -12,8 +12,8 @@ import numpy as np
 
 from sightline.sim import scene_patterns
 from sightline.sim.camera import floor_tile
-from sightline.sim.scene_texture_parts import SIDE, Field, Random, Texture, grid, mixed, near, rgb, soft
-from sightline.sim.scenes import HARDER_FROM, JUDGED_FROM, LATER_FROM, VALIDATED_FROM
+from sightline.sim.scenes.textures import SIDE, Field, Random, Texture, grid, mixed, near, rgb, soft
+from sightline.sim.scenes.model import HARDER_FROM, JUDGED_FROM, LATER_FROM, VALIDATED_FROM
 
 _FLOORS = 16  # of the simulated room's own; each takes as long to make as a scene
 

@@ -29,15 +29,15 @@ from sightline.sim.bus import (
     SimSocketConfig,
     SimulationInfo,
 )
-from sightline.sim.cadence import PeriodicTimer
+from sightline.sim.process import PeriodicTimer
 from sightline.sim.label_bus import to_json
 from sightline.sim.motor_port import MotorPort
-from sightline.sim.robot_model import load_robot
+from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
 from sightline.sim.sockets import BusClients, SocketFolder
 
 if TYPE_CHECKING:
-    from sightline.sim.world import World
+    from sightline.sim.world.world import World
 
 ENCODERS_US, TRUTH_US = 10_000, 20_000
 LAG_TOLD_US = 100_000
@@ -92,7 +92,7 @@ class Simulation:
 
     def _wait(self) -> None:
         """Sleep to the next step's deadline, and mind how late it is."""
-        from sightline.sim.world import STEP_US
+        from sightline.sim.world.world import STEP_US
 
         late_us = monotonic_us() - (self._offset_us + self._world.now_us + STEP_US)
         if late_us < 0:
@@ -172,7 +172,7 @@ def _simulate(simulation: Simulation, config: SimConfig, robot: str) -> None:
 def _world_class() -> type[World]:
     """Imported late: whoever only reads `SimConfig` needs neither PyBullet nor NumPy."""
     try:
-        from sightline.sim.world import World
+        from sightline.sim.world.world import World
     except ImportError as error:
         raise ConfigError(f"the simulation needs {error.name}; install it with: pip install 'sightline[sim]'") from None
     return World

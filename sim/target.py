@@ -5,11 +5,11 @@ from typing import Protocol
 
 import numpy as np
 
-from sightline.sim.engine import pybullet
+from sightline.sim.world.engine import pybullet
 from sightline.sim.path import Place
-from sightline.sim.physics import Vector
-from sightline.sim.start import target_phase, thing_phase, thing_place
-from sightline.sim.thing_bodies import ThingBodies
+from sightline.sim.world.physics import Vector
+from sightline.sim.world.start import target_phase, thing_phase, thing_place
+from sightline.sim.world.bodies import ThingBodies
 from sightline.sim.things import Forced, OnPath, Pushed, Static
 
 PUSH_S = 0.4

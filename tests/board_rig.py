@@ -5,7 +5,7 @@ import math
 import cv2
 import numpy as np
 
-from sightline.operator_side.calibrate import Board
+from sightline.operator_side.calibrate.camera import Board
 from sightline.protocol.messages import CameraModel
 from tests.vision_rig import jpeg_of
 

@@ -14,7 +14,7 @@ import simplejpeg
 
 from sightline.sim.scene_defects import as_seen
 from sightline.sim.scene_render import SceneRenderer
-from sightline.sim.scenes import COLUMNS, HEIGHT_PX, JUDGED_FROM, THINGS, WIDTH_PX
+from sightline.sim.scenes.model import COLUMNS, HEIGHT_PX, JUDGED_FROM, THINGS, WIDTH_PX
 
 FILE = Path(__file__).parent / "judged_scenes.json"
 PINNED = [(COLUMNS["nominal"], 1), (COLUMNS["same-colour boxes"], 212), (COLUMNS["all at once"], 333), (THINGS, 1204)]

@@ -16,7 +16,7 @@ from sightline.sim.look import Look, look_named
 from tests.vision_rig import camera
 from sightline.vision_side.decode import Decoder, Picture
 from sightline.vision_side.detect.port import Detection
-from sightline.vision_side.track import from_odometry
+from sightline.vision_side.tracking.track import from_odometry
 
 LENS = camera()
 BLUE, HOUSING, SKY, FLOOR = (20, 36, 190), (18, 18, 20), (196, 199, 204), (118, 116, 112)

@@ -1,7 +1,7 @@
 """The numbers of the gate's limits as they should be, and configurations made of them."""
 
 from sightline.protocol.messages import Twist
-from sightline.robot_side.limits import (
+from sightline.robot_side.safety.limits import (
     SafetyConfig,
 )
 

@@ -15,8 +15,8 @@ from websockets.sync.client import ClientConnection, connect
 from sightline.protocol.errors import LinkError
 from sightline.protocol.transports.link import Link
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.protocol.transports.websocket import open_websocket
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.websocket.link import open_websocket
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh_session import open_session
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from sightline.protocol.channels import FRAME, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Status
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.link_rigs import free_endpoint, until
 
 # A 16 x 16 grey JPEG is enough: the robot never decodes.
@@ -30,7 +30,7 @@ _RUN = """
 import sys
 from sightline.protocol.errors import SightlineError
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.driver import run
+from sightline.robot_side.driver.process import run
 try:
     sys.exit(run(RobotConfig.model_validate_json(sys.argv[1])))
 except SightlineError as error:

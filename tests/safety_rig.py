@@ -1,9 +1,9 @@
 """A gate with its own clock, and short ways to say what arrives. Used by the gate's tests."""
 
 from sightline.protocol.messages import AnswerHeader, Echo, Request, RequestHeader, Twist, Verb
-from sightline.robot_side.guard import RangeGuard
-from sightline.robot_side.limits import SafetyConfig
-from sightline.robot_side.safety import SafetyGate
+from sightline.robot_side.safety.guard import RangeGuard
+from sightline.robot_side.safety.limits import SafetyConfig
+from sightline.robot_side.safety.gate import SafetyGate
 
 ROBOT, VISION, OTHER, HUMAN = "0000aaaa", "0000bbbb", "0000cccc", "0000dddd"
 MS = 1000

@@ -3,9 +3,9 @@
 import math
 
 from sightline.sim.look import look_named
-from sightline.sim.robot_model import RobotModel, load_robot
+from sightline.sim.robot import RobotModel, load_robot
 from sightline.sim.scenario import Scenario, Start, load_scenario
-from sightline.sim.world import World
+from sightline.sim.world.world import World
 
 RADIUS_M, TRACK_M = 0.035, 0.174
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 from random import Random
 
 from sightline.protocol.messages import Holder
-from sightline.robot_side.stream import Stream, StreamConfig
+from sightline.robot_side.network.stream import Stream, StreamConfig
 
 VISION = Holder(source="vision", session="0000bbbb")
 PACKET_BYTES = 1360

@@ -2,15 +2,15 @@
 
 import random
 
-from sightline.operator_side.teleop import Teleop
+from sightline.operator_side.teleop.control import Teleop
 from sightline.operator_side.teleop_speed import Speeds
 from sightline.protocol.channels import ACK, FRAME, REPLY, REQUEST, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Request
 from sightline.protocol.transports.link import Message
-from sightline.protocol.twist_text import parse_twist
+from sightline.protocol.text import parse_twist
 from sightline.robot_side.config import PluginChoice, RobotConfig
-from sightline.robot_side.driving import DriverCore
+from sightline.robot_side.driver.core import DriverCore
 
 ROBOT, PERSON, VISION = "0000000a", "0000000b", "0000000c"
 STEP_US = 2_000

@@ -11,7 +11,7 @@ from tests.link_rigs import until
 _RUN = """
 import fcntl, termios
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)  # so that its Ctrl-C and its hang-up are signals
-from sightline.operator_side.cli import main
+from sightline.operator_side.cli.app import main
 main()
 """
 

@@ -10,11 +10,11 @@ from sightline.protocol.channels import CAMERA
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import MAX_CHANNELS_SHOWN, CameraModel, FrameHeader, StreamStatus
-from sightline.robot_side.adjusting import CameraAdaptation
-from sightline.robot_side.encoding import EncodingTarget
+from sightline.robot_side.network.core import CameraAdaptation
+from sightline.robot_side.network.bitrate_control import EncodingTarget
 from sightline.robot_side.ports import Picture, scaled_model, scaled_size
 from sightline.robot_side.sending import NetworkCore
-from sightline.robot_side.stream import StreamConfig
+from sightline.robot_side.network.stream import StreamConfig
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.pipeline import Frame, Pipeline
 

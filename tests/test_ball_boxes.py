@@ -11,9 +11,9 @@ import pytest
 pytest.importorskip("pybullet")
 
 from examples import older_range
-from sightline.operator_side.lockstep import Conditions, run_lockstep
-from sightline.operator_side.scenario_settings import robot_of, vision_config
-from sightline.operator_side.score import ACQUIRED_WITHIN_DEG, score
+from sightline.evaluation.lockstep import Conditions, run_lockstep
+from sightline.evaluation.scenario_config import robot_of, vision_config
+from sightline.evaluation.score.figures import ACQUIRED_WITHIN_DEG, score
 from sightline.sim.scenario import load_scenario
 from sightline.vision_side.config import DetectorConfig, HsvConfig
 

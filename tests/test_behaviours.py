@@ -7,8 +7,8 @@ import pytest
 
 from sightline.operator_side.behaviours import write_page
 from sightline.operator_side.behaviours_page import kept, page_lines, picture_name
-from sightline.operator_side.behaviours_rows import CHARACTER, LOOKS, ROWS, Row
-from sightline.operator_side.score import Score
+from sightline.evaluation.score.behaviours import CHARACTER, LOOKS, ROWS, Row
+from sightline.evaluation.score.figures import Score
 from sightline.operator_side.speed_runs import GOALS_M, LAWS, SpeedCase, free_way, speed_cases, speed_run, speeds_of
 from sightline.sim.scenario import load_scenario, scenario_names
 from tests.test_score import truth

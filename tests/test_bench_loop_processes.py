@@ -13,18 +13,18 @@ import pytest
 import typer
 
 from sightline.benchmarks.camera import measure_camera
-from sightline.benchmarks.loop import run_race
-from sightline.benchmarks.loop_crew import free_port
-from sightline.benchmarks.loop_eyes import PipelineVision
-from sightline.benchmarks.loop_machine import children_of
-from sightline.benchmarks.loop_pictures import COUNT, camera_of, write_pictures
-from sightline.benchmarks.loop_setting import FLOOR, OUR_DETECTOR, OURS, PEERS, TCP, WITH_OUR_DETECTOR, LoopSetting
+from sightline.benchmarks.loop.race import run_race
+from sightline.benchmarks.loop.processes import free_port
+from sightline.benchmarks.loop.vision import PipelineVision
+from sightline.benchmarks.loop.counters import children_of
+from sightline.benchmarks.loop.pictures import COUNT, camera_of, write_pictures
+from sightline.benchmarks.loop.figures import FLOOR, OUR_DETECTOR, OURS, PEERS, TCP, WITH_OUR_DETECTOR, LoopSetting
 from sightline.benchmarks.loop_sockets import carried_between, carried_bytes
-from sightline.benchmarks.peers.classic_eyes import ClassicVision
+from sightline.benchmarks.peers.classic_detector import ClassicVision
 from sightline.benchmarks.watchers import measure_watchers
 from sightline.operator_side.cli_bench_loop import register_loop_benches
 from sightline.protocol.errors import HardwareError
-from sightline.robot_side.hardware.folder_camera import FolderCamera, FolderCameraConfig
+from sightline.robot_side.hardware.cameras.files import FolderCamera, FolderCameraConfig
 from tests.link_rigs import until
 
 SMALL = LoopSetting(Path(), 160, 120, fps=30.0, seconds=2.0, tries=1)
@@ -129,8 +129,8 @@ def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkey
 def test_terminated_it_leaves_no_process_and_no_folder(tmp_path):
     code = """
 from pathlib import Path
-from sightline.benchmarks.loop import run_race
-from sightline.benchmarks.loop_setting import LoopSetting
+from sightline.benchmarks.loop.race import run_race
+from sightline.benchmarks.loop.figures import LoopSetting
 run_race(LoopSetting(Path(), 160, 120, seconds=60.0, peers=(), tries=1), print)
 """
     bench = subprocess.Popen(

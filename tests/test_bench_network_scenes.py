@@ -7,10 +7,10 @@ import sys
 import pytest
 
 from sightline.benchmarks.network_fleet import ROBOTS, fleet_checks
-from sightline.benchmarks.network_wheels import moves_again_s, on_old_sight, read_wheel_commands
-from sightline.operator_side.faults.judge import MotorRow
+from sightline.benchmarks.network.figures import moves_again_s, on_old_sight, read_wheel_commands
+from sightline.evaluation.faults.evidence import MotorRow
 from sightline.operator_side.network_medium import reached_ms, reported_check, stop_checks_of
-from sightline.sim.wire_tun import why_impossible
+from sightline.sim.tun_emulator import why_impossible
 
 TICK_US = 20_000
 SECOND_US = 1_000_000
@@ -141,7 +141,7 @@ def test_a_robot_that_is_missing_is_noticed():
 @pytest.mark.slow
 @pytest.mark.skipif(bool(why_impossible()), reason="needs root and /dev/net/tun")
 def test_a_standby_is_run_for_real():
-    command = [sys.executable, "-m", "sightline.operator_side.cli", "bench", "network", "--only", "standby", "--seconds", "4",
+    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "bench", "network", "--only", "standby", "--seconds", "4",
                "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     said = json.loads(done.stdout)

@@ -6,7 +6,7 @@ from websockets.sync.client import connect
 from sightline.protocol.channels import DETECTIONS, MAX_HEADER_BYTES
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import Detections, DetectionsHeader
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, Vision
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import typer
 
-from sightline.operator_side import cli
+from sightline.operator_side.cli import app as cli
 from sightline.operator_side.service_settings import load_service
-from sightline.operator_side.teleop_text import KEYS
+from sightline.operator_side.teleop.terminal import KEYS
 from sightline.robot_side.hardware.gpio_drive import GpioDriveConfig
 
 ROOT = Path(__file__).parent.parent

@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from sightline.operator_side import cli_calibrate
-from sightline.operator_side.calibrate import (
+from sightline.operator_side.calibrate.camera import (
     Ball,
     Board,
     Mounting,
@@ -23,7 +23,7 @@ from sightline.operator_side.calibrate import (
 from sightline.operator_side.calibrate_pictures import collect
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.jpeg import JpegSize
-from sightline.robot_side.hardware.lens import guessed_model, read_model
+from sightline.robot_side.hardware.cameras.lens import guessed_model, read_model
 from sightline.robot_side.hardware.still_camera import StillCamera
 from tests.board_rig import BOARD, TRUTH, draw_board, rays, tilted_views, turned
 from tests.link_rigs import until

@@ -4,7 +4,7 @@ import pytest
 
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice
-from sightline.robot_side.hardware.picamera import PiCamera
+from sightline.robot_side.hardware.cameras.picamera import PiCamera
 from sightline.robot_side.hardware.v4l2_camera import V4l2Camera
 from sightline.robot_side.plugins import build_device
 from tests.camera_contract import check_camera

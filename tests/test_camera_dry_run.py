@@ -2,7 +2,7 @@
 
 import pytest
 
-from sightline.operator_side.local_camera import local_camera
+from sightline.operator_side.calibrate.local_camera import local_camera
 from sightline.protocol.channels import ACK, CAMERA, FRAME, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError, HardwareError
@@ -13,7 +13,7 @@ from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 from tests.vision_rig import camera, jpeg_of, scene
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.dry_run import AckingService, ProgressPrinter, watch_camera, watch_robot
+from sightline.vision_side.serving.dry_run import AckingService, ProgressPrinter, watch_camera, watch_robot
 from sightline.vision_side.pipeline import Observation, PipelineAnswer
 
 MODEL = camera()
@@ -72,7 +72,7 @@ def test_a_camera_needs_no_robot():
 
 
 def test_a_camera_that_is_unplugged_is_said_once_and_waited_for(monkeypatch):
-    monkeypatch.setattr("sightline.vision_side.dry_run._RETRY_S", 0.0)
+    monkeypatch.setattr("sightline.vision_side.serving.dry_run._RETRY_S", 0.0)
     gone = HardwareError("camera /dev/video0 was unplugged; plug it in again")
     said = watch([BALL, gone, gone, None, BALL])
     assert said[2:] == ["camera: camera /dev/video0 was unplugged; plug it in again", "camera: back"]

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.operator_side.toml_text import toml_text
+from sightline.operator_side.config.toml_text import toml_text
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import CameraModel
-from sightline.robot_side.hardware.folder_camera import FolderCamera
-from sightline.robot_side.hardware.lens import LensConfig, camera_model
+from sightline.robot_side.hardware.cameras.files import FolderCamera
+from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
 from sightline.robot_side.hardware.still_camera import StillCamera
 from sightline.robot_side.hardware.video_camera import VideoCamera
 from tests.camera_contract import next_picture

@@ -13,10 +13,10 @@ import pytest
 
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.robot_side.config import PluginChoice
-from sightline.robot_side.hardware.buffer_time import CaptureClock, Clocks
+from sightline.robot_side.hardware.cameras.timing import CaptureClock, Clocks
 from sightline.robot_side.hardware.v4l2_camera import V4l2Camera
 from sightline.robot_side.hardware.v4l2_device import whole_jpeg
-from sightline.robot_side.hardware.v4l2_trouble import check_device, device_owner, open_error
+from sightline.robot_side.hardware.cameras.v4l2 import check_device, device_owner, open_error
 from sightline.robot_side.plugins import build_device
 from tests.camera_contract import next_picture
 from tests.camera_rig import FakeDevice, jpeg

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sightline.operator_side.channel_inbox import MAX_WAITING, ChannelInbox
+from sightline.operator_side.client.messages import MAX_WAITING, ChannelInbox
 from sightline.protocol.channels import CHANNELS, JPEG
 from sightline.protocol.transports.memory import MemoryNetwork
 from tests.test_channel_text import usual

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.operator_side.check_text import Check, check_line, number
+from sightline.evaluation.checks import Check, check_line, number
 
 
 @pytest.mark.parametrize(("value", "text"), [

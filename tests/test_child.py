@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sightline.protocol.clock import monotonic_us
-from sightline.robot_side import ipc, plugins
+from sightline.robot_side import pipe as ipc, plugins
 from sightline.robot_side.child import DriverEnd
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from tests.link_rigs import free_endpoint, until
@@ -20,7 +20,7 @@ ROOT = Path(__file__).parent.parent
 STRANGE = "raise SystemExit(7)"
 CAMERA = """
 from sightline.protocol.config import Config
-from sightline.robot_side.hardware.folder_camera import FolderCamera
+from sightline.robot_side.hardware.cameras.files import FolderCamera
 class MyCamera(FolderCamera):
     pass
 """
@@ -67,7 +67,7 @@ def test_from_a_checkout_that_nobody_installed_both_processes_are_the_checkout_s
     checkout = tmp_path / "checkout"
     for package in ("protocol", "robot_side"):
         shutil.copytree(ROOT / package, checkout / package, ignore=shutil.ignore_patterns("__pycache__"))
-    with (checkout / "robot_side" / "network.py").open("r+") as source:
+    with (checkout / "robot_side" / "network" / "process.py").open("r+") as source:
         text = source.read()
         source.seek(0)
         source.write(text.replace("def main() -> None:", "def main() -> None:\n    print(__file__, flush=True)"))
@@ -75,4 +75,4 @@ def test_from_a_checkout_that_nobody_installed_both_processes_are_the_checkout_s
     popen_there = partial(subprocess.Popen, cwd=checkout, env=environ)
     monkeypatch.setattr(subprocess, "Popen", popen_there)
     with RobotProcess(tmp_path) as robot:
-        assert until(lambda: str(checkout / "robot_side" / "network.py") in robot.output(), 20), robot.output()
+        assert until(lambda: str(checkout / "robot_side" / "network" / "process.py") in robot.output(), 20), robot.output()

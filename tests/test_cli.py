@@ -9,8 +9,8 @@ import tomllib
 import pytest
 import typer
 
-from sightline.operator_side import cli
-from sightline.operator_side.extras import needs
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError
 
 
@@ -140,7 +140,7 @@ def test_a_mistake_is_one_line_and_its_exit_code(capsys, arguments, code, expect
 def test_a_robot_may_be_given_by_its_address(capsys, monkeypatch):
     """As in `vision --robot ws-legacy://HOST:9091`: an older robot has an address and no id."""
     seen = []
-    monkeypatch.setattr("sightline.vision_side.service_process.run", lambda config: seen.append(config) or 0)
+    monkeypatch.setattr("sightline.vision_side.serving.process.run", lambda config: seen.append(config) or 0)
     assert run(capsys, "vision", "--robot", "ws-legacy://127.0.0.1:9091")[0] == 0
     assert run(capsys, "vision", "--robot", "r7", "--connect", "ws://127.0.0.1:9090")[0] == 0
     assert [(config.robot, config.connect) for config in seen] == [
@@ -190,7 +190,7 @@ def test_config_commands_print_what_a_script_can_read(capsys, tmp_path):
 @pytest.mark.parametrize("arguments", [["--help"], ["config", "show", "robot"], ["arm", "a/b"]])
 def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
     script = (
-        "import sys; from sightline.operator_side import cli; cli.run(sys.argv[1:]);"
+        "import sys; from sightline.operator_side.cli import app as cli; cli.run(sys.argv[1:]);"
         "heavy = {'numpy', 'cv2', 'pybullet', 'matplotlib', 'av', 'mcap', 'zenoh'} & set(sys.modules);"
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )

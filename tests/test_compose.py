@@ -11,10 +11,10 @@ import pytest
 from packaging.requirements import Requirement
 from typer.main import get_command
 
-from sightline.operator_side.cli import app
+from sightline.operator_side.cli.app import app
 from sightline.operator_side.service_settings import load_service
 from sightline.robot_side.child import _END_S
-from sightline.robot_side.driver import _SHUTDOWN_US
+from sightline.robot_side.driver.process import _SHUTDOWN_US
 from tests.compose_rig import COMPOSE, DEFAULT, HEAVY, PROFILES, ROOT, SERVICES, ask
 from tests.link_rigs import free_endpoint
 

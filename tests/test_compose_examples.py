@@ -16,8 +16,8 @@ from sightline.protocol.channels import DETECTIONS
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import Detections, DetectionsHeader
-from sightline.protocol.transports.zenoh import open_zenoh
-from sightline.protocol.twist_text import parse_twist
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.text import parse_twist
 from tests.compose_rig import ROOT
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess

@@ -6,9 +6,9 @@ from concurrent.futures import ProcessPoolExecutor
 import pytest
 
 from sightline.protocol.conformance.bench import KEPT_MESSAGES
-from sightline.protocol.conformance.case import GROUPS, Case, Level, Suite
-from sightline.protocol.conformance.robot import CASES, prepare
-from sightline.protocol.conformance.runner import Outcome, chosen, passed, run_case, run_cases
+from sightline.conformance.case import GROUPS, Case, Level, Suite
+from sightline.conformance.robot.cases import CASES, prepare
+from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_cases
 from sightline.protocol.errors import ConfigError
 from tests.conformance import (  # noqa: F401  (they fill BROKEN)
     broken_arming,

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from sightline.protocol.conformance import codec_process
-from sightline.protocol.conformance.case import Level
+from sightline.conformance.case import Level
 from sightline.protocol.conformance.codec import CASES, END, run_codec
-from sightline.protocol.conformance.codec_lines import (
+from sightline.conformance.codec import (
     MAX_ANSWER_BYTES,
     ProgramError,
     Question,
@@ -22,7 +22,7 @@ from sightline.protocol.conformance.codec_lines import (
     same,
 )
 from sightline.protocol.conformance.codec_questions import VECTORS, codec_cases
-from sightline.protocol.conformance.runner import Outcome
+from sightline.conformance.runner import Outcome
 from sightline.protocol.errors import ConfigError
 from tests.conformance.codec_broken import WRONG
 

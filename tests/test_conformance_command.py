@@ -7,15 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from sightline.operator_side import cli, keys
-from sightline.operator_side.conform_access import access_for
-from sightline.protocol.conformance import vision
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side.setup import keys
+from sightline.operator_side.cli.conform import access_for
+from sightline.conformance.vision import cases as vision
 from sightline.protocol.conformance.bench import Access
-from sightline.protocol.conformance.case import Case, Level
+from sightline.conformance.case import Case, Level
 from sightline.protocol.conformance.html_report import to_html
-from sightline.protocol.conformance.report import summary, to_dict, to_junit, to_page
-from sightline.protocol.conformance.robot import CASES
-from sightline.protocol.conformance.runner import Outcome, Result
+from sightline.conformance.report import summary, to_dict, to_junit, to_page
+from sightline.conformance.robot.cases import CASES
+from sightline.conformance.runner import Outcome, Result
 from tests.conformance.small_server import SmallServer
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess

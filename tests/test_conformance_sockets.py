@@ -7,13 +7,13 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from sightline.protocol.conformance.bench import Access
-from sightline.protocol.conformance.live import LiveBench
-from sightline.protocol.conformance.raw_websocket import LOST, PING, TEXT, RawWebSocket, split_url, xor
-from sightline.protocol.conformance.robot import CASES, prepare
-from sightline.protocol.conformance.runner import Outcome, run_cases
+from sightline.conformance.benches import LiveBench
+from sightline.conformance.raw_peers import LOST, PING, TEXT, RawWebSocket, split_url, xor
+from sightline.conformance.robot.cases import CASES, prepare
+from sightline.conformance.runner import Outcome, run_cases
 from sightline.protocol.conformance.virtual import FROM_ROBOT
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 from tests.conformance.broken_sockets import BEHIND_TOKENS, DEFECTS
 from tests.conformance.small_server import SmallServer
 from tests.link_rigs import free_endpoint

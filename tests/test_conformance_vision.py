@@ -2,11 +2,11 @@
 
 import pytest
 
-from sightline.protocol.conformance.case import Level
+from sightline.conformance.case import Level
 from sightline.protocol.conformance.codec import CASES as CODEC_CASES
-from sightline.protocol.conformance.robot import CASES as ROBOT_CASES
-from sightline.protocol.conformance.runner import Outcome, run_case
-from sightline.protocol.conformance.vision import CASES, prepare
+from sightline.conformance.robot.cases import CASES as ROBOT_CASES
+from sightline.conformance.runner import Outcome, run_case
+from sightline.conformance.vision.cases import CASES, prepare
 from tests.conformance import (  # noqa: F401
     vision_broken_answers,
     vision_broken_flow,

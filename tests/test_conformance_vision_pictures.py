@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sightline.protocol.conformance import vision_pictures
-from sightline.protocol.conformance.vision_jpeg import encode_jpeg
+from sightline.conformance.vision.drawing import encode_jpeg
 from sightline.protocol.conformance.vision_pictures import (
     CAMERA,
     DRAWINGS,

@@ -9,15 +9,15 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from sightline.protocol.conformance.bench import Access
-from sightline.protocol.conformance.live import LiveBench
-from sightline.protocol.conformance.runner import Outcome, run_case
+from sightline.conformance.benches import LiveBench
+from sightline.conformance.runner import Outcome, run_case
 from sightline.protocol.conformance.virtual import TO_ROBOT
-from sightline.protocol.conformance.vision import CASES
-from sightline.protocol.conformance.vision_socket_server import _take
-from sightline.protocol.transports.opening import open_link
+from sightline.conformance.vision.cases import CASES
+from sightline.conformance.vision.websocket import _take
+from sightline.protocol.transports.open import open_link
 from tests.conformance.vision_sockets import SOCKETS, SocketVision
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.service_process import serve
+from sightline.vision_side.serving.process import serve
 
 REAL = [case for case in CASES if case.real]
 TOKEN = "0123456789abcdefABCDEF_-"

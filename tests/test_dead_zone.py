@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from sightline.operator_side.scenario_settings import robot_config
+from sightline.evaluation.scenario_config import robot_config
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.dead_zone import BlindZoneError, check_blind_zone
-from sightline.robot_side.guard import GuardConfig
+from sightline.robot_side.safety.guard import GuardConfig
 from sightline.robot_side.ports import Ranges
-from sightline.sim.robot_model import load_robot
+from sightline.sim.robot import load_robot
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 

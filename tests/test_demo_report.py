@@ -5,19 +5,19 @@ from dataclasses import replace
 import pytest
 
 from sightline.benchmarks.real_time import Kinds, _figures
-from sightline.operator_side import demo_report
+from sightline.evaluation.demo import report as demo_report
 from sightline.operator_side.demo import RECORDING, DemoOptions, DemoRun
-from sightline.operator_side.lockstep import Conditions, Lockstep
-from sightline.operator_side.recording import Recorder
-from sightline.operator_side.replay import VISION_CONFIG
-from sightline.operator_side.scenario_settings import robot_config, robot_of, vision_config
-from sightline.operator_side.score import AT_LEAST
+from sightline.evaluation.lockstep import Conditions, Lockstep
+from sightline.operator_side.recording.recorder import Recorder
+from sightline.operator_side.recording.replay import VISION_CONFIG
+from sightline.evaluation.scenario_config import robot_config, robot_of, vision_config
+from sightline.evaluation.score.figures import AT_LEAST
 from sightline.operator_side.score_bounds import EXACT
 from sightline.protocol.channels import CAMERA
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import Stamp
 from sightline.sim.scenario import load_scenario
-from sightline.sim.world import World
+from sightline.sim.world.world import World
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import FrameHeader
 from tests.onnx_rig import brightness_model, without_gpu
-from sightline.vision_side import plugin_choice
+from sightline.vision_side import plugins as plugin_choice
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.choice import (
+from sightline.vision_side.detect.registry import (
     GROUP,
     REGISTRY,
     build_detector,
@@ -24,9 +24,9 @@ from sightline.vision_side.detect.choice import (
     split_kind,
 )
 from sightline.vision_side.detect.colour_filter import ColorFilter
-from sightline.vision_side.detect.label_filter import LabelFilter
-from sightline.vision_side.detect.local import Adaptive, Hsv
-from sightline.vision_side.detect.onnx_detector import OnnxDetector
+from sightline.vision_side.detect.filters import LabelFilter
+from sightline.vision_side.detect.color.detectors import Adaptive, Hsv
+from sightline.vision_side.detect.onnx.detector import OnnxDetector
 from sightline.vision_side.detect.port import DetectFrame, result_of
 from sightline.vision_side.detect.shadow import ShadowDetector
 from sightline.vision_side.detect.tracked import TrackIds

@@ -7,15 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from sightline.operator_side import cli, cli_detector
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side import cli_detector
 from tests.onnx_rig import brightness_model, without_gpu
 from sightline.vision_side import detector_service
-from sightline.vision_side.detect import onnx_detector
-from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.onnx import detector as onnx_detector
+from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.remote import oip_grpc
 
 BROKEN = '''
-from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.color.detectors import Hsv
 
 
 class Late(Hsv):
@@ -179,7 +180,7 @@ def test_the_group_alone_shows_its_help(capsys) -> None:
 
 def test_listing_imports_nothing_heavy_before_it_is_needed() -> None:
     """`detector --help` answers without OpenCV."""
-    code = "import sys; from sightline.operator_side import cli; cli.run(['detector', '--help']); print('cv2' in sys.modules)"
+    code = "import sys; from sightline.operator_side.cli import app as cli; cli.run(['detector', '--help']); print('cv2' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.rstrip().endswith("False")
 

@@ -13,7 +13,7 @@ from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.colour_filter import ColorFilter
 from sightline.vision_side.detect.formats import foxglove_annotations, supervision_fields, vision_msgs_fields
-from sightline.vision_side.detect.label_filter import LabelFilter
+from sightline.vision_side.detect.filters import LabelFilter
 from sightline.vision_side.detect.overlap import corners, overlap
 from sightline.vision_side.detect.port import (
     NO_DEADLINE,

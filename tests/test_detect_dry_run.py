@@ -9,7 +9,7 @@ from tests.detector_rig import BALL, MODEL
 from tests.detector_rig import Bench as DrivingBench
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.detect.port import Maker, result_of
-from sightline.vision_side.dry_run import AckingService, LocalRun
+from sightline.vision_side.serving.dry_run import AckingService, LocalRun
 
 STARTS, GONE = "m.onnx runs on cpu: no GPU runtime is installed", "detector far: no answer: LATE"
 

@@ -15,11 +15,11 @@ from tests.detector_contract import assert_kept
 from tests.onnx_rig import brightness_model, model, node, part, tensor, value, without_gpu, yolo_model
 from tests.vision_rig import camera, jpeg_of, scene
 from sightline.vision_side.decode import Decoder, Picture
-from sightline.vision_side.detect.golden import difference, golden_picture, golden_text, read_golden
-from sightline.vision_side.detect.onnx_detector import OnnxDetector
+from sightline.vision_side.detect.onnx.self_test import difference, golden_picture, golden_text, read_golden
+from sightline.vision_side.detect.onnx.detector import OnnxDetector
 from sightline.vision_side.detect.onnx_engine import open_engine
-from sightline.vision_side.detect.onnx_header import OnnxHeader, Tensor, read_onnx_header
-from sightline.vision_side.detect.onnx_reading import Letterbox, ModelFormat, fit_picture, model_format, read_outputs
+from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor, read_onnx_header
+from sightline.vision_side.detect.onnx.tensors import Letterbox, ModelFormat, fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection
 
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 400.0, 300.0]]

@@ -8,8 +8,8 @@ import pytest
 from tests.onnx_rig import brightness_model, several_model
 from tests.test_detect_onnx import NEEDS_RUNTIME, detector, frame
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.onnx_header import read_onnx_header
-from sightline.vision_side.detect.onnx_reading import model_format
+from sightline.vision_side.detect.onnx.engine import read_onnx_header
+from sightline.vision_side.detect.onnx.tensors import model_format
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame
 
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 300.0, 200.0]]
@@ -42,7 +42,7 @@ def test_several_pictures_are_one_run_with_the_answers_that_each_gets_alone(tmp_
 
 @NEEDS_RUNTIME
 def test_what_is_no_picture_is_left_out_and_no_run_is_too_large(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("sightline.vision_side.detect.onnx_detector._MOST_AT_ONCE", 2)
+    monkeypatch.setattr("sightline.vision_side.detect.onnx.detector._MOST_AT_ONCE", 2)
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1, refine=())
     runs = counted(eye, monkeypatch)
     good = [grey(level, seq) for seq, level in enumerate(LEVELS)]

@@ -9,8 +9,8 @@ from sightline.protocol.errors import HardwareError
 from tests.onnx_rig import brightness_model, yolo_model
 from tests.test_detect_onnx import NEEDS_RUNTIME, detector, engine, frame
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect import onnx_detector
-from sightline.vision_side.detect.golden import golden_picture, golden_text
+from sightline.vision_side.detect.onnx import detector as onnx_detector
+from sightline.vision_side.detect.onnx.self_test import golden_picture, golden_text
 from sightline.vision_side.detect.port import NO_DEADLINE, Detection
 
 __all__ = ["engine"]

@@ -12,7 +12,7 @@ from tests.vision_rig import camera, jpeg_of, scene
 from sightline.vision_side.config import DetectorConfig, TargetConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.checking import checked_results, validated
-from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Maker, result_of
 from sightline.vision_side.pipeline import NO_ANSWER, Frame, Pipeline
 

@@ -25,7 +25,7 @@ class VisionProcess:
         self._arguments = arguments
 
     def __enter__(self) -> "VisionProcess":
-        command = [sys.executable, "-m", "sightline.operator_side.cli", "vision", *self._arguments]
+        command = [sys.executable, "-m", "sightline.operator_side.cli.app", "vision", *self._arguments]
         self.process = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT)
         return self
 
@@ -42,7 +42,7 @@ class VisionProcess:
 
 
 def sightline(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "sightline.operator_side.cli", *arguments], capture_output=True, text=True,
+    return subprocess.run([sys.executable, "-m", "sightline.operator_side.cli.app", *arguments], capture_output=True, text=True,
                           timeout=30, check=False)
 
 

@@ -15,10 +15,10 @@ from tests.link_rigs import until
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.agreement import REPORT_EVERY_US, Agreement, disagreement
-from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Maker, result_of
 from sightline.vision_side.detect.shadow import ShadowDetector
-from sightline.vision_side.missions.choice import configured_mission
+from sightline.vision_side.missions.registry import configured_mission
 
 
 def result(t_us: int, *boxes: tuple[float, float, float, float], name: str = "hsv") -> DetectionResult:

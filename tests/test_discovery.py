@@ -6,18 +6,18 @@ import sys
 
 import pytest
 
-from sightline.protocol.transports.zenoh_around import find_listeners
-from sightline.protocol.transports.zenoh_discovery import MULTICAST_OFF, multicast_section
+from sightline.protocol.transports.zenoh.discovery import find_listeners
+from sightline.protocol.transports.zenoh.session import MULTICAST_OFF, multicast_section
 from sightline.protocol.transports.zenoh_session import session_config
 
 INSIDE = """
 import fcntl, os, socket, struct, subprocess, sys
-from sightline.operator_side import cli
-from sightline.protocol.transports.zenoh_discovery import MULTICAST_GROUP as GROUP
+from sightline.operator_side.cli import app as cli
+from sightline.protocol.transports.zenoh.session import MULTICAST_GROUP as GROUP
 
 ROBOT = '''
 import sys, time
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 with open_zenoh(sys.argv[2], listen=[sys.argv[1]], role="robot"):
     print("on", flush=True)
     time.sleep(60)

@@ -8,11 +8,12 @@ import sys
 
 import pytest
 
-from sightline.operator_side import cli, keys
-from sightline.operator_side.doctor import between, cameras, machine
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side.setup import keys
+from sightline.operator_side.doctor import network as between, cameras, machine
 from sightline.operator_side.doctor.finding import Finding, as_object, histogram
-from sightline.protocol.transports.port_owner import port_owner
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.diagnosis import port_owner
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess
 

@@ -10,12 +10,12 @@ import pytest
 
 from sightline.protocol.config import Config
 from sightline.protocol.messages import Twist
-from sightline.robot_side import ipc
+from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice, RobotConfig
-from sightline.robot_side.driver import Driver, run
-from sightline.robot_side.ending import EXIT_SIGNALS, IGNORED_SIGNALS
-from sightline.robot_side.latch import StopLatch
-from sightline.robot_side.limits import SafetyConfig
+from sightline.robot_side.driver.process import Driver, run
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
+from sightline.robot_side.driver.persistence import StopLatch
+from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.ports import WheelAngles
 from sightline.robot_side.scribe import BackgroundWriter
 from tests.link_rigs import free_endpoint, until

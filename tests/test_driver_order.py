@@ -11,12 +11,12 @@ from sightline.protocol.channels import TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import AnswerHeader, Echo
 from sightline.protocol.transports.link import Message
-from sightline.robot_side import ipc
+from sightline.robot_side import pipe as ipc
 from sightline.robot_side.child import DriverEnd
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.driver import Driver
-from sightline.robot_side.ending import EXIT_SIGNALS, IGNORED_SIGNALS
-from sightline.robot_side.limits import SafetyConfig
+from sightline.robot_side.driver.process import Driver
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
+from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.parent import NetworkEnd
 
 SEQ, T_US = 7, 1_000
@@ -116,7 +116,7 @@ def test_the_frame_that_a_verdict_permits_carries_the_latency_of_that_verdict(dr
     monkeypatch.setattr(driver.child, "send_aside", lambda packet: told.append(ipc.unpack_motion(packet)))
     monkeypatch.setattr(driver.child, "send", lambda packet: told.append(ipc.unpack_ack(packet)))
     driver._driving.gate.latency_us = None
-    monkeypatch.setattr("sightline.robot_side.driver.monotonic_us", lambda: T_US + 4_000)
+    monkeypatch.setattr("sightline.robot_side.driver.process.monotonic_us", lambda: T_US + 4_000)
     _arm(driver)
     parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
     parent.forward(answer(driver._driving.session))
@@ -139,6 +139,6 @@ def test_a_verdict_is_told_though_the_next_tick_is_not_due(driver, ends):
 
 def _arm(driver):
     """Bring the gate to HOLD as its own table would; how it arms is tested with the gate."""
-    from sightline.robot_side.states import Event
+    from sightline.robot_side.safety.states import Event
 
     driver._driving.gate._go(Event.ARM, "armed for the test")

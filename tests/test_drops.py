@@ -5,15 +5,15 @@ import threading
 import time
 from collections import Counter
 
-from sightline.operator_side.status_text import drops_text, encoding_text, status_lines
+from sightline.operator_side.client.status import drops_text, encoding_text, status_lines
 from sightline.protocol.channels import FRAME
 from sightline.protocol.messages import CameraModel, State, Status, StreamStatus
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.protocol.transports.opening import LinkGroup
+from sightline.protocol.transports.open import LinkGroup
 from sightline.robot_side.child import NetworkSetup
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.hardware.newest import LatestPicture
-from sightline.robot_side.network import Network
+from sightline.robot_side.network.process import Network
 from sightline.robot_side.parent import NetworkEnd
 from sightline.robot_side.ports import Picture
 from tests.camera_rig import jpeg

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sightline.operator_side import cli_faults
-from sightline.operator_side.check_text import Check, at_most
-from sightline.operator_side.faults import camera
+from sightline.evaluation.checks import Check, at_most
+from sightline.evaluation.faults import camera
 from sightline.operator_side.faults.attacks import ATTACKS, MALFORMED, OVERSIZED
 from sightline.operator_side.faults.bench import run_case, watched_us
-from sightline.operator_side.faults.judge import (
+from sightline.evaluation.faults.evidence import (
     Blind,
     MotorRow,
     SentCommand,
@@ -28,15 +28,15 @@ from sightline.operator_side.faults.judge import (
     stop_checks,
 )
 from sightline.operator_side.faults.ledger import GOOD, INJECTED, EventLog, read_events
-from sightline.operator_side.faults.machine import describe_machine
+from sightline.evaluation.faults.report import describe_machine
 from sightline.operator_side.faults.report import markdown, passed, run_line, to_dict, worst_checks
-from sightline.operator_side.faults.row import Outcome
+from sightline.evaluation.faults.runner import Outcome
 from sightline.operator_side.faults.rows import CASES, chosen
-from sightline.operator_side.faults.sampler import read_holes, stalled_us
+from sightline.evaluation.faults.sampler import read_holes, stalled_us
 from sightline.protocol.channels import TWIST
 from sightline.protocol.errors import ConfigError, WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.twist_text import parse_twist
+from sightline.protocol.text import parse_twist
 from sightline.robot_side.kinematics import DiffDriveConfig
 
 RADIUS_M = DiffDriveConfig().wheel_radius_m

@@ -6,10 +6,10 @@ import pytest
 import typer
 
 from sightline.operator_side import cli_faults
-from sightline.operator_side.faults.judge import MotorRow
+from sightline.evaluation.faults.evidence import MotorRow
 from sightline.operator_side.faults.report import with_rows_of
 from sightline.operator_side.faults.rows_crowd import _tick_checks, permille_us, undisturbed_gaps_us
-from sightline.operator_side.faults.sampler import Hole
+from sightline.evaluation.faults.sampler import Hole
 from sightline.operator_side.faults.worst import page_with_summary
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -122,8 +122,8 @@ def test_the_command_writes_both_pages(tmp_path, monkeypatch):
 
 
 def _measured(row):
-    from sightline.operator_side.faults.judge import Stop, stop_checks
-    from sightline.operator_side.faults.row import Outcome
+    from sightline.evaluation.faults.evidence import Stop, stop_checks
+    from sightline.evaluation.faults.runner import Outcome
 
     return Outcome(row, tuple(stop_checks(Stop(150.0, 560.0, 0.19))))
 

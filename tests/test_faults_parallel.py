@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from sightline.operator_side.check_text import Check
+from sightline.evaluation.checks import Check
 from sightline.operator_side.faults import parallel
 from sightline.operator_side.faults.parallel import run_cases
 from sightline.operator_side.faults.report import progress_line
 from sightline.operator_side.faults.rig import Setup
-from sightline.operator_side.faults.row import Case, Outcome
+from sightline.evaluation.faults.runner import Case, Outcome
 
 GOOD = (Check("zero", 1.0, "ms", 2.0, True),)
 

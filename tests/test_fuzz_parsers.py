@@ -27,8 +27,8 @@ from sightline.protocol.legacy import (
 )
 from sightline.protocol.messages import WireModel
 from sightline.protocol.refusals import RejectReason
-from sightline.protocol.transports.websocket_framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
-from sightline.protocol.twist_text import MAX_TWIST_BYTES, format_twist, parse_twist
+from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
+from sightline.protocol.text import MAX_TWIST_BYTES, format_twist, parse_twist
 
 CORPUS = Path(__file__).parent / "fuzz_corpus"
 MOST_PICTURE_BYTES = 120

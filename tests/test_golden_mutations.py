@@ -7,9 +7,9 @@ import math
 
 import pytest
 
-from sightline.protocol.golden import INEXACT_KEY, outcome
+from sightline.protocol.spec.golden import INEXACT_KEY, outcome
 from sightline.protocol.golden_cases import CASES
-from sightline.protocol.golden_wires import FRAMING_CASES, framing_outcome
+from sightline.protocol.spec.framing_cases import FRAMING_CASES, framing_outcome
 from sightline.protocol.messages import MAX_INTEGER
 from sightline.protocol.refusals import RejectReason
 

@@ -16,7 +16,7 @@ from sightline.operator_side.service_settings import load_service
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import Twist
 from sightline.robot_side.hardware.gpio_drive import GpioDrive
-from sightline.robot_side.hardware.gpio_table import DutyTable, table_of, table_text
+from sightline.robot_side.hardware.gpio import DutyTable, table_of, table_text
 from sightline.robot_side.kinematics import DiffDriveConfig, wheel_speeds
 from sightline.robot_side.plugins import load_device
 from tests.drive_contract import check_drive

@@ -7,10 +7,11 @@ import tomllib
 
 import pytest
 
-from sightline.operator_side import cli, cli_robot_tools, wheel_test
+from sightline.operator_side.cli import app as cli, calibrate as cli_robot_tools
+from sightline.operator_side.calibrate import wheels as wheel_test
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice, RobotConfig
-from sightline.robot_side.ending import EXIT_SIGNALS
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS
 from tests.link_rigs import until
 from tests.terminal_rig import Terminal
 

@@ -7,19 +7,19 @@ import json
 
 import pytest
 
-from sightline.operator_side import cli
+from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import FrameHeader
 from tests import demanded
 from tests.vision_rig import camera, jpeg_of, scene
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder, Picture
-from sightline.vision_side.detect.choice import build_detector
-from sightline.vision_side.detect.golden import KEY, difference, golden_picture, read_golden
-from sightline.vision_side.detect.onnx_detector import SHIPPED
+from sightline.vision_side.detect.registry import build_detector
+from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
+from sightline.vision_side.detect.onnx.detector import SHIPPED
 from sightline.vision_side.detect.onnx_engine import open_engine
-from sightline.vision_side.detect.onnx_header import read_onnx_header
-from sightline.vision_side.detect.onnx_reading import fit_picture, model_format, read_outputs
+from sightline.vision_side.detect.onnx.engine import read_onnx_header
+from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame
 
 GPU = "cuda"

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from sightline.protocol.messages import STILL, Twist
-from sightline.robot_side.guard import GuardConfig, RangeGuard, _Near
+from sightline.robot_side.safety.guard import GuardConfig, RangeGuard, _Near
 from sightline.robot_side.ports import Ranges
 
 DEFAULTS = {

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from sightline.operator_side import cli, install
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side.setup import install
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice, RobotConfig
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from sightline.protocol import golden
-from sightline.protocol.schema import json_schema
+from sightline.protocol.spec import golden
+from sightline.protocol.spec.generate import json_schema
 from tests.javascript_rig import EXAMPLES, ROOT, node
 
 VECTORS = ROOT / "protocol" / "vectors"

@@ -15,7 +15,7 @@ from tests.javascript_rig import JsProcess, JsRobot, free_port, node
 from tests.link_rigs import until
 
 pytestmark = pytest.mark.slow
-SIGHTLINE = [sys.executable, "-m", "sightline.operator_side.cli"]
+SIGHTLINE = [sys.executable, "-m", "sightline.operator_side.cli.app"]
 PATIENCE_S = 20.0
 # Brightness of the canvas at a grid of points: a picture has several, an empty canvas one.
 LEVELS = """(() => {

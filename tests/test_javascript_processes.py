@@ -14,7 +14,7 @@ from tests.javascript_rig import ROOT, JsProcess, JsRobot, JsVision, free_port, 
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess, driving
 
-SIGHTLINE = [sys.executable, "-m", "sightline.operator_side.cli"]
+SIGHTLINE = [sys.executable, "-m", "sightline.operator_side.cli.app"]
 
 
 def sightline(*arguments: str, ok: bool = True) -> str:

@@ -6,7 +6,7 @@ import stat
 
 import pytest
 
-from sightline.robot_side.latch import StopLatch
+from sightline.robot_side.driver.persistence import StopLatch
 
 
 @pytest.fixture

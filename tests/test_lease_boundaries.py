@@ -3,7 +3,7 @@
 import pytest
 
 from sightline.protocol.messages import Holder
-from sightline.robot_side.lease import HUMANS, RANKS, Lease
+from sightline.robot_side.safety.lease import HUMANS, RANKS, Lease
 
 ROBOT, OTHER = "0000aaaa", "0000cccc"
 VISION, OTHER_VISION = Holder(source="vision", session="0000bbbb"), Holder(source="vision", session="0000cccc")

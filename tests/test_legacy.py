@@ -20,7 +20,7 @@ from sightline.protocol.legacy import (
     text_bound,
 )
 from sightline.protocol.refusals import RejectReason
-from sightline.protocol.twist_text import parse_twist
+from sightline.protocol.text import parse_twist
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 UNIT = st.floats(0, 1)

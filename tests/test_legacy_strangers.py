@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 import websocket
 
-from sightline.benchmarks.loop_pictures import camera_of, write_pictures
+from sightline.benchmarks.loop.pictures import camera_of, write_pictures
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.twist_text import parse_twist
+from sightline.protocol.text import parse_twist
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, driving, stop_after
 
@@ -155,7 +155,7 @@ def our_vision(folder: Path, endpoint: str):
     """`sightline vision` for a robot that says nothing of its camera."""
     lens = "\n".join(f"{name} = {json.dumps(value)}" for name, value in camera_of(640, 480).model_dump().items())
     (folder / "vision.toml").write_text(f'connect = ["{endpoint}"]\n[camera]\n{lens}\n')
-    command = ("-m", "sightline.operator_side.cli", "vision", "--config", folder / "vision.toml")
+    command = ("-m", "sightline.operator_side.cli.app", "vision", "--config", folder / "vision.toml")
     with running(*command) as process:
         yield process
 

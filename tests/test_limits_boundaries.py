@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from sightline.protocol.messages import STILL
-from sightline.robot_side.limits import (
+from sightline.robot_side.safety.limits import (
     MIN_TICK_US,
     STOP_DISTANCE_BOUND_M,
     STOP_TIME_BOUND_US,

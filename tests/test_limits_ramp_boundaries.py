@@ -5,7 +5,7 @@ import math
 import pytest
 
 from sightline.protocol.messages import STILL
-from sightline.robot_side.limits import (
+from sightline.robot_side.safety.limits import (
     AxisRamp,
     Ramp,
     SafetyConfig,

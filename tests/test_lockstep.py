@@ -2,11 +2,11 @@
 
 import pytest
 
-from sightline.operator_side.lockstep import Conditions, run_lockstep
-from sightline.operator_side.score import score
+from sightline.evaluation.lockstep import Conditions, run_lockstep
+from sightline.evaluation.score.figures import score
 from sightline.operator_side.score_bounds import checks_of
 from sightline.protocol.messages import State
-from sightline.sim.robot_model import load_robot
+from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
 
 ROBOT = load_robot("raspberry")

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 import pytest
 
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.log_lines import (
+from sightline.protocol.log import (
     LOG_FORMAT_VARIABLE,
     AsyncLineWriter,
     JsonLineStream,
@@ -59,7 +59,7 @@ def test_a_form_that_is_none_is_refused(monkeypatch):
 
 
 def test_a_service_says_its_errors_as_json_too():
-    command = [sys.executable, "-m", "sightline.operator_side.cli", "vision", "--connect", "nowhere", "--log", "json"]
+    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "vision", "--connect", "nowhere", "--log", "json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
     assert done.returncode == 2 and done.stdout == ""
     said = json.loads(done.stderr)

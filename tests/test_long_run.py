@@ -7,10 +7,10 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, State, Twist
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.protocol.twist_text import format_twist
+from sightline.protocol.text import format_twist
 from sightline.robot_side.config import PluginChoice, RobotConfig
-from sightline.robot_side.driving import DriverCore
-from sightline.robot_side.limits import STOP_TIME_BOUND_US, SafetyConfig
+from sightline.robot_side.driver.core import DriverCore
+from sightline.robot_side.safety.limits import STOP_TIME_BOUND_US, SafetyConfig
 from sightline.robot_side.ports import Picture, WheelAngles
 from sightline.robot_side.sending import NetworkCore
 

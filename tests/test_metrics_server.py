@@ -7,9 +7,9 @@ import urllib.request
 
 import pytest
 
-from sightline.operator_side import metrics_server
-from sightline.operator_side.bounded_threads import MAX_CONNECTIONS
-from sightline.operator_side.metrics_server import serving
+from sightline.operator_side.cockpit import metrics as metrics_server
+from sightline.operator_side.cockpit.http_server import MAX_CONNECTIONS
+from sightline.operator_side.cockpit.metrics import serving
 from tests.link_rigs import until
 
 

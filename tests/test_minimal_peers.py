@@ -11,9 +11,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from sightline.operator_side.requests import Operator
+from sightline.operator_side.client.requests import Operator
 from sightline.protocol.messages import State
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess
 
@@ -65,7 +65,7 @@ class Process:
 
 def vision(endpoint: str) -> Process:
     """`sightline vision`, as a person starts it."""
-    return Process("-m", "sightline.operator_side.cli", "vision", "--connect", endpoint)
+    return Process("-m", "sightline.operator_side.cli.app", "vision", "--connect", endpoint)
 
 
 def port_of(endpoint: str) -> str:

@@ -10,7 +10,7 @@ from sightline.protocol.messages import FrameHeader, Pose
 from tests.course_rig import Course, Drive, Row
 from tests.vision_rig import camera
 from sightline.vision_side.missions.body import Footprint
-from sightline.vision_side.missions.goto_baseline import GotoBaseline
+from sightline.evaluation.baselines.goto import GotoBaseline
 from sightline.vision_side.missions.port import Plan, RangeScan, View
 
 THYMIO = Footprint(front_m=0.08, rear_m=0.03, half_width_m=0.0635)

@@ -11,7 +11,7 @@ from sightline.protocol.messages import FrameHeader
 from tests.vision_rig import camera
 from sightline.vision_side.missions.body import Footprint, braking_mps, clear_of
 from sightline.vision_side.missions.giving_up import ProgressChecker, ProgressCheckerConfig
-from sightline.vision_side.missions.ground import CELL_M, Costmap, cells_of
+from sightline.vision_side.missions.planner import CELL_M, Costmap, cells_of
 from sightline.vision_side.missions.port import RangeScan, View
 from sightline.vision_side.missions.ranging import PoseMemory, about_robot, echoes, in_odometry
 from sightline.vision_side.missions.route import HORIZON_M, Planner
@@ -84,7 +84,7 @@ def test_a_wall_at_a_grazing_angle_is_not_given_up() -> None:
 
 
 def test_the_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sightline.vision_side.missions.ground.MAX_CELLS", 100)
+    monkeypatch.setattr("sightline.vision_side.missions.planner.MAX_CELLS", 100)
     ground = Costmap()
     for step in range(300):
         ground.see((step * CELL_M, 0.5), np.array([[step * CELL_M, 0.6]]))

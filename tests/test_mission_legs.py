@@ -13,9 +13,9 @@ from tests.vision_rig import camera
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.body import Footprint
 from sightline.vision_side.missions.legs import Legs, nearest_legs
-from sightline.vision_side.missions.legs_baseline import LegsBaseline
+from sightline.evaluation.baselines.legs import LegsBaseline
 from sightline.vision_side.missions.port import RangeScan, View
-from sightline.vision_side.track import from_odometry
+from sightline.vision_side.tracking.track import from_odometry
 
 LENS = camera()
 LEG_M = 0.055

@@ -12,7 +12,7 @@ from tests.course_rig import Course, Drive, Row
 from tests.lane_rig import BLOCK_M, LENS, LaneWorld
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.missions.body import Footprint
-from sightline.vision_side.missions.lamp import COLOURS, UNKNOWN, BoxLightReader, HousingLightReader, LampConfig
+from sightline.vision_side.missions.lights import COLOURS, UNKNOWN, BoxLightReader, HousingLightReader, LampConfig
 from sightline.vision_side.missions.lane import Lane, LaneConfig
 from sightline.vision_side.missions.port import View
 from sightline.vision_side.missions.stop_line import StopConfig, StopLine

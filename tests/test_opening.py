@@ -4,7 +4,7 @@ import pytest
 
 from sightline.protocol.channels import FRAME, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.transports.opening import LinkGroup, open_link
+from sightline.protocol.transports.open import LinkGroup, open_link
 from tests.link_rigs import free_endpoint, until
 
 

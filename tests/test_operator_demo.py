@@ -16,7 +16,7 @@ from sightline.protocol.errors import SightlineError
 
 pytestmark = pytest.mark.slow
 
-COMMAND = [sys.executable, "-m", "sightline.operator_side.cli", "demo"]
+COMMAND = [sys.executable, "-m", "sightline.operator_side.cli.app", "demo"]
 
 
 def running_in(folder: Path) -> list[str]:
@@ -61,7 +61,7 @@ def test_it_drives_and_says_so_to_a_script(driven):
 def test_the_twists_on_the_wire_come_again_from_the_recording(driven):
     folder, _ = driven
     script = (
-        "import sys; from pathlib import Path; from sightline.operator_side.replay import replay;"
+        "import sys; from pathlib import Path; from sightline.operator_side.recording.replay import replay;"
         "result = replay(Path(sys.argv[1])); print(result); sys.exit(0 if result.ok and result.total > 60 else 1)"
     )
     fresh = subprocess.run(

@@ -8,20 +8,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sightline.operator_side import recording
-from sightline.operator_side.lockstep import Conditions, Lockstep
-from sightline.operator_side.recording import CHUNK_BYTES, MAX_WAITING, Recorder, read_about, read_recording
-from sightline.operator_side.replay import VISION_CONFIG, replay, replay_steps
-from sightline.operator_side.scenario_settings import robot_config, vision_config
+from sightline.operator_side.recording import recorder as recording
+from sightline.evaluation.lockstep import Conditions, Lockstep
+from sightline.operator_side.recording.recorder import CHUNK_BYTES, MAX_WAITING, Recorder, read_about, read_recording
+from sightline.operator_side.recording.replay import VISION_CONFIG, replay, replay_steps
+from sightline.evaluation.scenario_config import robot_config, vision_config
 from sightline.protocol.channels import CAMERA, CHANNELS, FRAME, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import Stamp
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.sim.robot_model import load_robot
+from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
-from sightline.sim.world import World
+from sightline.sim.world.world import World
 
 MESSAGES = st.builds(
     lambda channel, header, payload: Message(channel, "vision" if channel.has_source else "", header, payload),

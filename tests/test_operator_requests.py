@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from sightline.operator_side.requests import Operator, read_report
-from sightline.operator_side.status_text import status_line, status_lines
+from sightline.operator_side.client.requests import Operator, read_report
+from sightline.operator_side.client.status import status_line, status_lines
 from sightline.protocol.channels import REQUEST, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError
@@ -14,7 +14,7 @@ from sightline.protocol.messages import AnswerHeader, Echo, Status, Verb
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.robot_side.config import PluginChoice, RobotConfig
-from sightline.robot_side.driving import DriverCore
+from sightline.robot_side.driver.core import DriverCore
 
 
 class PumpedRobot:

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 import pytest
 
 from sightline.protocol.channels import CHANNELS, DETECTIONS, MISSION
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess
 

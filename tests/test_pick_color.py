@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sightline.operator_side.pick_color import (
+from sightline.operator_side.calibrate.color import (
     MOST_MARKED,
     Box,
     check_trial,

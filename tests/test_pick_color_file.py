@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sightline.operator_side.cli import run
+from sightline.operator_side.cli.app import run
 from sightline.operator_side.film import Film
 from sightline.operator_side.pick_color_file import check_config, write_ranges
-from sightline.operator_side.pick_color_toml import ranges_toml, with_ranges
+from sightline.operator_side.calibrate.color_file import ranges_toml, with_ranges
 from sightline.operator_side.service_settings import load_service
 from sightline.protocol.errors import ConfigError
 from tests.test_pick_color import ball_picture

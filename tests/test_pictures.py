@@ -7,14 +7,14 @@ from contextlib import ExitStack
 import pytest
 
 from sightline.operator_side import pictures as pictures_module
-from sightline.operator_side import reel as reel_module
+from sightline.operator_side.cockpit import frame_buffer as reel_module
 from sightline.operator_side.pictures import Pictures, viewer_role
-from sightline.operator_side.reel import FrameBuffer, fill
+from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
 from sightline.protocol.channels import ACK, FRAME, OVERLAY, STATUS
 from sightline.protocol.codec import decode, encode
-from sightline.protocol.golden_case import jpeg
+from sightline.protocol.spec.message_cases import jpeg
 from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader, Stamp
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 from tests.link_rigs import free_endpoint, until
 
 PATIENCE_S = 0.3

@@ -4,14 +4,15 @@ import time
 
 import pytest
 
-from sightline.operator_side import cli, keys
-from sightline.operator_side.around_text import as_object, lines
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side.setup import keys
+from sightline.operator_side.client.discovery import as_object, lines
 from sightline.protocol.channels import STATUS
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.messages import Stamp, State, Status
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.presence import (
+from sightline.protocol.transports.zenoh.presence import (
     MAX_PEERS,
     PeerInfo,
     Presence,
@@ -20,9 +21,9 @@ from sightline.protocol.transports.presence import (
     presence_key,
     robot_with_same_id,
 )
-from sightline.protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
-from sightline.protocol.transports.zenoh import open_zenoh
-from sightline.protocol.transports.zenoh_around import discover, peers_at
+from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.transports.zenoh.discovery import discover, peers_at
 from sightline.protocol.transports.zenoh_session import open_session
 from sightline.protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint
@@ -192,7 +193,7 @@ def test_when_secured_nobody_is_believed_to_be_a_robot_by_another_certificate(tm
     folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
     keys.make(folder, [])
     with open_zenoh("r2", listen=[endpoint], role="robot", secure=str(folder)):
-        from sightline.protocol.transports.secured import load_role_keys
+        from sightline.protocol.transports.security import load_role_keys
 
         rogue = open_session((), [endpoint], 5.0, load_role_keys(str(folder), "viewer"))
         try:

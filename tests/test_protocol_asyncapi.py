@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from sightline.protocol import schema
+from sightline.protocol.spec import generate as schema
 from sightline.protocol.channels import CHANNELS, Direction
 
-DOCUMENT = json.loads((Path(schema.__file__).parent / "asyncapi.json").read_text("utf-8"))
+DOCUMENT = json.loads((Path(schema.__file__).parent.parent / "asyncapi.json").read_text("utf-8"))
 ALLOWED = {
     "root": {"asyncapi", "id", "info", "servers", "defaultContentType", "channels", "operations", "components"},
     "server": {"host", "protocol", "protocolVersion", "pathname", "description", "title", "summary", "variables",

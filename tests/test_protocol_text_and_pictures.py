@@ -11,11 +11,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sightline.protocol.errors import WireError
-from sightline.protocol.golden_case import jpeg, segments
+from sightline.protocol.spec.message_cases import jpeg, segments
 from sightline.protocol.jpeg import MAX_SEGMENTS, JpegSize, read_jpeg_size
 from sightline.protocol.messages import Twist
 from sightline.protocol.refusals import RejectReason
-from sightline.protocol.twist_text import MAX_TWIST_BYTES, format_twist, parse_twist
+from sightline.protocol.text import MAX_TWIST_BYTES, format_twist, parse_twist
 
 ABNF_NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
 GRAMMAR = re.compile(rf"{ABNF_NUMBER}\|{ABNF_NUMBER}", re.ASCII)

@@ -9,17 +9,17 @@ from pathlib import Path
 import pytest
 from pydantic import TypeAdapter
 
-from sightline.protocol import golden, schema
+from sightline.protocol.spec import golden, generate as schema
 from sightline.protocol.channels import CHANNELS
-from sightline.protocol.field_words import doc_of, unit_of
-from sightline.protocol.golden_case import MessageCase
+from sightline.protocol.spec.field_docs import doc_of, unit_of
+from sightline.protocol.spec.message_cases import MessageCase
 from sightline.protocol.golden_cases import CASES
-from sightline.protocol.golden_wires import FRAMING_CASES, READERS
+from sightline.protocol.spec.framing_cases import FRAMING_CASES, READERS
 from sightline.protocol.refusals import RejectReason
-from sightline.protocol.twist_text import MAX_TWIST_BYTES
+from sightline.protocol.text import MAX_TWIST_BYTES
 
-VECTORS = Path(schema.__file__).parent / "vectors"
-README = (Path(schema.__file__).parent / "README.md").read_text("utf-8")
+VECTORS = Path(schema.__file__).parent.parent / "vectors"
+README = (Path(schema.__file__).parent.parent / "README.md").read_text("utf-8")
 
 
 @pytest.mark.parametrize("path", sorted(VECTORS.rglob("*.json")), ids=lambda path: f"{path.parent.name}/{path.stem}")
@@ -86,7 +86,7 @@ def test_every_field_has_a_meaning_and_what_has_a_unit_says_it():
     models = schema.json_schema()["$defs"].items()
     named = [(name, field) for name, model in models for field in model.get("properties", ())]
     assert len(named) > 80
-    assert [field for field in named if not doc_of(*field)] == [], "add them to protocol/field_words.py"
+    assert [field for field in named if not doc_of(*field)] == [], "add them to protocol/spec/field_docs.py"
     assert [unit_of(field) for field in ("t_us", "angular_rad_s", "pitch_rad", "x_m")] == ["µs", "rad/s", "rad", "m"]
     assert unit_of("seq") == unit_of("session") == ""
 

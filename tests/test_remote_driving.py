@@ -50,7 +50,7 @@ def _driving(tmp_path, detector, *options, beside=None):
     robot = RobotProcess(tmp_path)
     (tmp_path / "pictures" / "0.jpg").write_bytes(FAR_BALL)
     log = tmp_path / "vision.log"
-    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli", "vision", "--connect", robot.endpoint, "--detector",
+    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli.app", "vision", "--connect", robot.endpoint, "--detector",
                detector, "--set", "boxes.height_m=0.2", *options]
     with robot, log.open("wb") as out:
         assert until(lambda: "on" in robot.output(), 10)

@@ -12,7 +12,7 @@ from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.zenoh_site import MAX_ROBOTS as MOST_AT_A_SITE
 from tests.remote_rig import frame, within
 from tests.test_remote_deadline import FakeRemote, Held, _who
-from sightline.vision_side.detect.by_session import MAX_ROBOTS, PerSession
+from sightline.vision_side.detect.per_robot import MAX_ROBOTS, PerSession
 from sightline.vision_side.detect.port import Maker, result_of
 from sightline.vision_side.detect.remote.fallback import GOOD_ANSWERS, Fallback
 from sightline.vision_side.detect.remote.zenoh_detector import ROLE, ZenohDetector

@@ -11,9 +11,9 @@ import pytest
 from sightline.protocol.errors import ConfigError
 from tests.link_rigs import until
 from tests.remote_rig import BALL_JPEG, GREY_JPEG, Server, box, frame, http_reply, said, within
-from sightline.vision_side.detect.remote.address import parse_address
+from sightline.vision_side.detect.remote.client import parse_address
 from sightline.vision_side.detect.remote.asking import ServerDetector
-from sightline.vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES, RETRY_US
+from sightline.vision_side.detect.remote.http_client import MAX_ANSWER_BYTES, RETRY_US
 from sightline.vision_side.detect.remote.http_jpeg import HttpJpeg, JpegServer
 
 GOOD = http_reply(said(box()))

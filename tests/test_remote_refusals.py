@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.remote_rig import COLUMNS, JPEG_INPUT, OUTPUTS, Server, frame, http_reply, within
-from sightline.vision_side.detect.remote.address import parse_address
+from sightline.vision_side.detect.remote.client import parse_address
 from sightline.vision_side.detect.remote.asking import ServerDetector
 from sightline.vision_side.detect.remote.oip import Inferred, OutputOptions, detections_of
 from sightline.vision_side.detect.remote.oip_http import HttpServer

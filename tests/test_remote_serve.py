@@ -8,9 +8,9 @@ import time
 import pytest
 
 from sightline.benchmarks.detector_streams import DEADLINE_MS, measure_streams
-from sightline.operator_side import cli
+from sightline.operator_side.cli import app as cli
 from sightline.operator_side.processes import Processes
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.link_rigs import free_endpoint, until
 from tests.remote_rig import within
 from tests.test_remote_zenoh import Robot
@@ -52,7 +52,7 @@ def test_a_process_that_serves_is_found_answers_and_ends_when_it_is_told_to(tmp_
 
 def test_it_ends_within_a_second_of_a_signal(tmp_path):
     endpoint = free_endpoint()
-    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli", "detector", "--serve", "hsv", "--listen", endpoint]
+    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli.app", "detector", "--serve", "hsv", "--listen", endpoint]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert "for robots" in process.stdout.readline()

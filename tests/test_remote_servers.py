@@ -20,9 +20,9 @@ from tests.remote_rig import (
     within,
 )
 from sightline.vision_side.config import DetectorConfig, HsvConfig, VisionConfig
-from sightline.vision_side.detect.choice import build_detector
+from sightline.vision_side.detect.registry import build_detector
 from sightline.vision_side.detect.contract import check_detector
-from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.remote.fallback import Fallback
 
 ROOT = Path(__file__).parent.parent

@@ -11,8 +11,8 @@ from sightline.protocol.messages import Detections, FrameHeader
 from sightline.protocol.transports.memory import MemoryNetwork
 from tests.remote_rig import BALL_JPEG
 from sightline.vision_side.config import HsvConfig
-from sightline.vision_side.detect.label_filter import LabelFilter
-from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.filters import LabelFilter
+from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.port import Circle, Detection, Maker, result_of
 from sightline.vision_side.detector_service import DetectorService, ServingOptions
 

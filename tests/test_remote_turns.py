@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from sightline.vision_side.detector_turns import FairQueue
+from sightline.vision_side.serving.detector_service import FairQueue
 
 DEADLINE_US = 100_000
 

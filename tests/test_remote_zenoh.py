@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sightline.operator_side.around_text import as_object, lines
+from sightline.operator_side.client.discovery import as_object, lines
 from sightline.protocol.channels import DETECTIONS, FRAME, STATUS
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import (
@@ -22,15 +22,15 @@ from sightline.protocol.messages import (
     State,
     Status,
 )
-from sightline.protocol.transports.zenoh import open_zenoh
-from sightline.protocol.transports.zenoh_around import peers_at
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.transports.zenoh.discovery import peers_at
 from sightline.protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 from tests.remote_rig import BALL_JPEG, GREY_JPEG, frame, within
 from tests.vision_rig import jpeg_of
 from sightline.vision_side.config import DetectorConfig, HsvConfig
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.local import Hsv
+from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.port import DetectFrame
 from sightline.vision_side.detect.remote.zenoh_detector import ZenohDetector
 from sightline.vision_side.detector_service import ROLE, DetectorService, ServingOptions

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from sightline.operator_side import keys
+from sightline.operator_side.setup import keys
 from sightline.protocol.channels import FRAME, TWIST
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.link_rigs import free_endpoint, until
 
 pytestmark = pytest.mark.slow
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 @contextmanager
 def _router(*arguments):
-    command = [sys.executable, "-m", "sightline.operator_side.cli", "router", *arguments]
+    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "router", *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             yield process

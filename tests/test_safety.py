@@ -5,11 +5,11 @@ import pytest
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import STILL, Echo, Request, RequestHeader, State, Twist, Verb
 from sightline.protocol.refusals import RejectReason
-from sightline.robot_side.limits import (
+from sightline.robot_side.safety.limits import (
     SafetyConfig,
     age_factor,
 )
-from sightline.robot_side.states import is_armed
+from sightline.robot_side.safety.states import is_armed
 from tests.safety_rig import HUMAN, MS, OTHER, ROBOT, VISION, Rig
 
 

@@ -7,9 +7,9 @@ import pytest
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import STILL, Echo, LastRejection, State, Twist, Verb
 from sightline.protocol.refusals import RejectReason
-from sightline.robot_side.limits import SafetyConfig
-from sightline.robot_side.safety import Decision, SafetyGate
-from sightline.robot_side.states import TRANSITIONS, Event, is_armed, next_state
+from sightline.robot_side.safety.limits import SafetyConfig
+from sightline.robot_side.safety.gate import Decision, SafetyGate
+from sightline.robot_side.safety.states import TRANSITIONS, Event, is_armed, next_state
 from tests.gate_rig import GUEST, VISION_HOLDER, A, D, F, G, H, S, driving, guest, guest_driving
 from tests.safety_rig import HUMAN, OTHER, ROBOT, VISION, Rig
 

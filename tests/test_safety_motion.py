@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import STILL, State, Twist, Verb
 from sightline.protocol.refusals import RejectReason
-from sightline.robot_side.limits import (
+from sightline.robot_side.safety.limits import (
     STOP_DISTANCE_BOUND_M,
     STOP_TIME_BOUND_US,
     Ramp,
@@ -17,7 +17,7 @@ from sightline.robot_side.limits import (
     clamp_twist,
     stop_bound,
 )
-from sightline.robot_side.states import TRANSITIONS, Event, is_armed, next_state
+from sightline.robot_side.safety.states import TRANSITIONS, Event, is_armed, next_state
 from tests.safety_rig import HUMAN, MS, VISION, Rig
 
 

@@ -4,11 +4,11 @@ import re
 from pathlib import Path
 
 from sightline.protocol.messages import State
-from sightline.robot_side.limits import SafetyConfig
-from sightline.robot_side.states import TRANSITIONS, Event
+from sightline.robot_side.safety.limits import SafetyConfig
+from sightline.robot_side.safety.states import TRANSITIONS, Event
 
 PAGE = Path(__file__).parent.parent / "docs" / "safety.md"
-MARKS = re.compile(r"(<!-- generated from robot_side/states.py[^\n]*-->\n).*?(<!-- /generated -->)", re.DOTALL)
+MARKS = re.compile(r"(<!-- generated from robot_side/safety/states.py[^\n]*-->\n).*?(<!-- /generated -->)", re.DOTALL)
 
 
 def table() -> str:

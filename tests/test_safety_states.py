@@ -7,8 +7,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import STILL, State, Verb
 from sightline.protocol.refusals import RejectReason
-from sightline.robot_side import safety
-from sightline.robot_side.states import TRANSITIONS
+from sightline.robot_side.safety import gate as safety
+from sightline.robot_side.safety.states import TRANSITIONS
 from tests.safety_rig import HUMAN, MS, OTHER, VISION, Rig
 
 RANK = {"guest": 0, "vision": 1, "teleop": 2}

@@ -7,10 +7,10 @@ import pytest
 
 from sightline.protocol.messages import STILL, Verb
 from sightline.protocol.refusals import RejectReason
-from sightline.robot_side.guard import GuardConfig, RangeGuard
-from sightline.robot_side.limits import AxisRamp
+from sightline.robot_side.safety.guard import GuardConfig, RangeGuard
+from sightline.robot_side.safety.limits import AxisRamp
 from sightline.robot_side.ports import Ranges
-from sightline.robot_side.safety import Decision
+from sightline.robot_side.safety.gate import Decision
 from tests.gate_rig import (
     A,
     D,

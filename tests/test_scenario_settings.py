@@ -2,16 +2,16 @@
 
 import pytest
 
-from sightline.operator_side import cli
-from sightline.operator_side.scenario_settings import robot_config, robot_of, vision_config, vision_table
+from sightline.operator_side.cli import app as cli
+from sightline.evaluation.scenario_config import robot_config, robot_of, vision_config, vision_table
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.limits import stop_bound
+from sightline.robot_side.safety.limits import stop_bound
 from sightline.sim.body import outline
-from sightline.sim.robot_model import load_robot, robot_names
+from sightline.sim.robot import load_robot, robot_names
 from sightline.sim.scenario import load_scenario, scenario_names
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.missions.choice import configured_mission
+from sightline.vision_side.missions.registry import configured_mission
 
 
 @pytest.mark.parametrize("name", scenario_names())

@@ -5,8 +5,8 @@ from statistics import fmean
 
 import pytest
 
-from sightline.operator_side.lockstep import Conditions, Run, run_lockstep
-from sightline.operator_side.scenario_settings import robot_of
+from sightline.evaluation.lockstep import Conditions, Run, run_lockstep
+from sightline.evaluation.scenario_config import robot_of
 from sightline.operator_side.score_course import STEP_S
 from sightline.protocol.messages import State
 from sightline.sim.scenario import load_scenario, scenario_names

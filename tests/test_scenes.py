@@ -10,13 +10,13 @@ pytest.importorskip("pybullet")
 
 import simplejpeg
 
-from sightline.sim import scene_backdrop
+from sightline.sim.scenes import render as scene_backdrop
 from sightline.sim.scene_defects import as_seen, streak, with_defects
-from sightline.sim.scene_plan import plan_scene
+from sightline.sim.scenes.plan import plan_scene
 from sightline.sim.scene_render import SceneRenderer
-from sightline.sim.scene_texture_parts import SIDE
+from sightline.sim.scenes.textures import SIDE
 from sightline.sim.scene_textures import FAMILIES, JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED, texture
-from sightline.sim.scenes import (
+from sightline.sim.scenes.model import (
     BALL_PX,
     COLUMNS,
     HARDER_FROM,
@@ -33,7 +33,7 @@ from sightline.sim.scenes import (
     Lens,
     trained_column,
 )
-from sightline.sim.scenes import TRAINED as TRAINED_COLUMN
+from sightline.sim.scenes.model import TRAINED as TRAINED_COLUMN
 from tests import judged_scenes
 
 ALL = [*COLUMNS.values(), THINGS, TRAINED_COLUMN]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from sightline.operator_side.score import median_and_worst, score
+from sightline.evaluation.score.figures import median_and_worst, score
 from sightline.operator_side.score_bounds import BOUNDS, UNITS, checks_of
 from sightline.operator_side.score_course import figures_of, goal_figures, legs_figures, light_figures
 from sightline.sim.scenario import load_scenario, scenario_names

@@ -10,15 +10,16 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from sightline.operator_side import cli, cli_score_detectors
-from sightline.operator_side import score_scenes as score_scenes_file
-from sightline.operator_side.score_detectors import Figures
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side import cli_score_detectors
+from sightline.evaluation.score import detector_report as score_scenes_file
+from sightline.evaluation.score.detectors import Figures
 from sightline.operator_side.score_detectors_bounds import LEAST_HITS, all_detector_checks, detector_checks
 from sightline.operator_side.score_detectors_text import check_lines
-from sightline.operator_side.score_scenes import LABELLED, Report, close_subjects, score_scenes, subjects
+from sightline.evaluation.score.detector_report import LABELLED, Report, close_subjects, score_scenes, subjects
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError
-from sightline.sim.scenes import COLUMNS
+from sightline.sim.scenes.model import COLUMNS
 from tests.remote_rig import frame
 from sightline.vision_side.detect.port import Detection, Maker, result_of
 

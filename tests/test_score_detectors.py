@@ -10,14 +10,15 @@ pytest.importorskip("pybullet")
 
 import cv2
 
-from sightline.operator_side import cli, cli_score_detectors
-from sightline.operator_side.score_detectors import FrameResult, LabelMatches, figures, frame_result, precisions
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side import cli_score_detectors
+from sightline.evaluation.score.detectors import FrameResult, LabelMatches, figures, frame_result, precisions
 from sightline.operator_side.score_detectors_text import markdown, text
-from sightline.operator_side.score_scenes import score_scenes, subjects
+from sightline.evaluation.score.detector_report import score_scenes, subjects
 from sightline.operator_side.score_sheet import Sheet
-from sightline.operator_side.train_choice import ball_threshold, label_threshold
-from sightline.sim.scene_plan import plan_scene
-from sightline.sim.scenes import COLUMNS, JUDGED_FROM, LabelledBox, Scene
+from sightline.training.shipping import ball_threshold, label_threshold
+from sightline.sim.scenes.plan import plan_scene
+from sightline.sim.scenes.model import COLUMNS, JUDGED_FROM, LabelledBox, Scene
 from sightline.vision_side.detect.overlap import overlap
 from sightline.vision_side.detect.port import Circle, Detection
 

@@ -8,8 +8,8 @@ import threading
 
 import pytest
 
-from sightline.protocol.log_lines import JsonLineStream
-from sightline.robot_side.latch import StopLatch
+from sightline.protocol.log import JsonLineStream
+from sightline.robot_side.driver.persistence import StopLatch
 from sightline.robot_side.scribe import BackgroundWriter
 from tests.link_rigs import until
 

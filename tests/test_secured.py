@@ -7,7 +7,7 @@ from itertools import product
 
 import pytest
 
-from sightline.operator_side import keys
+from sightline.operator_side.setup import keys
 from sightline.protocol.channels import (
     ACK,
     CHANNELS,
@@ -21,7 +21,7 @@ from sightline.protocol.channels import (
     Direction,
 )
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.transports.secured import (
+from sightline.protocol.transports.security import (
     ROLES,
     SOURCES_OF_ROLE,
     certificate_role,
@@ -30,8 +30,8 @@ from sightline.protocol.transports.secured import (
     may_subscribe,
 )
 from sightline.protocol.transports.websocket_keys import read_tokens
-from sightline.protocol.transports.zenoh import open_zenoh
-from sightline.protocol.transports.zenoh_around import list_robots
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.transports.zenoh.discovery import list_robots
 from sightline.protocol.transports.zenoh_session import MAX_MESSAGE_BYTES, open_session
 from tests.link_rigs import free_endpoint, until
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from sightline.operator_side import keys
+from sightline.operator_side.setup import keys
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader
 from sightline.protocol.transports.denied import WHY
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess, Vision, driving
 
@@ -32,7 +32,7 @@ def robot(tmp_path):
 
 
 def _sightline(*arguments):
-    command = [sys.executable, "-m", "sightline.operator_side.cli", *arguments]
+    command = [sys.executable, "-m", "sightline.operator_side.cli.app", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
 
 

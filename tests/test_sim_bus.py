@@ -19,7 +19,7 @@ from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.robot_side.ports import Camera, Drive, RangeSensor
 from sightline.sim.bus import MOTION, MOTION_SET, SimCamera, SimDrive, SimRange, TruthReader
-from sightline.sim.robot_model import load_robot
+from sightline.sim.robot import load_robot
 from sightline.sim.service import SimConfig, run
 from sightline.sim.sockets import SocketFolder
 

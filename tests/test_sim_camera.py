@@ -12,7 +12,7 @@ import simplejpeg
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.sim.look import look_named
 from sightline.sim.scenario import Wall, load_scenario
-from sightline.sim.world import World
+from sightline.sim.world.world import World
 from tests.sim_rig import robot_with, seen_at
 
 BALL_RADIUS_M = 0.10

@@ -10,7 +10,7 @@ pytest.importorskip("pybullet")
 import numpy as np
 import simplejpeg
 
-from sightline.operator_side.labels import Labels, boxes_message
+from sightline.evaluation.labels import Labels, boxes_message
 from sightline.operator_side.labels_service import LabelPublisher
 from sightline.protocol.channels import DETECTIONS, FRAME
 from sightline.protocol.codec import decode, encode
@@ -19,7 +19,7 @@ from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.sim.bus import SimCamera, TruthReader
 from sightline.sim.label_bus import Label, LabelReader, to_json
 from sightline.sim.scenario import Wall, load_scenario
-from sightline.sim.world import World
+from sightline.sim.world.world import World
 from tests.sim_rig import robot_with, seen_at
 from tests.test_sim_bus import eventually, started
 from sightline.vision_side.config import BoxesConfig

@@ -9,13 +9,13 @@ pytest.importorskip("pybullet")
 import numpy as np
 import simplejpeg
 
-from sightline.operator_side.scenario_settings import robot_config
+from sightline.evaluation.scenario_config import robot_config
 from sightline.protocol.messages import Twist
-from sightline.robot_side.guard import RangeGuard
+from sightline.robot_side.safety.guard import RangeGuard
 from sightline.robot_side.kinematics import Odometer, wheel_speeds
-from sightline.sim.robot_model import load_robot, robot_names
+from sightline.sim.robot import load_robot, robot_names
 from sightline.sim.scenario import Start, Wall, load_scenario
-from sightline.sim.world import World
+from sightline.sim.world.world import World
 from tests.sim_rig import empty
 
 ROBOTS = [name for name in robot_names() if name != "chaser-small"]  # it differs in nothing that these tests look at

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sightline.protocol.errors import ConfigError
-from sightline.sim.cadence import PeriodicTimer
+from sightline.sim.process import PeriodicTimer
 from sightline.sim.look import look_named
 from sightline.sim.motors import Motor
 from sightline.sim.path import ClosedPath, Leg, Place
-from sightline.sim.robot_model import load_robot, robot_names
+from sightline.sim.robot import load_robot, robot_names
 from sightline.sim.scenario import OnPath, load_scenario, scenario_names
 
 STEP_S = 0.004

@@ -14,13 +14,13 @@ import simplejpeg
 
 from sightline.protocol.errors import ConfigError
 from sightline.sim.light import LIT, Light, Phase, color_of
-from sightline.sim.robot_model import load_robot
+from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
-from sightline.sim.start import goals_seen
+from sightline.sim.world.start import goals_seen
 from sightline.sim.target import PathMover
 from sightline.sim.things import Legs
 from sightline.sim.toml_file import laid_over
-from sightline.sim.world import World
+from sightline.sim.world.world import World
 from tests.sim_rig import robot_with
 
 # --- legs --------------------------------------------------------------------------------------------------------

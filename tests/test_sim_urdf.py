@@ -8,7 +8,7 @@ import pytest
 
 from sightline.protocol.errors import ConfigError
 from sightline.sim.body import outline, urdf_body, urdf_from_model
-from sightline.sim.robot_model import ROBOTS, load_robot, robot_names
+from sightline.sim.robot import ROBOTS, load_robot, robot_names
 from sightline.sim.urdf import Urdf
 
 WHEELS = ("left_wheel_joint", "right_wheel_joint")

@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from sightline.sim.robot_model import load_robot
+from sightline.sim.robot import load_robot
 from sightline.sim.scenario import Start, Wall, load_scenario, scenario_names
-from sightline.sim.world import STEP_US, World
+from sightline.sim.world.world import STEP_US, World
 from tests.sim_rig import RADIUS_M, TRACK_M, DeadReckoning, empty, robot_with, seen_at
 
 

@@ -10,7 +10,7 @@ from sightline.protocol.channels import REQUEST, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import Request, RequestHeader, Verb
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.robot_side.child import DriverEnd
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.held import MAX_PENDING, PendingRequests

@@ -6,7 +6,7 @@ import random
 import pytest
 
 from sightline.protocol.messages import Holder
-from sightline.robot_side.stream import Stream, StreamConfig
+from sightline.robot_side.network.stream import Stream, StreamConfig
 
 VISION, VIEWER = Holder(source="vision", session="0000bbbb"), Holder(source="viewer", session="0000cccc")
 FRAME_US = 33_333

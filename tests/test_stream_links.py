@@ -3,8 +3,8 @@
 import pytest
 
 from sightline.protocol.messages import Holder
-from sightline.robot_side.encoding import LEAST_QUALITY_PERCENT, SCALES_PERCENT
-from sightline.robot_side.stream import Stream, StreamConfig
+from sightline.robot_side.network.bitrate_control import LEAST_QUALITY_PERCENT, SCALES_PERCENT
+from sightline.robot_side.network.stream import Stream, StreamConfig
 from tests.stream_rig import VISION, Camera, Leg, run
 
 SEEDS = [1, 2, 3, 4, 5]

@@ -6,7 +6,7 @@ import socket
 from pathlib import Path
 
 from sightline.robot_side.config import PluginChoice, RobotConfig
-from sightline.robot_side.driver import zero_motors
+from sightline.robot_side.driver.process import zero_motors
 from sightline.robot_side.supervision import SystemdNotifier
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess

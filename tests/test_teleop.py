@@ -2,7 +2,7 @@
 
 import pytest
 
-from sightline.operator_side.teleop import Mode
+from sightline.operator_side.teleop.control import Mode
 from sightline.operator_side.teleop_keys import MOVES
 from sightline.protocol.messages import STILL, State, Twist, Verb
 from tests.teleop_rig import PERSON, VISION, TeleopRig, vision_drives

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from sightline.operator_side.teleop_evdev import Gamepad
-from sightline.operator_side.teleop_pad import (
+from sightline.operator_side.teleop.gamepad import (
     ABS_X,
     ABS_Y,
     BTN_EAST,

@@ -5,7 +5,17 @@ import itertools
 import pytest
 
 from sightline.operator_side.teleop_keys import LONGEST_HOLD_US, MOVES, Hold, split_keys
-from sightline.operator_side.teleop_pad import ABS_RX, ABS_X, ABS_Y, BTN_EAST, BTN_SOUTH, BTN_TL, BTN_TR, Pad, PadKey
+from sightline.operator_side.teleop.gamepad import (
+    ABS_RX,
+    ABS_X,
+    ABS_Y,
+    BTN_EAST,
+    BTN_SOUTH,
+    BTN_TL,
+    BTN_TR,
+    Pad,
+    PadKey,
+)
 from sightline.operator_side.teleop_speed import Speeds, SpeedUp
 from sightline.protocol.messages import STILL, State, Status, Twist
 

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from sightline.operator_side import cli
+from sightline.operator_side.cli import app as cli
 from sightline.protocol.messages import State
 from sightline.protocol.transports.zenoh_session import open_session
 from tests.link_rigs import free_endpoint, until

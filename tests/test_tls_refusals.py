@@ -7,11 +7,11 @@ import sys
 
 import pytest
 
-from sightline.protocol.log_lines import RepeatLimiter
+from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports import tcp_table
 from sightline.protocol.transports.denied import Certificates
 from sightline.protocol.transports.tcp_table import Visitors
-from sightline.protocol.transports.tls_refusals import refusal_cause
+from sightline.protocol.transports.zenoh.access_log import refusal_cause
 from tests.link_rigs import free_endpoint, until
 
 SECOND_US = 1_000_000
@@ -162,12 +162,12 @@ def test_who_comes_and_goes_is_named_and_who_stays_is_not():
 @pytest.mark.slow
 @pytest.mark.parametrize("log", ["text", "json"])
 def test_a_router_names_who_it_refuses_among_its_own_lines(tmp_path, log):
-    from sightline.operator_side import keys
+    from sightline.operator_side.setup import keys
 
     keys.make(tmp_path / "k", [])
     endpoint = free_endpoint().replace("tcp/", "tls/")
     port = int(endpoint.rpartition(":")[2])
-    command = [sys.executable, "-m", "sightline.operator_side.cli", "router", "--listen", endpoint, "--secure",
+    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "router", "--listen", endpoint, "--secure",
                str(tmp_path / "k"), "--log", log]
     out = (tmp_path / "out").open("w+")
     with subprocess.Popen(command, stdout=out, stderr=out) as router:

@@ -10,13 +10,13 @@ pytest.importorskip("pybullet")
 
 import cv2
 
-from sightline.operator_side import cli
-from sightline.operator_side.train_network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
-from sightline.operator_side.train_rounds import SceneRange
+from sightline.operator_side.cli import app as cli
+from sightline.training.network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
+from sightline.training.schedule import SceneRange
 from sightline.operator_side.train_samples import CUT_PX, WHOLE_PX, sample
-from sightline.operator_side.train_scenes import DrawnScenes, drawn_scenes
+from sightline.training.scenes import DrawnScenes, drawn_scenes
 from sightline.protocol.errors import ConfigError
-from sightline.sim.scenes import HEIGHT_PX, LABELS, WIDTH_PX, LabelledBox
+from sightline.sim.scenes.model import HEIGHT_PX, LABELS, WIDTH_PX, LabelledBox
 from tests.train_rig import weights
 
 BALL = LabelledBox("ball", (100.0, 60.0, 141.0, 99.0), 1.0)
@@ -208,7 +208,7 @@ class TestGraph:
     @classmethod
     def made(cls, tmp_path_factory):
         pytest.importorskip("onnx")
-        from sightline.operator_side.train_export import onnx_bytes
+        from sightline.training.export import onnx_bytes
 
         path = tmp_path_factory.mktemp("model") / "random.onnx"
         path.write_bytes(onnx_bytes(weights(), {"min_score": "0.5"}))
@@ -265,7 +265,7 @@ class TestGraph:
             assert np.isfinite(boxes).all() and np.isfinite(scores).all()
 
     def test_a_threshold_becomes_one_half(self, made, tmp_path):
-        from sightline.operator_side.train_export import onnx_bytes, shifted
+        from sightline.training.export import onnx_bytes, shifted
 
         _, before, labels = self.outputs(made, self.picture())
         thresholds = [0.2] * len(LABELS)

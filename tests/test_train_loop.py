@@ -13,18 +13,20 @@ import cv2
 import onnx
 import torch
 
-from sightline.operator_side import cli, train_export, train_run
-from sightline.operator_side.train_export import onnx_bytes, weights_in
+from sightline.operator_side.cli import app as cli
+from sightline.training import export as train_export
+from sightline.operator_side import train_run
+from sightline.training.export import onnx_bytes, weights_in
 from sightline.operator_side.train_loop import train
-from sightline.operator_side.train_module import Network, begin_from, folded
-from sightline.operator_side.train_network import AGAINST, OUTPUTS, Layer, network
-from sightline.operator_side.train_rounds import Training
+from sightline.training.loop import Network, begin_from, folded
+from sightline.training.network import AGAINST, OUTPUTS, Layer, network
+from sightline.training.schedule import Training
 from sightline.operator_side.train_samples import CUT_PX
-from sightline.operator_side.train_scenes import DrawnScenes
+from sightline.training.scenes import DrawnScenes
 from sightline.protocol.errors import ConfigError, HardwareError
-from sightline.sim.scenes import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED_FROM, WIDTH_PX, LabelledBox
+from sightline.sim.scenes.model import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED_FROM, WIDTH_PX, LabelledBox
 from tests.train_rig import weights
-from sightline.vision_side.detect.onnx_detector import SHIPPED
+from sightline.vision_side.detect.onnx.detector import SHIPPED
 
 
 def scenes(count=4):

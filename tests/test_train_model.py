@@ -9,10 +9,10 @@ pytest.importorskip("pybullet")
 
 from sightline.operator_side import cli_train
 from sightline.operator_side.score_detectors_bounds import MOST_WRONG
-from sightline.operator_side.score_scenes import score_scenes, subjects
-from sightline.sim.scenes import COLUMNS, JUDGED_FROM, LABELS, WIDTH_PX
-from sightline.vision_side.detect.onnx_detector import SHIPPED
-from sightline.vision_side.detect.onnx_header import read_onnx_header
+from sightline.evaluation.score.detector_report import score_scenes, subjects
+from sightline.sim.scenes.model import COLUMNS, JUDGED_FROM, LABELS, WIDTH_PX
+from sightline.vision_side.detect.onnx.detector import SHIPPED
+from sightline.vision_side.detect.onnx.engine import read_onnx_header
 
 CARD = SHIPPED.with_suffix(".md").read_text("utf-8")
 SEED = JUDGED_FROM + 40_000  # other scenes than those of the card

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sightline.operator_side.train_rounds import LEAST_SHARE, WHOLE_FROM, SceneRange, Training
+from sightline.training.schedule import LEAST_SHARE, WHOLE_FROM, SceneRange, Training
 
 
 @pytest.mark.parametrize("rounds", [(1000,), (1000, 600), (300, 1000, 500), (300, 400, 500, 600, 700)])

@@ -10,14 +10,14 @@ pytest.importorskip("pybullet")
 pytest.importorskip("onnx")
 
 from sightline.operator_side.train_card import Card, card_text
-from sightline.operator_side.train_export import shifted
-from sightline.operator_side.train_rounds import Training
+from sightline.training.export import shifted
+from sightline.training.schedule import Training
 from sightline.operator_side.train_shipping import chosen_thresholds, final_report, written
-from sightline.sim.scenes import COLUMNS, LABELS
+from sightline.sim.scenes.model import COLUMNS, LABELS
 from tests.train_rig import weights
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.choice import build_detector
-from sightline.vision_side.detect.onnx_header import read_onnx_header
+from sightline.vision_side.detect.registry import build_detector
+from sightline.vision_side.detect.onnx.engine import read_onnx_header
 
 
 @contextmanager

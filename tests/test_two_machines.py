@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from sightline.operator_side.faults.wires import BenchWire
-from sightline.sim.wire import LinkShape, LinkShapes
-from sightline.sim.wire_tun import ADDRESS_A, ADDRESS_B, why_impossible
+from sightline.sim.network_emulator import LinkShape, LinkShapes
+from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B, why_impossible
 from tests.link_rigs import until
 
 pytestmark = [
@@ -61,7 +61,7 @@ class Machines:
         return self._once(self._command(machine, arguments))
 
     def _command(self, machine, arguments):
-        return ["ip", "netns", "exec", self._names[machine], sys.executable, "-m", "sightline.operator_side.cli",
+        return ["ip", "netns", "exec", self._names[machine], sys.executable, "-m", "sightline.operator_side.cli.app",
                 *arguments.split()]
 
     def _once(self, command):
@@ -110,6 +110,6 @@ def test_the_page_is_true(section, wire, tmp_path):
 
 def test_every_command_of_the_page_is_known():
     names = set(re.findall(r"sightline ([a-z]\w*)", PAGE))
-    command = [sys.executable, "-m", "sightline.operator_side.cli", "-h"]
+    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "-h"]
     known = subprocess.run(command, capture_output=True, text=True, check=True)
     assert names <= set(re.findall(r"^  (\w+) ", known.stdout, re.MULTILINE)), names

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from sightline.operator_side import keys
+from sightline.operator_side.setup import keys
 from sightline.protocol.channels import CAMERA, DETECTIONS, FRAME, OVERLAY, PREVIEW, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader, Stamp
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.zenoh_session import open_session
 from tests.link_rigs import free_endpoint, until
 from tests.vision_rig import camera, jpeg_of, scene

@@ -21,7 +21,7 @@ from sightline.protocol.mission_messages import MissionReport, MissionRequest
 from sightline.protocol.transports.memory import MemoryNetwork
 from tests.vision_rig import camera, jpeg_of, scene
 from sightline.vision_side.config import DetectorConfig, VisionConfig
-from sightline.vision_side.dry_run import AckingService
+from sightline.vision_side.serving.dry_run import AckingService
 from sightline.vision_side.pipeline import Observation
 from sightline.vision_side.reporting import LEAST_GAP_S, PERIOD_S, Reporter
 from sightline.vision_side.service import Service

@@ -20,8 +20,8 @@ from sightline.protocol.messages import (
 )
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.protocol.transports.zenoh import open_zenoh
-from sightline.protocol.twist_text import parse_twist
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.text import parse_twist
 from tests.link_rigs import until
 from tests.robot_process import RobotProcess
 from tests.vision_rig import Rig, acquired_at, ball_about_lens, camera, circle, errors_after, still
@@ -29,7 +29,7 @@ from sightline.vision_side.boxes_service import BoxesService
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.boxes import REMEMBERED, locate_box
 from sightline.vision_side.detect.port import Detection
-from sightline.vision_side.service_process import serve
+from sightline.vision_side.serving.process import serve
 
 MODEL = camera()
 FRAME_US = 33_333

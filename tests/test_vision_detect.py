@@ -12,11 +12,11 @@ from sightline.protocol.messages import CameraModel
 from tests.vision_rig import ball_about_lens, camera, draw_ball, jpeg_of, scene
 from sightline.vision_side.config import HsvConfig, HsvRange
 from sightline.vision_side.decode import Decoder, Picture
-from sightline.vision_side.detect.colour import color_table
+from sightline.vision_side.detect.color.hsv import color_table
 from sightline.vision_side.detect.disc import fit_circle, fit_round_part
 from sightline.vision_side.detect.hsv import HsvDetector
 from sightline.vision_side.detect.port import Detection
-from sightline.vision_side.sphere import locate_sphere
+from sightline.vision_side.tracking.locate import locate_sphere
 
 SIZES = [(320, 240), (640, 480)]
 

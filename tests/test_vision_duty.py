@@ -7,8 +7,8 @@ from sightline.protocol.messages import STILL, FrameHeader, RequestId, Twist
 from tests.mission_contract import CAMERA
 from tests.vision_rig import jpeg_of, scene
 from sightline.vision_side.config import MissionConfig, VisionConfig
-from sightline.vision_side.missions.choice import mission_spec
-from sightline.vision_side.missions.duty import SETTLE_S, MissionSwitch
+from sightline.vision_side.missions.registry import mission_spec
+from sightline.vision_side.missions.switch import SETTLE_S, MissionSwitch
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.pipeline import Frame, Pipeline
 

@@ -11,12 +11,12 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import AnswerHeader, FrameHeader, Stamp, State, Status
 from sightline.protocol.transports.link import LatestSlot
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh_site import open_fleet
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import JPEG
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.fleet import Fleet
+from sightline.vision_side.serving.fleet import Fleet
 
 
 class Robot:

@@ -12,11 +12,11 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, CameraModel, FrameHeader
 from sightline.protocol.mission_messages import MissionRequest
 from tests.mission_contract import CAMERA, check_mission
-from sightline.vision_side import plugin_choice
+from sightline.vision_side import plugins as plugin_choice
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.port import Circle, Detection
-from sightline.vision_side.missions import choice
-from sightline.vision_side.missions.choice import BUILT_IN, configured_mission, mission_spec, requested_mission
+from sightline.vision_side.missions import registry as choice
+from sightline.vision_side.missions.registry import BUILT_IN, configured_mission, mission_spec, requested_mission
 from sightline.vision_side.missions.port import Plan, View
 
 CONFIG = VisionConfig()

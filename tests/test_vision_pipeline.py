@@ -11,7 +11,7 @@ import sightline.vision_side
 from sightline.protocol.channels import MAX_HEADER_BYTES
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import STILL, AnswerHeader, FrameHeader, RequestId
-from sightline.protocol.twist_text import format_twist
+from sightline.protocol.text import format_twist
 from tests.vision_rig import Rig, camera, eight, jpeg_of, scene
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header, encode_answer

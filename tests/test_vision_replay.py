@@ -2,16 +2,16 @@
 
 import pytest
 
-from sightline.operator_side.lockstep import Conditions, Lockstep
-from sightline.operator_side.recording import Recorder, read_about, read_recording
-from sightline.operator_side.replay import VISION_CONFIG, replay, replay_steps
-from sightline.operator_side.scenario_settings import robot_config, vision_config
+from sightline.evaluation.lockstep import Conditions, Lockstep
+from sightline.operator_side.recording.recorder import Recorder, read_about, read_recording
+from sightline.operator_side.recording.replay import VISION_CONFIG, replay, replay_steps
+from sightline.evaluation.scenario_config import robot_config, vision_config
 from sightline.protocol.channels import CAMERA, MISSION, SCAN, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Stamp
-from sightline.sim.robot_model import load_robot
+from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
-from sightline.sim.world import World
+from sightline.sim.world.world import World
 from tests.test_operator_recording import record
 from tests.test_vision_asking import FRAME_US, GOTO, MODEL, Bench, scan
 from tests.vision_rig import camera

@@ -15,11 +15,11 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, CameraModel, FrameHeader, Stamp
 from sightline.protocol.transports.link import LatestSlot, Message
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.protocol.twist_text import parse_twist
+from sightline.protocol.text import parse_twist
 from tests.vision_rig import camera, jpeg_of, scene
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.service import Service
-from sightline.vision_side.service_process import serve
+from sightline.vision_side.serving.process import serve
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -140,7 +140,7 @@ def test_the_process_ends_within_a_second_of_a_signal(number: signal.Signals) ->
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    code = (f"from sightline.vision_side.config import VisionConfig; from sightline.vision_side.service_process import run; "
+    code = (f"from sightline.vision_side.config import VisionConfig; from sightline.vision_side.serving.process import run; "
             f"raise SystemExit(run(VisionConfig(connect=(), listen=('{endpoint}',))))")
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from sightline.protocol.config import Config as Settings
-from sightline.protocol.transports.opening import open_link
+from sightline.protocol.transports.open import open_link
 from sightline.robot_side.ports import Ranges
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess
 from tests.vision_rig import jpeg_of
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.service_process import serve
+from sightline.vision_side.serving.process import serve
 
 pytestmark = pytest.mark.slow
 QUIET = VisionConfig.model_validate({"search": {"enabled": False}})
@@ -54,7 +54,7 @@ def grey_camera(folder):
 
 def sightline(*arguments):
     """One command as a person gives it."""
-    return subprocess.run([sys.executable, "-m", "sightline.operator_side.cli", *arguments], capture_output=True, text=True,
+    return subprocess.run([sys.executable, "-m", "sightline.operator_side.cli.app", *arguments], capture_output=True, text=True,
                           timeout=30, check=False)
 
 

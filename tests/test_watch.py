@@ -13,7 +13,7 @@ import av
 import cv2
 import pytest
 
-from sightline.operator_side.cli import run
+from sightline.operator_side.cli.app import run
 from sightline.operator_side.film import Film
 from tests.javascript_browser import Browser, chromium
 from tests.link_rigs import free_endpoint, until

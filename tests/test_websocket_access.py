@@ -11,7 +11,7 @@ from websockets.sync.client import connect
 
 from sightline.protocol.channels import ACK, DETECTIONS, FRAME, REQUEST, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket_access import (
     NO_TOKEN,
     NOT_LISTED,
@@ -24,7 +24,7 @@ from sightline.protocol.transports.websocket_doorlog import BurstLimiter
 from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint, with_allowed
 from sightline.protocol.transports.websocket_keys import own_token, read_tokens
 from sightline.protocol.transports.websocket_peer import NOT_GRANTED
-from sightline.protocol.transports.websocket_seat import DRIVER_SLOT_US, DriverSlot
+from sightline.protocol.transports.websocket.legacy import DRIVER_SLOT_US, DriverSlot
 from sightline.robot_side.config import RobotConfig
 from tests.link_rigs import claim, until
 from tests.websocket_rig import V1, free_ws

@@ -10,7 +10,7 @@ from websockets.sync.client import connect
 from sightline.protocol.transports.websocket_dialects import BAD_FRAMING
 from sightline.protocol.transports.websocket_endpoints import host_problem, origin_problem
 from sightline.protocol.transports.websocket_listen import CROSS_SITE, TOO_MANY_CLIENTS, WRONG_SUBPROTOCOL
-from sightline.protocol.transports.websocket_places import MAX_CLIENTS, MAX_HANDSHAKES
+from sightline.protocol.transports.websocket.server import MAX_CLIENTS, MAX_HANDSHAKES
 from tests.link_rigs import hail, until
 from tests.websocket_rig import V1, Robot, upgrade
 

@@ -11,7 +11,7 @@ import pytest
 from sightline.protocol.channels import STATUS, TWIST
 from sightline.protocol.refusals import RejectReason
 from sightline.protocol.transports.link_rules import INEXACT_KEY, OVERSIZE
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
 from sightline.protocol.transports.websocket_listen import CROSS_SITE, TOO_MANY_CLIENTS, WRONG_SUBPROTOCOL
 from sightline.protocol.transports.websocket_peer import SILENT

@@ -16,7 +16,7 @@ from sightline.protocol.messages import AnswerHeader, Detections, DetectionsHead
 from sightline.protocol.refusals import RejectReason
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.link_rules import OVERSIZE
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket_dialects import BAD_FRAMING
 from sightline.protocol.transports.websocket_listen import CROSS_SITE
 from tests.link_rigs import free_endpoint, until

@@ -14,7 +14,7 @@ from sightline.protocol.codec import decode
 from sightline.protocol.messages import FrameHeader
 from sightline.protocol.refusals import RejectReason
 from sightline.protocol.transports.link_rules import OVERSIZE
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket_dialects import BAD_FRAMING
 from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint
 from tests.link_rigs import until

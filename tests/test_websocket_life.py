@@ -2,7 +2,7 @@
 
 import pytest
 
-from sightline.protocol.transports.websocket_life import (
+from sightline.protocol.transports.websocket.connection import (
     PING_EVERY_US,
     SILENCE_US,
     STALLED_LIMIT_US,

@@ -14,7 +14,7 @@ from sightline.protocol.codec import encode
 from sightline.protocol.messages import FrameHeader
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.link_rules import OVERSIZE
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
 from tests.link_rigs import claim, hail, until
 from tests.websocket_rig import HELLO, TWIST_KEY, V1, Robot, bare_client, closed_with, received

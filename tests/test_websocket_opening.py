@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from sightline.operator_side import keys
+from sightline.operator_side.setup import keys
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket_dialects import OTHER_ROBOT
 from tests.link_rigs import until
 from tests.websocket_rig import Robot, free_ws

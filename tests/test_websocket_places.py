@@ -14,11 +14,11 @@ from sightline.protocol.channels import REQUEST
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import Request
-from sightline.protocol.transports.secured import ROLES
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.security import ROLES
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket_access import grants_of_role
 from sightline.protocol.transports.websocket_listen import TOO_MANY_CLIENTS
-from sightline.protocol.transports.websocket_places import (
+from sightline.protocol.transports.websocket.server import (
     MAX_CLIENTS,
     MAX_HANDSHAKES,
     MAX_HANDSHAKES_PER_ADDRESS,

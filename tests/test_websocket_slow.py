@@ -9,7 +9,7 @@ import pytest
 
 from sightline.protocol.channels import FRAME, STATUS
 from sightline.protocol.transports.link_rules import OVERSIZE
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket_peer import SILENT
 from tests.link_rigs import claim, until
 from tests.websocket_rig import Robot, bare_client, free_ws, never_reads, pause_until, resident_kib

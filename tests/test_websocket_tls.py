@@ -9,10 +9,10 @@ import trustme
 import websocket
 from websockets.sync.client import connect
 
-from sightline.operator_side import keys
+from sightline.operator_side.setup import keys
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket_listen import NO_TLS
 from tests.link_rigs import until
 from tests.websocket_rig import V1, address_of, free_ws

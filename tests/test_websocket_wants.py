@@ -6,7 +6,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from sightline.protocol.channels import DETECTIONS, OVERLAY, PREVIEW, STATUS, TWIST
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket.link import open_websocket
 from tests.link_rigs import claim, free_endpoint, hail, until
 
 

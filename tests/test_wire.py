@@ -11,8 +11,16 @@ from hypothesis import strategies as st
 
 from sightline.operator_side.faults.wires import BenchWire
 from sightline.protocol.errors import ConfigError
-from sightline.sim.wire import IP_HEADER_BYTES, MAX_WAITING, EmulatedLink, Leg, LinkShape, LinkShapes, Medium
-from sightline.sim.wire_tun import ADDRESS_A, _read_shapes, why_impossible
+from sightline.sim.network_emulator import (
+    IP_HEADER_BYTES,
+    MAX_WAITING,
+    EmulatedLink,
+    Leg,
+    LinkShape,
+    LinkShapes,
+    Medium,
+)
+from sightline.sim.tun_emulator import ADDRESS_A, _read_shapes, why_impossible
 
 PACKET = bytes(range(100))
 LONG_US = 10**9

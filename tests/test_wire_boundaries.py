@@ -6,7 +6,7 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import JpegSize, read_jpeg_size
 from sightline.protocol.messages import Twist
 from sightline.protocol.refusals import RejectReason
-from sightline.protocol.twist_text import format_twist, parse_twist
+from sightline.protocol.text import format_twist, parse_twist
 
 
 def twist(linear_mps, angular_rad_s):

@@ -12,13 +12,13 @@ import pytest
 
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.errors import LinkError
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.link_rigs import free_endpoint, until
 
 PRELUDE = """
 import sys, time
 from sightline.protocol.channels import *
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 endpoint = sys.argv[1]
 """
 ROBOT = """

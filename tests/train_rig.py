@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sightline.operator_side.train_network import network
+from sightline.training.network import network
 
 _HEAD = np.float32(0.02)
 

@@ -12,7 +12,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from sightline.protocol.channels import FRAME, TWIST
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint
 from tests.link_rigs import free_endpoint, until
 

@@ -37,8 +37,8 @@ from sightline.vision_side.detect.around import maker_of, notices_of
 from sightline.vision_side.detect.checking import checked_results
 from sightline.vision_side.detect.own_decoders import DecoderPool
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
-from sightline.vision_side.detector_turns import FairQueue, FrameCounters, QueuedFrame
-from sightline.vision_side.service_process import ends_on_signal
+from sightline.vision_side.serving.detector_service import FairQueue, FrameCounters, QueuedFrame
+from sightline.vision_side.serving.process import ends_on_signal
 
 ROLE: Final = "detector"
 _WAIT_S: Final = 0.2

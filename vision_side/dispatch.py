@@ -8,16 +8,16 @@ from sightline.protocol.codec import encode
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import DetectionsHeader, Echo, FrameHeader, RequestId
 from sightline.protocol.transports.link import LatestSlot, Link, Message
-from sightline.vision_side.asking import DetectorSwap, MissionRequests
+from sightline.vision_side.serving.mission_channel import DetectorSwap, MissionRequests
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.around import notices_of
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.shadow import ShadowDetector
 from sightline.vision_side.detect.timing import TimedDetector
-from sightline.vision_side.missions.choice import configured_mission
+from sightline.vision_side.missions.registry import configured_mission
 from sightline.vision_side.pipeline import SOURCE, Observation, Pipeline
 from sightline.vision_side.reporting import Reporter
-from sightline.vision_side.scan import decode_scan
+from sightline.vision_side.missions.ranges import decode_scan
 
 NO_FRAMES = Observation("no frames")
 _ENDED = "the robot started anew, which ended it: say it again"

@@ -18,9 +18,9 @@ from sightline.vision_side.detect.port import (
     Detector,
     PictureDetector,
 )
-from sightline.vision_side.foretell import LatencyEstimator
-from sightline.vision_side.missions.choice import MissionSpec, configured_mission
-from sightline.vision_side.missions.duty import MissionSwitch
+from sightline.vision_side.tracking.prediction import LatencyEstimator
+from sightline.vision_side.missions.registry import MissionSpec, configured_mission
+from sightline.vision_side.missions.switch import MissionSwitch
 from sightline.vision_side.missions.port import Plan, RangeScan, View
 
 Detections = tuple[Detection, ...]

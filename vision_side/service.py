@@ -16,11 +16,11 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.messages import CameraModel, FrameHeader, Stamp
 from sightline.protocol.refusals import RejectReason
 from sightline.protocol.transports.link import LatestSlot, Link, Message
-from sightline.protocol.twist_text import format_twist
+from sightline.protocol.text import format_twist
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.counts import Counts
+from sightline.vision_side.serving.service import Counts
 from sightline.vision_side.detect.around import attach_detector
-from sightline.vision_side.detect.choice import configured_detector
+from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.detect.hsv import HsvDetector
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.timing import TimedDetector

@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from sightline.benchmarks.loop_tally import Tally
-from sightline.benchmarks.peers.eyes import Vision
+from sightline.benchmarks.peers.contest import Vision
 from sightline.benchmarks.peers.film import Film
 
 _RETRY_S: Final = 0.1
@@ -47,10 +47,10 @@ def _part(peer: ModuleType, role: str, settings: dict[str, Any]) -> Callable[[],
 def _vision(settings: dict[str, Any]) -> Vision:
     """A robot has no use for any, and they are large; nor has a peer with its own for what ours import and set."""
     if settings["eyes"] == "classic":
-        from sightline.benchmarks.peers.classic_eyes import ClassicVision
+        from sightline.benchmarks.peers.classic_detector import ClassicVision
 
         return ClassicVision(settings["delay_ms"], settings["busy_ms"])
-    from sightline.benchmarks.loop_eyes import PipelineVision as OurEyes
+    from sightline.benchmarks.loop.vision import PipelineVision as OurEyes
 
     return OurEyes(settings["width_px"], settings["height_px"], settings["delay_ms"], settings["busy_ms"])
 

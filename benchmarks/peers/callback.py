@@ -15,7 +15,7 @@ import zenoh
 
 if TYPE_CHECKING:
     from sightline.benchmarks.loop_tally import Tally
-    from sightline.benchmarks.peers.eyes import Vision
+    from sightline.benchmarks.peers.contest import Vision
     from sightline.benchmarks.peers.film import Film
 
 STAMP: Final = struct.Struct("<Q")

@@ -6,11 +6,11 @@ import statistics
 import time
 from typing import TYPE_CHECKING, Final
 
-from sightline.protocol.twist_text import parse_twist
+from sightline.protocol.text import parse_twist
 
 if TYPE_CHECKING:
     from sightline.benchmarks.loop_tally import Tally
-    from sightline.benchmarks.peers.eyes import Vision
+    from sightline.benchmarks.peers.contest import Vision
     from sightline.benchmarks.peers.film import Film
 
 _HOT_STEPS: Final = 150

@@ -14,7 +14,7 @@ import zmq
 
 if TYPE_CHECKING:
     from sightline.benchmarks.loop_tally import Tally
-    from sightline.benchmarks.peers.eyes import Vision
+    from sightline.benchmarks.peers.contest import Vision
     from sightline.benchmarks.peers.film import Film
 
 Socket = zmq.Socket[bytes]

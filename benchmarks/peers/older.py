@@ -17,7 +17,7 @@ from websockets.sync.client import ClientConnection, connect
 
 if TYPE_CHECKING:
     from sightline.benchmarks.loop_tally import Tally
-    from sightline.benchmarks.peers.eyes import Vision
+    from sightline.benchmarks.peers.contest import Vision
     from sightline.benchmarks.peers.film import Film
 
 COMMAND_PERIOD_S: Final = 0.0551

@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from sightline.benchmarks.loop_tally import Tally
-    from sightline.benchmarks.peers.eyes import Vision
+    from sightline.benchmarks.peers.contest import Vision
     from sightline.benchmarks.peers.film import Film
 
 HEAD: Final = struct.Struct("<IQ")

@@ -79,7 +79,7 @@ def read_format(answer: bytes) -> str:
 
 def delivered(kind: str, sets: list[str]) -> Finding:
     """The rate that a camera really delivers; what it cannot do at all, it says itself."""
-    from sightline.operator_side.local_camera import local_camera
+    from sightline.operator_side.calibrate.local_camera import local_camera
 
     try:
         with local_camera(kind, sets) as opened:

@@ -14,11 +14,11 @@ from importlib import metadata
 from pathlib import Path
 
 from sightline.operator_side.doctor.finding import Finding, trouble
-from sightline.operator_side.extras import needs
+from sightline.operator_side.preflight import needs
 from sightline.protocol import VERSION
 from sightline.protocol.errors import SightlineError
-from sightline.protocol.transports.port_owner import port_owner
-from sightline.protocol.transports.zenoh_discovery import MULTICAST_GROUP
+from sightline.protocol.transports.diagnosis import port_owner
+from sightline.protocol.transports.zenoh.session import MULTICAST_GROUP
 
 PORTS = {7447: "Zenoh", 9090: "sightline.v1", 9091: "the older dialect"}
 _HOT_C = 80.0
@@ -172,7 +172,7 @@ def _clock() -> Finding:
 def _certificates(folder: str) -> Iterator[Finding]:
     try:
         with needs("secure"):
-            from sightline.operator_side import keys
+            from sightline.operator_side.setup import keys
 
             certificates = keys.look(Path(folder))
     except SightlineError as error:

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
-from sightline.operator_side.check_text import Check, at_least, at_most
-from sightline.operator_side.faults.judge import (
+from sightline.evaluation.checks import Check, at_least, at_most
+from sightline.evaluation.faults.evidence import (
     MEMORY_MB,
     Blind,
     Stop,
@@ -16,10 +16,10 @@ from sightline.operator_side.faults.judge import (
     stop_checks,
 )
 from sightline.operator_side.faults.rig import RobotFixture
-from sightline.operator_side.faults.row import Case, Injected, Outcome
-from sightline.operator_side.faults.sampler import STALL_US
+from sightline.evaluation.faults.runner import Case, Injected, Outcome
+from sightline.evaluation.faults.sampler import STALL_US
 from sightline.protocol.errors import SightlineError
-from sightline.sim.wire_tun import why_impossible
+from sightline.sim.tun_emulator import why_impossible
 
 MOST_TRIES: Final = 3
 _TO_THE_END_US: Final = 10**9

@@ -11,11 +11,11 @@ from sightline.protocol.channels import FRAME, TWIST, key_for
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
 from sightline.protocol.transports.link import LatestSlot, Message
-from sightline.protocol.transports.zenoh import ZenohLink, open_zenoh
-from sightline.protocol.twist_text import format_twist
+from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
+from sightline.protocol.text import format_twist
 
 if TYPE_CHECKING:
-    from sightline.operator_side.faults.peer import PeerOptions
+    from sightline.evaluation.faults.peer import PeerOptions
 
 KEPT: Final = 256
 WAIT_S: Final = 0.05

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from sightline.operator_side.faults.judge import SentCommand
+from sightline.evaluation.faults.evidence import SentCommand
 from sightline.protocol.clock import monotonic_us
 
 GOOD: Final = "good"

@@ -10,9 +10,9 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from sightline.benchmarks.interrupted import terminated_like_interrupted
+from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.operator_side.faults.bench import run_case
-from sightline.operator_side.faults.row import Case, Outcome
+from sightline.evaluation.faults.runner import Case, Outcome
 
 _FORK: Final = multiprocessing.get_context("fork")  # nothing is open here that a copy could spoil: no link, no thread
 _END_S: Final = 30.0

@@ -4,13 +4,13 @@ import threading
 from typing import TYPE_CHECKING
 
 from sightline.operator_side.faults.ledger import INJECTED, REQUESTED, EventLog
-from sightline.operator_side.requests import SOURCE as OPERATOR_SOURCE
-from sightline.operator_side.requests import Operator
+from sightline.operator_side.client.requests import SOURCE as OPERATOR_SOURCE
+from sightline.operator_side.client.requests import Operator
 from sightline.protocol.messages import Verb
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 
 if TYPE_CHECKING:
-    from sightline.operator_side.faults.peer import PeerOptions
+    from sightline.evaluation.faults.peer import PeerOptions
 
 
 def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from sightline.operator_side.check_text import Check, number
-from sightline.operator_side.faults.row import Outcome
+from sightline.evaluation.checks import Check, number
+from sightline.evaluation.faults.runner import Outcome
 
 Results = Sequence[Sequence[Outcome]]
 _LOWEST_IS_WORST: Final = ("injected", "drives again", "sent", "speed kept", "commands after it", "reset refused",

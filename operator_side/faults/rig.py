@@ -12,20 +12,20 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from sightline.operator_side.faults import camera, judge
+from sightline.evaluation.faults import camera, evidence as judge
 from sightline.operator_side.faults.clock import write_wrong_clock
-from sightline.operator_side.faults.fleet import COMMAND_LINE, Fleet, raise_priority
-from sightline.operator_side.faults.judge import MotorRow, SentCommand, wheel_mps
+from sightline.evaluation.faults.fixture import COMMAND_LINE, Fleet, raise_priority
+from sightline.evaluation.faults.evidence import MotorRow, SentCommand, wheel_mps
 from sightline.operator_side.faults.ledger import GOOD, INJECTED, read_events
-from sightline.operator_side.faults.peer import PeerOptions, Role
-from sightline.operator_side.faults.sampler import Hole, read_holes, stalled_us
+from sightline.evaluation.faults.peer import PeerOptions, Role
+from sightline.evaluation.faults.sampler import Hole, read_holes, stalled_us
 from sightline.operator_side.faults.wires import BenchWire
-from sightline.operator_side.toml_text import toml_text
+from sightline.operator_side.config.toml_text import toml_text
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import SightlineError
-from sightline.robot_side.limits import TICK_US
+from sightline.robot_side.safety.limits import TICK_US
 from sightline.sim.bus import SimDrive, SimSocketConfig
-from sightline.sim.wire_tun import ADDRESS_A
+from sightline.sim.tun_emulator import ADDRESS_A
 
 ROBOT: Final = "r1"
 READY_S: Final = 30.0
@@ -101,7 +101,7 @@ class RobotFixture:
         self.web_endpoint = f"ws://127.0.0.1:{_free_port()}" if self.setup.web else ""
         self._write_files(self._sockets)
         self.fleet.run("sim", COMMAND_LINE, ["sim", "--config", str(self.folder / "sim.toml")])
-        self.fleet.run("sampler", "sightline.operator_side.faults.sampler", [str(self.folder / "holes.csv")])
+        self.fleet.run("sampler", "sightline.evaluation.faults.sampler", [str(self.folder / "holes.csv")])
         self.fleet.wait_line("sim", "simulation ready", READY_S)
         self.fleet.wait_line("sampler", "sampling", READY_S)
         for name in ("sim", "sampler"):
@@ -113,7 +113,7 @@ class RobotFixture:
 
     def _write_files(self, sockets: str) -> None:
         device = {"kind": "sim", "options": {"socket_dir": sockets}}
-        eye = {"kind": "sightline.operator_side.faults.camera:FaultyCamera",
+        eye = {"kind": "sightline.evaluation.faults.camera:FaultyCamera",
                "options": {"socket_dir": sockets, "folder": str(self.folder)}}
         camera.write_spares(self.folder)
         self.camera_mode(self.setup.camera)
@@ -148,13 +148,13 @@ class RobotFixture:
             config=self.folder / "vision.toml" if role == "vision" else None, **changes,
         )
         self._peers.append(name)
-        self.fleet.run(name, "sightline.operator_side.faults.peer", [options.model_dump_json()],
+        self.fleet.run(name, "sightline.evaluation.faults.peer", [options.model_dump_json()],
                        namespace=self.wire.far_side if self.wire else "", environment=self._environment())
 
     def start_crowd(self, kind: str) -> None:
         """Let many WebSocket clients come; what they do is noted as by a peer called `crowd`."""
         arguments = [kind, self.web_endpoint, str(self.folder / "crowd.ledger")]
-        self.fleet.run("crowd", "sightline.operator_side.faults.crowd", arguments)
+        self.fleet.run("crowd", "sightline.evaluation.faults.load_clients", arguments)
 
     def _environment(self) -> dict[str, str]:
         return {"PYTHONPATH": str(self.folder)} if self.setup.clock else {}

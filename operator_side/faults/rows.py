@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from typing import Final
 
-from sightline.operator_side.faults import rows_commands, rows_crowd, rows_network, rows_people, rows_processes
-from sightline.operator_side.faults.row import Case
+from sightline.operator_side.faults import rows_commands, rows_crowd, rows_network, rows_people
+from sightline.evaluation.faults import cases as rows_processes
+from sightline.evaluation.faults.runner import Case
 from sightline.operator_side.settings_errors import no_such_name
 from sightline.protocol.errors import ConfigError
 

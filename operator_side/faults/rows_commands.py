@@ -3,13 +3,13 @@
 from functools import partial
 from typing import Final
 
-from sightline.operator_side.check_text import at_least, at_most
-from sightline.operator_side.faults.judge import most_gain_mps2, wheel_mps
+from sightline.evaluation.checks import at_least, at_most
+from sightline.evaluation.faults.evidence import most_gain_mps2, wheel_mps
 from sightline.operator_side.faults.rig import RobotFixture, Setup
-from sightline.operator_side.faults.row import Case, Injected
-from sightline.operator_side.faults.rows_processes import SETTLED_S
+from sightline.evaluation.faults.runner import Case, Injected
+from sightline.evaluation.faults.cases import SETTLED_S
 from sightline.protocol.clock import monotonic_us
-from sightline.robot_side.limits import SafetyConfig
+from sightline.robot_side.safety.limits import SafetyConfig
 
 ATTACKED_S: Final = 3.0
 LEASE_US: Final = SafetyConfig().lease_ms * 1000

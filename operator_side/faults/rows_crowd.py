@@ -5,17 +5,17 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
-from sightline.operator_side.check_text import Check, at_least, at_most
-from sightline.operator_side.faults.crowd import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
-from sightline.operator_side.faults.judge import MotorRow, wheel_mps
+from sightline.evaluation.checks import Check, at_least, at_most
+from sightline.evaluation.faults.load_clients import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
+from sightline.evaluation.faults.evidence import MotorRow, wheel_mps
 from sightline.operator_side.faults.ledger import INJECTED
 from sightline.operator_side.faults.rig import READY_S, RobotFixture, Setup
-from sightline.operator_side.faults.row import Case, Injected
-from sightline.operator_side.faults.rows_processes import AGAIN_S, BUSY, SETTLED_S, busy_processes
-from sightline.operator_side.faults.sampler import Hole
+from sightline.evaluation.faults.runner import Case, Injected
+from sightline.evaluation.faults.cases import AGAIN_S, BUSY, SETTLED_S, busy_processes
+from sightline.evaluation.faults.sampler import Hole
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.transports.websocket_places import MAX_CLIENTS
-from sightline.robot_side.limits import TICK_US
+from sightline.protocol.transports.websocket.server import MAX_CLIENTS
+from sightline.robot_side.safety.limits import TICK_US
 
 LOADED_S: Final = 6.0
 KEPT_MPS: Final = 0.4

@@ -4,10 +4,10 @@ from functools import partial
 from typing import Final
 
 from sightline.operator_side.faults.rig import RobotFixture, Setup
-from sightline.operator_side.faults.row import Case, Injected
-from sightline.operator_side.faults.rows_processes import drives_again
+from sightline.evaluation.faults.runner import Case, Injected
+from sightline.evaluation.faults.cases import drives_again
 from sightline.protocol.clock import monotonic_us
-from sightline.sim.wire import LinkShape, LinkShapes
+from sightline.sim.network_emulator import LinkShape, LinkShapes
 
 DISTURBED_S: Final = 6.0
 CUT: Final = LinkShape(cut=True)

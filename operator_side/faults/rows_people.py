@@ -4,16 +4,16 @@ import signal
 from functools import partial
 from typing import Final
 
-from sightline.operator_side.check_text import at_least, at_most
-from sightline.operator_side.faults.judge import MotorRow, wheel_mps
+from sightline.evaluation.checks import at_least, at_most
+from sightline.evaluation.faults.evidence import MotorRow, wheel_mps
 from sightline.operator_side.faults.ledger import REQUESTED
 from sightline.operator_side.faults.rig import RobotFixture, Setup
-from sightline.operator_side.faults.row import Case, Injected
+from sightline.evaluation.faults.runner import Case, Injected
 from sightline.operator_side.faults.rows_network import LOSSY, shape
-from sightline.operator_side.faults.rows_processes import AGAIN_S, SETTLED_S, drives_again
+from sightline.evaluation.faults.cases import AGAIN_S, SETTLED_S, drives_again
 from sightline.protocol.clock import monotonic_us
 from sightline.robot_side.kinematics import DiffDriveConfig
-from sightline.sim.wire import LinkShapes
+from sightline.sim.network_emulator import LinkShapes
 from sightline.vision_side.config import TrackConfig
 
 BAD_S: Final = 3.0

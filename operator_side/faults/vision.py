@@ -13,14 +13,14 @@ from sightline.protocol.channels import TWIST, Channel
 from sightline.protocol.codec import decode
 from sightline.protocol.messages import AnswerHeader
 from sightline.protocol.transports.link import LatestSlot, Link, Message
-from sightline.protocol.transports.zenoh import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.hsv import HsvDetector
 from sightline.vision_side.pipeline import SOURCE as VISION_SOURCE
-from sightline.vision_side.service_process import serve
+from sightline.vision_side.serving.process import serve
 
 if TYPE_CHECKING:
-    from sightline.operator_side.faults.peer import PeerOptions
+    from sightline.evaluation.faults.peer import PeerOptions
 
 SLOW_S: Final = 0.33
 """Ten frame intervals at 30 fps."""

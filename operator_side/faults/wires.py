@@ -1,4 +1,4 @@
-"""The bench's end of `sim/wire_tun.py`: two namespaces and the wire between them, shaped while it runs. Shell."""
+"""The bench's end of `sim/tun_emulator.py`: two namespaces and the wire between them, shaped while it runs. Shell."""
 
 import json
 import os
@@ -10,8 +10,8 @@ from types import TracebackType
 from typing import IO, Final, Self
 
 from sightline.protocol.errors import HardwareError
-from sightline.sim.wire import LinkShapes
-from sightline.sim.wire_tun import namespaces
+from sightline.sim.network_emulator import LinkShapes
+from sightline.sim.tun_emulator import namespaces
 
 _END_S: Final = 2.0
 _PLAIN: Final = ("taken", "delivered", "delivered_bytes")
@@ -33,7 +33,7 @@ class BenchWire:
             self._ending.enter_context(namespaces(self.robot_side, self.far_side))
             log = self._ending.enter_context(self._log.open("wb"))
             self._process = subprocess.Popen(
-                [sys.executable, "-u", "-m", "sightline.sim.wire_tun", self.robot_side, self.far_side],
+                [sys.executable, "-u", "-m", "sightline.sim.tun_emulator", self.robot_side, self.far_side],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True,
             )
             self._ending.callback(self._end, self._process)

@@ -14,11 +14,11 @@ from typing import Final, TypeVar
 
 from sightline.protocol.channels import Channel
 from sightline.protocol.codec import decode, encode
-from sightline.protocol.conformance.case import ConformanceError, NotApplicableError
+from sightline.conformance.case import ConformanceError, NotApplicableError
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import WireModel
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.secured import SOURCES_OF_ROLE, certificate_role
+from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
 
 KEPT_MESSAGES: Final = 600
 """Per channel; 20 s of frames at 30 fps, longer than any case lasts."""

@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Case, Level, NotApplicableError, Suite
-from sightline.protocol.conformance.codec_lines import ProgramError, same
+from sightline.conformance.case import Case, Level, NotApplicableError, Suite
+from sightline.conformance.codec import ProgramError, same
 from sightline.protocol.conformance.codec_process import CodecProgram
 from sightline.protocol.conformance.codec_questions import CodecCase, codec_cases
-from sightline.protocol.conformance.runner import Outcome, Result
+from sightline.conformance.runner import Outcome, Result
 
 END: Final = "C-CODEC-9001"
 

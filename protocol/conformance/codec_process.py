@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from types import TracebackType
 from typing import IO, Any, Final, Self
 
-from sightline.protocol.conformance.codec_lines import MAX_ANSWER_BYTES, ProgramError, Question, read_answer, shown
+from sightline.conformance.codec import MAX_ANSWER_BYTES, ProgramError, Question, read_answer, shown
 from sightline.protocol.errors import ConfigError
 
 START_S: Final = 10.0

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from sightline.protocol.conformance.codec_lines import Question
-from sightline.protocol.golden import outcome
+from sightline.conformance.codec import Question
+from sightline.protocol.spec.golden import outcome
 
 VECTORS: Final = Path(__file__).parent.parent / "vectors"
 _HEX: Final = "_hex"

@@ -5,9 +5,9 @@ from html import escape
 from itertools import groupby
 from typing import Final
 
-from sightline.protocol.conformance.case import Level
-from sightline.protocol.conformance.report import summary
-from sightline.protocol.conformance.runner import Outcome, Result, passed, printable
+from sightline.conformance.case import Level
+from sightline.conformance.report import summary
+from sightline.conformance.runner import Outcome, Result, passed, printable
 
 _CLASSES: Final = {Outcome.PASSED: "passed", Outcome.FAILED: "failed", Outcome.SKIPPED: "skipped"}
 _STYLE: Final = """

@@ -4,7 +4,7 @@ from typing import Final
 
 from sightline.protocol.channels import STATUS
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
+from sightline.conformance.case import Suite
 from sightline.protocol.conformance.robot_flow import (
     OWNED_US,
     QUICK_FPS,
@@ -15,7 +15,7 @@ from sightline.protocol.conformance.robot_flow import (
     silent_fps,
     taught,
 )
-from sightline.protocol.conformance.robot_rig import Robot, Sender
+from sightline.conformance.robot.fixture import Robot, Sender
 from sightline.protocol.messages import Status
 
 SUITE: Final = Suite("R")

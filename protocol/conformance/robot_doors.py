@@ -6,10 +6,10 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
-from sightline.protocol.conformance.raw_websocket import BINARY, TEXT, RawWebSocket, split_url
-from sightline.protocol.conformance.robot_rig import GOOD, Robot, Sender, as_json
-from sightline.protocol.conformance.robot_sockets import (
+from sightline.conformance.case import Suite
+from sightline.conformance.raw_peers import BINARY, TEXT, RawWebSocket, split_url
+from sightline.conformance.robot.fixture import GOOD, Robot, Sender, as_json
+from sightline.conformance.robot.websocket import (
     SESSION,
     SWITCHED,
     block,
@@ -20,7 +20,7 @@ from sightline.protocol.conformance.robot_sockets import (
     packets_of,
     spoken,
 )
-from sightline.protocol.transports.websocket_framing import MAX_HELLO_BYTES, IncomingMessage
+from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, IncomingMessage
 
 SUITE: Final = Suite("R")
 _HANDSHAKE_S: Final = 4.0

@@ -9,8 +9,8 @@ from typing import Final
 
 from sightline.protocol.channels import FRAME, STATUS
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
-from sightline.protocol.conformance.robot_rig import Robot, Sender
+from sightline.conformance.case import Suite
+from sightline.conformance.robot.fixture import Robot, Sender
 from sightline.protocol.messages import Stamp
 
 SUITE: Final = Suite("R")

@@ -7,10 +7,10 @@ from typing import Final
 
 from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, REPLY, STATUS
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
-from sightline.protocol.conformance.raw_websocket import BINARY, CONTINUED, PING, PONG, TEXT, Frame, RawWebSocket
-from sightline.protocol.conformance.robot_rig import Robot, Sender, as_json
-from sightline.protocol.conformance.robot_sockets import (
+from sightline.conformance.case import Suite
+from sightline.conformance.raw_peers import BINARY, CONTINUED, PING, PONG, TEXT, Frame, RawWebSocket
+from sightline.conformance.robot.fixture import Robot, Sender, as_json
+from sightline.conformance.robot.websocket import (
     PASSING_S,
     SESSION,
     SOON_S,
@@ -25,7 +25,7 @@ from sightline.protocol.conformance.robot_sockets import (
     packets_of,
     spoken,
 )
-from sightline.protocol.transports.websocket_framing import MAX_BLOCK_BYTES
+from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES
 
 SUITE: Final = Suite("R")
 

@@ -4,8 +4,8 @@ from typing import Final
 
 from sightline.protocol.channels import TWIST
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
-from sightline.protocol.conformance.robot_rig import CRAWL, Robot, Sender, as_json
+from sightline.conformance.case import Suite
+from sightline.conformance.robot.fixture import CRAWL, Robot, Sender, as_json
 from sightline.protocol.messages import MAX_INTEGER, Status
 
 SUITE: Final = Suite("R")

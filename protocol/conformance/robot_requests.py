@@ -4,8 +4,8 @@ from typing import Final
 
 from sightline.protocol.channels import ACK, REPLY, REQUEST
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
-from sightline.protocol.conformance.robot_rig import Robot, Sender, as_json
+from sightline.conformance.case import Suite
+from sightline.conformance.robot.fixture import Robot, Sender, as_json
 from sightline.protocol.messages import Reply, Stamp, State
 
 SUITE: Final = Suite("R")

@@ -3,9 +3,9 @@
 from typing import Final
 
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
-from sightline.protocol.conformance.robot_arming import expect_arm_rejected, is_soon
-from sightline.protocol.conformance.robot_rig import CRAWL, GOOD, Robot, Sender, arm, armed
+from sightline.conformance.case import Suite
+from sightline.conformance.robot.arming import expect_arm_rejected, is_soon
+from sightline.conformance.robot.fixture import CRAWL, GOOD, Robot, Sender, arm, armed
 from sightline.protocol.messages import State, Status
 
 SUITE: Final = Suite("R")

@@ -3,9 +3,9 @@
 from typing import Any, Final
 
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
-from sightline.protocol.conformance.raw_websocket import BINARY, TEXT, RawWebSocket
-from sightline.protocol.conformance.robot_sockets import (
+from sightline.conformance.case import Suite
+from sightline.conformance.raw_peers import BINARY, TEXT, RawWebSocket
+from sightline.conformance.robot.websocket import (
     SOON_S,
     SWITCHED,
     block,
@@ -16,7 +16,7 @@ from sightline.protocol.conformance.robot_sockets import (
     is_answered,
     offered,
 )
-from sightline.protocol.transports.websocket_framing import SUBPROTOCOL
+from sightline.protocol.transports.websocket.framing import SUBPROTOCOL
 
 SUITE: Final = Suite("R")
 _CLAUSE: Final = "14.3 Token"

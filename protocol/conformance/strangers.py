@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Final, Self
 
-from sightline.protocol.transports.secured import load_role_keys
+from sightline.protocol.transports.security import load_role_keys
 from sightline.protocol.transports.zenoh_session import open_session
 
 _OPEN_S: Final = 5.0

@@ -3,8 +3,8 @@
 from typing import Final
 
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
-from sightline.protocol.conformance.vision_socket_server import RawClient
+from sightline.conformance.case import Suite
+from sightline.conformance.vision.websocket import RawClient
 from sightline.protocol.conformance.vision_sockets import BACK_S, client_of, ends, met, need_websocket, server_of
 
 SUITE = Suite("V")

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from typing import Final
 
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Case, Level, Suite
+from sightline.conformance.case import Case, Level, Suite
 from sightline.protocol.conformance.vision_pictures import claiming, commented, many_scans, picture, png
-from sightline.protocol.conformance.vision_robot import RobotPlayed
+from sightline.conformance.vision.fixture import RobotPlayed
 
 SUITE = Suite("V")
 _CHECK: Final = "3.2 Bounds check"

@@ -15,10 +15,10 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from sightline.protocol.conformance.vision_jpeg import Pixel, Scene, encode_jpeg
+from sightline.conformance.vision.drawing import Pixel, Scene, encode_jpeg
 from sightline.protocol.messages import CameraModel
 
-HERE = Path(__file__).parent / "pictures"
+HERE = Path(__file__).parent.parent.parent / "conformance" / "vision" / "pictures"
 CAMERA: Final = CameraModel(width_px=320, height_px=240, fx_px=190.7, fy_px=190.7, cx_px=160.0, cy_px=120.0,
                             x_m=0.055, z_m=0.06, calibrated=True)
 """80 degrees wide. A ball of 0.1 m radius at one metre has a radius of 20 px."""

@@ -3,8 +3,8 @@
 from typing import Final
 
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
-from sightline.protocol.conformance.vision_robot import RobotPlayed
+from sightline.conformance.case import Suite
+from sightline.conformance.vision.fixture import RobotPlayed
 
 SUITE = Suite("V")
 _BACK_US: Final = 5_000_000

@@ -9,10 +9,10 @@ from typing import Any, Final
 from sightline.protocol.channels import CAMERA, FRAME, Channel
 from sightline.protocol.codec import encode
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
+from sightline.conformance.case import Suite
 from sightline.protocol.conformance.vision_pictures import CAMERA as LENS
 from sightline.protocol.conformance.vision_pictures import picture
-from sightline.protocol.conformance.vision_socket_server import (
+from sightline.conformance.vision.websocket import (
     BINARY,
     PING,
     PONG,
@@ -24,7 +24,7 @@ from sightline.protocol.conformance.vision_socket_server import (
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import FrameHeader, Stamp
 from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint
-from sightline.protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL, pack, parse_hello
+from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL, pack, parse_hello
 from sightline.protocol.transports.websocket_tls import server_tls_context
 
 SUITE = Suite("V")

@@ -7,8 +7,8 @@ follows a yellow ball, which is what ours do unless told otherwise.
 from typing import Final
 
 from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.case import Suite
-from sightline.protocol.conformance.vision_robot import Answer, RobotPlayed
+from sightline.conformance.case import Suite
+from sightline.conformance.vision.fixture import Answer, RobotPlayed
 
 SUITE = Suite("V")
 _SECOND: Final = 20

@@ -9,7 +9,7 @@ from functools import partial
 
 from sightline.protocol.channels import CHANNELS, Channel
 from sightline.protocol.transports.link import Link, Message
-from sightline.protocol.transports.opening import LinkGroup
+from sightline.protocol.transports.open import LinkGroup
 
 
 class Relay:

@@ -6,7 +6,7 @@ import socket
 import ssl
 
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
-from sightline.protocol.transports.secured import RoleKeys
+from sightline.protocol.transports.security import RoleKeys
 
 _TLS_TIMEOUT_S = 1.0
 _PLAIN = "it is a plain link, not TLS; give --secure there too, or on neither end"

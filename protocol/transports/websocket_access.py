@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.secured import may_publish
+from sightline.protocol.transports.security import may_publish
 from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint, with_allowed
 
 NOT_LISTED: Final = "NOT_LISTED"

@@ -9,7 +9,7 @@ from typing import Final, Protocol
 from sightline.protocol.channels import Channel
 from sightline.protocol.errors import WireError
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.websocket_framing import (
+from sightline.protocol.transports.websocket.framing import (
     MAX_BLOCK_BYTES,
     MAX_HELLO_BYTES,
     IncomingMessage,

@@ -6,7 +6,7 @@ import socket
 
 from sightline.protocol.errors import LinkError
 from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES
-from sightline.protocol.transports.port_owner import port_owner
+from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint
 
 

@@ -6,7 +6,7 @@ import socket
 import struct
 from typing import Final, NamedTuple
 
-from sightline.protocol.transports.websocket_life import SILENCE_US, SendPath
+from sightline.protocol.transports.websocket.connection import SILENCE_US, SendPath
 
 
 class _Fields(NamedTuple):

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.secured import ROLES, certificate_role
+from sightline.protocol.transports.security import ROLES, certificate_role
 
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{16,128}")
 

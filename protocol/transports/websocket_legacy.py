@@ -21,9 +21,9 @@ from sightline.protocol.refusals import RejectReason
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.websocket_dialects import BAD_FRAMING, PeerError
 from sightline.protocol.transports.websocket_endpoints import LegacyOptions
-from sightline.protocol.transports.websocket_framing import IncomingMessage
-from sightline.protocol.transports.websocket_seat import DriverSlot
-from sightline.protocol.twist_text import format_twist, parse_twist
+from sightline.protocol.transports.websocket.framing import IncomingMessage
+from sightline.protocol.transports.websocket.legacy import DriverSlot
+from sightline.protocol.text import format_twist, parse_twist
 
 GUEST: Final = "guest"
 GUEST_SESSION: Final = "00000000"

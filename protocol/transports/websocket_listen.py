@@ -11,7 +11,7 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
-from sightline.protocol.transports.secured import certificate_role
+from sightline.protocol.transports.security import certificate_role
 from sightline.protocol.transports.websocket_access import (
     NO_TOKEN,
     NOT_LISTED,
@@ -23,10 +23,10 @@ from sightline.protocol.transports.websocket_access import (
 from sightline.protocol.transports.websocket_dialects import BAD_FRAMING, PeerError
 from sightline.protocol.transports.websocket_door import listening_socket
 from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint, host_problem, origin_problem
-from sightline.protocol.transports.websocket_framing import MAX_HELLO_BYTES, SUBPROTOCOL
+from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL
 from sightline.protocol.transports.websocket_keys import read_tokens
 from sightline.protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS, Promote, count_close
-from sightline.protocol.transports.websocket_places import ConnectionLimits, Slot, may_control
+from sightline.protocol.transports.websocket.server import ConnectionLimits, Slot, may_control
 from sightline.protocol.transports.websocket_tls import server_tls_context, tls_handshake
 from sightline.protocol.transports.websocket_wire import CLOSE_S, Connection
 

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Final
 from sightline.protocol.channels import ACK, Channel
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import WireError
-from sightline.protocol.log_lines import RepeatLimiter
+from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.link_rules import OVERSIZE
 from sightline.protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, PeerCodec, PeerError, SightlineV1
-from sightline.protocol.transports.websocket_framing import IncomingMessage
-from sightline.protocol.transports.websocket_life import Keepalive
-from sightline.protocol.transports.websocket_outbox import Outbox, Publication
+from sightline.protocol.transports.websocket.framing import IncomingMessage
+from sightline.protocol.transports.websocket.connection import Keepalive
+from sightline.protocol.transports.websocket.peer import Outbox, Publication
 from sightline.protocol.transports.websocket_wire import CLOSE_S, Connection
 
 if TYPE_CHECKING:

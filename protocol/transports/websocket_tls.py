@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.secured import certificate_role
+from sightline.protocol.transports.security import certificate_role
 
 
 def server_tls_context(folder: str, source: str) -> ssl.SSLContext:

@@ -10,7 +10,7 @@ from sightline.protocol.channels import CHANNELS, Channel
 from sightline.protocol.codec import encode
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.link_rules import LinkRules
-from sightline.protocol.transports.websocket_framing import Hello
+from sightline.protocol.transports.websocket.framing import Hello
 
 Callback = Callable[[Message], None]
 _WATCHED = tuple(one for one in CHANNELS.values() if one.while_watched)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.transports.websocket_kernel import send_path
-from sightline.protocol.transports.websocket_life import SendPath
+from sightline.protocol.transports.websocket.connection import SendPath
 from sightline.protocol.transports.websocket_messages import MessageReader, unmasked_head
 
 if TYPE_CHECKING:

@@ -15,11 +15,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.log_lines import JsonLineStream, RepeatLimiter
+from sightline.protocol.log import JsonLineStream, RepeatLimiter
 from sightline.protocol.transports import denied
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
 from sightline.protocol.transports.tcp_table import Visitors
-from sightline.protocol.transports.tls_refusals import TLS_LOG_FILTER, refusal_cause
+from sightline.protocol.transports.zenoh.access_log import TLS_LOG_FILTER, refusal_cause
 
 _STDOUT = 1
 _GULP_BYTES = 1_048_576  # what an unprivileged pipe can hold; one that is full costs lines

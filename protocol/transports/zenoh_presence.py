@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.transports.presence import (
+from sightline.protocol.transports.zenoh.presence import (
     MAX_ABOUT,
     MAX_PEERS,
     PRESENCE_PATTERN,

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
-from sightline.protocol.transports.port_owner import port_owner
-from sightline.protocol.transports.secured import RoleKeys, size_limit_section
+from sightline.protocol.transports.diagnosis import port_owner
+from sightline.protocol.transports.security import RoleKeys, size_limit_section
 from sightline.protocol.transports.tls_trouble import diagnose_tls
-from sightline.protocol.transports.zenoh_discovery import MULTICAST_OFF, multicast_section
+from sightline.protocol.transports.zenoh.session import MULTICAST_OFF, multicast_section
 
 if TYPE_CHECKING:
     import zenoh

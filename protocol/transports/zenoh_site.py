@@ -18,8 +18,8 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints
 from sightline.protocol.transports.link import Link
 from sightline.protocol.transports.link_rules import LinkRules
-from sightline.protocol.transports.secured import load_role_keys
-from sightline.protocol.transports.zenoh import ZenohLink
+from sightline.protocol.transports.security import load_role_keys
+from sightline.protocol.transports.zenoh.link import ZenohLink
 from sightline.protocol.transports.zenoh_presence import PresenceAnnouncer
 from sightline.protocol.transports.zenoh_session import CLOSED_SESSION, open_session
 

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.robot_side.hardware.gpio_pins import Pins, open_pins
-from sightline.robot_side.hardware.gpio_table import DutyTable, TableConfig, table_of
+from sightline.robot_side.hardware.gpio import DutyTable, TableConfig, table_of
 from sightline.robot_side.ports import WheelAngles
 
 BcmPin = Annotated[int, Field(ge=2, le=27)]

@@ -3,7 +3,7 @@
 import time
 
 from sightline.protocol.clock import monotonic_us
-from sightline.robot_side.hardware.buffer_time import Clocks
+from sightline.robot_side.hardware.cameras.timing import Clocks
 
 
 class FrameTimer:

@@ -7,8 +7,8 @@ from pydantic import Field
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import HardwareError
-from sightline.robot_side.hardware.folder_camera import jpeg_size
-from sightline.robot_side.hardware.lens import LensConfig, camera_model
+from sightline.robot_side.hardware.cameras.files import jpeg_size
+from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
 from sightline.robot_side.hardware.pace import FrameTimer
 from sightline.robot_side.ports import Picture
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import CameraModel
-from sightline.robot_side.hardware.lens import camera_model
+from sightline.robot_side.hardware.cameras.lens import camera_model
 from sightline.robot_side.hardware.newest import LatestPicture
 from sightline.robot_side.hardware.v4l2_device import Capture, V4l2CameraConfig, V4l2Device, open_capture
 from sightline.robot_side.ports import Picture

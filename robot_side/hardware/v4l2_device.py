@@ -14,10 +14,10 @@ from pydantic import Field
 
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import JpegSize
-from sightline.robot_side.hardware.buffer_time import CaptureClock
-from sightline.robot_side.hardware.lens import LensConfig
+from sightline.robot_side.hardware.cameras.timing import CaptureClock
+from sightline.robot_side.hardware.cameras.lens import LensConfig
 from sightline.robot_side.hardware.pace import read_clocks
-from sightline.robot_side.hardware.v4l2_trouble import check_device, open_error
+from sightline.robot_side.hardware.cameras.v4l2 import check_device, open_error
 from sightline.robot_side.ports import Picture, scaled_quality, scaled_size
 
 _SELECT_TIMEOUT_S = 2  # OpenCV waits this long for a picture; its own default of 10 would hide a frozen camera

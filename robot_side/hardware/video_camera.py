@@ -13,7 +13,7 @@ from pydantic import Field
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import JpegSize
-from sightline.robot_side.hardware.lens import LensConfig, camera_model
+from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
 from sightline.robot_side.hardware.pace import FrameTimer
 from sightline.robot_side.ports import Picture, scaled_quality, scaled_size
 

@@ -3,8 +3,8 @@
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import State, Twist, Verb
 from sightline.protocol.refusals import RejectReason
-from sightline.robot_side.judge import AcceptedCommand, CommandResult
-from sightline.robot_side.lease import RANKS
+from sightline.robot_side.safety.validation import AcceptedCommand, CommandResult
+from sightline.robot_side.safety.lease import RANKS
 from tests.conformance.breaking import breaks, wrap
 
 

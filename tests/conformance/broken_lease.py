@@ -1,7 +1,7 @@
 """Robots that are wrong about who drives. Pure."""
 
 from sightline.protocol.messages import Holder, State, Twist
-from sightline.robot_side.lease import RANKS, Lease
+from sightline.robot_side.safety.lease import RANKS, Lease
 from tests.conformance.breaking import bend_out, breaks, fields_of, wrap
 
 STILL = Twist(linear_mps=0.0, angular_rad_s=0.0)

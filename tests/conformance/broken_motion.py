@@ -3,7 +3,7 @@
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import State, Twist
 from sightline.protocol.refusals import CLAMPED, RejectReason
-from sightline.robot_side.judge import AcceptedCommand
+from sightline.robot_side.safety.validation import AcceptedCommand
 from tests.conformance.breaking import bend_out, breaks, fields_of, wrap
 from tests.conformance.broken_lease import who_sends
 

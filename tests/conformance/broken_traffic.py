@@ -5,8 +5,8 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.messages import Twist
 from sightline.protocol.refusals import RejectReason
 from sightline.protocol.transports.link import Message
-from sightline.robot_side.judge import AcceptedCommand
-from sightline.robot_side.lease import Lease
+from sightline.robot_side.safety.validation import AcceptedCommand
+from sightline.robot_side.safety.lease import Lease
 from sightline.robot_side.ports import Picture
 from tests.conformance.breaking import as_json, bend_acks, bend_out, breaks, fields_of, wrap
 from tests.conformance.broken_lease import lease_of

@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from sightline.operator_side import keys
+from sightline.operator_side.setup import keys
 from tests.javascript_rig import EXAMPLES, ROOT, JsRobot, JsVision, free_port, node
 from tests.link_rigs import free_endpoint, until
 from tests.robot_process import RobotProcess
 
-SIGHTLINE = [sys.executable, "-m", "sightline.operator_side.cli"]
+SIGHTLINE = [sys.executable, "-m", "sightline.operator_side.cli.app"]
 KEPT = ROOT / "runs" / "conformance"
 PAGE = ROOT / "docs" / "conformance.md"
 ADAPTER = EXAMPLES.parent / "codec_adapter.py"

@@ -11,8 +11,8 @@ from sightline.protocol.messages import CameraModel
 from sightline.protocol.transports import link_rules, memory
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.driving import DriverCore
-from sightline.robot_side.limits import TICK_US, SafetyConfig
+from sightline.robot_side.driver.core import DriverCore
+from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
 from sightline.robot_side.ports import Picture, Ranges, WheelAngles
 from sightline.robot_side.sending import NetworkCore
 from tests.robot_process import JPEG

@@ -16,7 +16,7 @@ import threading
 import time
 
 from sightline.protocol.channels import CHANNELS, Direction, key_for
-from sightline.protocol.conformance.raw_websocket import xor
+from sightline.conformance.raw_peers import xor
 from sightline.protocol.errors import WireError
 from sightline.protocol.refusals import RejectReason
 from sightline.protocol.transports.memory import MemoryNetwork

@@ -6,10 +6,10 @@ and no other. The steps that a broken one may change, in the order of a frame's 
 
 from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST, key_for
 from sightline.protocol.conformance.vision_pictures import HALF_CAMERA
-from sightline.protocol.golden_case import packed
+from sightline.protocol.spec.message_cases import packed
 from sightline.protocol.messages import STILL, FrameHeader
 from sightline.protocol.transports.link import Message
-from sightline.protocol.twist_text import format_twist
+from sightline.protocol.text import format_twist
 from tests.conformance.vision_rig import COMPUTE_US, VirtualVision
 from sightline.vision_side.pipeline import Observation, PipelineAnswer, answer_header
 

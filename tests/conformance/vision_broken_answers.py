@@ -2,7 +2,7 @@
 
 from sightline.protocol.channels import REQUEST, key_for
 from sightline.protocol.conformance.vision_pictures import picture
-from sightline.protocol.golden_case import packed
+from sightline.protocol.spec.message_cases import packed
 from sightline.protocol.messages import Stamp
 from tests.conformance.vision_broken import STANDING, BrokenVision, breaks, frame_header
 from sightline.vision_side.pipeline import Observation, PipelineAnswer

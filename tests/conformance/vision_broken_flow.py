@@ -4,7 +4,7 @@ import json
 from collections import deque
 
 from sightline.protocol.channels import FRAME
-from sightline.protocol.conformance.vision_flow import BROKEN_STATUS
+from sightline.conformance.vision.flow import BROKEN_STATUS
 from tests.conformance.vision_broken import STANDING, BrokenVision, breaks
 from tests.conformance.vision_broken_answers import PerSession
 from sightline.vision_side.pipeline import Observation, PipelineAnswer

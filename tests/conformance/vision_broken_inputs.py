@@ -3,7 +3,7 @@
 import json
 from contextlib import suppress
 
-from sightline.protocol.conformance.vision_hostile import CAMERAS
+from sightline.conformance.vision.hostile import CAMERAS
 from sightline.protocol.conformance.vision_limits import DOUBTED, READ, REFUSED
 from sightline.protocol.conformance.vision_pictures import CAMERA, picture
 from tests.conformance.vision_broken import STANDING, BrokenVision, breaks, frame_header, header_of

@@ -13,7 +13,7 @@ from websockets.exceptions import ConnectionClosedError, WebSocketException
 from websockets.frames import Opcode
 from websockets.sync.client import connect
 
-from sightline.protocol.conformance.vision_socket_server import SESSION_BEGINS
+from sightline.conformance.vision.websocket import SESSION_BEGINS
 
 SOCKETS = {
     "V-SOCK-01": "offers a sub-protocol of its own",

@@ -20,14 +20,14 @@ _GATE = (
     "tests/test_safety_lease_boundaries.py",
 )
 TABLES = {
-    "robot_side/safety.py": _GATE,
-    "robot_side/states.py": _GATE,
-    "robot_side/judge.py": ("tests/test_record_boundaries.py",),
-    "robot_side/lease.py": ("tests/test_lease_boundaries.py",),
-    "robot_side/limits.py": ("tests/test_limits_boundaries.py", "tests/test_limits_ramp_boundaries.py"),
-    "robot_side/guard.py": ("tests/test_guard_boundaries.py",),
+    "robot_side/safety/gate.py": _GATE,
+    "robot_side/safety/states.py": _GATE,
+    "robot_side/safety/validation.py": ("tests/test_record_boundaries.py",),
+    "robot_side/safety/lease.py": ("tests/test_lease_boundaries.py",),
+    "robot_side/safety/limits.py": ("tests/test_limits_boundaries.py", "tests/test_limits_ramp_boundaries.py"),
+    "robot_side/safety/guard.py": ("tests/test_guard_boundaries.py",),
     "robot_side/kinematics.py": ("tests/test_kinematics_boundaries.py",),
-    "protocol/twist_text.py": ("tests/test_wire_boundaries.py",),
+    "protocol/text.py": ("tests/test_wire_boundaries.py",),
     "protocol/jpeg.py": ("tests/test_wire_boundaries.py",),
 }
 """Each judged file and the tables that must notice any change to it."""

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from sightline.protocol.channels import ACK, DETECTIONS, REQUEST, STATUS, TWIST
-from sightline.protocol.transports.websocket import open_websocket
+from sightline.protocol.transports.websocket.link import open_websocket
 
 with open_websocket("r1", listen=sys.argv[1:3], role="robot") as link:
     link.subscribe(TWIST, lambda message: message.source == "teleop" and link.publish(STATUS, b"{}", message.payload))

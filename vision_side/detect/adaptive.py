@@ -15,8 +15,8 @@ from pydantic import Field
 from sightline.protocol.config import Config as Settings
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.chroma import ColorModel
-from sightline.vision_side.detect.colour import Region
+from sightline.vision_side.detect.color.adaptive import ColorModel
+from sightline.vision_side.detect.color.hsv import Region
 from sightline.vision_side.detect.hsv import HsvDetector
 from sightline.vision_side.detect.labels import Label
 from sightline.vision_side.detect.pixel_track import PixelTrack

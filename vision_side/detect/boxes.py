@@ -16,7 +16,7 @@ from sightline.protocol.messages import CameraModel, DetectedBox, Detections, De
 from sightline.protocol.refusals import RejectReason
 from sightline.vision_side.config import BoxesConfig
 from sightline.vision_side.detect.port import Circle, Detection
-from sightline.vision_side.sphere import Sighting, points_ahead
+from sightline.vision_side.tracking.locate import Sighting, points_ahead
 
 REMEMBERED = 128
 """Frames; at 60 per second twice what any robot would still move for."""

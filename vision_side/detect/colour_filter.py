@@ -11,7 +11,7 @@ from sightline.protocol.errors import WireError
 from sightline.vision_side.config import HsvRange
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.detect.around import DetectorWrapper
-from sightline.vision_side.detect.colour import color_table
+from sightline.vision_side.detect.color.hsv import color_table
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
 
 LEAST_SHARE: Final = 0.3

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.colour import ColorMask, Region
+from sightline.vision_side.detect.color.hsv import ColorMask, Region
 from sightline.vision_side.detect.disc import Fit, Outline, fit_round_part
 from sightline.vision_side.detect.edge import Box, sharp_outline
 from sightline.vision_side.detect.port import Circle, Detection

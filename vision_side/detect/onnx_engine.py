@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.vision_side.config import Device
-from sightline.vision_side.detect.onnx_header import OnnxHeader
+from sightline.vision_side.detect.onnx.engine import OnnxHeader
 
 Arrays = dict[str, NDArray[Any]]
 PROVIDERS: Final = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider",

@@ -16,9 +16,9 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.detect.agreement import Agreement, LabelTest
 from sightline.vision_side.detect.around import attach_detector, close_detector, notices_of
-from sightline.vision_side.detect.by_session import MAX_ROBOTS
+from sightline.vision_side.detect.per_robot import MAX_ROBOTS
 from sightline.vision_side.detect.checking import validated
-from sightline.vision_side.detect.news import Notices
+from sightline.vision_side.detect.plugin_calls import Notices
 from sightline.vision_side.detect.own_decoders import DecoderPool
 from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
 

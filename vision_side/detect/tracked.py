@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from sightline.vision_side.detect.around import DetectorWrapper
-from sightline.vision_side.detect.by_session import PerSession
+from sightline.vision_side.detect.per_robot import PerSession
 from sightline.vision_side.detect.overlap import corners, overlap
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
 

@@ -14,14 +14,14 @@ from pydantic import Field
 from sightline.protocol.config import Config
 from sightline.protocol.messages import STILL, CameraModel, Pose, Twist
 from sightline.vision_side.config import LatencyConfig
-from sightline.vision_side.foretell import Motion, MotionPredictor
+from sightline.vision_side.tracking.prediction import Motion, MotionPredictor
 from sightline.vision_side.missions.body import Footprint, braking_mps, clear_of
 from sightline.vision_side.missions.giving_up import ProgressChecker, ProgressCheckerConfig
-from sightline.vision_side.missions.ground import CELL_M, Costmap
+from sightline.vision_side.missions.planner import CELL_M, Costmap
 from sightline.vision_side.missions.port import Plan, RangeScan, View
 from sightline.vision_side.missions.ranging import PoseMemory, about_robot, echoes, in_odometry
 from sightline.vision_side.missions.route import Planner, Point
-from sightline.vision_side.track import to_odometry
+from sightline.vision_side.tracking.track import to_odometry
 
 Metres = Annotated[float, Field(ge=-100, le=100)]
 

@@ -17,8 +17,8 @@ from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.follow import Follow
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.ranging import Points, PoseMemory, about_robot, echoes, in_odometry
-from sightline.vision_side.sphere import Sighting, points_ahead
-from sightline.vision_side.track import from_odometry
+from sightline.vision_side.tracking.locate import Sighting, points_ahead
+from sightline.vision_side.tracking.track import from_odometry
 
 _SPAN_MARGIN_RAD = math.radians(1.5)  # a lidar's rays stand 1 degree apart, and the person walks on meanwhile
 _GAP_M = 0.10  # echoes further apart than this, one after the other, are of two legs

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from sightline.protocol.config import Config
 from sightline.protocol.messages import STILL, CameraModel, Twist
-from sightline.vision_side.missions.blob import Blob, largest
+from sightline.evaluation.baselines.pixels import Blob, largest
 from sightline.vision_side.missions.port import Plan, View
 
 Pixels = Annotated[float, Field(ge=0, le=1e4)]

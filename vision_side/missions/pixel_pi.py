@@ -11,7 +11,7 @@ from pydantic import Field
 
 from sightline.protocol.config import Config
 from sightline.protocol.messages import STILL, CameraModel, Twist
-from sightline.vision_side.missions.blob import largest
+from sightline.evaluation.baselines.pixels import largest
 from sightline.vision_side.missions.port import Plan, View
 
 Bound = Annotated[float | None, Field(gt=0, le=1e6)]

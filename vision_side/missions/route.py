@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sightline.vision_side.missions.ground import CELL_M, Cells, cells_of
+from sightline.vision_side.missions.planner import CELL_M, Cells, cells_of
 
 Point = tuple[float, float]
 Cell = tuple[int, int]

@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from sightline.protocol.config import Config
-from sightline.vision_side.missions.lamp import UNKNOWN
+from sightline.vision_side.missions.lights import UNKNOWN
 
 _FRAMES = 2  # a colour that lets go must be seen this often, one after the other; one that stops counts at once
 

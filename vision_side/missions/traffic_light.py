@@ -16,12 +16,12 @@ from sightline.protocol.messages import STILL, CameraModel, Pose, Twist
 from sightline.vision_side.config import BoxesConfig, LatencyConfig
 from sightline.vision_side.detect.boxes import locate_box
 from sightline.vision_side.detect.port import Detection
-from sightline.vision_side.foretell import Motion, MotionPredictor
-from sightline.vision_side.missions.lamp import UNKNOWN, BoxLightReader, HousingLightReader, LampConfig, Light
+from sightline.vision_side.tracking.prediction import Motion, MotionPredictor
+from sightline.vision_side.missions.lights import UNKNOWN, BoxLightReader, HousingLightReader, LampConfig, Light
 from sightline.vision_side.missions.lane import Lane, LaneConfig, Line
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.stop_line import StopConfig, StopLine
-from sightline.vision_side.track import to_odometry
+from sightline.vision_side.tracking.track import to_odometry
 
 Place = tuple[float, float]
 

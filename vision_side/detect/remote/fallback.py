@@ -12,10 +12,10 @@ from typing import Final, Protocol, runtime_checkable
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.detect.around import attach_detector, close_detector, notices_of
-from sightline.vision_side.detect.by_session import MAX_ROBOTS
-from sightline.vision_side.detect.news import Notices
+from sightline.vision_side.detect.per_robot import MAX_ROBOTS
+from sightline.vision_side.detect.plugin_calls import Notices
 from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
-from sightline.vision_side.detect.remote.by_deadline import MAX_PIXELS, DeadlineDetector
+from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, DeadlineDetector
 
 GOOD_ANSWERS: Final = 10
 """In a row; a third of a second at 30 fps."""

@@ -17,11 +17,11 @@ from sightline.protocol.refusals import RejectReason
 from sightline.vision_side.config import Fraction
 from sightline.vision_side.detect.labels import clean_label
 from sightline.vision_side.detect.port import DetectFrame, Maker
-from sightline.vision_side.detect.remote.address import Address, parse_address
+from sightline.vision_side.detect.remote.client import Address, parse_address
 from sightline.vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector
 from sightline.vision_side.detect.remote.boxes_read import MIN_SCORE, hash_of, read_boxes
-from sightline.vision_side.detect.remote.by_deadline import MAX_PIXELS, DeadlineDetector, PixelBound
-from sightline.vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES, HttpExchange
+from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, DeadlineDetector, PixelBound
+from sightline.vision_side.detect.remote.http_client import MAX_ANSWER_BYTES, HttpExchange
 from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 SESSION, SEQ = "X-Sightline-Session", "X-Sightline-Seq"

@@ -5,10 +5,10 @@ from typing import Any, Final
 
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.detect.port import DetectFrame, Maker
-from sightline.vision_side.detect.remote.address import Address, parse_address
+from sightline.vision_side.detect.remote.client import Address, parse_address
 from sightline.vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector, seconds_left
-from sightline.vision_side.detect.remote.by_deadline import DeadlineDetector
-from sightline.vision_side.detect.remote.http_exchange import MAX_ANSWER_BYTES
+from sightline.vision_side.detect.remote.deadline import DeadlineDetector
+from sightline.vision_side.detect.remote.http_client import MAX_ANSWER_BYTES
 from sightline.vision_side.detect.remote.oip import OipModel, OutputOptions, detections_of, tensor_of
 from sightline.vision_side.detect.remote.oip_messages import (
     INFER,

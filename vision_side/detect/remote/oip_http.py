@@ -1,10 +1,10 @@
 """`oip+http://HOST/MODEL`: a model of an inference server (Triton, OpenVINO Model Server) over HTTP. Shell."""
 
 from sightline.vision_side.detect.port import DetectFrame, Maker
-from sightline.vision_side.detect.remote.address import Address, parse_address
+from sightline.vision_side.detect.remote.client import Address, parse_address
 from sightline.vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector
-from sightline.vision_side.detect.remote.by_deadline import DeadlineDetector
-from sightline.vision_side.detect.remote.http_exchange import HttpExchange
+from sightline.vision_side.detect.remote.deadline import DeadlineDetector
+from sightline.vision_side.detect.remote.http_client import HttpExchange
 from sightline.vision_side.detect.remote.oip import OipModel, OutputOptions, detections_of, tensor_of
 from sightline.vision_side.detect.remote.oip_json import HEADER_LENGTH, infer_body, read_infer, read_metadata
 from sightline.vision_side.detect.remote.oip_settings import OipSettings

@@ -8,7 +8,7 @@ from sightline.protocol.config import Config as Settings
 from sightline.vision_side.config import Fraction
 from sightline.vision_side.detect.labels import Label
 from sightline.vision_side.detect.remote.boxes_read import MIN_SCORE
-from sightline.vision_side.detect.remote.by_deadline import MAX_PIXELS, PixelBound
+from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, PixelBound
 from sightline.vision_side.detect.remote.oip import OutputOptions
 
 

@@ -4,7 +4,7 @@ from collections import Counter
 from enum import StrEnum
 from typing import Final
 
-from sightline.vision_side.detect.news import Notices
+from sightline.vision_side.detect.plugin_calls import Notices
 
 _LONGEST: Final = 160
 _TOLD_AT: Final = frozenset(10**power for power in range(10))

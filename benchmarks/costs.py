@@ -1,0 +1,71 @@
+"""What encoding and decoding of the small messages costs: `sightline bench codec`. Shell (reads the clock)."""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
+from sightline.protocol.text import format_twist, parse_twist
+
+CODEC_BOUND_US: Final = 10.0
+_ROUNDS: Final = 200
+_PER_ROUND: Final = 50
+
+_FRAME = FrameHeader(
+    session="0a1b2c3d",
+    seq=123_456,
+    t_us=987_654_321,
+    pose=(1.2345, -0.4321, 0.5678),
+    moving=(0.2012, -0.3498),
+    applied=(0.2, -0.35),
+    latency_us=52_000,
+)
+_ANSWER = AnswerHeader(
+    source="vision",
+    session="4e5f6071",
+    seq=123_400,
+    echo=Echo(channel="frame", session="0a1b2c3d", seq=123_456, t_us=987_654_321),
+    compute_us=2_300,
+)
+_TWIST = Twist(linear_mps=0.2, angular_rad_s=-0.35)
+
+
+@dataclass(frozen=True, slots=True)
+class CodecCost:
+    """Median time of one encode and one decode, in microseconds, beside the bound."""
+
+    name: str
+    median_us: float
+    bound_us: float = CODEC_BOUND_US
+
+    @property
+    def ok(self) -> bool:
+        """Whether it is within its bound."""
+        return self.median_us <= self.bound_us
+
+
+def measure_codec() -> list[CodecCost]:
+    """Medians over 200 rounds of 50 calls in a hot loop; after idling 33 ms the same calls cost several times more."""
+    return [CodecCost("frame header", _median_us(_frame)), CodecCost("answer header and twist", _median_us(_answer))]
+
+
+def _frame() -> None:
+    decode(FrameHeader, encode(_FRAME))
+
+
+def _answer() -> None:
+    decode(AnswerHeader, encode(_ANSWER))
+    parse_twist(format_twist(_TWIST))
+
+
+def _median_us(call: Callable[[], None]) -> float:
+    rounds = []
+    for _ in range(_ROUNDS):
+        begin_ns = time.perf_counter_ns()
+        for _ in range(_PER_ROUND):
+            call()
+        rounds.append((time.perf_counter_ns() - begin_ns) / _PER_ROUND / 1000)
+    return statistics.median(rounds)

@@ -1,0 +1,82 @@
+"""Sightline itself as a contestant of `bench loop`: the real robot and vision services. Shell (processes)."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from sightline.benchmarks.loop_course import Accepted, Course, course_of_headers
+from sightline.benchmarks.loop.processes import BenchProcesses, free_port
+from sightline.benchmarks.loop.counters import children_of
+from sightline.benchmarks.loop.figures import LoopSetting
+from sightline.protocol.channels import STATUS
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import Stamp, Status
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.open import open_link
+
+ROBOT: Final = "r1"
+TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{}"}
+
+
+@dataclass(slots=True)
+class Ours:
+    """The services, running."""
+
+    pids: dict[str, int]
+    ports: tuple[int, ...]
+    endpoint: str
+    tally: Path
+    accepted: list[Accepted] = field(default_factory=list)
+
+    def note(self, message: Message) -> None:
+        """Keep what a status says of the commands accepted."""
+        stamp, status = decode(Stamp, message.header), decode(Status, message.payload, STATUS.max_payload_bytes)
+        self.accepted.append((stamp.t_us, status.accepted))
+
+    def course(self, begin_us: int, end_us: int) -> Course:
+        """What became of the pictures of that time; only after the vision has ended."""
+        headers = [(seq, t_us, latency_us) for seq, t_us, latency_us in json.loads(self.tally.read_text())]
+        return course_of_headers(headers, self.accepted, begin_us, end_us)
+
+
+def endpoint_of(transport: str, port: int) -> str:
+    """An endpoint of `transport`. Raises ConfigError for one that is unknown."""
+    if transport not in TRANSPORTS:
+        raise ConfigError(f"--transport {transport!r}: {', '.join(TRANSPORTS)}")
+    return TRANSPORTS[transport].format(port)
+
+
+@contextmanager
+def running_services(setting: LoopSetting, folder: Path, crew: BenchProcesses) -> Iterator[Ours]:
+    """Robot and vision, seen working. Raises HardwareError with a service's own words if one does not start."""
+    port = free_port()
+    endpoint = endpoint_of(setting.transport, port)
+    driver = crew.start("robot", "sightline.operator_side.cli.app", "robot", "--config", str(_robot_toml(setting, folder, endpoint)))
+    crew.wait_line("robot", f"robot {ROBOT}: on")
+    with open_link(ROBOT, connect=[endpoint], role="operator") as link:
+        tally = folder / "headers.json"
+        config = {"robot": ROBOT, "connect": [endpoint]}
+        slow = {"delay_ms": setting.detector_delay_ms, "busy_ms": setting.busy_ms}
+        settings = {"config": config, "tally": str(tally), **slow}
+        vision = crew.start("vision", "sightline.benchmarks.loop_vision", json.dumps(settings))
+        pids = {"driver": driver, "network": children_of(driver)[0], "vision": vision}
+        ours = Ours(pids, (port,), endpoint, tally)
+        link.subscribe(STATUS, ours.note)
+        crew.wait_line("vision", "target seen")
+        yield ours
+
+
+def _robot_toml(setting: LoopSetting, folder: Path, endpoint: str) -> Path:
+    """JSON's strings and numbers are TOML's too."""
+    path = folder / "robot.toml"
+    path.write_text(
+        f"robot = {json.dumps(ROBOT)}\nlisten = [{json.dumps(endpoint)}]\nstate_dir = {json.dumps(str(folder))}\n"
+        f'[camera]\nkind = "folder"\noptions = {{path = {json.dumps(str(setting.pictures))}, fps = {setting.fps}}}\n'
+        f'[drive]\nkind = "log"\n[safety]\nauto_arm = true\n[stream]\nmax_fps = {setting.fps}\n',
+        "utf-8",
+    )
+    return path

@@ -1,0 +1,128 @@
+"""The rows of `bench network`: what the wire does, when, and what is demanded then. Pure."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from sightline.protocol.errors import ConfigError
+from sightline.sim.network_emulator import LinkShape, LinkShapes
+
+HOLD_AGE_MS: Final = 400.0
+"""A frame older than this is not driven on; the robot's default `safety.zero_speed_age_ms`."""
+CUT_S: Final = 5.0
+NOTHING_S: Final = 1.0
+STEP_SETTLES_S: Final = 2.0
+HEALS_S: Final = 1.0
+ZENOH: Final = "zenoh"
+WEBSOCKET: Final = "websocket"
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """Shapes in force for `seconds`, or for its share of the time asked for where that is None."""
+
+    shapes: LinkShapes
+    seconds: float | None = None
+    settle_s: float = 0.0
+    """How long after its beginning its bounds hold."""
+    judged: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One network. Bounds that are None are not demanded; `over_loopback_ms` is over the first phase's p50.
+
+    A row with a `scene` is more than one robot and one vision: its scene runs and judges it. With `passes_through` the
+    camera hands over its own JPEGs, which nobody can make smaller.
+    """
+
+    name: str
+    what: str
+    phases: tuple[Phase, ...]
+    least_fps: float | None = None
+    p50_ms: float | None = None
+    p95_ms: float | None = None
+    over_first_ms: float | None = None
+    most_holds: int | None = None
+    longest_hold_s: float | None = None
+    flows_again_s: float | None = None
+    scene: str = ""
+    passes_through: bool = False
+    transports: tuple[str, ...] = (ZENOH, WEBSOCKET)
+
+    @property
+    def draws(self) -> bool:
+        """Whether chance has a part in it, so that one seed is not another."""
+        legs = [leg for phase in self.phases for leg in (phase.shapes.ab, phase.shapes.ba)]
+        return not self.scene and any(
+            leg.loss or leg.burst_start or leg.jitter_ms or leg.reorder or leg.duplicate or leg.corrupt for leg in legs
+        )
+
+
+def both(**changes: float | bool) -> LinkShapes:
+    """The same shape each way."""
+    shape = LinkShape.model_validate(changes)
+    return LinkShapes(ab=shape, ba=shape)
+
+
+def _steady(**changes: float | bool) -> tuple[Phase, ...]:
+    return (Phase(both(**changes)),)
+
+
+_NEAR: Final = both(delay_ms=1)
+_SITE: Final = (ZENOH,)
+"""Rows with a router, or with one vision for many robots, which WebSocket has not."""
+
+CASES: Final = (
+    Case("rtt40", "40 ms round trip", _steady(delay_ms=20), least_fps=28, p50_ms=40 + 15),
+    Case("near", "no loss, 1 ms each way", (Phase(both(), judged=False), Phase(_NEAR)), over_first_ms=2 + 1),
+    Case("radio", "10 Mbit/s, 40 ms round trip, 2 % loss", _steady(delay_ms=20, loss=0.02, rate_bit_s=1e7), least_fps=12,
+        p95_ms=160, most_holds=1, longest_hold_s=0.5),
+    Case("bursts", "10 Mbit/s, 40 ms round trip, losses five in a row, 1 % in all",
+        _steady(delay_ms=20, burst_start=0.002, burst_end=0.2, rate_bit_s=1e7), least_fps=12, p95_ms=160),
+    Case("thin", "2 Mbit/s, 10 ms round trip", _steady(delay_ms=5, rate_bit_s=2e6), p95_ms=250),
+    Case("through", "2 Mbit/s, 10 ms round trip, a camera's own JPEGs of 46 kB", _steady(delay_ms=5, rate_bit_s=2e6),
+        p95_ms=250, passes_through=True),
+    Case("step", "10 Mbit/s, then 1 Mbit/s", (
+        Phase(both(delay_ms=5, rate_bit_s=1e7), judged=False),
+        Phase(both(delay_ms=5, rate_bit_s=1e6), settle_s=STEP_SETTLES_S),
+    ), p95_ms=250),
+    Case("rise", "1 Mbit/s, then 10 Mbit/s", (
+        Phase(both(delay_ms=5, rate_bit_s=1e6), judged=False),
+        Phase(both(delay_ms=5, rate_bit_s=1e7), settle_s=STEP_SETTLES_S),
+    ), least_fps=12, p95_ms=160),
+    Case("rtt200", "200 ms round trip", _steady(delay_ms=100), least_fps=20, p95_ms=200 + 60),
+    Case("cut", "a partition of 5 s", (
+        Phase(_NEAR, judged=False), Phase(both(cut=True), CUT_S, judged=False), Phase(_NEAR, settle_s=HEALS_S),
+    ), flows_again_s=HEALS_S),
+    Case("nothing", "20 Mbit/s, 10 ms round trip, a second of nothing", (
+        Phase(both(delay_ms=5, rate_bit_s=2e7), judged=False), Phase(both(cut=True), NOTHING_S, judged=False),
+        Phase(both(delay_ms=5, rate_bit_s=2e7), settle_s=HEALS_S),
+    ), flows_again_s=HEALS_S),
+    Case("medium", "one half-duplex medium of 1 Mbit/s, video offered at 4, an operator says STOP",
+        (Phase(both(rate_bit_s=1e6).model_copy(update={"half_duplex": True})),), scene="medium", transports=_SITE),
+    Case("uplink", "vision, standby, a second reader and a viewer at a router beyond the radio", (Phase(_NEAR),),
+        scene="uplink", transports=_SITE),
+    Case("standby", "the driving vision killed with -9, a standby beside it", (Phase(_NEAR),), scene="standby"),
+    Case("router", "the router killed with -9 and started again after 1 s", (Phase(_NEAR),), scene="router",
+        transports=_SITE),
+    Case("moved", "the robot gets another address", (Phase(_NEAR),), scene="moved", transports=_SITE),
+    Case("fleet", "20 robots at 320x240, 15 fps, into one vision", (Phase(_NEAR),), scene="fleet", transports=_SITE),
+)
+
+
+def chosen(only: Iterable[str], transport: str = ZENOH) -> tuple[Case, ...]:
+    """The rows named, all where none is, of those that `transport` can do. Raises ConfigError for another name."""
+    names = tuple(only)
+    possible = tuple(row for row in CASES if transport in row.transports)
+    known = [row.name for row in possible]
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"--only {name!r} is no row over {transport}; there are: {', '.join(known)}")
+    return tuple(row for row in possible if not names or row.name in names)
+
+
+def spans_s(row: Case, seconds: float) -> list[float]:
+    """How long each phase lasts when `seconds` are shared among those that have no length of their own."""
+    shared = sum(phase.seconds is None for phase in row.phases)
+    return [seconds / shared if phase.seconds is None else phase.seconds for phase in row.phases]

@@ -1,0 +1,136 @@
+"""`sightline bench network`: robot and vision in two network namespaces, a shaped wire between. Shell (processes).
+
+The robot plays recorded pictures through a camera that can change their quality and size; nothing is rendered.
+"""
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from sightline.evaluation.processes import terminated_like_interrupted
+from sightline.benchmarks.loop.processes import BenchProcesses
+from sightline.benchmarks.loop_figures import LoopCheck, at_most
+from sightline.benchmarks.loop.pictures import write_pictures
+from sightline.benchmarks.network_figures import Stretch, figures_of, network_checks
+from sightline.benchmarks.network_fleet import fleet
+from sightline.benchmarks.network.cases import Case, spans_s
+from sightline.benchmarks.network.stage import (
+    BenchWire,
+    NetworkRun,
+    NetworkSetting,
+    Scene,
+    Stage,
+    Wiring,
+    start_robot,
+    start_vision,
+)
+from sightline.benchmarks.network.scenes import moved, router, standby
+from sightline.benchmarks.network_uplink import uplink
+from sightline.benchmarks.network.figures import on_old_sight, read_wheel_commands
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.sim.network_emulator import LinkShapes
+from sightline.sim.tun_emulator import ADDRESS_A, why_impossible
+
+WIDTH_PX, HEIGHT_PX, FPS = 640, 480, 30.0
+SCENES: Final[Mapping[str, Scene]] = {
+    "uplink": uplink, "standby": standby, "router": router, "moved": moved, "fleet": fleet,
+}
+_SETTLE_S: Final = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Who hears how it goes: that a run begins, and what came of it."""
+
+    begins: Callable[[str], None]
+    ended: Callable[[NetworkRun], None]
+
+
+def run_network(
+    rows: Sequence[Case], setting: NetworkSetting, wiring: Wiring, telling: Progress, scenes: Mapping[str, Scene]
+) -> list[NetworkRun]:
+    """Every row, with every seed where chance has a part in it; `scenes` are added to `SCENES`.
+
+    Raises ConfigError without root; a process that does not run is a check that fails.
+    """
+    why = why_impossible()
+    if why:
+        raise ConfigError(f"bench network {why}: it makes network namespaces; run it as root on Linux")
+    turns = [(row, seed) for row in rows for seed in (setting.seeds if row.draws else setting.seeds[:1])]
+    runs: list[NetworkRun] = []
+    with terminated_like_interrupted(), tempfile.TemporaryDirectory(prefix="sightline-network-") as name:
+        film = write_film(Path(name))
+        for number, (row, seed) in enumerate(turns, start=1):
+            telling.begins(f"{row.name}, seed {seed} ({number} of {len(turns)})")
+            folder = Path(name) / str(number)
+            folder.mkdir()
+            stage = Stage(film, film.parent / "pictures", folder, wiring, setting, seed)
+            runs.append(_run(row, stage, {**SCENES, **scenes}))
+            telling.ended(runs[-1])
+    return runs
+
+
+def write_film(folder: Path) -> Path:
+    """The recorded pictures as a film: a camera that decodes may change quality and size."""
+    pictures, path = folder / "pictures", folder / "film.avi"
+    pictures.mkdir()
+    write_pictures(pictures, WIDTH_PX, HEIGHT_PX)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), FPS, (WIDTH_PX, HEIGHT_PX))
+    for jpeg in sorted(pictures.iterdir()):
+        writer.write(np.asarray(cv2.imread(str(jpeg))))
+    writer.release()
+    return path
+
+
+def _run(row: Case, stage: Stage, scenes: Mapping[str, Scene]) -> NetworkRun:
+    try:
+        return scenes[row.scene](row, stage) if row.scene else _course(row, stage)
+    except HardwareError as error:
+        why = f"runs: {error}"[:160]
+        return NetworkRun(row, stage.seed, 0, (), (LoopCheck(why, None, "", 1.0, ok=False),))
+
+
+def _course(row: Case, stage: Stage) -> NetworkRun:
+    """One robot and one vision, the wire shaped phase by phase."""
+    with stage.wire() as wire, stage.crew("crew") as crew:
+        # From the first packet on: what TCP learned of a better wire would be what is measured.
+        before = wire.shape(stage.seeded(row.phases[0].shapes))
+        _start(row, wire, crew, stage)
+        stretches = []
+        for phase, seconds in zip(row.phases, spans_s(row, stage.setting.seconds), strict=True):
+            wire.shape(stage.seeded(phase.shapes))
+            begin_us = monotonic_us()
+            settle_s = phase.settle_s or (0.0 if phase.seconds else _SETTLE_S)
+            time.sleep(seconds if phase.seconds else seconds + settle_s)
+            stretches.append(Stretch(begin_us, begin_us + round(settle_s * 1e6), monotonic_us()))
+            crew.check()
+        injected = wire.shape(LinkShapes()) - before
+        crew.end()
+    notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
+    figures = tuple(figures_of(notes, stretch) for stretch in stretches)
+    harmed = LoopCheck("injected", float(injected), "", 1.0, injected >= 1)
+    return NetworkRun(row, stage.seed, injected, figures, (harmed, *network_checks(row, figures), *_wheel_checks(stage, notes)))
+
+
+def _wheel_checks(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[LoopCheck]:
+    """From what the wheels were told, whatever the robot says of itself; over Zenoh, where twists can be heard."""
+    if notes["twists"]:
+        lines = on_old_sight(read_wheel_commands(stage.wheels.read_text("ascii")), notes["twists"])
+        yield at_most("moved on frames over 400 ms", float(lines), "lines", 0)
+
+
+def _start(row: Case, wire: BenchWire, crew: BenchProcesses, stage: Stage) -> None:
+    """Robot and watcher on one side, vision on the other, seen driving over the wire as it is."""
+    start_robot(stage, crew, wire.robot_side, passes_through=row.passes_through)
+    crew.start("watch", "sightline.benchmarks.network.watch", stage.form.format("127.0.0.1"), str(stage.folder / "notes.json"),
+               namespace=wire.robot_side)
+    crew.wait_line("watch", "watching")
+    start_vision(stage, crew, wire.far_side, stage.form.format(ADDRESS_A))

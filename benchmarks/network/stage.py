@@ -1,0 +1,147 @@
+"""What the rows of `bench network` are run with: a setting, a folder, robots and visions on the wire. Shell (files)."""
+
+import json
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from sightline.benchmarks.loop.processes import BenchProcesses
+from sightline.benchmarks.loop_figures import LoopCheck
+from sightline.benchmarks.loop.ours import ROBOT
+from sightline.benchmarks.network_figures import NetworkFigures
+from sightline.benchmarks.network.cases import WEBSOCKET, ZENOH, Case
+from sightline.protocol.errors import ConfigError
+from sightline.sim.network_emulator import LinkShapes
+
+PORTS: Final = {ZENOH: "tcp/{}:7447", WEBSOCKET: "ws://{}:9090"}
+EVERYWHERE: Final = "0.0.0.0"
+QUALITY: Final = 80
+_HFOV_DEG: Final = 80.0
+_TOKENED: Final = (WEBSOCKET,)
+
+
+class BenchWire(Protocol):
+    """What shapes the packets between the two namespaces."""
+
+    robot_side: str
+    far_side: str
+    carried_bytes: dict[str, int]
+
+    def shape(self, shapes: LinkShapes) -> int:
+        """Put `shapes` in force; returns how many packets were harmed so far."""
+        ...
+
+
+Wiring = Callable[[Path], AbstractContextManager[BenchWire]]
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkSetting:
+    """`seconds` are shared among a row's phases; `seeds` draw what the wire loses."""
+
+    transport: str = ZENOH
+    seconds: float = 20.0
+    seeds: tuple[int, ...] = (1,)
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for what cannot be run."""
+        if self.transport not in PORTS:
+            raise ConfigError(f"--transport {self.transport!r}: {', '.join(PORTS)}")
+        if not 4 <= self.seconds <= 600:
+            raise ConfigError(f"--seconds {self.seconds:g}: 4 to 600")
+        if not self.seeds:
+            raise ConfigError("--seeds: at least one, e.g. 1,2,3")
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkRun:
+    """One row with one seed; `injected` packets or processes were harmed. `facts` are what was seen besides."""
+
+    row: Case
+    seed: int
+    injected: int
+    figures: tuple[NetworkFigures, ...]
+    checks: tuple[LoopCheck, ...]
+    facts: Mapping[str, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One run of a row: what the camera plays, a folder of its own, what makes the wire."""
+
+    film: Path
+    pictures: Path
+    folder: Path
+    wiring: Wiring
+    setting: NetworkSetting
+    seed: int
+
+    def wire(self) -> AbstractContextManager[BenchWire]:
+        """The two namespaces and what lies between."""
+        return self.wiring(self.folder / "wire.log")
+
+    def seeded(self, shapes: LinkShapes) -> LinkShapes:
+        """`shapes`, their chance drawn from this run's seed."""
+        return shapes.model_copy(update={"seed": self.seed})
+
+    def crew(self, name: str) -> BenchProcesses:
+        """Processes with a folder of their own: some may be killed while the others are looked after."""
+        folder = self.folder / name
+        folder.mkdir()
+        return BenchProcesses(folder)
+
+    @property
+    def form(self) -> str:
+        """An endpoint, its host left out."""
+        return PORTS[self.setting.transport]
+
+    @property
+    def wheels(self) -> Path:
+        """What the robot's wheels were told: t_us,left_rad_s,right_rad_s."""
+        return self.folder / "wheels.csv"
+
+
+Scene = Callable[[Case, Stage], NetworkRun]
+
+
+def start_robot(stage: Stage, crew: BenchProcesses, namespace: str, *, connect: str = "", passes_through: bool = False) -> int:
+    """A robot that listens, or connects where a router is; returns its process id once it is on."""
+    config = _robot_toml(stage, connect, passes_through)
+    pid = crew.start("robot", "sightline.operator_side.cli.app", "robot", "--config", str(config), namespace=namespace)
+    crew.wait_line("robot", f"robot {ROBOT}: on")
+    return pid
+
+
+def start_vision(stage: Stage, crew: BenchProcesses, namespace: str, endpoint: str) -> int:
+    """A vision, seen working; returns its process id."""
+    secure = ("--secure", str(stage.folder)) if stage.setting.transport in _TOKENED else ()
+    pid = crew.start("vision", "sightline.operator_side.cli.app", "vision", "--robot", ROBOT, "--connect", endpoint, *secure,
+                     namespace=namespace)
+    crew.wait_line("vision", "target seen")
+    return pid
+
+
+def _robot_toml(stage: Stage, connect: str, passes_through: bool) -> Path:
+    """JSON's strings and numbers are TOML's too."""
+    path = stage.folder / "robot.toml"
+    where = {"connect": [connect]} if connect else {"listen": [stage.form.format(EVERYWHERE)]}
+    top: dict[str, Any] = {"robot": ROBOT, **where, "state_dir": str(stage.folder)}
+    if stage.setting.transport in _TOKENED:  # beyond loopback it asks for tokens
+        top["secure"] = str(stage.folder)
+        for role in ("vision", "operator"):
+            (stage.folder / f"{role}.token").write_text(f"{role}-of-the-bench", "ascii")
+    path.write_text(
+        "".join(f"{name} = {json.dumps(value)}\n" for name, value in top.items())
+        + f"[camera]\n{_camera_toml(stage, passes_through)}"
+        + f'[drive]\nkind = "log"\noptions = {{path = {json.dumps(str(stage.wheels))}}}\n[safety]\nauto_arm = true\n',
+        "utf-8",
+    )
+    return path
+
+
+def _camera_toml(stage: Stage, passes_through: bool) -> str:
+    kind, path = ("folder", stage.pictures) if passes_through else ("video", stage.film)
+    quality = "" if passes_through else f"quality = {QUALITY}, "
+    return f'kind = "{kind}"\noptions = {{path = {json.dumps(str(path))}, {quality}hfov_deg = {_HFOV_DEG}}}\n'

@@ -1,0 +1,71 @@
+"""A person who says STOP again and again, for `bench network`: once it drives STOP, then reset and arm. Shell.
+
+    python -m sightline.benchmarks.network.stop_client ENDPOINT ROBOT LEDGER SECONDS SEED
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Final
+
+from sightline.operator_side.faults.ledger import REQUESTED, EventLog
+from sightline.operator_side.client.requests import SOURCE, Operator
+from sightline.protocol.messages import Reply, State, Status, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.zenoh.link import open_zenoh
+
+STOPPED: Final = "stopped"
+"""Noted with the stamp of the first status that said so."""
+RESET: Final = "reset"
+"""Noted just before it is asked: the wheels stay at zero until then."""
+DRIVES_MPS: Final = 0.2
+_PATIENCE_S: Final = 20.0
+_PAUSE_S: Final = 0.2, 0.8
+"""Between driving and STOP, drawn: a STOP meets the video in every phase."""
+
+
+def run(endpoint: str, robot: str, ledger: EventLog, seconds: float, seed: int) -> None:
+    """Until the time is over. Raises LinkError when the robot does not answer."""
+    chance = Random(seed)
+    with open_zenoh(robot, connect=[endpoint], role=SOURCE, timeout_s=15) as link:
+        operator = Operator(link)
+        operator.wait_report(10.0)
+        print("person ready", flush=True)
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            _until(operator, _drives)
+            time.sleep(chance.uniform(*_PAUSE_S))
+            ledger.note(REQUESTED)
+            operator.stop(lambda: print("a STOP took over 300 ms to be confirmed", flush=True))
+            assert operator.report is not None
+            ledger.note(STOPPED, operator.report.stamp.t_us)
+            _until(operator, lambda status: not any(status.applied))
+            ledger.note(RESET)
+            _agreed(lambda: operator.ask(Verb.RESET))
+            _agreed(lambda: operator.arm(_PATIENCE_S))
+    print("person done", flush=True)
+
+
+def _agreed(ask: Callable[[], Reply]) -> None:
+    """As a person does, ask anew when the robot says that what was asked came too late: the medium is full."""
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while not (reply := ask()).ok:
+        if not reply.detail.startswith(RejectReason.STALE) or time.monotonic() > deadline_s:
+            raise SystemExit(f"the robot refused: {reply.detail}")
+
+
+def _drives(status: Status) -> bool:
+    return status.state in (State.ACTIVE, State.DEGRADED) and abs(status.applied[0]) >= DRIVES_MPS
+
+
+def _until(operator: Operator, happened: Callable[[Status], bool]) -> None:
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while not happened(status := operator.wait_report().status):
+        if time.monotonic() > deadline_s:
+            raise SystemExit(f"the robot neither drives nor stands as it should: {status.state}, {status.reason}")
+
+
+if __name__ == "__main__":
+    run(sys.argv[1], sys.argv[2], EventLog(Path(sys.argv[3])), float(sys.argv[4]), int(sys.argv[5]))

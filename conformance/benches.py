@@ -1,0 +1,102 @@
+"""A bench in real time: the peer is somebody at an endpoint. Shell (a lock, a clock, a link's threads)."""
+
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Final, Self
+
+from sightline.protocol.channels import Channel
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.conformance.bench import Access, Bench
+from sightline.conformance.case import NotApplicableError
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.security import certificate_role
+
+_WAITING: Final = 1024  # messages that a case has not yet looked at; it looks every few milliseconds
+_NAP_S: Final = 0.005
+
+
+class LiveBench(Bench):
+    """Use it in a `with`. Callbacks of the link only store; the case's thread handles what was stored."""
+
+    def __init__(
+        self,
+        robot: str,
+        open_it: Callable[[str], Link],
+        hears: Sequence[Channel],
+        put_it: Callable[[str, bytes, bytes], None] | None = None,
+        *,
+        roles: Sequence[str] = ("vision",),
+        endpoint: str = "",
+        older: str = "",
+        access: Access | None = None,
+    ) -> None:
+        """`open_it(role)` opens a link, again after each `leave`; `put_it` sends what a link refuses to send.
+
+        Each of `roles` has a link of its own, where keys decide who may say what; the first hears, and says whatever
+        no other may say. Raises what `open_it` raises.
+        """
+        super().__init__(robot, endpoint, older, access)
+        self._open_it, self._hears, self._put_it, self._roles = open_it, hears, put_it, roles
+        self._links: dict[str, Link] = {}
+        self._news = threading.Condition()
+        self._waiting: deque[Message] = deque(maxlen=_WAITING)
+        self._dropped: Counter[str] = Counter()
+        self.join()
+
+    @property
+    def now_us(self) -> int:
+        return monotonic_us()
+
+    @property
+    def dropped_here(self) -> Counter[str]:
+        return sum(map(_refused, self._links.values()), self._dropped)
+
+    def send(self, channel: Channel, header: bytes, payload: bytes, source: str) -> None:
+        link = self._links.get(certificate_role(source)) or self._links.get(self._roles[0])
+        if link is not None:
+            link.publish(channel, header, payload, source)
+
+    def put(self, key: str, header: bytes, payload: bytes) -> None:
+        if self._put_it is None:
+            raise NotApplicableError("over WebSocket nothing is sent under a key")
+        self._put_it(key, header, payload)
+
+    def leave(self) -> None:
+        for role in tuple(self._links):
+            link = self._links.pop(role)
+            link.close()
+            self._dropped += _refused(link)
+
+    def join(self) -> None:
+        for role in self._roles:
+            self._links[role] = self._open_it(role)
+        for channel in self._hears:
+            self._links[self._roles[0]].subscribe(channel, self._store)
+
+    def _store(self, message: Message) -> None:
+        with self._news:
+            self._waiting.append(message)
+            self._news.notify()
+
+    def _pass_time(self, until_us: int) -> None:
+        with self._news:
+            if not self._waiting:
+                self._news.wait(min(_NAP_S, max(0, until_us - self.now_us) / 1e6))
+            waiting = list(self._waiting)
+            self._waiting.clear()
+        for message in waiting:
+            self._hear(message)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.leave()
+
+
+def _refused(link: Link) -> Counter[str]:
+    return Counter(getattr(link, "refused", Counter()))

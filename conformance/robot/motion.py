@@ -1,0 +1,279 @@
+"""Cases on what the wheels do: limits, ramps, silence and ageing sight, as seen in `applied`. Pure.
+
+How long a stop takes is the time between two arrivals at the kit, so that the link's delay is in both ends of it.
+"""
+
+import math
+from typing import Final
+
+from sightline.protocol.channels import STATUS
+from sightline.protocol.conformance.bench import Bench
+from sightline.conformance.case import Suite
+from sightline.conformance.robot.fixture import CRAWL, Robot, Sender, armed
+from sightline.protocol.messages import FrameHeader, Planar, State, Status
+from sightline.protocol.refusals import CLAMPED
+
+SUITE: Final = Suite("R")
+_STOPS_WITHIN_US: Final = 700_000
+_RESOLUTION_US: Final = 100_000
+"""Between two status."""
+_TOLERANCE: Final = 0.01
+_ZERO: Final = (0.0, 0.0)
+
+
+def _settled(robot: Robot) -> Planar:
+    """What is applied once the ramps are over."""
+    robot.bench.rest(1_200_000)
+    told = [robot.next_status(2).applied, *(header.applied for _, header in robot.frames()[-1:])]
+    return max(told, key=lambda pair: abs(pair[0]) + abs(pair[1]))
+
+
+def _driven(bench: Bench, text: bytes) -> tuple[Status, Planar]:
+    robot, _driver = armed(bench, text=text)
+    applied = _settled(robot)
+    return robot.status(), applied
+
+
+@SUITE.must("R-LIM-01", "2.8 Fields")
+def reaches_the_command(bench: Bench) -> None:
+    """A twist within the limits is applied as it was sent: linear first, angular second, with their signs."""
+    for text, wanted in ((b"0.1000|0.3000", (0.1, 0.3)), (b"-0.0500|-0.2000", (-0.05, -0.2))):
+        _status, applied = _driven(bench, text)
+        near = math.isclose(applied[0], wanted[0], abs_tol=0.005) and math.isclose(applied[1], wanted[1], abs_tol=0.02)
+        bench.expect(near, f"{text.decode()} is applied as {applied}")
+        bench.rest(1_000_000 if Sender(Robot(bench), "operator").granted("disarm") else 0)
+        bench.forget()
+
+
+@SUITE.must("R-LIM-02", "9. Status")
+def limits_are_told(bench: Bench) -> None:
+    """`status` tells the robot's limits, both above zero."""
+    status = Robot(bench).status()
+    told = (status.max_linear_mps, status.max_angular_rad_s)
+    bench.expect(min(told) > 0, f"max_linear_mps and max_angular_rad_s are {told}")
+
+
+def _limits(status: Status) -> Planar:
+    return status.max_linear_mps or math.inf, status.max_angular_rad_s or math.inf
+
+
+@SUITE.must("R-LIM-03", "4.3 Limits")
+def linear_is_clamped(bench: Bench) -> None:
+    """A linear speed beyond the limit is accepted and cut to the limit."""
+    status, applied = _driven(bench, b"48.0000|0.0000")
+    bench.need(status.max_linear_mps > 0, "the robot tells no limit (R-LIM-02)")
+    bench.expect(applied[0] <= status.max_linear_mps + _TOLERANCE, f"{applied[0]} m/s of {status.max_linear_mps}")
+
+
+@SUITE.must("R-LIM-04", "4.3 Limits")
+def angular_is_clamped(bench: Bench) -> None:
+    """A turn rate beyond the limit is accepted and cut to the limit."""
+    status, applied = _driven(bench, b"0.0000|-48.0000")
+    bench.need(status.max_angular_rad_s > 0, "the robot tells no limit (R-LIM-02)")
+    least = -status.max_angular_rad_s - _TOLERANCE
+    bench.expect(applied[1] >= least, f"{applied[1]} rad/s of {status.max_angular_rad_s}")
+
+
+@SUITE.must("R-LIM-05", "4.3 Limits")
+def clamped_is_counted(bench: Bench) -> None:
+    """A value beyond the limits is counted as CLAMPED, one within them is not."""
+    robot, driver = armed(bench)
+    before = robot.next_status().refused.get(CLAMPED, 0)
+    within = robot.next_status(2).refused.get(CLAMPED, 0)
+    bench.expect(within == before, f"{within - before} twists within the limits were counted as CLAMPED")
+    driver.drive(b"48.0000|0.0000")
+    grows = robot.reaches(lambda status: status.refused.get(CLAMPED, 0) > within, 600_000)
+    bench.expect(grows, f"48 m/s was not counted as CLAMPED: {robot.status().refused}")
+
+
+@SUITE.should("R-LIM-06", "4.3 Limits")
+def the_curve_stays(bench: Bench) -> None:
+    """Both axes are cut by one factor, so that the robot drives the curve it was told."""
+    robot = Robot(bench)
+    told = robot.status()
+    bench.need(min(told.max_linear_mps, told.max_angular_rad_s) > 0, "the robot tells no limits (R-LIM-02)")
+    asked = 4 * told.max_linear_mps, told.max_angular_rad_s
+    _status, applied = _driven(bench, f"{asked[0]:.4f}|{asked[1]:.4f}".encode())
+    bench.need(applied[0] > 0, "it does not drive (R-LIM-01)")
+    wanted, seen = asked[1] / asked[0], applied[1] / applied[0]
+    bench.expect(math.isclose(wanted, seen, rel_tol=0.1), f"curvature {seen:.2f} instead of {wanted:.2f} 1/m")
+
+
+@SUITE.should("R-LIM-07", "6.4 Arming")
+def ramps_up(bench: Bench) -> None:
+    """Speed builds up in a ramp: the frames show values on the way to the limit."""
+    robot = Robot(bench)
+    goal = _limits(robot.status())[0]
+    bench.need(goal < math.inf, "the robot tells no limit (R-LIM-02)")
+    mark = bench.mark()
+    armed(bench, text=f"{goal:.4f}|0".encode())
+    bench.rest(1_000_000)
+    speeds = [header.applied[0] for _, header in robot.frames(mark)]
+    bench.need(max(speeds, default=0.0) > 0.9 * goal, "it does not reach its limit (R-LIM-03)")
+    between = [speed for speed in speeds if 0.02 * goal < speed < 0.9 * goal]
+    bench.expect(len(between) >= 2, f"from 0 to {goal} m/s within one frame: {between}")
+
+
+# --- silence ---------------------------------------------------------------------------------------------------------
+
+
+def _reports(bench: Bench, since: int) -> list[tuple[int, Planar, State]]:
+    """(time of arrival, applied, state) of each status since a mark."""
+    read = ((one.at_us, one.payload(Status)) for one in bench.heard(STATUS, since))
+    return [(at_us, status.applied, status.state) for at_us, status in read if status]
+
+
+def _zero_us(bench: Bench, since: int) -> int | None:
+    """When a status first says that the wheels are at zero, where they stay."""
+    told = [(at_us, applied) for at_us, applied, _ in _reports(bench, since)]
+    last_moving = max((number for number, one in enumerate(told) if one[1] != _ZERO), default=-1)
+    return told[last_moving + 1][0] if last_moving + 1 < len(told) else None
+
+
+def _driving(bench: Bench) -> tuple[Robot, Sender]:
+    """A robot that drives as fast as it may."""
+    limit = _limits(Robot(bench).status())[0]
+    robot, driver = armed(bench, text=f"{min(limit, 10.0):.4f}|0.0000".encode())
+    bench.rest(700_000)
+    bench.need(robot.next_status().applied[0] > 0, "it does not drive (R-LIM-01)")
+    return robot, driver
+
+
+def _stopping(bench: Bench) -> tuple[Robot, Sender]:
+    """A robot that drives as fast as it may, and has been seen to stop by silence."""
+    robot, driver = _driving(bench)
+    text, driver.driving, driver.acks = driver.driving, None, False
+    rests = robot.reaches(lambda status: status.applied == _ZERO and status.state is State.HOLD, 1_000_000)
+    bench.need(rests, "silence alone does not stop it (R-SIL-01)")
+    driver.acks, driver.driving = True, text
+    again = robot.reaches(lambda status: status.state in (State.ACTIVE, State.DEGRADED), 1_500_000)
+    bench.need(again, "it does not go on from HOLD (R-SIL-08)")
+    bench.rest(700_000)
+    return robot, driver
+
+
+def _silent(robot: Robot, driver: Sender) -> tuple[int, FrameHeader]:
+    """The driver answers nothing any more: a mark when the first frame came that was not answered, and that frame."""
+    driver.fall_silent()
+    cited = robot.frame()
+    return robot.bench.mark(), cited
+
+
+def _expect_stop(bench: Bench, mark: int, what: str) -> None:
+    began_us = bench.now_us
+    bench.rest(1_500_000)
+    zero_us = _zero_us(bench, mark)
+    bench.expect(zero_us is not None, f"{what}: the wheels still turn after 1.5 s")
+    assert zero_us is not None
+    took_us = zero_us - began_us
+    said = f"{what}: at zero {took_us / 1e3:.0f} ms after the first frame not answered"
+    bench.expect(took_us <= _STOPS_WITHIN_US + _RESOLUTION_US, said)
+
+
+@SUITE.must("R-SIL-01", "5.4 Silence")
+def silence_stops(bench: Bench) -> None:
+    """When twists cease the robot holds, with the wheels at zero within 700 ms."""
+    robot, driver = _driving(bench)
+    _expect_stop(bench, _silent(robot, driver)[0], "silence")
+
+
+@SUITE.must("R-SIL-02", "5.4 Silence")
+def refused_twists_keep_nothing_alive(bench: Bench) -> None:
+    """Refused twists do not keep the wheels turning."""
+    Sender(Robot(bench)).need_unknown()
+    robot, driver = _stopping(bench)
+    mark, cited = _silent(robot, driver)
+    for number in range(10):
+        bench.after(number * 90_000, lambda: driver.twist(cited, echo_seq=cited.seq + 5000))
+    _expect_stop(bench, mark, "refused twists")
+
+
+@SUITE.must("R-SIL-03", "5.4 Silence")
+def others_keep_nothing_alive(bench: Bench) -> None:
+    """Good twists of somebody who does not hold the lease do not keep the wheels turning."""
+    robot, driver = _stopping(bench)
+    other = Sender(robot, acks=False)
+    refused = robot.status().refused.get("NOT_HOLDER", 0)
+    other.drive()
+    kept_out = robot.reaches(lambda status: status.refused.get("NOT_HOLDER", 0) > refused, 1_000_000)
+    bench.need(kept_out, "a second driver is not kept out (R-LEASE-02)")
+    mark, _cited = _silent(robot, driver)
+    for number in range(20):  # until before the lease of the first could end
+        bench.after(number * 20_000, lambda: other.twist(robot.frames()[-1][1]))
+    other.fall_silent()
+    _expect_stop(bench, mark, "another's twists")
+
+
+@SUITE.must("R-SIL-04", "5.3 Age")
+def old_sight_stops(bench: Bench) -> None:
+    """Twists that go on citing one old frame do not keep the wheels turning: age is judged at every tick."""
+    robot, driver = _stopping(bench)
+    mark, cited = _silent(robot, driver)
+    for number in range(38):
+        bench.after(number * 10_000, lambda: driver.twist(cited, b"10.0000|0.0000"))
+    _expect_stop(bench, mark, "twists on one frame")
+
+
+@SUITE.must("R-SIL-05", "5.3 Age")
+def ageing_sight_slows(bench: Bench) -> None:
+    """On frames between 150 and 400 ms old the robot drives, DEGRADED, at a lower speed."""
+    robot, driver = armed(bench)
+    limit = _limits(robot.status())[0]
+    bench.need(limit < math.inf, "the robot tells no limit (R-LIM-02)")
+    driver.drive(f"{limit:.4f}|0.0000".encode())
+    bench.rest(1_000_000)
+    full = robot.next_status().applied[0]
+    driver.delay_us = driver.compute_us = 250_000
+    bench.rest(1_500_000)
+    mark, accepted = bench.mark(), robot.status()
+    bench.rest(1_000_000)
+    seen = _reports(bench, mark)
+    bench.need(full > 0, "it does not drive (R-LIM-01)")
+    bench.need(robot.status().accepted > accepted.accepted, "answers 250 ms late are not accepted (R-CAUS-10)")
+    slow = [applied[0] for _, applied, state in seen if state is State.DEGRADED]
+    bench.expect(slow, f"answers 250 ms late leave it {sorted({state.value for _, _, state in seen})}")
+    bench.expect(min(slow) < 0.9 * full, f"it still drives at {min(slow)} of {full} m/s")
+
+
+@SUITE.must("R-SIL-06", "5.4 Silence")
+def hold_is_said(bench: Bench) -> None:
+    """HOLD is said within 300 ms of the last good twist, give or take a status."""
+    robot, driver = armed(bench)
+    driver.fall_silent()
+    held = robot.reaches(lambda status: status.state is State.HOLD, 600_000)
+    bench.expect(held, f"600 ms after the last twist it is {robot.status().state}")
+
+
+@SUITE.must("R-SIL-07", "6.3 States")
+def long_hold_disarms(bench: Bench) -> None:
+    """Ten seconds of HOLD disarm."""
+    robot, driver = armed(bench)
+    driver.fall_silent()
+    bench.need(robot.reaches(lambda status: status.state is State.HOLD, 2_000_000), "it does not hold (R-SIL-06)")
+    early = robot.reaches(lambda status: status.state is State.DISARMED, 8_500_000)
+    bench.expect(not early, "it disarmed before ten seconds were over")
+    reached = robot.reaches(lambda status: status.state is State.DISARMED, 2_500_000)
+    bench.expect(reached, f"after 11 s it is {robot.status().state}")
+
+
+@SUITE.must("R-SIL-08", "6.3 States")
+def hold_goes_on(bench: Bench) -> None:
+    """From HOLD the same driver's next twists drive on without arming again."""
+    robot, driver = armed(bench)
+    driver.fall_silent()
+    bench.need(robot.reaches(lambda status: status.state is State.HOLD, 2_000_000), "it does not hold (R-SIL-06)")
+    bench.rest(700_000)
+    driver.acks = True
+    driver.drive(CRAWL)
+    on = robot.reaches(lambda status: status.state in (State.ACTIVE, State.DEGRADED), 1_000_000)
+    bench.expect(on, f"then it is {robot.status().state}")
+
+
+@SUITE.must("R-SIL-09", "5.4 Silence")
+def acks_keep_nothing_alive(bench: Bench) -> None:
+    """Many acks of the driver do not keep the wheels turning."""
+    robot, driver = _stopping(bench)
+    mark, cited = _silent(robot, driver)
+    for number in range(100):
+        bench.after(number * 10_000, lambda: driver.ack(cited))
+    _expect_stop(bench, mark, "acks")

@@ -1,0 +1,296 @@
+"""Cases on single twists: header fields, the grammar, and what a twist cites. Each is a row of a table. Pure.
+
+A robot that is not armed judges every command all the same and counts a good one as DISARMED, so no wheel turns here.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from sightline.protocol.channels import MAX_HEADER_BYTES, TWIST
+from sightline.protocol.conformance.bench import Bench
+from sightline.conformance.case import Case, Level, Suite
+from sightline.conformance.robot.fixture import CRAWL, GOOD, Robot, Sender, as_json
+from sightline.protocol.messages import MAX_INTEGER, FrameHeader
+
+SUITE: Final = Suite("R")
+
+Fields = dict[str, Any]
+Making = Callable[[Fields], bytes]
+
+
+def _set(**changes: Any) -> Making:
+    return lambda fields: as_json({**fields, **changes})
+
+
+def _without(name: str) -> Making:
+    return lambda fields: as_json({key: value for key, value in fields.items() if key != name})
+
+
+def _echo(**changes: Any) -> Making:
+    return lambda fields: as_json({**fields, "echo": {**fields["echo"], **changes}})
+
+
+def _again(name: str, first: str) -> Making:
+    """`name` given twice: `first`, then as it was."""
+    return lambda fields: b'{"%b":%b,' % (name.encode(), first.encode()) + as_json(fields)[1:]
+
+
+def _wrapped(before: bytes, after: bytes = b"") -> Making:
+    return lambda fields: before + as_json(fields) + after
+
+
+def _bytes(data: bytes) -> Making:
+    return lambda _fields: data
+
+
+Row = tuple[str, Level, str, str, str, Sequence[Making]]
+MUST, SHOULD = Level.MUST, Level.SHOULD
+
+HEADERS: Final[Sequence[Row]] = (
+    ("R-HEAD-01", MUST, "2.1 JSON", "Unknown fields of a header are ignored.", GOOD,
+     (_set(colour="red", nested={"a": [1, 2]}), _echo(note="x"))),
+    ("R-HEAD-02", MUST, "2.4 Version", "Another version is refused as UNSUPPORTED_VERSION.", "UNSUPPORTED_VERSION",
+     (_set(v=2), _set(v=0))),
+    ("R-HEAD-03", MUST, "2.4 Version", "An absent version means 1.", GOOD, (_without("v"),)),
+    ("R-HEAD-04", MUST, "2.8 Fields", "A header without `session` or `seq` is MALFORMED.", "MALFORMED",
+     (_without("session"), _without("seq"))),
+    ("R-HEAD-05", MUST, "2.8 Fields", "A header without `echo` is MALFORMED.", "MALFORMED", (_without("echo"),)),
+    ("R-HEAD-06", MUST, "2.1 JSON", "A real number, a string, true or null in place of an integer is MALFORMED.",
+     "MALFORMED", (_set(seq=1000.5), _set(seq="1000"), _set(seq=True), _set(seq=None))),
+    ("R-HEAD-07", MUST, "2.2 Numbers", "An integer beyond 2^53 - 1 is MALFORMED, be it 30 digits long.", "MALFORMED",
+     (_set(seq=MAX_INTEGER + 1), _set(seq=10**29))),
+    ("R-HEAD-08", MUST, "2.2 Numbers", "A negative integer is MALFORMED.", "MALFORMED",
+     (_set(compute_us=-1), _set(seq=-1))),
+    ("R-HEAD-09", MUST, "2.5 Session and sequence", "A session that is not 8 lower-case hex digits is MALFORMED.",
+     "MALFORMED", (_set(session="ABCDEF01"), _set(session="abc"), _set(session="0123456789"))),
+    ("R-HEAD-10", MUST, "2.1 JSON", "Of a field given twice the last counts.", GOOD,
+     (_again("session", '"ffffffff"'), _again("v", "9"))),
+    ("R-HEAD-11", MUST, "2.1 JSON", "A byte order mark before the header is MALFORMED.", "MALFORMED",
+     (_wrapped(b"\xef\xbb\xbf"),)),
+    ("R-HEAD-12", MUST, "2.1 JSON", "A header that is no JSON object is MALFORMED.", "MALFORMED",
+     (_bytes(b"[1,2]"), _bytes(b'{"v":1,'), _bytes(b"null"), _wrapped(b"", b"}"))),
+    ("R-HEAD-13", MUST, "2.8 Fields", "An absent `compute_us` means 0.", GOOD, (_without("compute_us"),)),
+    ("R-HEAD-14", MUST, "2.2 Numbers", "NaN and Infinity in a header are MALFORMED.", "MALFORMED",
+     (_bytes(b'{"v":1,"source":"vision","session":"0a0b0c0d","seq":NaN}'), _set(compute_us=float("inf")))),
+    ("R-HEAD-15", MUST, "2.1 JSON", "A header that is not UTF-8 is MALFORMED.", "MALFORMED",
+     (lambda fields: as_json({**fields, "note": "#"}).replace(b"#", b"\xff\xfe"),)),
+    ("R-HEAD-16", MUST, "4.6 Guests", "A twist of a role other than guest without a header is MALFORMED.", "MALFORMED",
+     (_bytes(b""),)),
+    ("R-HEAD-18", MUST, "2.2 Numbers", "The greatest integer that the bounds allow, 2^53 - 1, is taken.", GOOD,
+     (_set(compute_us=MAX_INTEGER),)),
+    ("R-HEAD-19", MUST, "2.4 Version", "`v` is judged before all else: whatever is not 1 is UNSUPPORTED_VERSION.",
+     "UNSUPPORTED_VERSION", (_set(v="1"), _set(v=True), _set(v=None), _set(v=1.0), _bytes(b'{"v":null,"seq":[]}'))),
+    ("R-HEAD-20", MUST, "2.2 Numbers", "An integer written with a point or an exponent is MALFORMED: 7.0, 7e0.",
+     "MALFORMED", (_set(compute_us=0.0), lambda fields: as_json({**fields, "compute_us": 7})[:-1] + b"e0}",
+                   lambda fields: _echo(seq=float(fields["echo"]["seq"]))(fields))),
+    ("R-HEAD-21", MUST, "1.4 Sizes", "A header of 512 bytes is read.", GOOD,
+     (lambda fields: as_json(fields)[:-1].ljust(MAX_HEADER_BYTES - 1) + b"}",)),
+    ("R-HEAD-22", MUST, "18.6 What an answer went by", "A twist may name the scan and the mission that it went by.",
+     GOOD, (_set(scan=7, mission={"session": "0a0b0c0d", "id": 3}),)),
+)  # fmt: skip
+
+CITED: Final[Sequence[Row]] = (
+    ("R-CAUS-02", MUST, "5.1 Order", "A twist that cites a `seq` never issued is refused as UNKNOWN_FRAME.",
+     "UNKNOWN_FRAME", (_echo(seq=MAX_INTEGER), lambda fields: _echo(seq=fields["echo"]["seq"] + 1000)(fields))),
+    ("R-CAUS-03", MUST, "5.1 Order", "A twist that cites a frame with a `t_us` off by one is refused as UNKNOWN_FRAME.",
+     "UNKNOWN_FRAME", (lambda fields: _echo(t_us=fields["echo"]["t_us"] + 1)(fields),
+                       lambda fields: _echo(t_us=fields["echo"]["t_us"] - 1)(fields))),
+    ("R-CAUS-05", MUST, "5.1 Order",
+     "A time from the future on a known `seq` is UNKNOWN_FRAME: the record before the age.", "UNKNOWN_FRAME",
+     (lambda fields: _echo(t_us=fields["echo"]["t_us"] + 10_000_000)(fields),)),
+    ("R-CAUS-06", MUST, "5.1 Order", "A twist that cites another session of the robot is refused as OTHER_SESSION.",
+     "OTHER_SESSION", (_echo(session="fffffff0"),)),
+    ("R-CAUS-08", MUST, "4.5 Echo", "A twist that cites a `beat` is refused as UNKNOWN_FRAME where none is issued.",
+     "UNKNOWN_FRAME", (_echo(channel="beat"),)),
+    ("R-CAUS-09", MUST, "2.7 Echo", "A twist that cites a channel the robot does not know is MALFORMED.", "MALFORMED",
+     (_echo(channel="camera"), _echo(channel="")),),
+)  # fmt: skip
+
+
+def _row_case(row: Row) -> Case:
+    number, level, clause, title, expected, makings = row
+
+    def run(bench: Bench) -> None:
+        sender = _ready(bench)
+        for making in makings:
+            sent = b""
+
+            def send(frame: FrameHeader, making: Making = making) -> None:
+                nonlocal sent
+                sender.seq += 1
+                sent = making(sender.header(frame))
+                bench.publish(TWIST, sent, CRAWL, sender.source)
+
+            verdict = sender.verdict_on_next(send)
+            bench.expect(verdict == expected, f"{sent[:160]!r}: {verdict or 'not counted'}, expected {expected}")
+
+    return Case(number, level, clause, title, run)
+
+
+def _ready(bench: Bench) -> Sender:
+    sender = Sender(Robot(bench))
+    sender.need_good()
+    return sender
+
+
+TEXTS: Final[Sequence[tuple[str, str, str, Sequence[bytes]]]] = (
+    ("R-GRAM-01", "Signs, a missing digit before or after the point, and exponents are taken.", GOOD,
+     (b"0.2000|-0.3500", b"+.1|-0.", b"1e-2|-1E-1", b"0|0", b"2.3028209556706964|0")),
+    ("R-GRAM-02", "A twist of one number or of three is MALFORMED.", "MALFORMED", (b"1", b"1|", b"|1", b"1|2|3", b"")),
+    ("R-GRAM-03", "Blanks and line ends are MALFORMED.", "MALFORMED", (b" 1|2", b"1|2\n", b"1 |2", b"1|2\0")),
+    ("R-GRAM-04", "`nan` is NOT_FINITE.", "NOT_FINITE", (b"nan|0", b"0|NaN", b"-nan|1")),
+    ("R-GRAM-05", "`inf` is NOT_FINITE.", "NOT_FINITE", (b"inf|0", b"0|-Infinity")),
+    ("R-GRAM-06", "A number beyond a double is NOT_FINITE.", "NOT_FINITE", (b"1e999|0", b"0|-9e308")),
+    ("R-GRAM-07", "Other ways of writing a number are MALFORMED.", "MALFORMED",
+     (b"1_0|2", b"0x1|0", "\u0661|0".encode(), b"--1|0", b"1e|0")),
+    ("R-GRAM-08", "An exponent of more than three digits is MALFORMED.", "MALFORMED", (b"1e0001|0",)),
+    ("R-GRAM-09", "Another mark than the bar is MALFORMED.", "MALFORMED", (b"1,2", b"0.2-0.35", b"1/2", b"1||2")),
+    ("R-GRAM-10", "Bytes that are no text are MALFORMED.", "MALFORMED", (b"\xff\xfe\0\x80", bytes(range(128, 192)))),
+    ("R-GRAM-11", "A number too small for a double is zero.", GOOD, (b"1e-999|0", b"0|-1e-400")),
+    ("R-GRAM-12", "`nan` in one of two fields is NOT_FINITE, whatever the other is.", "NOT_FINITE",
+     (b"nan|x", b"x|-NaN")),
+    ("R-GRAM-13", "`nan` alone, or as a part of a word, is MALFORMED.", "MALFORMED", (b"nan", b"nans|0", b"0|nano")),
+    ("R-GRAM-14", "A twist of 64 bytes is read.", GOOD, (b"0.1".ljust(62, b"0") + b"|0",)),
+)  # fmt: skip
+
+
+def _text_case(number: str, title: str, expected: str, texts: Sequence[bytes]) -> Case:
+    def run(bench: Bench) -> None:
+        sender = _ready(bench)
+        for text in texts:
+            verdict = sender.judged(text)
+            bench.expect(verdict == expected, f"{text!r}: {verdict or 'not counted'}, expected {expected}")
+
+    return Case(number, Level.MUST, "4.1 Grammar", title, run)
+
+
+for _row in (*HEADERS, *CITED):
+    SUITE.add(_row_case(_row))
+for _text in TEXTS:
+    SUITE.add(_text_case(*_text))
+
+
+@SUITE.must("R-HEAD-17", "1.3 Keys")
+def source_disagrees(bench: Bench) -> None:
+    """A source in the header other than the key's is refused as UNKNOWN_SOURCE."""
+    sender = _ready(bench)
+
+    def send(frame: FrameHeader) -> None:
+        sender.seq += 1
+        bench.publish(TWIST, as_json(sender.header(frame)), CRAWL, "teleop")
+
+    verdict = sender.verdict_on_next(send)
+    bench.expect(verdict == "UNKNOWN_SOURCE", f"a header of vision under the key of teleop: {verdict or 'not counted'}")
+
+
+# --- what a twist cites, over time -----------------------------------------------------------------------------------
+
+
+@SUITE.must("R-CAUS-01", "5.2 Record")
+def newest_frame(bench: Bench) -> None:
+    """A twist that answers the newest frame at once is judged good."""
+    sender = Sender(Robot(bench))
+    verdict = sender.judged()
+    bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
+
+
+@SUITE.must("R-CAUS-04", "5.3 Age")
+def stale_frame(bench: Bench) -> None:
+    """A twist that cites a frame more than a second old is refused as STALE, or UNKNOWN_FRAME if that is forgotten."""
+    sender = _ready(bench)
+    frame = sender.robot.frame()
+    bench.rest(1_200_000)
+    verdict = sender.verdict(lambda: sender.twist(frame))
+    bench.expect(verdict in ("STALE", "UNKNOWN_FRAME"), f"it was {verdict or 'not counted'}")
+
+
+@SUITE.must("R-CAUS-07", "4.5 Echo")
+def cites_a_status(bench: Bench) -> None:
+    """A twist that cites a `status` is refused as UNKNOWN_FRAME."""
+    sender = _ready(bench)
+    frame, stamp = sender.robot.frame(), sender.robot.stamp()
+    assert stamp is not None
+    verdict = sender.verdict(
+        lambda: sender.twist(frame, echo_channel="status", echo_seq=stamp.seq, echo_t_us=stamp.t_us)
+    )
+    bench.expect(verdict == "UNKNOWN_FRAME", f"it was {verdict or 'not counted'}")
+
+
+@SUITE.must("R-CAUS-10", "5.1 Order")
+def earlier_frame(bench: Bench) -> None:
+    """A twist that answers the frame before the newest is judged good while that is young."""
+    sender = _ready(bench)
+    earlier = sender.robot.frame()
+    bench.wait(lambda: _newest_seq(sender.robot) > earlier.seq, 300_000)
+    bench.need(_newest_seq(sender.robot) > earlier.seq, "no second frame within 300 ms")
+    verdict = sender.verdict(lambda: sender.twist(earlier))
+    bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
+
+
+def _newest_seq(robot: Robot) -> int:
+    heard = robot.frames()
+    return heard[-1][1].seq if heard else -1
+
+
+@SUITE.must("R-CAUS-11", "5.1 Order")
+def reasons_in_order(bench: Bench) -> None:
+    """Of several faults the first in the order of judging is the reason: session before `seq`."""
+    sender = _ready(bench)
+    foreign = sender.judged(echo_session="fffffff0")
+    bench.need(foreign == "OTHER_SESSION", f"another session is {foreign or 'not counted'} (R-CAUS-06)")
+    verdict = sender.judged(echo_session="fffffff0", seq=0)
+    bench.expect(verdict == "OTHER_SESSION", f"it was {verdict or 'not counted'}")
+
+
+# --- a sender's own seq ----------------------------------------------------------------------------------------------
+
+
+@SUITE.must("R-SEQ-06", "5.1 Order")
+def replayed_seq(bench: Bench) -> None:
+    """A twist with the `seq` of the one before is refused as OUT_OF_ORDER."""
+    sender = _ready(bench)
+    verdict = sender.judged(seq=sender.seq)
+    bench.expect(verdict == "OUT_OF_ORDER", f"it was {verdict or 'not counted'}")
+
+
+@SUITE.must("R-SEQ-07", "5.1 Order")
+def earlier_seq(bench: Bench) -> None:
+    """A twist with a `seq` below the last is refused as OUT_OF_ORDER."""
+    sender = _ready(bench)
+    sender.seq = 50
+    bench.need(sender.judged() == GOOD, "an ordinary twist is not judged good")
+    verdict = sender.judged(seq=20)
+    bench.expect(verdict == "OUT_OF_ORDER", f"it was {verdict or 'not counted'}")
+
+
+@SUITE.must("R-SEQ-08", "2.5 Session and sequence")
+def gaps(bench: Bench) -> None:
+    """A `seq` that jumps forward is taken."""
+    sender = _ready(bench)
+    sender.seq += 1000
+    verdict = sender.judged()
+    bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
+
+
+@SUITE.must("R-SEQ-09", "5.1 Order")
+def new_session_counts_anew(bench: Bench) -> None:
+    """Another session of the same role counts from its own beginning."""
+    first = _ready(bench)
+    first.seq = 5000
+    bench.need(first.judged() == GOOD, "an ordinary twist is not judged good")
+    first.fall_silent()
+    bench.rest(1_500_000)
+    verdict = Sender(first.robot).judged()
+    bench.need(verdict != "NOT_HOLDER", "the lease does not end by silence (R-LEASE-04)")
+    bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
+
+
+@SUITE.must("R-SEQ-10", "5.1 Order")
+def refused_seq_bars_nobody(bench: Bench) -> None:
+    """The `seq` of a twist refused for what it cites is not remembered: the next ordinary one is good."""
+    sender = _ready(bench)
+    refused = sender.judged(echo_seq=MAX_INTEGER, seq=MAX_INTEGER)
+    bench.need(refused == "UNKNOWN_FRAME", f"an unknown frame is {refused or 'not counted'} (R-CAUS-02)")
+    verdict = sender.judged()
+    bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
+

@@ -1,0 +1,279 @@
+"""Cases about a vision's answers: framing, headers, grammar. Pure."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from typing import Any, Final
+
+from sightline.protocol.channels import MAX_HEADER_BYTES
+from sightline.protocol.conformance.bench import Bench
+from sightline.conformance.case import Case, Level, Suite
+from sightline.protocol.conformance.vision_pictures import png
+from sightline.conformance.vision.fixture import Answer, RobotPlayed
+from sightline.protocol.errors import WireError
+from sightline.protocol.spec.message_cases import packed
+from sightline.protocol.messages import MAX_INTEGER
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link_rules import INEXACT_KEY, OVERSIZE
+from sightline.protocol.text import parse_twist
+
+SUITE = Suite("V")
+_SESSION: Final = re.compile(r"[0-9a-f]{8}")
+_FOUR_DECIMALS: Final = re.compile(rb"[+-]?[0-9]+\.[0-9]{4}\|[+-]?[0-9]+\.[0-9]{4}")
+
+
+def _sample(bench: Bench, junk: int = 0) -> list[Answer]:
+    """Answers to six views, of a target beside and ahead and of none, and to so many that are no pictures."""
+    robot = RobotPlayed(bench)
+    for name in ("left", "left", "centre", "centre", "right", "absent"):
+        sent = robot.frame(name)
+        robot.is_answered(sent)
+    for _ in range(junk):
+        robot.frame(jpeg=png())
+        bench.rest(100_000)
+    answers = robot.answers()
+    if not answers:
+        robot.need_nothing_dropped()
+    bench.need(answers, "it answers nothing")
+    return answers
+
+
+def _every(bench: Bench, good: Callable[[dict[str, Any]], object], reason: str) -> None:
+    """Every answer's header is as it must be."""
+    for answer in _sample(bench):
+        bench.expect(good(answer.fields), f"{reason}: {answer.heard.message.header[:200]!r}")
+
+
+def _integer(value: object, least: int = 0) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= MAX_INTEGER
+
+
+# --- framing ---------------------------------------------------------------------------------------------------------
+
+
+@SUITE.must("V-FRAM-01", "7.1 Answers")
+def every_frame_is_answered(bench: Bench) -> None:
+    """A frame that nothing replaces is answered, by a twist or an ack, within half a second."""
+    robot = RobotPlayed(bench)
+    for name in ("centre", "left", "absent", "right", "centre"):
+        robot.answer_to(robot.frame(name))
+
+
+@SUITE.should("V-FRAM-02", "7.1 Answers")
+def one_answer(bench: Bench) -> None:
+    """A frame is answered by a twist or by an ack, not by both."""
+    robot = RobotPlayed(bench).met()
+    for sent in robot.film("centre", 5, 100_000):
+        kinds = {one.is_twist for one in robot.answers_to(sent)}
+        bench.expect(len(kinds) < 2, f"frame {sent.seq} got a twist and an ack")
+
+
+@SUITE.must("V-FRAM-03", "7.1 Answers")
+def empty_ack(bench: Bench) -> None:
+    """An ack has no payload."""
+    before = bench.dropped_here[OVERSIZE]
+    _sample(bench)
+    bench.need(bench.dropped_here[OVERSIZE] == before, "its twists are too large already")
+    _sample(bench, junk=3)
+    bench.expect(bench.dropped_here[OVERSIZE] == before, "an answer to what is no picture was over its channel's size")
+
+
+@SUITE.must("V-FRAM-04", "1.3 Keys")
+def exact_keys(bench: Bench) -> None:
+    """It publishes under exact keys: channel and role, nothing more."""
+    before = bench.dropped_here[INEXACT_KEY]
+    robot = RobotPlayed(bench)
+    robot.film("left", 5, 100_000)
+    bench.expect(bench.dropped_here[INEXACT_KEY] == before, "something came under a key that is none")
+
+
+@SUITE.must("V-FRAM-05", "1.3 Keys")
+def same_role(bench: Bench) -> None:
+    """The role in an answer's header is the one in its key."""
+    for answer in _sample(bench):
+        source, key = answer.fields.get("source"), answer.heard.message.source
+        bench.need(isinstance(source, str), "its headers name no role")
+        bench.expect(source == key, f"the header says {source!r}, the key {key!r}")
+
+
+@SUITE.must("V-FRAM-06", "1.1 Peers")
+def drives_as_vision(bench: Bench) -> None:
+    """It drives as `vision`: teleop is a human's rank, and guests carry no header."""
+    for answer in _sample(bench):
+        bench.expect(answer.heard.message.source == "vision", f"it came as {answer.heard.message.source!r}")
+
+
+# --- frames' headers, as a robot may write them ----------------------------------------------------------------------
+
+_READS: Final[dict[str, tuple[str, str, Callable[[dict[str, Any]], bytes]]]] = {
+    "V-FRAM-11": ("2.8 Fields", "A frame with nothing but its stamp is read: the rest has defaults.",
+                  lambda it: packed({name: it[name] for name in ("v", "session", "seq", "t_us")})),
+    "V-FRAM-12": ("1.4 Sizes", "A header of 512 bytes is read.", lambda it: packed(it).ljust(MAX_HEADER_BYTES)),
+    "V-FRAM-13": ("2.1 JSON", "`latency_us` may be null.", lambda it: packed(it | {"latency_us": None})),
+    "V-FRAM-14": ("2.1 JSON", "Unknown fields of a header are ignored.",
+                  lambda it: packed(it | {"weather": {"rain": [1, None, "x"]}, "camera": "front"})),
+    "V-FRAM-15": ("2.4 Version", "A header without a version is of version 1.",
+                  lambda it: packed({name: value for name, value in it.items() if name != "v"})),
+    "V-FRAM-16": ("2.1 JSON", "Of a field given twice the last counts.",
+                  lambda it: b'{"v":1,"session":"ffffffff","seq":3,"t_us":5,' + packed(it)[1:]),
+    "V-FRAM-17": ("2.1 JSON", "Blanks and line ends between a header's fields are JSON, and read.",
+                  lambda it: json.dumps(it, indent=2).encode()),
+    "V-FRAM-18": ("2.1 JSON", "Characters of a header may be escaped.",
+                  lambda it: packed(it).replace(b'"seq"', b'"\\u0073eq"')),
+}
+
+
+def _reads(write: Callable[[dict[str, Any]], bytes]) -> Callable[[Bench], None]:
+    def run(bench: Bench) -> None:
+        robot = RobotPlayed(bench).met()
+        for _ in range(2):
+            fields = robot.next_fields()
+            stamp = {name: fields[name] for name in ("session", "seq", "t_us")}
+            sent = robot.frame(header=write(fields), **stamp)
+            answer = robot.answer_to(sent)
+            bench.expect(answer.is_twist, f"it came to {answer.words()}, not to a twist")
+
+    return run
+
+
+for _id, (_clause, _title, _write) in _READS.items():
+    SUITE.add(Case(_id, Level.MUST, _clause, _title, _reads(_write)))
+
+
+@SUITE.must("V-FRAM-19", "2.2 Numbers")
+def largest_integers(bench: Bench) -> None:
+    """`seq` and `t_us` up to 2^53 - 1 come back as they were."""
+    robot = RobotPlayed(bench, first_seq=MAX_INTEGER - 40, first_t_us=MAX_INTEGER - 60_000_000)
+    answer = robot.answer_to(robot.frame(seq=MAX_INTEGER, t_us=MAX_INTEGER))
+    got = (answer.echo.get("seq"), answer.echo.get("t_us"))
+    bench.expect(got == (MAX_INTEGER, MAX_INTEGER), f"it cites seq {got[0]} and t_us {got[1]}")
+
+
+@SUITE.must("V-FRAM-20", "2.2 Numbers")
+def zeros(bench: Bench) -> None:
+    """A session may begin with `seq` 0 at `t_us` 0."""
+    robot = RobotPlayed(bench, first_seq=0, first_t_us=0)
+    answer = robot.answer_to(robot.frame(seq=0, t_us=0))
+    bench.expect(answer.echo.get("seq") == 0, f"it came to {answer.words()}")
+
+
+# --- headers of answers ----------------------------------------------------------------------------------------------
+
+
+@SUITE.must("V-HEAD-01", "2.1 JSON")
+def header_is_an_object(bench: Bench) -> None:
+    """An answer's header is one JSON object in UTF-8, without a byte order mark."""
+    for answer in _sample(bench):
+        header = answer.heard.message.header
+        bench.expect(answer.fields and header[:1] not in b"\xef\xfe\xff", f"no JSON object in UTF-8: {header[:80]!r}")
+
+
+@SUITE.must("V-HEAD-02", "1.4 Sizes")
+def header_size(bench: Bench) -> None:
+    """Nothing it sends is over its channel's size: headers at most 512 bytes, a twist at most 64."""
+    before = bench.dropped_here[OVERSIZE]
+    RobotPlayed(bench).film("left", 5, 100_000)
+    bench.expect(bench.dropped_here[OVERSIZE] == before, "a header or a payload was over its bound")
+
+
+@SUITE.must("V-HEAD-03", "2.4 Version")
+def version(bench: Bench) -> None:
+    """`v` is 1, or absent."""
+    _every(bench, lambda it: _integer(it.get("v", 1)) and it.get("v", 1) == 1, "`v` is not 1")
+
+
+@SUITE.must("V-HEAD-04", "2.5 Session and sequence")
+def session_form(bench: Bench) -> None:
+    """`session` is 8 lower-case hex digits."""
+    _every(bench, lambda it: not it or _SESSION.fullmatch(str(it.get("session"))), "no 8 lower-case hex digits")
+
+
+@SUITE.must("V-HEAD-05", "2.2 Numbers")
+def seq_form(bench: Bench) -> None:
+    """`seq` is an integer from 0 to 2^53 - 1."""
+    _every(bench, lambda it: not it or _integer(it.get("seq")), "`seq` is no integer within bounds")
+
+
+@SUITE.must("V-HEAD-06", "2.8 Fields")
+def source_form(bench: Bench) -> None:
+    """`source` is given."""
+    _every(bench, lambda it: not it or isinstance(it.get("source"), str), "no `source`")
+
+
+@SUITE.must("V-HEAD-07", "2.7 Echo")
+def echo_form(bench: Bench) -> None:
+    """`echo` has all of its four fields."""
+    wanted = {"channel", "session", "seq", "t_us"}
+    _every(bench, lambda it: not it or wanted <= set(it.get("echo") or ()), "the echo is not complete")
+
+
+@SUITE.must("V-HEAD-08", "2.2 Numbers")
+def compute_form(bench: Bench) -> None:
+    """`compute_us` is an integer from 0 on, or absent."""
+    _every(bench, lambda it: _integer(it.get("compute_us", 0)), "`compute_us` is no integer within bounds")
+
+
+@SUITE.should("V-HEAD-09", "7.4 Window")
+def compute_given(bench: Bench) -> None:
+    """`compute_us` is given: without it a slow detector looks like a slow link, and the window widens."""
+    answers = _sample(bench)
+    bench.expect(any(one.fields.get("compute_us") for one in answers if one.fields) or not answers[0].fields,
+                 "it is 0 or absent in every answer")
+
+
+@SUITE.must("V-HEAD-10", "2.2 Numbers")
+def no_infinite_numbers(bench: Bench) -> None:
+    """No NaN and no Infinity in a header: JSON has none."""
+    for answer in _sample(bench):
+        header = answer.heard.message.header
+        bench.expect(b"NaN" not in header and b"Infinity" not in header, f"{header[:200]!r}")
+
+
+# --- grammar of twists -----------------------------------------------------------------------------------------------
+
+
+def _twists(bench: Bench) -> list[Answer]:
+    twists = [one for one in _sample(bench) if one.is_twist]
+    bench.need(twists, "it sends no twists")
+    return twists
+
+
+@SUITE.must("V-GRAM-01", "4.1 Grammar")
+def grammar(bench: Bench) -> None:
+    """A twist's payload is `linear|angular` in the grammar, and nothing else."""
+    for twist in _twists(bench):
+        try:
+            parse_twist(twist.text)
+        except WireError as error:
+            bench.expect(error.reason is not RejectReason.MALFORMED, error.detail)
+
+
+@SUITE.must("V-GRAM-02", "4.1 Grammar")
+def finite(bench: Bench) -> None:
+    """Both numbers of a twist are finite."""
+    for twist in _twists(bench):
+        bench.expect(all(map(math.isfinite, twist.speeds)), f"{twist.text!r}")
+
+
+@SUITE.should("V-GRAM-03", "4.2 Writing")
+def four_decimals(bench: Bench) -> None:
+    """A twist is written with four decimals."""
+    for twist in _twists(bench):
+        bench.expect(not _is_number_pair(twist) or _FOUR_DECIMALS.fullmatch(twist.text), f"{twist.text!r}")
+
+
+def _is_number_pair(twist: Answer) -> bool:
+    try:
+        parse_twist(twist.text)
+    except WireError:
+        return False
+    return True
+
+
+@SUITE.should("V-GRAM-04", "4.2 Writing")
+def no_minus_zero(bench: Bench) -> None:
+    """Zero has no sign."""
+    for twist in _twists(bench):
+        bench.expect(not any(number == 0 and math.copysign(1, number) < 0 for number in twist.speeds),
+                     f"{twist.text!r}")

@@ -1,0 +1,53 @@
+"""Every case for a vision, in the order of the report, and how each begins. Shell (some cases have sockets)."""
+
+from typing import Final
+
+from sightline.conformance.vision import (
+    answers as vision_answers,
+    causality as vision_causality,
+    flow as vision_flow,
+    hostile as vision_hostile,
+)
+from sightline.protocol.conformance import (
+    vision_doors,
+    vision_limits,
+    vision_reconnect,
+    vision_sockets,
+    vision_steering,
+)
+from sightline.protocol.conformance.bench import Bench
+from sightline.conformance.case import Case
+from sightline.conformance.vision.fixture import RobotPlayed
+
+_FIRST_US: Final = 20_000_000
+"""A vision may still be starting, or be started now."""
+_AGAIN_US: Final = 3_000_000
+"""One that lost its robot in the last case tries again every second."""
+_EVERY_US: Final = 100_000
+_PARTS: Final = (
+    vision_answers, vision_causality, vision_flow, vision_limits, vision_hostile, vision_reconnect, vision_steering,
+    vision_sockets, vision_doors,
+)
+
+CASES: Final[tuple[Case, ...]] = tuple(case for part in _PARTS for case in part.SUITE.cases)
+
+
+def is_there(bench: Bench) -> bool:
+    """Whether a vision answers at all: it may have been started a moment ago, or be started now."""
+    prepare(bench)
+    return bool(bench.mark() or bench.dropped_here.total())
+
+
+def prepare(bench: Bench) -> None:
+    """Wait until the vision hears the kit's robot: some answer, even one that this end turns away.
+
+    The robot names no camera: a case is about what happens then.
+    """
+    robot = RobotPlayed(bench, camera=None)
+    before = bench.dropped_here.total()
+    deadline_us = bench.now_us + (_AGAIN_US if bench.mark() else _FIRST_US)
+    while bench.now_us < deadline_us:
+        robot.frame("absent")
+        if bench.wait(lambda: robot.answers() or bench.dropped_here.total() > before, _EVERY_US):
+            break
+    robot.stop()

@@ -1,0 +1,228 @@
+"""Cases about credit, silence, and what a robot says of itself: flow, silence, status. Pure."""
+
+from collections.abc import Callable
+from typing import Final
+
+from sightline.protocol.channels import REQUEST
+from sightline.protocol.conformance.bench import Bench
+from sightline.conformance.case import Case, Level, Suite
+from sightline.protocol.conformance.vision_pictures import CAMERA as LENS
+from sightline.protocol.conformance.vision_pictures import HALF_CAMERA
+from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, RobotPlayed
+from sightline.protocol.spec.message_cases import packed
+from sightline.protocol.messages import Holder, LastRejection, State, Status
+
+SUITE = Suite("V")
+_BURST: Final = 20
+_FLOOD: Final = 1_000
+_CATCH_UP_US: Final = 1_000_000
+_STEADY: Final = 60
+_STEADY_ANSWERED: Final = 0.9
+"""Of frames at 30 fps, one at a time: a detector may take a frame's time, and a scheduler has bad moments."""
+
+
+@SUITE.should("V-FLOW-01", "3.3 A refused picture")
+def refused_picture_is_acknowledged(bench: Bench) -> None:
+    """What is no picture is acknowledged, so that its credit comes back."""
+    robot = RobotPlayed(bench).met()
+    robot.answer_to(robot.frame(jpeg=b"no picture at all"))
+
+
+@SUITE.must("V-FLOW-02", "7.1 Answers")
+def burst(bench: Bench) -> None:
+    """Of a burst of 20 frames the newest is answered within a second."""
+    robot = RobotPlayed(bench).met()
+    sent = [robot.frame("left") for _ in range(_BURST)]
+    robot.answer_to(sent[-1], _CATCH_UP_US)
+
+
+@SUITE.must("V-FLOW-03", "1.5 Delivery")
+def flood(bench: Bench) -> None:
+    """After a thousand frames without a pause, a plain frame is answered within a second: nothing queued up."""
+    robot = RobotPlayed(bench).met()
+    for number in range(_FLOOD):
+        robot.frame(jpeg=b"flood")
+        if number % 50 == 49:
+            bench.rest(5_000)
+    robot.answer_to(robot.frame(), _CATCH_UP_US)
+
+
+@SUITE.must("V-FLOW-04", "7.1 Answers")
+def slow_robot(bench: Bench) -> None:
+    """A robot that sends a frame every second and a half is answered each time."""
+    robot = RobotPlayed(bench).met()
+    for _ in range(3):
+        bench.rest(1_500_000)
+        robot.answer_to(robot.frame())
+
+
+@SUITE.must("V-FLOW-05", "7.1 Answers")
+def steady(bench: Bench) -> None:
+    """Two seconds at 30 fps: nine frames of ten are answered before half a second is over."""
+    robot = RobotPlayed(bench).met()
+    sent = robot.film("left", _STEADY)
+    bench.rest(ANSWER_US)
+    answered = sum(bool(robot.answers_to(one)) for one in sent)
+    bench.expect(answered >= _STEADY_ANSWERED * len(sent), f"{answered} of {len(sent)} frames were answered")
+
+
+@SUITE.must("V-FLOW-06", "10.1 Camera, odometry, scan")
+def no_camera_model(bench: Bench) -> None:
+    """Frames of a robot that names no camera are answered, if only by acks."""
+    robot = RobotPlayed(bench, camera=None)
+    bench.rest(100_000)
+    for _ in range(3):
+        robot.answer_to(robot.frame())
+
+
+@SUITE.should("V-FLOW-07", "10.1 Camera, odometry, scan")
+def late_camera_model(bench: Bench) -> None:
+    """A camera model that comes two seconds late is taken in: twists follow within a second."""
+    robot = RobotPlayed(bench, camera=None)
+    robot.film("left", 40, 50_000)
+    robot.show(LENS)
+    sent = robot.film("left", 20, 50_000)
+    robot.need_nothing_dropped()
+    bench.expect(any(one.is_twist for frame in sent for one in robot.answers_to(frame)), "no twist came")
+
+
+@SUITE.should("V-FLOW-08", "10.1 Camera, odometry, scan")
+def other_camera_model(bench: Bench) -> None:
+    """A camera that changes its picture size is followed: twists within a second."""
+    robot = RobotPlayed(bench).met()
+    robot.show(HALF_CAMERA)
+    bench.rest(50_000)
+    sent = robot.film("left_half", 20, 50_000)
+    bench.expect(any(one.is_twist for frame in sent for one in robot.answers_to(frame)), "no twist came")
+
+
+@SUITE.should("V-FLOW-09", "7.1 Answers")
+def replaced_frames(bench: Bench) -> None:
+    """Frames that a newer one replaced are not answered: of 20 at once, at most half."""
+    robot = RobotPlayed(bench).met()
+    sent = [robot.frame("left") for _ in range(_BURST)]
+    bench.rest(_CATCH_UP_US)
+    answered = sum(bool(robot.answers_to(one)) for one in sent)
+    bench.expect(answered <= _BURST // 2, f"{answered} of {_BURST} frames sent at once were answered")
+
+
+# --- silence ---------------------------------------------------------------------------------------------------------
+
+
+@SUITE.should("V-SIL-01", "7.1 Answers")
+def silent_without_frames(bench: Bench) -> None:
+    """When frames cease, so do twists: nothing is said twice to keep a robot going."""
+    robot = RobotPlayed(bench).met()
+    robot.film("left", 10)
+    bench.rest(_CATCH_UP_US)
+    mark = bench.mark()
+    bench.rest(2_000_000)
+    bench.expect(not robot.answers(mark), f"{len(robot.answers(mark))} answers came without a frame")
+
+
+@SUITE.must("V-SIL-02", "7.1 Answers")
+def back_after_silence(bench: Bench) -> None:
+    """After five seconds without a frame, the next one is answered."""
+    robot = RobotPlayed(bench).met()
+    bench.rest(5_000_000)
+    robot.answer_to(robot.frame())
+
+
+@SUITE.must("V-SIL-03", "3.3 A refused picture")
+def silent_about_no_pictures(bench: Bench) -> None:
+    """When pictures cease to be pictures, twists cease."""
+    robot = RobotPlayed(bench).met()
+    robot.film("left", 5)
+    bench.rest(_CATCH_UP_US)
+    mark = bench.mark()
+    for _ in range(10):
+        robot.frame(jpeg=b"\xff\xd8\xff\xd9")
+        bench.rest(FRAME_US)
+    bench.expect(not robot.twists(mark), f"{len(robot.twists(mark))} twists answered what is no picture")
+
+
+# --- what the robot says of itself -----------------------------------------------------------------------------------
+
+
+def _goes_on(bench: Bench, status: Status | bytes | None, what: str, twists: bool = True) -> None:
+    """With `status` said at 10 Hz, frames go on being answered."""
+    robot = RobotPlayed(bench).met()
+    robot.status = status
+    bench.rest(250_000)
+    for sent in robot.film("left", 8, 100_000):
+        answers = robot.answers_to(sent)
+        if not answers:
+            robot.need_nothing_dropped()
+        good = any(one.is_twist for one in answers) if twists else answers
+        bench.expect(good, f"no {'twist' if twists else 'answer'} for frame {sent.seq} {what}")
+
+
+@SUITE.must("V-STAT-01", "6.4 Arming")
+def disarmed(bench: Bench) -> None:
+    """A disarmed robot is driven all the same: arming needs five good commands in a row."""
+    _goes_on(bench, Status(state=State.DISARMED, reason="not armed"), "while disarmed")
+
+
+@SUITE.must("V-STAT-02", "7.1 Answers")
+def stopped(bench: Bench) -> None:
+    """Frames of a stopped robot are answered: what people see through it needs credit."""
+    _goes_on(bench, Status(state=State.STOPPED, reason="stop was asked for"), "while stopped", twists=False)
+
+
+@SUITE.must("V-STAT-03", "7.1 Answers")
+def refused(bench: Bench) -> None:
+    """A robot that refuses every twist is answered on."""
+    last = LastRejection(source="vision", reason="STALE", detail="frame is 900 ms old")
+    _goes_on(bench, Status(state=State.HOLD, reason="no command", refused={"STALE": 99}, last_refusal=last),
+             "while refused")
+
+
+@SUITE.must("V-STAT-04", "7.1 Answers")
+def other_driver(bench: Bench) -> None:
+    """While somebody else drives, frames are answered."""
+    _goes_on(bench, Status(state=State.ACTIVE, reason="teleop drives",
+                           holder=Holder(source="teleop", session="99999999")), "while teleop drives", twists=False)
+
+
+@SUITE.must("V-STAT-05", "11. Versions")
+def newer_status(bench: Bench) -> None:
+    """Unknown fields and unknown reasons in `status` change nothing."""
+    _goes_on(bench, packed({"state": "HOLD", "reason": "x", "refused": {"TOO_PURPLE": 3}, "battery": {"volts": 11.1}}),
+             "after a status with unknown fields")
+
+
+@SUITE.must("V-STAT-06", "1.2 Messages")
+def no_status(bench: Bench) -> None:
+    """A robot that says no `status` at all is answered."""
+    robot = RobotPlayed(bench, status=None).met()
+    for sent in robot.film("left", 5, 100_000):
+        bench.expect(robot.answers_to(sent), f"no answer to frame {sent.seq}")
+
+
+BROKEN_STATUS: Final = {
+    "V-STAT-11": ("A `status` that is no JSON ends nothing.", b"{state"),
+    "V-STAT-12": ("A `status` with an unknown state ends nothing.", packed({"state": "FLYING", "reason": "x"})),
+    "V-STAT-13": ("Control characters and markup in `status` end nothing.",
+                  packed({"state": "HOLD", "reason": "\x1b[2J\x00<script>alert(1)</script>\u202e"})),
+    "V-STAT-14": ("A `status` of 4096 bytes ends nothing.", packed({"state": "HOLD", "reason": "x"}).ljust(4096)),
+    "V-STAT-15": ("A `status` that is a list ends nothing.", b"[1,2,3]"),
+}
+
+
+def _status_is(payload: bytes) -> Callable[[Bench], None]:
+    return lambda bench: _goes_on(bench, payload, f"after the status {payload[:40]!r}")
+
+
+for _id, (_title, _payload) in BROKEN_STATUS.items():
+    SUITE.add(Case(_id, Level.MUST, "13.2 Bounds", _title, _status_is(_payload)))
+
+
+@SUITE.should("V-REQ-01", "6.4 Arming")
+def asks_for_nothing(bench: Bench) -> None:
+    """It asks a disarmed or stopped robot for nothing: arming and reset are a person's."""
+    for state in (State.DISARMED, State.STOPPED):
+        robot = RobotPlayed(bench, status=Status(state=state, reason="a person did this"))
+        robot.film("left", 20, 100_000)
+        robot.stop()
+    bench.expect(not bench.heard(REQUEST), f"it asked: {[one.message.payload for one in bench.heard(REQUEST)][:3]}")
+

@@ -1,0 +1,193 @@
+"""Cases about what is not the protocol: broken headers, broken cameras, noise, strangers' keys. Pure."""
+
+from collections.abc import Callable
+from random import Random
+from typing import Any, Final
+
+from sightline.protocol.channels import CAMERA, FRAME, MAX_HEADER_BYTES, STATUS
+from sightline.protocol.codec import encode
+from sightline.protocol.conformance.bench import Bench
+from sightline.conformance.case import Case, Level, Suite
+from sightline.protocol.conformance.vision_pictures import CAMERA as LENS
+from sightline.protocol.conformance.vision_pictures import HALF_CAMERA, picture
+from sightline.conformance.vision.fixture import ANSWER_US, RobotPlayed
+from sightline.protocol.spec.message_cases import packed
+
+SUITE = Suite("V")
+_JSON, _NUMBERS, _VERSION, _FIELDS = "2.1 JSON", "2.2 Numbers", "2.4 Version", "2.8 Fields"
+_SESSION, _CAMERA = "2.5 Session and sequence", "10.1 Camera, odometry, scan"
+_NOISE: Final = 600
+Fields = dict[str, Any]
+
+
+def _without(fields: Fields, name: str) -> Fields:
+    return {one: value for one, value in fields.items() if one != name}
+
+
+HEADERS: Final[dict[str, tuple[str, str, Callable[[Fields], bytes]]]] = {
+    "V-HOST-01": ("An empty header", _JSON, lambda _: b""),
+    "V-HOST-02": ("A header cut short", _JSON, lambda it: packed(it)[:-1]),
+    "V-HOST-03": ("A header that is a list", _JSON, lambda it: b"[" + packed(it) + b"]"),
+    "V-HOST-04": ("A header that is not UTF-8", _JSON, lambda it: packed(it)[:-1] + b',"x":"\xff\xfe"}'),
+    "V-HOST-05": ("A header with a byte order mark", _JSON, lambda it: b"\xef\xbb\xbf" + packed(it)),
+    "V-HOST-06": ("Something after the header's object", _JSON, lambda it: packed(it) + b"{}"),
+    "V-HOST-07": ("Version 2", _VERSION, lambda it: packed(it | {"v": 2})),
+    "V-HOST-08": ("Version 0", _VERSION, lambda it: packed(it | {"v": 0})),
+    "V-HOST-09": ("A version that is a text", _VERSION, lambda it: packed(it | {"v": "1"})),
+    "V-HOST-10": ("A negative `seq`", _NUMBERS, lambda it: packed(it | {"seq": -it["seq"]})),
+    "V-HOST-11": ("A `seq` of 2^53", _NUMBERS, lambda it: packed(it | {"seq": 2**53})),
+    "V-HOST-12": ("A `seq` that is a text", _JSON, lambda it: packed(it | {"seq": str(it["seq"])})),
+    "V-HOST-13": ("A `seq` that is a real number", _NUMBERS, lambda it: packed(it | {"seq": float(it["seq"])})),
+    "V-HOST-14": ("A time that is `true`", _NUMBERS, lambda it: packed(it | {"t_us": True})),
+    "V-HOST-15": ("A session in upper case", _SESSION, lambda it: packed(it | {"session": "ABCDEF01"})),
+    "V-HOST-16": ("A session of seven digits", _SESSION, lambda it: packed(it | {"session": it["session"][:7]})),
+    "V-HOST-17": ("A frame without its time", _FIELDS, lambda it: packed(_without(it, "t_us"))),
+    "V-HOST-18": ("A frame without its `seq`", _FIELDS, lambda it: packed(_without(it, "seq"))),
+    "V-HOST-19": ("A frame without its session", _FIELDS, lambda it: packed(_without(it, "session"))),
+    "V-HOST-20": ("A pose of two numbers", _FIELDS, lambda it: packed(it | {"pose": [0, 0]})),
+    "V-HOST-21": ("A pose that is not a number", _NUMBERS, lambda it: packed(it | {"pose": [float("nan"), 0, 0]})),
+    "V-HOST-22": ("A pose ten thousand kilometres away", _FIELDS, lambda it: packed(it | {"pose": [1e7, 0, 0]})),
+    "V-HOST-23": ("`null` where no null belongs", _JSON, lambda it: packed(it | {"moving": None})),
+    "V-HOST-24": ("Brackets in brackets, 150 deep, and one left open", _JSON,
+                  lambda it: packed(it)[:-1] + b',"x":' + b"[" * 150 + b"]" * 149 + b"}"),
+}
+"""What makes a frame no frame: title, clause, header."""
+
+
+def _refused(write: Callable[[Fields], bytes], title: str) -> Callable[[Bench], None]:
+    def run(bench: Bench) -> None:
+        robot = RobotPlayed(bench).met()
+        for _ in range(2):
+            fields = robot.next_fields()
+            mark = bench.mark()
+            header = write(fields)
+            bench.need(len(header) <= MAX_HEADER_BYTES, "this header is too long to be sent")
+            robot.frame("left", header=header)
+            bench.rest(ANSWER_US // 4)
+            bench.expect(not robot.twists(mark), f"it drove by this: {title}")
+
+    return run
+
+
+for _id, (_title, _clause, _write) in HEADERS.items():
+    SUITE.add(Case(_id, Level.MUST, _clause, f"{_title} drives nothing.", _refused(_write, _title)))
+
+
+@SUITE.must("V-HOST-31", "13.2 Bounds")
+def all_headers_and_well(bench: Bench) -> None:
+    """After every broken header, plain frames are answered as before."""
+    robot = RobotPlayed(bench).met()
+    for _, _, write in HEADERS.values():
+        robot.frame("left", header=write(robot.next_fields()))
+        bench.rest(20_000)
+    robot.expect_driven("broken headers")
+
+
+@SUITE.must("V-HOST-32", "13.2 Bounds")
+def noise(bench: Bench) -> None:
+    """After hundreds of random messages on the robot's channels, plain frames are answered as before."""
+    random = Random(bench.now_us)
+    robot = RobotPlayed(bench).met()
+    good = {FRAME: picture("left"), CAMERA: encode(LENS), STATUS: packed({"state": "HOLD", "reason": "x"})}
+    for number in range(_NOISE):
+        channel = random.choice((FRAME, CAMERA, STATUS))
+        header = _damaged(random, encode(robot.stamp()))
+        bench.publish(channel, header, _damaged(random, good[channel]))
+        if number % 10 == 9:
+            bench.rest(5_000)
+    robot.show(LENS)
+    robot = RobotPlayed(bench)
+    robot.expect_driven("random messages")
+
+
+def _damaged(random: Random, data: bytes) -> bytes:
+    """Some bytes replaced, or cut, or all of them random."""
+    kind = random.randrange(3)
+    if kind == 0:
+        return random.randbytes(random.randrange(200))
+    if kind == 1:
+        return data[: random.randrange(len(data))]
+    changed = bytearray(data)
+    for _ in range(1 + random.randrange(4)):
+        changed[random.randrange(len(changed))] = random.randrange(256)
+    return bytes(changed)
+
+
+@SUITE.must("V-HOST-33", "13.2 Bounds")
+def absurd_odometry(bench: Bench) -> None:
+    """Odometry at its bounds, a thousand kilometres away at a million metres a second, gets a finite answer."""
+    robot = RobotPlayed(bench).met()
+    far: Fields = {"pose": (1e6, -1e6, 1e6), "moving": (1e6, -1e6), "applied": (-1e6, 1e6), "latency_us": 2**53 - 1}
+    for _ in range(3):
+        robot.answer_to(robot.frame("left", **far))
+    robot.expect_driven("absurd odometry")
+
+
+# --- cameras ---------------------------------------------------------------------------------------------------------
+
+_LENS: Final[Fields] = LENS.model_dump(mode="json")
+_SMALL: Final[Fields] = HALF_CAMERA.model_dump(mode="json")
+CAMERAS: Final[dict[str, tuple[str, str, bytes, Fields]]] = {
+    "V-HOST-41": ("A camera model that is no JSON", _CAMERA, b"{width", {}),
+    "V-HOST-42": ("A camera model without focal length", _CAMERA, packed(_SMALL | {"fx_px": 0}), {}),
+    "V-HOST-43": ("A camera model 15 pixels wide", _CAMERA, packed(_SMALL | {"width_px": 15}), {}),
+    "V-HOST-44": ("A camera model with nine terms of distortion", _CAMERA,
+                  packed(_SMALL | {"distortion": [0.0] * 9}), {}),
+    "V-HOST-45": ("A camera model with texts for numbers", _CAMERA, packed(_SMALL | {"height_px": "120"}), {}),
+    "V-HOST-46": ("A camera model that is not a number", _CAMERA, packed(_SMALL | {"cx_px": float("nan")}), {}),
+    "V-HOST-47": ("A camera model of version 2", _VERSION, packed(_SMALL), {"v": 2}),
+    "V-HOST-48": ("A camera model with a negative `seq` in its header", _NUMBERS, packed(_SMALL), {"seq": -1}),
+}
+"""What must not be believed, or pictures would no longer fit: title, clause, payload, what differs in the header."""
+
+
+def _not_believed(payload: bytes, header: Fields, title: str) -> Callable[[Bench], None]:
+    def run(bench: Bench) -> None:
+        robot = RobotPlayed(bench).met()
+        robot.camera = None  # the good one is not repeated
+        robot.say(CAMERA, payload, packed(robot.stamp().model_dump() | header))
+        robot.film("centre", 4, 80_000)  # it may look at cameras between frames only
+        robot.expect_driven(title[0].lower() + title[1:])
+
+    return run
+
+
+for _id, (_title, _clause, _payload, _header) in CAMERAS.items():
+    SUITE.add(Case(_id, Level.MUST, _clause, f"{_title} is not believed.", _not_believed(_payload, _header, _title)))
+
+
+@SUITE.must("V-HOST-51", "13.2 Bounds")
+def absurd_lens(bench: Bench) -> None:
+    """A lens within the bounds and beyond reason ends nothing: with a good one again, twists come within a second."""
+    robot = RobotPlayed(bench).met()
+    for changes in ({"fx_px": 1e-3}, {"cx_px": 1e6, "cy_px": -1e6}, {"pitch_rad": 1e6}, {"distortion": (1e6,) * 8},
+                    {"z_m": -1e6}):
+        robot.show(LENS.model_copy(update=changes))
+        robot.film("left", 3, 20_000)
+    robot.show(LENS)
+    sent = robot.film("left", 20, 50_000)
+    bench.expect(any(one.is_twist for frame in sent for one in robot.answers_to(frame)), "no twist came any more")
+
+
+# --- keys ------------------------------------------------------------------------------------------------------------
+
+KEYS: Final = {
+    "V-HOST-61": ("A frame under a wildcard", "sightline/*/frame"),
+    "V-HOST-62": ("A frame of another robot", "sightline/another/frame"),
+    "V-HOST-63": ("A frame under everything", "**"),
+}
+
+
+def _not_heard(key: str, title: str) -> Callable[[Bench], None]:
+    def run(bench: Bench) -> None:
+        robot = RobotPlayed(bench).met()
+        mark = bench.mark()
+        bench.put(key.replace("another", f"x{bench.robot}"[:32]), packed(robot.next_fields()), picture("left"))
+        bench.rest(ANSWER_US)
+        bench.expect(not robot.answers(mark), f"it answered this: {title}")
+
+    return run
+
+
+for _id, (_title, _key) in KEYS.items():
+    SUITE.add(Case(_id, Level.MUST, "1.3 Keys", f"{_title} is not this robot's.", _not_heard(_key, _title)))

@@ -1,0 +1,148 @@
+"""What a demo leaves and says when it is over: score.json, trajectory.png, run.mp4, a table. Shell (writes files)."""
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from sightline.evaluation.checks import Check, check_line
+from sightline.operator_side.demo import RECORDING, DemoRun
+from sightline.operator_side.preflight import needs
+from sightline.operator_side.processes import last_line
+from sightline.operator_side.recording.replay import Replayed, Step, replay
+from sightline.evaluation.score.figures import Score, score
+from sightline.operator_side.score_bounds import checks_of
+from sightline.operator_side.score_course import figures_of
+from sightline.operator_side.shaped_vision import INJECTED
+from sightline.protocol.errors import SightlineError
+
+REAL_TIME_FACTOR: Final = 1.5
+"""The bounds are those of lockstep; a real machine is granted this much more."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoReport:
+    """The judgement of a run."""
+
+    run: DemoRun
+    score: Score
+    checks: list[Check]
+    replayed: Replayed
+    injected: dict[str, Any] | None
+
+    @property
+    def ok(self) -> bool:
+        """Whether every check holds."""
+        return all(check.ok for check in self.checks)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `--json` prints and score.json holds."""
+        options = self.run.options
+        return {
+            "ok": self.ok,
+            "checks": [asdict(check) for check in self.checks],
+            "score": asdict(self.score),
+            "scenario": options.scenario, "seed": options.seed, "latency_ms": options.latency_ms, "loss": options.loss,
+            "replayed": asdict(self.replayed), "injected": self.injected,
+            "recorder_dropped": self.run.dropped_by_recorder, "recorder_failed": self.run.recorder_failed,
+            "interrupted": self.run.interrupted, "folder": str(self.run.folder),
+        }
+
+
+def report(run: DemoRun) -> DemoReport:
+    """Judge `run` and write its files. Raises SightlineError for a run that was ended before it began."""
+    if not run.samples:
+        raise SightlineError(f"ended before the robot drove; the logs are in {run.folder}")
+    recording = run.folder / RECORDING
+    said: list[tuple[int, str, str]] = []
+    replayed = replay(recording, lambda step: said.append(_printed(step)))
+    during = [one for one in said if run.samples[0].t_us <= one[0] <= run.samples[-1].t_us]
+    result = score(run.samples, run.scenario.stand_off_m, figures_of(run.scenario, run.samples, during))
+    injected = _injected(run)
+    checks = _checks(run, result) + _injection_checks(run, injected)
+    judged = DemoReport(run, result, checks, replayed, injected)
+    (run.folder / "score.json").write_text(json.dumps(judged.to_dict(), indent=2) + "\n", "utf-8")
+    _draw(run, recording)
+    return judged
+
+
+def _printed(step: Step) -> tuple[int, str, str]:
+    """What the mission said of a frame: the same pipeline says the same of the same frames."""
+    return step.frame.header.t_us, step.answer.seen.phase, step.answer.seen.note
+
+
+def _draw(run: DemoRun, recording: Path) -> None:
+    with needs("report"):
+        from sightline.evaluation.plots import plot_run
+        from sightline.operator_side.video import film_run
+    options = run.options
+    title = f"{run.scenario.name}, seed {options.seed}, +{options.latency_ms:g} ms, {options.loss:.0%} loss"
+    plot_run(run.folder / "trajectory.png", run.samples, run.scenario, title)
+    film_run(run.folder / "run.mp4", recording, run.samples, run.scenario)
+
+
+def _injected(run: DemoRun) -> dict[str, Any] | None:
+    """What the shaped link says it did; None if it was not asked for or did not say."""
+    line = last_line(run.folder / "vision.log")
+    if not line.startswith(INJECTED):
+        return None
+    counts: dict[str, Any] = json.loads(line.removeprefix(INJECTED))
+    return counts
+
+
+def _injection_checks(run: DemoRun, injected: dict[str, Any] | None) -> list[Check]:
+    """A run that was to lose messages and lost none has shown nothing."""
+    if not run.options.loss:
+        return []
+    lost = sum(leg["lost"] for leg in injected.values()) if injected else 0
+    sent = sum(leg["sent"] for leg in injected.values()) if injected else 0
+    share = lost / sent if sent else 0.0
+    wanted = run.options.loss
+    # Three standard deviations of a fair draw: outside of that the loss was not what was asked for.
+    near = 3 * math.sqrt(wanted * (1 - wanted) / sent) if sent else 0.0
+    return [Check("injected_loss", share, "share", wanted, sent > 0 and abs(share - wanted) <= near + 1e-9)]
+
+
+def _checks(run: DemoRun, result: Score) -> list[Check]:
+    """The scenario's bounds; of the older dialect, slow and without odometry, only that it follows is demanded."""
+    if run.options.transport != "legacy":
+        return checks_of(run.options.scenario, result, run.options.latency_ms, REAL_TIME_FACTOR)
+    unseen = 100 * sum(not sample.visible for sample in run.samples) / len(run.samples)
+    return [
+        Check("out of view", unseen, "%", 0.0, unseen == 0),
+        Check("wall_contacts", result.wall_contacts, "steps", 0.0, result.wall_contacts == 0),
+    ]
+
+
+def summary(judged: DemoReport) -> list[str]:
+    """The closing lines: the score with its bounds, where everything lies, what to try next."""
+    run, replayed = judged.run, judged.replayed
+    lines = [check_line(check) for check in judged.checks]
+    lines.append(_replay_line(replayed))
+    if run.dropped_by_recorder:
+        lines.append(f"the recorder dropped {run.dropped_by_recorder} messages: the disk was too slow")
+    if run.recorder_failed:
+        lines.append(f"the recording ends early: {run.recorder_failed}")
+    if run.killed:
+        lines.append(f"had to be killed: {', '.join(run.killed)}; see their logs")
+    lines.append(f"left in {run.folder}: score.json trajectory.png run.mp4 run.mcap motors.csv *.log")
+    return [*lines, _next_thing(run)]
+
+
+def _replay_line(replayed: Replayed) -> str:
+    if not replayed.total:
+        return "replay: vision's answers did not cross the recorder's transport, so there is nothing to compare"
+    if replayed.gaps or replayed.missing_frames:
+        lost = f"{replayed.gaps} answers and {replayed.missing_frames} frames are not in the recording"
+        return f"replay: cannot be compared, for {lost}; run without loss to compare"
+    return f"replay: {replayed.equal} of {replayed.total} answers equal byte for byte"
+
+
+def _next_thing(run: DemoRun) -> str:
+    options = run.options
+    if not options.latency_ms and not options.loss:
+        eyes = f" --detector {options.detector}" if options.detector else ""
+        return f"next: sightline demo --scenario {options.scenario}{eyes} --latency-ms 100 --loss 0.1"
+    other = "pushed" if run.scenario.name == "eight" else "eight"
+    return f"next: sightline demo --scenario {other} --latency-ms {options.latency_ms:g} --loss {options.loss:g}"

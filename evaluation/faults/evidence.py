@@ -1,0 +1,195 @@
+"""What the motors' own log says of a stop, held against what was demanded. Pure.
+
+Nothing here believes the software under test: the motors' log is stamped by the simulation, the ledger by whoever sent.
+"""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from sightline.evaluation.checks import Check, at_most
+from sightline.robot_side.kinematics import DiffDriveConfig
+from sightline.robot_side.safety.limits import TICK_US, SafetyConfig, stop_bound
+
+FALLS_MS: Final = 340.0
+ZERO_MS: Final = 700.0
+DISTANCE_M: Final = 0.25
+OLD_US: Final = SafetyConfig().zero_speed_age_ms * 1000
+MEMORY_MB: Final = 5.0
+_LEAVES_MAXIMUM: Final = 0.99
+"""Speed counts as falling from where it leaves 99 % of its maximum for good."""
+_FASTER_MPS: Final = 0.005
+"""Less than this is no gain of speed: turning a wheel's speed into a twist and back rounds."""
+_AT_REST_MPS: Final = 0.01
+"""A wheel is at zero when its motor is told zero and its rim moves slower than this: 2 % of top speed, as in the
+bound that the robot computes for itself."""
+_RAMPED_OUT_US: Final = stop_bound(SafetyConfig()).ramped_us + 2 * TICK_US
+"""Age of a frame at which even the ramp that it left behind is at its end, by the robot's own limits."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotorRow:
+    """One line of the motors' log: speeds as told, and how far the wheels had really turned."""
+
+    t_us: int
+    left_rad_s: float
+    right_rad_s: float
+    left_rad: float
+    right_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class SentCommand:
+    """One good command, as its sender noted it: when it left and when the frame behind it was captured."""
+
+    t_us: int
+    frame_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class Blind:
+    """From `from_us` on nothing that is sent counts as sight any more, until `until_us` (None: to the end).
+
+    With `by_frame`, nothing that is captured: where only pictures are cut off, one under way may still be answered.
+    """
+
+    from_us: int
+    until_us: int | None = None
+    by_frame: bool = False
+
+    def is_earlier(self, one: SentCommand) -> bool:
+        """Whether a command is from before the blindness."""
+        return (one.frame_us if self.by_frame else one.t_us) <= self.from_us
+
+    def hides(self, one: SentCommand, now_us: int) -> bool:
+        """Whether a command must not move the wheels at `now_us`."""
+        return not self.is_earlier(one) and (self.until_us is None or now_us < self.until_us)
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Counted from the last valid command. None: never in the window."""
+
+    falls_ms: float | None
+    zero_ms: float | None
+    distance_m: float
+
+
+def read_motors(text: str) -> list[MotorRow]:
+    """Whole lines of `motors.csv`; a line that is still being written is left out."""
+    lines = text.split("\n")[1:-1]
+    parts = [line.split(",") for line in lines]
+    return [MotorRow(int(t), float(left), float(right), float(a), float(b)) for t, left, right, a, b in parts]
+
+
+def wheel_mps(row: MotorRow) -> float:
+    """Speed that the faster wheel is told, at its rim, m/s."""
+    return max(abs(row.left_rad_s), abs(row.right_rad_s)) * DiffDriveConfig().wheel_radius_m
+
+
+def _rim_m(before: MotorRow, after: MotorRow) -> float:
+    """Way of the faster wheel between two rows."""
+    turned_rad = max(abs(after.left_rad - before.left_rad), abs(after.right_rad - before.right_rad))
+    return turned_rad * DiffDriveConfig().wheel_radius_m
+
+
+def _axle_m(before: MotorRow, after: MotorRow) -> float:
+    """Way of the middle of the axle between two rows."""
+    turned_rad = (after.left_rad - before.left_rad + after.right_rad - before.right_rad) / 2
+    return abs(turned_rad) * DiffDriveConfig().wheel_radius_m
+
+
+def measure_stop(rows: Sequence[MotorRow], since_us: int, until_us: int | None = None) -> Stop:
+    """The stop after the last valid command at `since_us`, within the log up to `until_us`."""
+    before = [row for row in rows if row.t_us <= since_us]
+    after = [row for row in rows if row.t_us > since_us and (until_us is None or row.t_us <= until_us)]
+    window = [*before[-1:], *after]
+    if len(window) < 2:
+        return Stop(None, None, 0.0)
+    distance_m = sum(_axle_m(a, b) for a, b in itertools.pairwise(window))
+    return Stop(_falls_ms(window, since_us), _zero_ms(window, since_us), distance_m)
+
+
+def _falls_ms(window: Sequence[MotorRow], since_us: int) -> float | None:
+    highest_mps = max(map(wheel_mps, window))
+    if highest_mps == 0:
+        return 0.0
+    fast = [index for index, row in enumerate(window) if wheel_mps(row) >= _LEAVES_MAXIMUM * highest_mps]
+    return _ms_after(window, fast[-1] + 1, since_us)
+
+
+def _zero_ms(window: Sequence[MotorRow], since_us: int) -> float | None:
+    told = [index for index, row in enumerate(window) if wheel_mps(row) > 0]
+    spans = list(itertools.pairwise(_thinned(window)))
+    rolling = [b.t_us for a, b in spans if _rim_m(a, b) > _AT_REST_MPS * (b.t_us - a.t_us) / 1e6]
+    if not spans or rolling[-1:] == [spans[-1][1].t_us]:
+        return None
+    told_ms = _ms_after(window, max(told, default=-1) + 1, since_us)
+    return None if told_ms is None else max(told_ms, *((end_us - since_us) / 1000 for end_us in rolling[-1:]), 0.0)
+
+
+def _thinned(window: Sequence[MotorRow]) -> list[MotorRow]:
+    """Rows at least a tick apart: the angles in the log come in physics steps of 4 ms, rows as often as commands."""
+    kept = list(window[:1])
+    for row in window:
+        if row.t_us - kept[-1].t_us >= TICK_US:
+            kept.append(row)
+    return kept
+
+
+def _ms_after(window: Sequence[MotorRow], index: int, since_us: int) -> float | None:
+    return max(0.0, (window[index].t_us - since_us) / 1000) if index < len(window) else None
+
+
+def last_valid_us(sent: Iterable[SentCommand], blind: Blind) -> int | None:
+    """When the last command left that still counted when the blindness began; None without one."""
+    return max((one.t_us for one in sent if blind.is_earlier(one)), default=None)
+
+
+def moved_on_old_sight(rows: Sequence[MotorRow], sent: Sequence[SentCommand], blind: Blind | None) -> int:
+    """Log lines whose motion no young frame allows.
+
+    With the newest frame behind any valid command older than 400 ms (and one tick, for which a decision holds) the
+    wheels must not gain speed; when even the ramp must be at its end, they must stand.
+    """
+    return sum(
+        (age_us > OLD_US + TICK_US and wheel_mps(row) > wheel_mps(before) + _FASTER_MPS)
+        or (age_us > _RAMPED_OUT_US and wheel_mps(row) > 0)
+        for (before, row), age_us in zip(itertools.pairwise(rows), _ages_us(rows[1:], sent, blind), strict=True)
+    )
+
+
+def _ages_us(rows: Iterable[MotorRow], sent: Sequence[SentCommand], blind: Blind | None) -> Iterable[float]:
+    """For each row, the age of the youngest frame that a valid command had brought by then."""
+    ordered = sorted(sent, key=lambda one: one.t_us)
+    for row in rows:
+        frames = (
+            one.frame_us for one in ordered
+            if one.t_us <= row.t_us and not (blind and blind.hides(one, row.t_us))
+        )
+        yield row.t_us - max(frames, default=float("-inf"))
+
+
+def most_gain_mps2(rows: Sequence[MotorRow], since_us: int, over_us: int = 100_000) -> float:
+    """The hardest change of a wheel's told speed over `over_us`, at its rim, since `since_us`."""
+    radius_m = DiffDriveConfig().wheel_radius_m
+    late = [row for row in rows if row.t_us >= since_us]
+    most, first = 0.0, 0
+    for row in late:
+        while row.t_us - late[first].t_us > over_us:
+            first += 1
+        change_rad_s = abs((row.left_rad_s + row.right_rad_s - late[first].left_rad_s - late[first].right_rad_s) / 2)
+        most = max(most, change_rad_s * radius_m / (over_us / 1e6))
+    return most
+
+
+def stop_checks(stop: Stop, zero_ms: float = ZERO_MS, distance_m: float = DISTANCE_M) -> list[Check]:
+    """The stop against its bounds."""
+    return [
+        at_most("falls", stop.falls_ms, "ms", min(FALLS_MS, zero_ms)),
+        at_most("zero", stop.zero_ms, "ms", zero_ms),
+        at_most("distance", stop.distance_m, "m", distance_m),
+    ]
+
+

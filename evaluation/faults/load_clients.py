@@ -1,0 +1,129 @@
+"""A hundred viewers by WebSocket of whom one never reads, or five hundred handshakes begun and left. Shell.
+
+    python -m sightline.evaluation.faults.load_clients viewers|handshakes ENDPOINT LEDGER
+
+It stands for other people's machines, so it takes little of this one's processor. Whoever is turned away or dropped
+comes again, for ever. The first of the viewers watch with an operator's role, for whom places are kept.
+"""
+
+import os
+import secrets
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from sightline.operator_side.faults.ledger import INJECTED, EventLog
+from sightline.protocol.channels import FRAME
+from sightline.protocol.codec import encode
+from sightline.protocol.transports.websocket.client import Client
+from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint
+from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, Hello
+from sightline.protocol.transports.websocket_peer import OPEN_S
+from sightline.protocol.transports.websocket.server import RESERVED_SLOTS
+
+if TYPE_CHECKING:
+    from sightline.protocol.transports.websocket_wire import Connection
+
+ADMITTED: Final = "admitted"
+SEEN: Final = "seen"
+READY: Final = "all have knocked"
+VIEWERS: Final = 100
+HANDSHAKES: Final = 500
+_NOT_READING_S: Final = 3.0
+_POLITE: Final = 10
+_AGAIN_S: Final = 0.25
+_BEGUN: Final = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgr"
+
+
+class Viewer:
+    """One viewer; `reads` is False for the one that takes nothing but the hello out of its connection."""
+
+    def __init__(self, ledger: EventLog, role: str, *, reads: bool) -> None:
+        self._ledger, self._reads = ledger, reads
+        hello = Hello(robot="r1", role=role, session=secrets.token_hex(4), wants=(FRAME.name,))
+        self._hello = encode(hello).decode("ascii")
+        self.admitted = False
+
+    def watch(self, wire: "Connection") -> None:
+        """Say hello and take pictures, until the robot has had enough."""
+        wire.protocol.max_message_size = MAX_BLOCK_BYTES + FRAME.max_payload_bytes
+        wire.say(self._hello)
+        wire.receive_one(time.monotonic() + OPEN_S)  # the robot's, which says that there is a place
+        self.admitted = True
+        self._ledger.note(ADMITTED)
+        if not self._reads:
+            time.sleep(_NOT_READING_S)
+            return
+        while True:
+            for message in wire.receive():
+                if isinstance(message, bytes):
+                    self._ledger.note(SEEN)
+            wire.wait(_AGAIN_S)
+
+
+def view(endpoint: str, ledger: EventLog) -> None:
+    """All viewers, for ever."""
+    roles = ["operator"] * RESERVED_SLOTS + ["viewer"] * (VIEWERS - RESERVED_SLOTS)
+    viewers = [Viewer(ledger, role, reads=number != RESERVED_SLOTS) for number, role in enumerate(roles)]
+    dialers = [Client(parse_websocket_endpoint(endpoint), viewer.watch, lambda _reason: None) for viewer in viewers]
+    waiting = list(zip(viewers, dialers, strict=True))
+    while waiting:
+        knocked = [pair for pair in waiting if pair[0].admitted or pair[1].trouble]
+        for pair in knocked:
+            ledger.note(INJECTED)
+            waiting.remove(pair)
+        time.sleep(_AGAIN_S)
+    print(READY, flush=True)
+    threading.Event().wait()
+
+
+def leave_handshakes(endpoint: str, ledger: EventLog) -> None:
+    """Begin them, and begin again what the robot has closed."""
+    end = parse_websocket_endpoint(endpoint)
+    begun: list[socket.socket] = []
+    told = False
+    while True:
+        begun = [one for one in begun if _is_open(one)]
+        while len(begun) < HANDSHAKES:
+            begun.append(_begin(end.host, end.port))
+            ledger.note(INJECTED)
+        if not told:
+            told = True
+            print(READY, flush=True)
+        time.sleep(_AGAIN_S)
+
+
+def _begin(host: str, port: int) -> socket.socket:
+    one = socket.create_connection((host, port), 5.0)
+    one.setblocking(False)
+    one.send(_BEGUN)
+    return one
+
+
+def _is_open(one: socket.socket) -> bool:
+    try:
+        if one.recv(4096):
+            return True
+    except BlockingIOError:
+        return True
+    except OSError:
+        pass
+    one.close()
+    return False
+
+
+_KINDS: Final[dict[str, Callable[[str, EventLog], None]]] = {"viewers": view, "handshakes": leave_handshakes}
+
+
+def main(kind: str, endpoint: str, ledger: str) -> None:
+    """Be a crowd until killed."""
+    os.nice(_POLITE)
+    _KINDS[kind](endpoint, EventLog(Path(ledger)))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:4])

@@ -1,0 +1,210 @@
+"""The whole line in virtual time: the services' own pure logic, a simulated world, a network in memory. Pure.
+
+Nothing here decides anything: robot, driver, stream and vision are the classes the real processes run. Every delay and
+loss is drawn from the seed, so a run repeats bit for bit, about twenty times faster than real.
+"""
+
+import zlib
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from sightline.evaluation.labels import Labels
+from sightline.evaluation.scenario_config import robot_config, vision_config
+from sightline.protocol.channels import ACK, FRAME, SCAN, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import FrameHeader, State
+from sightline.protocol.transports.link import LatestSlot, Message
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.text import format_twist
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.driver.core import DriverCore
+from sightline.robot_side.safety.limits import TICK_US
+from sightline.robot_side.ports import Picture
+from sightline.robot_side.sending import NetworkCore
+from sightline.sim.process import PeriodicTimer
+from sightline.sim.robot import RobotModel
+from sightline.sim.scenario import Scenario
+from sightline.sim.truth import Truth
+from sightline.sim.world.world import World
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.around import close_detector, notices_of
+from sightline.vision_side.detect.registry import configured_detector
+from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
+from sightline.vision_side.missions.ranges import decode_scan
+
+COMPUTE_US = 4_000
+"""What one frame costs the vision side in virtual time: one step of the world, above what it takes in truth."""
+_SAMPLE_US = 20_000
+_ROBOT_SESSION, _VISION_SESSION = "00000001", "00000002"
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What the network does: added latency in all (half on each leg), jitter in all, loss on each leg."""
+
+    latency_ms: float = 0.0
+    loss: float = 0.0
+    jitter_ms: float = 0.0
+
+
+@dataclass(slots=True)
+class Run:
+    """What a run leaves."""
+
+    samples: list[Truth] = field(default_factory=list)
+    twists: list[bytes] = field(default_factory=list)
+    """Every twist the vision side sent, in order."""
+    states: set[State] = field(default_factory=set)
+    said: list[tuple[int, str, str]] = field(default_factory=list)
+    """Capture time of each frame that was answered, and the mission's phase and note."""
+    news: list[str] = field(default_factory=list)
+    """What the detector had to tell a person."""
+
+
+class Lockstep:
+    """One robot, one vision, one world. `step` advances all by one step of the world."""
+
+    def __init__(
+        self,
+        world: World,
+        robot: RobotConfig,
+        vision: VisionConfig,
+        conditions: Conditions,
+        seed: int,
+    ) -> None:
+        self.world = world
+        self.run = Run()
+        self.network = MemoryNetwork(
+            seed, round(conditions.latency_ms * 1000), round(conditions.jitter_ms * 1000), conditions.loss
+        )
+        self.driving = DriverCore(robot, _ROBOT_SESSION)
+        self._sending = NetworkCore(robot.stream, _ROBOT_SESSION, 0, robot.max_frame_bytes)
+        self._robot_link = self.network.link(robot.robot)
+        self._robot_link.subscribe(TWIST, self._on_twist)
+        self._robot_link.subscribe(ACK, lambda message: self._sending.on_ack(message, self._now_us))
+        self._vision_link = self.network.link(robot.robot, role=SOURCE)
+        self._frames: LatestSlot[Message] = self._vision_link.latest(FRAME)
+        self._pipeline = Pipeline(vision, world.camera_model, eyes=configured_detector(vision))
+        self._scanned = self._vision_link.latest(SCAN) if self._pipeline.mission.wants_scan else None
+        self._labels = Labels(vision.boxes, world.camera_model) if vision.detector.kind == "boxes" else None
+        self._computed: deque[tuple[int, Message]] = deque(maxlen=1)
+        self._answers = 0
+        self._camera_tick = 0
+        self._frame_interval_us = 1e6 / world.robot.camera.fps
+        self._scans = PeriodicTimer(1e6 / world.robot.lidar.rate_hz)
+        self._now_us = 0
+
+    def step(self) -> None:
+        """One step of the world, then everything that is due."""
+        self.world.step()
+        self._now_us = self.world.now_us
+        self.network.advance(self._now_us)
+        self._see()
+        self._film()
+        if self._now_us % TICK_US == 0:
+            self._tick()
+        if self._now_us % _SAMPLE_US == 0:
+            self.run.samples.append(self.world.truth())
+
+    def close(self) -> None:
+        """Hear what the detector has to say, and let go of it."""
+        self.run.news += notices_of(self._pipeline.eyes)
+        close_detector(self._pipeline.eyes)
+
+    # --- robot ---------------------------------------------------------------------------------------------------
+
+    def _film(self) -> None:
+        """The camera's next tick: a picture, if the stream wants one."""
+        if self._now_us < self._camera_tick * self._frame_interval_us:
+            return
+        self._camera_tick += 1
+        if not self._sending.may_capture(self._now_us, self._robot_link.has_listener(FRAME)):
+            return
+        sent = self._sending.on_camera(Picture(self.world.render(), self._now_us), self._now_us)
+        if sent is not None:
+            header, message = sent
+            if self._labels is not None:
+                self._labels.label(header, self.world.labels())
+            self.driving.on_issued(header.seq, header.t_us, zlib.crc32(message.payload))
+            self._robot_link.publish(message.channel, message.header, message.payload)
+
+    def _on_twist(self, message: Message) -> None:
+        judged = self.driving.on_twist(message, self._now_us)
+        if judged is not None:
+            self._sending.on_judged(judged, self._now_us)
+        self._tick()
+
+    def _tick(self) -> None:
+        scan = self.world.scan() if self._scans.due(self._now_us) else None
+        self.world.set_wheels(*self.driving.tick(self._now_us, self.world.wheel_angles(), scan))
+        self._sending.motion = self.driving.motion()
+        self._publish_scans()
+        self.run.states.add(self.driving.gate.state)
+
+    def _publish_scans(self) -> None:
+        """For a mission that goes by them; of all that the driver publishes, nothing else is listened to here."""
+        if self._scanned is None:
+            return
+        for message in self.driving.messages(self._now_us):
+            if message.channel is SCAN:
+                self._robot_link.publish(SCAN, message.header, message.payload)
+
+    # --- vision --------------------------------------------------------------------------------------------------
+
+    def _see(self) -> None:
+        """Send what is computed, then take the newest frame: one at a time, as the real service does."""
+        if self._computed and self._computed[0][0] > self._now_us:
+            return
+        if self._computed:
+            _, message = self._computed.popleft()
+            self._vision_link.publish(message.channel, message.header, message.payload)
+        taken = self._frames.take()
+        if taken is not None:
+            self._computed.append((self._now_us + COMPUTE_US, self._answer(taken)))
+
+    def _answer(self, message: Message) -> Message:
+        frame = Frame(decode(FrameHeader, message.header), message.payload)
+        scan = self._scanned.take() if self._scanned else None
+        if scan is not None:
+            self._pipeline.see_scan(*decode_scan(scan.header, scan.payload))
+        answer = self._pipeline.step(frame) if self._labels is None else self._pipeline.follow(
+            *self._labels.of(frame.header)
+        )
+        self.run.said.append((frame.header.t_us, answer.seen.phase, answer.seen.note))
+        header = encode(answer_header(frame.header, _VISION_SESSION, self._answers, COMPUTE_US, answer))
+        self._answers += 1
+        if answer.twist is None:
+            return Message(ACK, SOURCE, header, b"")
+        text = format_twist(answer.twist)
+        self.run.twists.append(text)
+        return Message(TWIST, SOURCE, header, text)
+
+
+def run_lockstep(
+    scenario: Scenario,
+    model: RobotModel,
+    seed: int,
+    conditions: Conditions,
+    seconds: float | None = None,
+    *,
+    vision: VisionConfig | None = None,
+    mission: str | None = None,
+    on_progress: Callable[[int], None] = lambda _now_us: None,
+) -> Run:
+    """One run of `scenario` for `seconds` (its own length if None). `on_progress` is told the time each second.
+
+    `vision` and `mission` stand in for what the scenario names.
+    """
+    vision = vision or vision_config(scenario, model, seed, mission)
+    with World(scenario, model, seed) as world:
+        lockstep = Lockstep(world, robot_config(model, auto_arm=True), vision, conditions, seed)
+        end_us = round((seconds or scenario.seconds) * 1e6)
+        try:
+            while world.now_us < end_us:
+                lockstep.step()
+                if world.now_us % 1_000_000 == 0:
+                    on_progress(world.now_us)
+        finally:
+            lockstep.close()
+        return lockstep.run

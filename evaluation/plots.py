@@ -1,0 +1,126 @@
+"""trajectory.png: where robot and target went, and what the scenario is about over time. Shell (writes a file)."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sightline.operator_side.preflight import needs
+from sightline.sim.scenario import Scenario, Wall
+from sightline.sim.things import Static
+from sightline.sim.truth import Truth
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.patches import Circle
+
+ROBOT_COLOUR, TARGET_COLOUR, WALL_COLOUR = "tab:blue", "goldenrod", "0.55"
+LIGHT_DRAWN_M = 0.06
+
+
+def plot_run(path: Path, samples: Sequence[Truth], scenario: Scenario, title: str) -> None:
+    """Draw `samples` (at least one). Raises ConfigError without Matplotlib."""
+    with needs("report"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    figure = Figure(figsize=(12, 6), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.1, 1))
+    _plot_ways(figure.add_subplot(grid[:, 0]), samples, scenario)
+    times_s = [(truth.t_us - samples[0].t_us) / 1e6 for truth in samples]
+    upper, lower = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
+    if scenario.goals_m or scenario.light:
+        _plot_speed(upper, times_s, samples)
+        (_plot_line if scenario.light else _plot_clearance)(lower, times_s, samples)
+    else:
+        _plot_bearing(upper, times_s, samples)
+        _plot_distance(lower, times_s, samples, scenario.stand_off_m)
+    figure.suptitle(title)
+    canvas.draw()  # type: ignore[no-untyped-call]  # equal scales change the numbers; what room those take shows now
+    canvas.print_png(path)  # type: ignore[no-untyped-call]
+
+
+def wall_corners(wall: Wall) -> list[tuple[float, float]]:
+    """The four corners of a wall seen from above, in metres."""
+    (x1, y1), (x2, y2) = wall.start_m, wall.end_m
+    length = math.hypot(x2 - x1, y2 - y1) or 1.0
+    across_x, across_y = -(y2 - y1) / length * wall.thickness_m / 2, (x2 - x1) / length * wall.thickness_m / 2
+    return [
+        (x1 + across_x, y1 + across_y), (x2 + across_x, y2 + across_y),
+        (x2 - across_x, y2 - across_y), (x1 - across_x, y1 - across_y),
+    ]
+
+
+def _plot_ways(axes: "Axes", samples: Sequence[Truth], scenario: Scenario) -> None:
+    for wall in scenario.walls:
+        axes.fill(*zip(*wall_corners(wall), strict=True), color=WALL_COLOUR)
+    _plot_things(axes, scenario)
+    if scenario.target.shape != "place":
+        axes.plot([t.target_x_m for t in samples], [t.target_y_m for t in samples], color=TARGET_COLOUR, label="target")
+    axes.plot([t.x_m for t in samples], [t.y_m for t in samples], color=ROBOT_COLOUR, label="robot")
+    start, end = samples[0], samples[-1]
+    axes.plot(start.x_m, start.y_m, "o", color=ROBOT_COLOUR)
+    axes.annotate(
+        "", (end.x_m + 0.15 * math.cos(end.yaw_rad), end.y_m + 0.15 * math.sin(end.yaw_rad)), (end.x_m, end.y_m),
+        arrowprops={"arrowstyle": "-|>", "color": ROBOT_COLOUR},
+    )
+    if scenario.target.shape != "place":
+        axes.add_patch(_circle((end.target_x_m, end.target_y_m), scenario.target.reach_m, TARGET_COLOUR))
+    axes.set(xlabel="x (m)", ylabel="y (m)", title="from above")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(loc="best")
+
+
+def _plot_things(axes: "Axes", scenario: Scenario) -> None:
+    """What stands about, but for what the seed moved it by; waypoints; the light and its line."""
+    for thing in scenario.things:
+        if isinstance(thing, Static):
+            axes.add_patch(_circle(thing.at_m, thing.reach_m, WALL_COLOUR))
+    if scenario.goals_m:
+        axes.plot(*zip(*scenario.goals_m, strict=True), "x", color=TARGET_COLOUR, markersize=12, label="waypoint")
+    if scenario.light:
+        axes.add_patch(_circle(scenario.light.at_m, LIGHT_DRAWN_M, "black"))
+        line_x_m, line_y_m = scenario.light.ahead(scenario.light.line_m)
+        axes.plot([line_x_m, line_x_m], [line_y_m - 0.1, line_y_m + 0.9], color="black")
+
+
+def _circle(centre: tuple[float, float], radius_m: float, colour: str) -> "Circle":
+    from matplotlib.patches import Circle
+
+    return Circle(centre, radius_m, color=colour)
+
+
+def _plot_bearing(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
+    axes.axhline(0.0, color="0.7", linewidth=1)
+    axes.plot(times_s, [math.degrees(truth.bearing_rad) for truth in samples], color=ROBOT_COLOUR)
+    axes.set(ylabel="bearing (deg)", title="bearing of the target")
+
+
+def _plot_distance(axes: "Axes", times_s: list[float], samples: Sequence[Truth], stand_off_m: float) -> None:
+    axes.axhline(stand_off_m, color="0.7", linewidth=1, label="stand-off")
+    axes.plot(times_s, [truth.distance_m for truth in samples], color=ROBOT_COLOUR)
+    axes.set(xlabel="time (s)", ylabel="distance (m)", title="distance, lens to the target's centre")
+    axes.legend(loc="best")
+
+
+def _plot_speed(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
+    axes.plot(times_s, [truth.linear_mps for truth in samples], color=ROBOT_COLOUR)
+    axes.set(ylabel="speed (m/s)", title="speed")
+
+
+def _plot_clearance(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
+    axes.axhline(0.10, color="0.7", linewidth=1, label="demanded")
+    axes.plot(times_s, [truth.clearance_m or 0.0 for truth in samples], color=ROBOT_COLOUR)
+    axes.set(xlabel="time (s)", ylabel="clearance (m)", title="clearance, body to the nearest obstacle")
+    axes.legend(loc="best")
+
+
+def _plot_line(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
+    """How far the front is beyond the line, on the colour that is lit."""
+    axes.axhline(0.0, color="black", linewidth=1)
+    ways_m = [truth.past_line_m or 0.0 for truth in samples]
+    for colour, shown in (("red", "tab:red"), ("yellow", "gold"), ("green", "tab:green")):
+        lit = [truth.light == colour for truth in samples]
+        axes.fill_between(times_s, min(ways_m), max(ways_m), where=lit, color=shown, alpha=0.25, linewidth=0)
+    axes.plot(times_s, ways_m, color=ROBOT_COLOUR)
+    axes.set(xlabel="time (s)", ylabel="beyond the line (m)", title="the robot's front and the stop line")

@@ -1,0 +1,171 @@
+"""How good a detector's answers are: each frame's verdict, and the figures over many. Pure.
+
+A frame's answer is what somebody who follows a ball would steer by: the surest detection that is called a ball.
+Going for another object is the unsafe failure, and is counted by itself.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+from sightline.sim.scenes.model import LabelledBox, Scene
+from sightline.vision_side.detect.overlap import corners, overlap
+from sightline.vision_side.detect.port import Detection
+
+BALL_LABELS: Final = ("ball", "target")
+HIT_OVERLAP: Final = 0.5
+"""Intersection by union, with the box of what is in view or of the whole ball, whichever is nearer."""
+CENTRED_FROM: Final = 0.98
+"""Seen share from which a hit's centre is compared with the ball's: the rest is cut off or behind something."""
+
+Answer = Literal["hit", "wrong object", "nowhere", "none"]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """One frame: was there a ball, what was the answer, how sure, how far off, how long it took (None: no answer)."""
+
+    has_ball: bool
+    verdict: Answer
+    score: float = 0.0
+    off_px: float | None = None
+    compute_us: int | None = None
+
+
+def ball_of(scene: Scene) -> LabelledBox | None:
+    """The ball, if there is one."""
+    return next((one for one in scene.truths if one.label == "ball"), None)
+
+
+def frame_result(
+    detections: Sequence[Detection] | None, scene: Scene, compute_us: int | None = None, balls: Sequence[str] = BALL_LABELS
+) -> FrameResult:
+    """The verdict on one frame; None is no answer, which is no hit. `balls` is what a ball may be called."""
+    ball = ball_of(scene)
+    asked = [one for one in detections or () if one.label in balls]
+    if not asked:
+        return FrameResult(ball is not None, "none", compute_us=compute_us)
+    best = asked[0]  # detectors give the best first, each by its own measure
+    if ball is not None and is_hit(best, ball):
+        return FrameResult(True, "hit", best.score, _off_px(best, ball), compute_us)
+    verdict: Answer = "wrong object" if _is_on_another(best, scene) else "nowhere"
+    return FrameResult(ball is not None, verdict, best.score, compute_us=compute_us)
+
+
+def is_hit(one: Detection, ball: LabelledBox) -> bool:
+    """Whether the detection is that ball."""
+    boxes = [ball.box] if ball.whole is None else [ball.box, ball.whole]
+    drawn = [corners(one)]
+    if one.circle is not None:
+        x, y, radius = one.circle.cx_px, one.circle.cy_px, one.circle.radius_px
+        drawn.append((x - radius, y - radius, x + radius, y + radius))
+    return max(overlap(mine, true) for mine in drawn for true in boxes) >= HIT_OVERLAP
+
+
+def _off_px(one: Detection, ball: LabelledBox) -> float | None:
+    """From the ball's centre, where all of it is in view."""
+    if ball.whole is None or ball.seen < CENTRED_FROM:
+        return None
+    x, y = (ball.whole[0] + ball.whole[2]) / 2, (ball.whole[1] + ball.whole[3]) / 2
+    if one.circle is not None:
+        return math.hypot(one.circle.cx_px - x, one.circle.cy_px - y)
+    return math.hypot((one.x1_px + one.x2_px) / 2 - x, (one.y1_px + one.y2_px) / 2 - y)
+
+
+def _is_on_another(one: Detection, scene: Scene) -> bool:
+    """Whether its middle lies in the box of something that is no ball."""
+    x, y = (one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2
+    others = [*scene.others, *(truth.box for truth in scene.truths if truth.label != "ball")]
+    return any(box[0] <= x <= box[2] and box[1] <= y <= box[3] for box in others)
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Of one detector in one column. Shares are 0..1."""
+
+    frames: int
+    balls: int
+    hits: float
+    """Of the frames with a ball."""
+    missed: float
+    """Of the frames with a ball: those without any answer."""
+    wrong_object: float
+    """Of all frames: those whose answer is another object."""
+    false_alarms: float
+    """Of the frames without a ball: those with any answer at all."""
+    centre_p50_px: float | None
+    """Of hits on balls that are wholly in view."""
+    centre_p95_px: float | None
+    compute_p50_us: float | None
+
+
+def figures(frames: Sequence[FrameResult]) -> Figures:
+    """Count them."""
+    balls = [one for one in frames if one.has_ball]
+    empty = [one for one in frames if not one.has_ball]
+    off = [one.off_px for one in balls if one.off_px is not None]
+    times = [float(one.compute_us) for one in frames if one.compute_us is not None]
+    return Figures(
+        len(frames), len(balls), _share(one.verdict == "hit" for one in balls),
+        _share(one.verdict == "none" for one in balls), _share(one.verdict == "wrong object" for one in frames),
+        _share(one.verdict != "none" for one in empty), _quantile(off, 0.5), _quantile(off, 0.95),
+        _quantile(times, 0.5),
+    )
+
+
+def _share(marks: Iterable[bool]) -> float:
+    counted = list(marks)
+    return sum(counted) / len(counted) if counted else 0.0
+
+
+def _quantile(values: Sequence[float], share: float) -> float | None:
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else None
+
+
+@dataclass
+class LabelMatches:
+    """One label over many frames: how many there are, and every detection of it with whether it was right."""
+
+    objects: int = 0
+    marks: list[tuple[float, bool]] = field(default_factory=list)
+
+    def add(self, label: str, detections: Sequence[Detection], scene: Scene) -> None:
+        """One frame: each object is found once, by the surest; what lies on something unclear does not count."""
+        left = [one.box for one in scene.truths if one.label == label]
+        self.objects += len(left)
+        for one in sorted((one for one in detections if one.label == label), key=lambda one: -one.score):
+            own = corners(one)
+            best = max(left, key=lambda box: overlap(own, box), default=None)
+            if best is not None and overlap(own, best) >= HIT_OVERLAP:
+                left.remove(best)
+                self.marks.append((one.score, True))
+            elif not any(overlap(own, box) > 0 for box in scene.unclear):
+                self.marks.append((one.score, False))
+
+    def take(self, more: "LabelMatches") -> None:
+        """What was found of this label in other frames."""
+        self.objects += more.objects
+        self.marks += more.marks
+
+    def average_precision(self) -> float | None:
+        """AP50: the area under precision by recall, precision never rising again; None without objects."""
+        if not self.objects:
+            return None
+        right, points = 0, []
+        for count, (_, is_right) in enumerate(sorted(self.marks, key=lambda mark: -mark[0]), start=1):
+            right += is_right
+            points.append((right / self.objects, right / count))
+        area, best, last = 0.0, 0.0, points[-1][0] if points else 0.0
+        for recall, precision in reversed(points):
+            area += best * (last - recall)
+            best, last = max(best, precision), recall
+        return area + best * last
+
+
+def precisions(found: Mapping[str, LabelMatches]) -> dict[str, tuple[int, float | None]]:
+    """Objects and AP50 of each label; of a label that was never found too, but nothing of who finds none of them."""
+    if not any(one.marks for one in found.values()):
+        return {}
+    return {label: (one.objects, one.average_precision()) for label, one in found.items()}

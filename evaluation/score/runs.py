@@ -1,0 +1,172 @@
+"""`sightline score`: lockstep runs over scenarios, seeds, latencies and losses, judged. Shell (processes).
+
+Each run is a process's own, so that they share the machine's cores; a run itself repeats bit for bit.
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import as_completed
+from dataclasses import asdict, dataclass, field
+from itertools import groupby, product
+from typing import Any, Final
+
+from sightline.evaluation.checks import Check
+from sightline.evaluation.lockstep import Conditions, Run, run_lockstep
+from sightline.evaluation.scenario_config import robot_of, vision_config
+from sightline.evaluation.score.figures import Score, median_and_worst, score
+from sightline.operator_side.score_bounds import checks_of
+from sightline.operator_side.score_course import figures_of
+from sightline.operator_side.worker_pool import worker_pool
+from sightline.protocol.errors import ConfigError
+from sightline.sim.look import look_named
+from sightline.sim.scenario import Scenario, load_scenario
+from sightline.vision_side.detect.registry import check_choice
+from sightline.vision_side.missions.registry import REGISTRY, configured_mission
+
+_MOST_NOTICES: Final = 3
+"""Of each group: later ones repeat the first with higher counts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One run to make. `seconds` None is the scenario's own length."""
+
+    scenario: str
+    latency_ms: float
+    loss: float
+    seed: int
+    seconds: float | None
+    mission: str | None = None
+    """In place of the scenario's own, as the robot, the look and the detector are."""
+    robot: str | None = None
+    look: str | None = None
+    detector: str | None = None
+
+    @property
+    def group(self) -> str:
+        """What it shares with the runs of other seeds."""
+        others = "".join(f" {one}" for one in (self.mission, self.robot, self.look, self.detector) if one)
+        return f"{self.scenario}{others} +{self.latency_ms:g} ms {100 * self.loss:g}% loss"
+
+
+@dataclass(frozen=True, slots=True)
+class ScoredFigure:
+    """One figure of one group: its median and its worst over the seeds; the worst is what is judged."""
+
+    group: str
+    name: str
+    median: float | None
+    worst: float | None
+    unit: str
+    bound: float
+    ok: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreReport:
+    """All runs, and what was demanded of them."""
+
+    runs: list[tuple[Case, Score]]
+    judged: list[ScoredFigure]
+    news: dict[str, list[str]] = field(default_factory=dict)
+    """What the detector had to tell a person, by group: why it gave no answer, for one."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether every run is within every bound."""
+        return all(one.ok for one in self.judged)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {
+            "ok": self.ok,
+            "checks": [
+                {"name": f"{one.group}: {one.name}", "value": one.worst, "median": one.median, "unit": one.unit,
+                 "bound": one.bound, "ok": one.ok}
+                for one in self.judged
+            ],
+            "news": self.news,
+            "runs": [{**asdict(case), "score": asdict(result)} for case, result in self.runs],
+        }
+
+
+def cases(
+    scenarios: Sequence[str], seeds: Sequence[int], latencies_ms: Sequence[float], losses: Sequence[float],
+    seconds: float | None, *, mission: str | None = None, robot: str | None = None, look: str | None = None,
+    detector: str | None = None,
+) -> list[Case]:
+    """Every combination, those of one group together. Raises ConfigError for a name or number that is none."""
+    if mission is not None:
+        REGISTRY.load(mission)
+    for name in scenarios:
+        scenario = load_scenario(name)
+        config = vision_config(scenario, robot_of(scenario, robot), 0, mission)
+        try:
+            configured_mission(config)
+        except ConfigError as error:
+            if mission is None:
+                raise
+            raise ConfigError(f"scenario {name}: {error}; choose with --scenario what {mission} can drive") from None
+        if detector is not None:
+            check_choice(detector, {}, config)
+    if look is not None:
+        look_named(look)
+    if not seeds or any(not 0 <= seed < 2**32 for seed in seeds):
+        raise ConfigError("--seeds needs whole numbers from 0, e.g. --seeds 101,102,103")
+    if any(not 0 <= one <= 10_000 for one in latencies_ms) or any(not 0 <= one < 1 for one in losses):
+        raise ConfigError("--latency-ms is 0 to 10000 and --loss 0 to below 1, e.g. --latency-ms 0,50 --loss 0.1")
+    return [
+        Case(name, latency_ms, loss, seed, seconds, mission, robot, look, detector)
+        for name, latency_ms, loss, seed in product(scenarios, latencies_ms, losses, seeds)
+    ]
+
+
+def run_case(case: Case) -> tuple[Score, list[str]]:
+    """One run in lockstep, scored, and the detector's news."""
+    scenario, run = run_of(case)
+    return score(run.samples, scenario.stand_off_m, figures_of(scenario, run.samples, run.said)), run.news
+
+
+def run_of(case: Case) -> tuple[Scenario, Run]:
+    """The run itself, and the scenario as it was run."""
+    scenario = load_scenario(case.scenario)
+    if case.look is not None:
+        scenario = scenario.model_copy(update={"look": look_named(case.look)})
+    model, conditions = robot_of(scenario, case.robot), Conditions(case.latency_ms, case.loss)
+    vision = vision_config(scenario, model, case.seed, case.mission)
+    if case.detector is not None:
+        vision = vision.model_copy(update={"detector": vision.detector.model_copy(update={"kind": case.detector})})
+    return scenario, run_lockstep(scenario, model, case.seed, conditions, case.seconds, vision=vision)
+
+
+def run_cases(wanted: Sequence[Case], jobs: int, on_done: Callable[[Case], None]) -> ScoreReport:
+    """Run `wanted` on `jobs` processes, in any order, and judge them. `on_done` is called as each is done."""
+    results: dict[Case, tuple[Score, list[str]]] = {}
+    with worker_pool(min(jobs, len(wanted))) as pool:
+        futures = {pool.submit(run_case, case): case for case in wanted}
+        for future in as_completed(futures):
+            results[futures[future]] = future.result()
+            on_done(futures[future])
+    runs = [(case, results[case][0]) for case in wanted]
+    news: dict[str, list[str]] = {}
+    for case in wanted:
+        for line in results[case][1]:
+            news.setdefault(case.group, []).append(line)
+    told = {group: list(dict.fromkeys(lines))[:_MOST_NOTICES] for group, lines in news.items()}
+    return ScoreReport(runs, scored_figures(runs), told)
+
+
+def scored_figures(runs: Sequence[tuple[Case, Score]]) -> list[ScoredFigure]:
+    """Each group's figures: median, worst, and whether every run of it is within the bound."""
+    judged = []
+    for name, members in groupby(runs, key=lambda run: run[0].group):
+        group = list(members)
+        checks = [checks_of(case.scenario, result, case.latency_ms) for case, result in group]
+        results = [result for _, result in group]
+        judged += [_scored_figure(name, list(same), results) for same in zip(*checks, strict=True)]
+    return judged
+
+
+def _scored_figure(group: str, checks: list[Check], results: list[Score]) -> ScoredFigure:
+    first = checks[0]
+    median, worst = median_and_worst(results, first.name)
+    return ScoredFigure(group, first.name, median, worst, first.unit, first.bound, all(check.ok for check in checks))

@@ -1,0 +1,152 @@
+"""Pictures to pick a colour from: of a file, of a video, of a robot. Shell (reads files, waits)."""
+
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import cv2
+import numpy as np
+
+from sightline.operator_side.recording.film import jpeg_pixels
+from sightline.operator_side.loopback_page import Answer, PageRequest
+from sightline.operator_side.calibrate.color import Image
+from sightline.operator_side.pictures import Pictures
+from sightline.operator_side.cockpit.frame_buffer import FrameBuffer
+from sightline.protocol.errors import ConfigError, LinkError, WireError
+
+MAX_FILE_BYTES: Final = 50_000_000
+MAX_PIXELS: Final = 25_000_000
+"""Of a picture from a file: a large photograph; a camera's frames are bounded by vision's own limits."""
+MAX_FRAMES: Final = 200
+PATIENCE_S: Final = 5.0
+_PAGE_QUALITY: Final = 92
+
+
+class Gallery(Protocol):
+    """Where a page's pictures come from."""
+
+    live: bool
+
+    def pixels(self, number: int) -> Image:
+        """The picture of that number. Raises ConfigError for one that is not kept."""
+        ...
+
+    def recent(self) -> Sequence[Image]:
+        """The last pictures, to try a range on."""
+        ...
+
+    def route(self, ask: PageRequest, body: bytes) -> Answer:
+        """`GET /picture`."""
+        ...
+
+
+class StillGallery:
+    """Pictures that are all there."""
+
+    live = False
+
+    def __init__(self, pictures: Sequence[Image]) -> None:
+        self._pictures = list(pictures)
+
+    def pixels(self, number: int) -> Image:
+        """Numbered from 1."""
+        if not 1 <= number <= len(self._pictures):
+            raise ConfigError(f"there is no picture {number}; there are {len(self._pictures)}")
+        return self._pictures[number - 1]
+
+    def recent(self) -> Sequence[Image]:
+        """All of them."""
+        return self._pictures
+
+    def route(self, ask: PageRequest, _body: bytes) -> Answer:
+        """`?number=N`, else the last."""
+        number = int(ask.get("number", len(self._pictures)))
+        done, data = cv2.imencode(".jpg", self.pixels(number), [cv2.IMWRITE_JPEG_QUALITY, _PAGE_QUALITY])
+        if not done:
+            return Answer(status=204)
+        count = {"X-Number": str(number), "X-Count": str(len(self._pictures))}
+        return Answer(data.tobytes(), "image/jpeg", headers=count)
+
+
+class LiveGallery:
+    """A robot's newest pictures, taken while the page asks for them."""
+
+    live = True
+
+    def __init__(self, reel: FrameBuffer) -> None:
+        self._reel = reel
+        self.route = reel.route
+
+    def pixels(self, number: int) -> Image:
+        """Of the reel."""
+        shot = self._reel.of(number)
+        if shot is None:
+            raise ConfigError("that picture is gone by now; pick in a newer one")
+        return _decoded(shot.jpeg)
+
+    def recent(self) -> Sequence[Image]:
+        """All that are kept."""
+        return [_decoded(one.shot.jpeg) for one in self._reel.shots]
+
+
+def of_picture(path: Path) -> list[Image]:
+    """The picture in a file. Raises ConfigError for what is none."""
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise ConfigError(f"{path}: is larger than {MAX_FILE_BYTES // 1_000_000} MB")
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    except cv2.error:
+        picture = None
+    if picture is None:
+        raise ConfigError(f"{path}: is no picture that can be read (PNG, JPEG ...)")
+    if picture.shape[0] * picture.shape[1] > MAX_PIXELS:
+        size = f"{picture.shape[1]}x{picture.shape[0]}"
+        raise ConfigError(f"{path}: is {size}, at most {MAX_PIXELS // 1_000_000} megapixels")
+    return [np.asarray(picture, np.uint8)]
+
+
+def of_video(path: Path, frames: int) -> list[Image]:
+    """`frames` pictures spread evenly over a video, or all if it has fewer. Raises ConfigError for what is none."""
+    if not path.is_file():
+        raise ConfigError(f"{path}: is no file; name a video")
+    capture = cv2.VideoCapture(str(path))
+    try:
+        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        wanted = {round(one) for one in np.linspace(0, count - 1, min(frames, count))} if count > 0 else set()
+        pictures = [np.asarray(picture, np.uint8) for number, picture in enumerate(_read(capture))
+                    if (number in wanted if wanted else number < frames)]
+    finally:
+        capture.release()
+    if not pictures:
+        raise ConfigError(f"{path}: is no video that can be read")
+    return pictures
+
+
+def _read(capture: Any) -> Iterator[Image]:
+    while (got := capture.read())[0]:
+        yield got[1]
+
+
+def of_robot(pictures: Pictures, frames: int) -> list[Image]:
+    """The next `frames` pictures of a robot. Raises LinkError if none comes."""
+    found: list[Image] = []
+    ends_s = time.monotonic() + PATIENCE_S
+    while len(found) < frames and time.monotonic() < ends_s:
+        shot = pictures.take(ends_s - time.monotonic())
+        if shot is not None:
+            found.append(_decoded(shot.jpeg))
+    if not found:
+        raise LinkError(f"no picture of robot {pictures.robot!r} within {PATIENCE_S:g} s; does its camera deliver?")
+    return found
+
+
+def _decoded(jpeg: bytes) -> Image:
+    try:
+        return jpeg_pixels(jpeg)
+    except WireError as error:
+        raise ConfigError(f"the robot's picture cannot be used: {error.detail}") from None

@@ -1,0 +1,72 @@
+"""The page of `sightline watch`: what vision sees, and what the robot does and why. Shell (threads)."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from sightline.operator_side.loopback_page import Answer, PageRequest, as_json, page, served
+from sightline.operator_side.mission_asking import MissionClient
+from sightline.operator_side.mission_text import detector_line, mission_line
+from sightline.operator_side.pictures import Pictures
+from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
+from sightline.operator_side.client.status import drops_text, encoding_text, millis, refusals_text, twist_text
+from sightline.protocol.channels import Channel
+from sightline.protocol.messages import Status
+from sightline.protocol.transports.link import Link
+
+_SHOWN_PICTURES = 2  # the newest, and the one before, which a second page may be about to fetch
+
+
+@contextmanager
+def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) -> Iterator[str]:
+    """Serve the page while inside; gives its address. Raises LinkError for a port in use."""
+    pictures, desk, ending = Pictures(link, role, first, secure), MissionClient(link), threading.Event()
+    reel = FrameBuffer(_SHOWN_PICTURES, pictures.age_us)
+
+    def state(_ask: PageRequest, _body: bytes) -> Answer:
+        return as_json(state_of(link.robot, desk, pictures.is_heard))
+
+    routes = {
+        "GET /": lambda _ask, _body: page("watch.html", robot=link.robot),
+        "GET /watch.mjs": lambda _ask, _body: page("watch.mjs"),
+        "GET /picture": reel.route,
+        "GET /state": state,
+    }
+    filling = threading.Thread(target=fill, args=(reel, pictures, ending), name="pictures", daemon=True)
+    with served(routes, port) as address:
+        filling.start()
+        try:
+            yield address
+        finally:
+            ending.set()
+            filling.join(2.0)
+
+
+def state_of(robot: str, desk: MissionClient, heard: bool) -> dict[str, Any]:
+    """What the page says beside the picture; `heard` is false for a robot that is silent."""
+    report = desk.operator.report
+    lines = _robot_lines(report.status) if report is not None else []
+    mission = desk.newest(0.0)
+    if mission is not None:
+        lines.insert(0, ("mission", mission_line(mission)))
+        if mission.detector:
+            lines.append(("detector", detector_line(mission)))
+    return {
+        "robot": robot, "heard": heard, "state": str(report.status.state) if report else "",
+        "reason": report.status.reason if report else "", "lines": lines,
+    }
+
+
+def _robot_lines(status: Status) -> list[tuple[str, str]]:
+    stream = status.stream
+    driver = f"{status.holder.source} {status.holder.session}" if status.holder else "nobody"
+    sight = f"{millis(status.frame_age_us)} old, capture to command {millis(status.latency_us)}"
+    return [
+        ("driver", driver),
+        ("wheels", twist_text(status.applied)),
+        ("obeyed sight", sight if status.frame_age_us is not None else "none now"),
+        ("stream", f"{stream.fps:.0f} frames/s, {encoding_text(stream)}"),
+        ("dropped", drops_text(stream)),
+        ("commands", f"{status.accepted} accepted, {refusals_text(status)}"),
+    ]

@@ -1,0 +1,267 @@
+"""A service's configuration from all its sources: defaults < profile < file < environment < --set < options. Shell.
+
+    loaded = load("robot", file="robot.toml", sets=["safety.max_linear_mps=0.3"], environ=os.environ)
+    loaded.config, loaded.origin("safety.max_linear_mps")
+
+Environment names are SIGHTLINE_<SERVICE>__<KEY>, `__` for each dot: SIGHTLINE_ROBOT__SAFETY__MAX_LINEAR_MPS=0.3.
+"""
+
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from sightline.operator_side.settings_errors import explain, no_such_name
+from sightline.operator_side.config.errors import is_known, known_keys
+from sightline.protocol.channels import check_robot_id
+from sightline.protocol.config import Config
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.log import LOG_FORMAT_VARIABLE
+from sightline.protocol.transports.open import check_endpoint
+
+SERVICES: Final = ("robot", "vision", "sim")
+ENV_PREFIX: Final = "SIGHTLINE_"
+OTHER_ENV_NAMES: Final = ("SIGHTLINE_DEBUG", LOG_FORMAT_VARIABLE)
+PROFILES: Final = Path(__file__).parent / "profiles"
+
+Key = tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """One value somebody gave. `text` is what was typed, where it was typed; `origin` is where."""
+
+    key: Key
+    value: Any
+    origin: str
+    text: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """A checked configuration and where its values came from."""
+
+    service: str
+    config: Config
+    given: Mapping[Key, Given]
+
+    def origin(self, key: Key) -> str:
+        """Who gave the value at `key`, "default" if nobody did."""
+        given = given_at(self.given, key)
+        return given.origin if given else "default"
+
+
+def model_of(service: str) -> type[Config]:
+    """The configuration model of a service. Raises ConfigError for a service that is none."""
+    if service == "robot":
+        from sightline.robot_side.config import RobotConfig
+
+        return RobotConfig
+    if service == "vision":
+        from sightline.vision_side.config import VisionConfig
+
+        return VisionConfig
+    if service == "sim":
+        from sightline.sim.service import SimConfig
+
+        return SimConfig
+    raise ConfigError(no_such_name("service", service, SERVICES))
+
+
+def load(
+    service: str,
+    *,
+    profile: str | None = None,
+    file: str | None = None,
+    sets: Sequence[str] = (),
+    options: Mapping[str, Any] | None = None,
+    environ: Mapping[str, str],
+    implied: Sequence[Given] = (),
+) -> Loaded:
+    """Merge all sources and check the whole. `options` maps dotted keys to values; None means not given.
+
+    `implied` is what other values imply where nobody says otherwise; it yields to every source.
+
+    Raises ConfigError, one line: the key, the value, where it came from and what is allowed.
+    """
+    model = model_of(service)
+    given: dict[Key, Given] = {}
+    for one in (
+        *implied,
+        *_from_profile(service, profile),
+        *(_from_file(file, file) if file else ()),
+        *_from_environment(service, environ),
+        *(_from_set(text) for text in sets),
+        *_from_options(options or {}),
+    ):
+        _put(given, one)
+    _check_names(given, service)
+    return Loaded(service, _validated(model, given), given)
+
+
+def given_at(given: Mapping[Key, Given], key: Key) -> Given | None:
+    """What was given for `key`, or for a list it lies in."""
+    for length in range(len(key), 0, -1):
+        if key[:length] in given:
+            return given[key[:length]]
+    return None
+
+
+# --- sources -----------------------------------------------------------------------------------------------------
+
+
+def _from_profile(service: str, profile: str | None) -> Iterable[Given]:
+    if profile is None:
+        return ()
+    names = [path.stem.removeprefix(f"{service}-") for path in sorted(PROFILES.glob(f"{service}-*.toml"))]
+    if profile not in names:
+        raise ConfigError(no_such_name("profile", profile, names))
+    return _from_file(str(PROFILES / f"{service}-{profile}.toml"), f"profile {profile}")
+
+
+def _from_file(file: str, origin: str) -> Iterable[Given]:
+    try:
+        table = tomllib.loads(Path(file).expanduser().read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror}; see --config") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file}: is no TOML: {error}") from None
+    return [Given(key, value, origin) for key, value in _leaves(table)]
+
+
+def _leaves(table: Mapping[str, Any], above: Key = ()) -> Iterable[tuple[Key, Any]]:
+    for name, value in table.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, (*above, name))
+        else:
+            yield (*above, name), value
+
+
+def _from_environment(service: str, environ: Mapping[str, str]) -> Iterable[Given]:
+    for name in sorted(environ):
+        if not name.startswith(ENV_PREFIX) or name in OTHER_ENV_NAMES:
+            continue
+        owner, *key = name.removeprefix(ENV_PREFIX).lower().split("__")
+        if owner not in SERVICES or not key or not is_known(model_of(owner), tuple(key)):
+            raise ConfigError(no_such_name("environment variable", name, _environment_names()))
+        if owner == service:
+            yield Given(tuple(key), _value(environ[name]), name, environ[name])
+
+
+def _environment_names() -> list[str]:
+    keys = [(service, *key) for service in SERVICES for key in known_keys(model_of(service))]
+    return [*OTHER_ENV_NAMES, *(ENV_PREFIX + "__".join(key).upper() for key in keys)]
+
+
+def _from_set(text: str) -> Given:
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise ConfigError(f"--set {text!r} is no setting: write key=value, e.g. --set safety.max_linear_mps=0.3")
+    return Given(tuple(name.strip().split(".")), _value(value), "--set", value)
+
+
+def _from_options(options: Mapping[str, Any]) -> Iterable[Given]:
+    for key, value in options.items():
+        if value is not None:
+            name = key.rpartition(".")[2].replace("_", "-")
+            yield Given(tuple(key.split(".")), value, f"--{name}")
+
+
+def _value(text: str) -> Any:
+    """`text` read as a TOML value; as a string if it is none."""
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    return table["value"] if len(table) == 1 else text
+
+
+# --- merging and checking ----------------------------------------------------------------------------------------
+
+
+def _put(given: dict[Key, Given], one: Given) -> None:
+    """The newer value replaces what was there, what is above it and what is below it."""
+    key = one.key
+    for other in [old for old in given if old[: len(key)] == key or key[: len(old)] == old]:
+        del given[other]
+    given[key] = one
+
+
+def _check_names(given: Mapping[Key, Given], service: str) -> None:
+    """Robot id and endpoints are refused here in words, not as a pattern."""
+    robot = given.get(("robot",)) if service != "sim" else None  # there it is what the robot is made of
+    if robot is not None and isinstance(robot.text or robot.value, str):
+        robot_id = str(robot.text or robot.value)
+        # A vision may name several by `*` and `?`.
+        check_robot_id(robot_id.replace("*", "x").replace("?", "x") if service == "vision" else robot_id)
+    for name in ("listen", "connect"):
+        one = given.get((name,))
+        for endpoint in _as_list(one.value) if one else ():
+            if isinstance(endpoint, str):
+                check_endpoint(endpoint)
+
+
+def _as_list(value: Any) -> list[Any]:
+    if isinstance(value, str):
+        return [part.strip() for part in value.split(",")]
+    return list(value) if isinstance(value, list | tuple) else [value]
+
+
+def _validated(model: type[Config], given: dict[Key, Given]) -> Config:
+    try:
+        return model.model_validate(_tree(model, given))
+    except ValidationError as error:
+        if _reread_typed_text(given, error):
+            return _validated(model, given)
+        text = explain(model, error, lambda key: _typed(given, key), lambda key: _label(given, key))
+        raise ConfigError(text) from None
+
+
+def _tree(model: type[Config], given: Mapping[Key, Given]) -> dict[str, Any]:
+    """The defaults with everything given laid over them, so that one key of a table leaves its others as they are."""
+    tree = model().model_dump()
+    for key, one in given.items():
+        table = tree
+        for name in key[:-1]:
+            if not isinstance(table.get(name), dict):
+                table[name] = {}
+            table = table[name]
+        table[key[-1]] = one.value
+    return tree
+
+
+def _reread_typed_text(given: dict[Key, Given], error: ValidationError) -> bool:
+    """Where text was typed and TOML read it as something else (`--set robot=1`, one endpoint), take it as meant."""
+    changed = False
+    for problem in error.errors(include_url=False, include_context=False):
+        key = tuple(str(part) for part in problem["loc"])
+        one = given.get(key)
+        if one is None or one.text is None:
+            continue
+        if problem["type"] == "string_type" and one.value != one.text:
+            given[key] = Given(key, one.text, one.origin, one.text)
+            changed = True
+        if problem["type"] == "tuple_type" and isinstance(one.value, str):
+            given[key] = Given(key, tuple(_as_list(one.value)), one.origin, one.text)
+            changed = True
+    return changed
+
+
+def _typed(given: Mapping[Key, Given], key: Key) -> Key:
+    """The key as it was given, where only its table was refused."""
+    return next((typed for typed in given if typed[: len(key)] == key), key)
+
+
+def _label(given: Mapping[Key, Given], key: Key) -> str:
+    """How to name `key` to a person: as and where they wrote it; of what is missing, where its neighbours are."""
+    one, dotted = given_at(given, key), ".".join(key)
+    if one is None:
+        beside = (one.origin for at, one in given.items() if len(key) > 1 and at[: len(key) - 1] == key[:-1])
+        file = next((origin for origin in beside if not origin.startswith((ENV_PREFIX, "--"))), "")
+        return f"{file}: {dotted}" if file else dotted
+    if one.origin == "--set":
+        return f"--set {dotted}"
+    return one.origin if one.origin.startswith((ENV_PREFIX, "--")) else f"{one.origin}: {dotted}"

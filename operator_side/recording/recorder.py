@@ -1,0 +1,195 @@
+"""A run on disk: `Recorder` writes what is on the wire to MCAP, `read_recording` gives it back. Shell.
+
+One MCAP channel per Sightline channel (and source: `twist/vision`), encoding `sightline.v1`: message data = header
+length (uint16, big-endian), header, payload, exactly as they came. `log_time` is when this end received it, for the
+robot's own clock is in the header. Opens in any MCAP tool; a file cut short by a kill reads up to the cut.
+"""
+
+import queue
+import struct
+import threading
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, Final, Self
+
+from sightline.operator_side.preflight import needs
+from sightline.protocol.channels import (
+    ACK,
+    CAMERA,
+    CHANNELS,
+    DETECTIONS,
+    FRAME,
+    MISSION,
+    REPORT,
+    SCAN,
+    STATUS,
+    TWIST,
+    Channel,
+)
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.log import log_line
+from sightline.protocol.transports.link import Link, Message
+
+if TYPE_CHECKING:
+    from mcap.writer import Writer
+
+ENCODING: Final = "sightline.v1"
+METADATA: Final = "sightline"
+RECORDED: Final = (FRAME, TWIST, ACK, STATUS, CAMERA, SCAN, MISSION, REPORT, DETECTIONS)
+MAX_WAITING: Final = 256
+"""Messages that wait for the disk; while it is slower than that, new ones are dropped and counted."""
+CHUNK_BYTES: Final = 256 * 1024  # a kill loses at most one chunk
+_LENGTH = struct.Struct(">H")
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A message and when it was received (Unix time)."""
+
+    log_time_ns: int
+    message: Message
+
+
+class Recorder:
+    """Records `link` from construction to `close`. Its callbacks only queue; a thread writes."""
+
+    def __init__(
+        self, link: Link, path: Path, about: Mapping[str, str], channels: Iterable[Channel] = RECORDED
+    ) -> None:
+        """`about` is kept in the file as metadata. Raises ConfigError for a path that cannot be written."""
+        self._queue: queue.Queue[tuple[int, Message] | None] = queue.Queue(MAX_WAITING)
+        self._path, self._file = path, _open_new(path)
+        self._writer = _writer(self._file, about)
+        self._ids: dict[str, int] = {}
+        self._counts: dict[str, int] = {}
+        self.dropped = 0
+        """For want of time to write them."""
+        self.failed = ""
+        """Why nothing more could be written, if so."""
+        self._closed = False
+        self._writing = threading.Thread(target=self._write_all, name="recorder", daemon=True)
+        self._writing.start()
+        for channel in channels:
+            link.subscribe(channel, self._take)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Messages written, by topic."""
+        return dict(self._counts)
+
+    def _take(self, message: Message) -> None:
+        if self._closed:
+            return
+        try:
+            self._queue.put_nowait((time.time_ns(), message))
+        except queue.Full:
+            self.dropped += 1
+
+    def _write_all(self) -> None:
+        while (item := self._queue.get()) is not None:
+            if not self.failed:
+                with self._telling():
+                    self._write(*item)
+
+    @contextmanager
+    def _telling(self) -> Iterator[None]:
+        """A disk that takes no more ends the recording with one line, and nothing else."""
+        try:
+            yield
+        except OSError as error:
+            if not self.failed:
+                self.failed = error.strerror or str(error)
+                log_line(f"recording {self._path}: {self.failed}; nothing more is recorded")
+
+    def _write(self, log_time_ns: int, message: Message) -> None:
+        topic = message.channel.name + (f"/{message.source}" if message.source else "")
+        if topic not in self._ids:
+            self._ids[topic] = self._writer.register_channel(topic=topic, message_encoding=ENCODING, schema_id=0)
+        count = self._counts[topic] = self._counts.get(topic, 0) + 1
+        data = _LENGTH.pack(len(message.header)) + message.header + message.payload
+        self._writer.add_message(self._ids[topic], log_time_ns, data, publish_time=log_time_ns, sequence=count)
+
+    def close(self) -> None:
+        """Write what waits and finish the file; idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        self._queue.put(None)
+        self._writing.join()
+        with self._telling():
+            self._writer.finish()  # type: ignore[no-untyped-call]
+        with self._telling():
+            self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _open_new(path: Path) -> IO[bytes]:
+    try:
+        return path.open("wb")
+    except OSError as error:
+        raise ConfigError(f"recording {path}: {error.strerror}; choose a folder that can be written") from None
+
+
+def _writer(file: IO[bytes], about: Mapping[str, str]) -> "Writer":
+    with needs("report"):
+        from mcap.writer import CompressionType, Writer
+    # JPEG does not compress; what is left is not worth the time on the machine that drives.
+    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
+    writer.start(profile="", library="sightline")
+    writer.add_metadata(METADATA, dict(about))
+    return writer
+
+
+def read_recording(path: Path) -> Iterator[Recorded]:
+    """Every message in the order it was received, up to where the file ends. Raises ConfigError if it is none."""
+    with _reading(path) as reader:
+        for _schema, channel, message in reader.iter_messages(log_time_order=False):
+            parsed = _parse(channel.topic, message.data)
+            if parsed is not None:
+                yield Recorded(message.log_time, parsed)
+
+
+def read_about(path: Path) -> dict[str, str]:
+    """The metadata that the recorder was given. Raises ConfigError if the file is no recording of Sightline."""
+    with _reading(path) as reader:
+        for record in reader.iter_metadata():
+            if record.name == METADATA:
+                return dict(record.metadata)
+    raise ConfigError(f"{path} is no recording of Sightline")
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[Any]:
+    """An MCAP reader; a file cut short simply ends."""
+    with needs("report"):
+        from mcap.exceptions import EndOfFile, McapError
+        from mcap.reader import NonSeekingReader
+    try:
+        with path.open("rb") as file:
+            yield NonSeekingReader(file)
+    except EndOfFile:
+        return
+    except OSError as error:
+        raise ConfigError(f"recording {path}: {error.strerror}") from None
+    except McapError as error:
+        raise ConfigError(f"{path} is no recording: {type(error).__name__}") from None
+
+
+def _parse(topic: str, data: bytes) -> Message | None:
+    name, _, source = topic.partition("/")
+    channel = CHANNELS.get(name)
+    if channel is None or len(data) < _LENGTH.size:
+        return None
+    end = _LENGTH.size + _LENGTH.unpack_from(data)[0]
+    return Message(channel, source, data[_LENGTH.size : end], data[end:])

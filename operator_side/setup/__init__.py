@@ -1,0 +1,1 @@
+"""Modules of operator_side.setup."""

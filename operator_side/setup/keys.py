@@ -1,0 +1,193 @@
+"""A private authority, a certificate and a token for each role, for `--secure DIR`: made, added, looked at. Shell.
+
+Written with `cryptography`, which is what Python's own packaging relies on; elliptic-curve keys (P-256) keep the TLS
+handshake short on a small robot. Only `ca.pem` and the files of its own role belong on a machine, and all tokens on a
+robot that serves WebSocket; `ca.key` belongs on none.
+"""
+
+from __future__ import annotations
+
+import datetime
+import ipaddress
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.security import ROLES
+
+if TYPE_CHECKING:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
+
+DAYS = 825
+"""The longest life that common TLS stacks accept of a certificate."""
+_TOKEN_BYTES = 24  # 192 bits, 32 letters
+LOOPBACK = ("localhost", "127.0.0.1")
+_BEGUN_EARLIER = datetime.timedelta(days=1)  # machines whose clocks differ by hours must still agree
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What a person wants to know of one certificate file."""
+
+    file: Path
+    role: str
+    hosts: tuple[str, ...]
+    ends: datetime.datetime
+
+
+def make(folder: Path, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
+    """A new authority and a certificate for each role, valid for `hosts` besides loopback. Returns the files.
+
+    Raises ConfigError, and changes nothing, if the folder holds keys already or cannot be written.
+    """
+    if (folder / "ca.pem").exists():
+        raise ConfigError(f"{folder} holds keys already; choose another folder, or delete it to begin anew")
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    for host in hosts:
+        _general_name(host)  # a host that is none is refused before anything is written
+    key = ec.generate_private_key(ec.SECP256R1())
+    builder = _builder("sightline authority", "sightline authority", key, days)
+    builder = builder.add_extension(x509.BasicConstraints(True, 0), True)
+    usage = dict.fromkeys(("digital_signature", "content_commitment", "key_encipherment", "data_encipherment",
+                           "key_agreement", "encipher_only", "decipher_only"), False)
+    builder = builder.add_extension(x509.KeyUsage(key_cert_sign=True, crl_sign=True, **usage), True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        files = _write(folder, "ca", key, _signed(builder, key))
+    except OSError as error:
+        raise ConfigError(f"cannot write keys to {folder}: {error.strerror}; choose another folder") from None
+    return files + [file for role in ROLES for file in add(folder, role, hosts, days)]
+
+
+def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
+    """A new certificate and WebSocket token of `role`, in place of the old; signed by the authority in `folder`.
+
+    Raises ConfigError for a role or host that is none, or without the authority's own key.
+    """
+    if role not in ROLES:
+        raise ConfigError(f"role {role!r} is none: {', '.join(ROLES)}")
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import ExtendedKeyUsageOID as Usage
+
+    authority = _authority_key(folder)
+    key = ec.generate_private_key(ec.SECP256R1())
+    names = [_general_name(host) for host in dict.fromkeys((*LOOPBACK, *hosts))]
+    builder = (
+        _builder(role, "sightline authority", key, days)
+        .add_extension(x509.BasicConstraints(False, None), True)
+        .add_extension(x509.SubjectAlternativeName(names), False)
+        .add_extension(x509.ExtendedKeyUsage([Usage.SERVER_AUTH, Usage.CLIENT_AUTH]), False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.public_key()), False)
+    )
+    return _write(folder, role, key, _signed(builder, authority)) + _write_token(folder, role)
+
+
+def look(folder: Path) -> list[Certificate]:
+    """The certificates in `folder`. Raises ConfigError if there is none or one cannot be read."""
+    found = [_read(file) for file in sorted(folder.glob("*.pem"))]
+    if not found:
+        raise ConfigError(f"no certificates in {folder}; make them with: sightline keys init {folder}")
+    return found
+
+
+def _builder(role: str, issuer: str, key: EllipticCurvePrivateKey, days: float) -> x509.CertificateBuilder:
+    from cryptography import x509
+
+    now = datetime.datetime.now(datetime.UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(_name(role))
+        .issuer_name(_name(issuer))
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _BEGUN_EARLIER)
+        .not_valid_after(now + datetime.timedelta(days=days))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False)
+    )
+
+
+def _name(text: str) -> x509.Name:
+    from cryptography import x509
+    from cryptography.x509.oid import NameOID
+
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    from cryptography import x509
+
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        if not host.isascii() or not all(part.replace("-", "a").isalnum() for part in host.split(".")):
+            raise ConfigError(f"host {host!r} is no name or address, e.g. robot.local or 192.168.1.20") from None
+        return x509.DNSName(host)
+
+
+def _signed(builder: x509.CertificateBuilder, key: EllipticCurvePrivateKey) -> x509.Certificate:
+    from cryptography.hazmat.primitives import hashes
+
+    return builder.sign(key, hashes.SHA256())
+
+
+def _write(folder: Path, name: str, key: EllipticCurvePrivateKey, certificate: x509.Certificate) -> list[Path]:
+    from cryptography.hazmat.primitives import serialization as forms
+
+    key_file, certificate_file = folder / f"{name}.key", folder / f"{name}.pem"
+    _private(key_file)
+    key_file.write_bytes(
+        key.private_bytes(forms.Encoding.PEM, forms.PrivateFormat.PKCS8, forms.NoEncryption())
+    )
+    certificate_file.write_bytes(certificate.public_bytes(forms.Encoding.PEM))
+    return [key_file, certificate_file]
+
+
+def _write_token(folder: Path, role: str) -> list[Path]:
+    file = folder / f"{role}.token"
+    _private(file)
+    file.write_text(secrets.token_urlsafe(_TOKEN_BYTES) + "\n")
+    return [file]
+
+
+def _private(file: Path) -> None:
+    file.touch(mode=0o600)
+    file.chmod(0o600)
+
+
+def _authority_key(folder: Path) -> EllipticCurvePrivateKey:
+    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey as Key
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+    try:
+        key = load_pem_private_key((folder / "ca.key").read_bytes(), None)
+    except (OSError, ValueError):
+        raise ConfigError(f"no authority in {folder}: ca.key is missing or broken; use the folder that "
+                          "`sightline keys init` made") from None
+    if not isinstance(key, Key):
+        raise ConfigError(f"{folder}/ca.key is not of `sightline keys init`")
+    return key
+
+
+def _read(file: Path) -> Certificate:
+    from cryptography import x509
+    from cryptography.x509.oid import NameOID
+
+    try:
+        read = x509.load_pem_x509_certificate(file.read_bytes())
+    except (OSError, ValueError):
+        raise ConfigError(f"{file} is no certificate; make new ones with: sightline keys init") from None
+    names = read.extensions
+    try:
+        alternative = names.get_extension_for_class(x509.SubjectAlternativeName).value
+        hosts = tuple(str(name.value) for name in alternative)
+    except x509.ExtensionNotFound:
+        hosts = ()
+    role = str(read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
+    return Certificate(file, role, hosts, read.not_valid_after_utc)

@@ -1,0 +1,35 @@
+"""`sightline router`: where robots, visions and people meet; each frame crosses a robot's radio once. Shell.
+
+It is a Zenoh router and nothing else: a stock `zenohd` does as well, without the access rules of `--secure`.
+"""
+
+import signal
+import threading
+from collections.abc import Sequence
+from contextlib import closing
+
+from sightline.protocol.transports.endpoints import check_zenoh_endpoints
+from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
+from sightline.protocol.transports.zenoh_log import log_rejected_peers
+from sightline.protocol.transports.zenoh_session import open_session
+
+_REACH_S = 5.0
+
+
+def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
+    """Serve until SIGTERM or SIGINT. Raises ConfigError, LinkError as `open_session` does."""
+    check_zenoh_endpoints(listen, connect)
+    secured = load_role_keys(secure, ROBOT_ROLE)
+    ending = threading.Event()
+    with log_rejected_peers(listen, secure, _print_line), closing(open_session(listen, connect, _REACH_S, secured)):
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda _number, _frame: ending.set())
+        rules = f"keys of {secure}, access rules on" if secure else "plain, open to whoever reaches it"
+        _print_line(f"on {', '.join(listen)}; {rules}")
+        ending.wait()
+    _print_line("ended")
+    return 0
+
+
+def _print_line(line: str) -> None:
+    print(f"router: {line}", flush=True)

@@ -1,0 +1,125 @@
+"""Opens a link by what its endpoints say: `tcp/host:port` is Zenoh, `ws://` and `ws-legacy://` are WebSocket. Shell.
+
+A robot may listen on several at once; then its link is all of them, and what any peer says is heard alike.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Any, Self
+
+from sightline.protocol.channels import FRAME, Channel
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports import endpoints, websocket_endpoints
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+
+
+def check_endpoint(endpoint: str) -> None:
+    """Raise ConfigError, with the right form, unless `endpoint` is one of some transport."""
+    if "://" in endpoint:
+        websocket_endpoints.parse_websocket_endpoint(endpoint)
+    else:
+        endpoints.parse_zenoh_endpoint(endpoint)
+
+
+def open_link(
+    robot: str,
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    role: str = "",
+    timeout_s: float = 5.0,
+    max_frame_bytes: int = FRAME.max_payload_bytes,
+    secure: str = "",
+    session: str = "",
+) -> Link:
+    """Open `robot`'s link on every endpoint given; use it in a `with`. `secure` is a folder of `sightline keys`,
+    `session` what this end calls its start, where it has said so elsewhere.
+
+    Raises ConfigError and LinkError as `open_zenoh` and `open_websocket` do; nothing stays open then.
+    """
+    options: dict[str, Any] = {"role": role, "timeout_s": timeout_s, "max_frame_bytes": max_frame_bytes}
+    web, zenoh = ([_of_kind(ends, is_web) for ends in (listen, connect)] for is_web in (True, False))
+    links: list[Link] = []
+    with ExitStack() as undo:
+        if any(zenoh) or not any(web):
+            from sightline.protocol.transports.zenoh.link import open_zenoh
+
+            of_zenoh = open_zenoh(robot, listen=zenoh[0], connect=zenoh[1], secure=secure, session=session, **options)
+            links.append(undo.enter_context(of_zenoh))
+        if any(web):
+            from sightline.protocol.transports.websocket.link import open_websocket
+
+            of_web = open_websocket(robot, listen=web[0], connect=web[1], secure=secure, **options)
+            links.append(undo.enter_context(of_web))
+        undo.pop_all()
+    return links[0] if len(links) == 1 else LinkGroup(links)
+
+
+def _of_kind(ends: Sequence[str], is_web: bool) -> list[str]:
+    return [endpoint for endpoint in ends if ("://" in endpoint) == is_web]
+
+
+class LinkGroup:
+    """Several links of one robot as one. They do not hear one another."""
+
+    def __init__(self, links: Sequence[Link]) -> None:
+        """Take over `links`, all of one robot. Raises ConfigError for none or for several robots."""
+        if len({link.robot for link in links}) != 1:
+            raise ConfigError("links of one robot can be joined, and at least one is needed")
+        self.robot = links[0].robot
+        self.links = tuple(links)
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        """As `Link` says, on all of them; True if any took it."""
+        taken = [link.publish(channel, header, payload, source) for link in self.links]
+        return any(taken)
+
+    def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
+        """As `Link` says, on all of them."""
+        for link in self.links:
+            link.subscribe(channel, callback)
+
+    def latest(self, channel: Channel) -> LatestSlot[Message]:
+        """Subscribe with one slot for all of them."""
+        slot: LatestSlot[Message] = LatestSlot()
+        self.subscribe(channel, slot.put)
+        return slot
+
+    def ignore(self, channel: Channel) -> None:
+        """As `Link` says, on all of them."""
+        for link in self.links:
+            link.ignore(channel)
+
+    def has_listener(self, channel: Channel) -> bool:
+        """Whether somebody listens on any of them."""
+        return any(link.has_listener(channel) for link in self.links)
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Publications that were replaced by newer ones before they left, by channel, of all that count them."""
+        return self._counted("dropped")
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Messages and peers turned away, by reason, of all."""
+        return self._counted("refused")
+
+    def _counted(self, name: str) -> Counter[str]:
+        return sum((Counter(dict(getattr(link, name, {}))) for link in self.links), Counter())
+
+    def close(self) -> None:
+        """Close all, the last opened first."""
+        for link in reversed(self.links):
+            link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,153 @@
+"""The connecting end of WebSocket: reaches one endpoint, and again whenever it is lost. Shell."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES
+from sightline.protocol.transports.websocket_access import bearer_header
+from sightline.protocol.transports.websocket_dialects import PeerError
+from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint
+from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL
+from sightline.protocol.transports.websocket_keys import own_token
+from sightline.protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS
+from sightline.protocol.transports.websocket_tls import client_tls_context, tls_handshake
+from sightline.protocol.transports.websocket_wire import Connection
+
+if TYPE_CHECKING:
+    from websockets.exceptions import ConnectionClosed
+    from websockets.typing import Subprotocol
+
+FIRST_PAUSE_S: Final = 0.2
+LONGEST_PAUSE_S: Final = 1.0
+PAUSE_GROWTH: Final = 1.5
+
+
+class Client:
+    """Keeps one connection to `endpoint` until closed."""
+
+    def __init__(
+        self,
+        endpoint: WebSocketEndpoint,
+        serve: Callable[[Connection], None],
+        refuse: Callable[[str], None],
+        keys: tuple[str, str] = ("", ""),
+    ) -> None:
+        """`serve` is called for each connection and returns when it is gone; it may raise PeerError to drop it.
+
+        `keys` are a folder with this end's token and whom it trusts, and the role of the link. Raises ConfigError for
+        a folder with broken files.
+        """
+        self.endpoint = endpoint
+        self._token = "" if endpoint.legacy else own_token(*keys)
+        self._context = client_tls_context(keys[0]) if endpoint.secure else None
+        self._serve, self._refuse = serve, refuse
+        self._closing = threading.Event()
+        self.trouble = ""
+        """Why the last attempt failed, for a person; empty if nobody answered."""
+        self.turned_away = threading.Event()
+        """Set when somebody answered who will not speak to this end."""
+        threading.Thread(target=self._run, name="websocket-dial", daemon=True).start()
+
+    def close(self) -> None:
+        """Connect no more. An open connection is for the link to close."""
+        self._closing.set()
+
+    def _run(self) -> None:
+        pause_s = FIRST_PAUSE_S
+        while not self._closing.is_set():
+            if self._connect():
+                pause_s = FIRST_PAUSE_S
+            self._closing.wait(pause_s)
+            pause_s = min(LONGEST_PAUSE_S, pause_s * PAUSE_GROWTH)
+
+    def _connect(self) -> bool:
+        """One connection from beginning to end. Returns whether it came about."""
+        from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+
+        try:
+            self._speak(self._open())
+            return True
+        except InvalidStatus as error:
+            answer = (error.response.body or b"").decode("utf-8", "replace").strip()
+            self._turned_away(answer[:200] or f"HTTP {error.response.status_code}", error.response.status_code < 500)
+        except ConnectionClosed as error:
+            self._turned_away(error.rcvd.reason if error.rcvd else "closed without a reason", _is_final(error))
+        except PeerError as error:
+            self._turned_away(str(error), True)
+        except InvalidHandshake as error:
+            if isinstance(error.__cause__, EOFError):
+                self._turned_away(self._hangs_up(), False)
+            else:
+                self._turned_away(f"what answers there is no Sightline WebSocket ({type(error).__name__})", True)
+        except (ssl.SSLEOFError, ssl.SSLZeroReturnError):
+            self._turned_away(self._hangs_up(), False)
+        except ssl.SSLError as error:
+            why = getattr(error, "verify_message", "") or error.reason or type(error).__name__
+            self._turned_away(f"no TLS with it: {why}; is the ca.pem of --secure its authority's?", True)
+        except OSError:  # nobody there, or not in time
+            self.trouble = ""
+        except Exception as error:  # whatever a broken peer makes the library raise, this thread must try again
+            self._turned_away(f"{type(error).__name__}: {error}"[:200], False)
+        return False
+
+    def _hangs_up(self) -> str:
+        """Of who closes the connection without a byte, as a listener does that has too many at once."""
+        other = "ws://" if self.endpoint.secure else "wss://"
+        return f"it hangs up without an answer: too many connections at once, or it speaks {other}, or is no Sightline"
+
+    def _open(self) -> Connection:
+        from websockets.client import ClientProtocol
+        from websockets.uri import parse_uri
+
+        end = self.endpoint
+        near = socket.create_connection((end.host, end.port), OPEN_S)
+        near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        if self._context is not None:
+            near = tls_handshake(near, self._context, end.host, time.monotonic() + OPEN_S)
+        name = f"[{end.host}]" if ":" in end.host else end.host
+        subprotocol: Subprotocol = SUBPROTOCOL  # type: ignore[assignment]
+        protocol = ClientProtocol(
+            parse_uri(f"{'wss' if end.secure else 'ws'}://{name}:{end.port}/"),
+            subprotocols=None if end.legacy else [subprotocol],
+            max_size=MAX_HELLO_BYTES,
+            **PROTOCOL_OPTIONS,
+        )
+        request = protocol.connect()
+        if self._token:
+            request.headers["Authorization"] = bearer_header(self._token)
+        protocol.send_request(request)
+        return Connection(near, protocol)
+
+    def _speak(self, wire: Connection) -> None:
+        """Shake hands, and serve until it is over."""
+        try:
+            wire.flush()
+            wire.receive_one(time.monotonic() + OPEN_S)
+            if wire.protocol.handshake_exc is not None:
+                raise wire.protocol.handshake_exc
+            if not self.endpoint.legacy and wire.protocol.subprotocol != SUBPROTOCOL:
+                raise PeerError("WRONG_SUBPROTOCOL", 1002, f"what answers there does not speak {SUBPROTOCOL}")
+            self._serve(wire)
+        except PeerError as error:
+            self._refuse(error.counted)
+            wire.close(error.code, str(error))
+            wire.linger()
+            raise
+        finally:
+            wire.shut()
+
+    def _turned_away(self, why: str, final: bool) -> None:
+        self.trouble = why
+        if final:
+            self.turned_away.set()
+
+
+def _is_final(closed: ConnectionClosed) -> bool:
+    """Whether trying again is of no use: anything but a peer that is just going away, or has no place just now."""
+    return closed.rcvd is not None and closed.rcvd.code not in (1000, 1001, 1013)

@@ -1,0 +1,299 @@
+"""WebSocket as a `Link`: `sightline.v1`, or the older text dialect, with threads; newest-only per peer. Shell.
+
+    with open_websocket("r1", listen="ws://127.0.0.1:9090") as link:
+        link.publish(STATUS, header, payload)
+
+Only what the table of channels calls passed on goes from peer to peer: who listens speaks with each who connects, and
+they do not hear one another.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+from types import TracebackType
+from typing import Final, Self
+
+from sightline.protocol.channels import FRAME, TWIST, Channel, parse_key
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.log import log_line
+from sightline.protocol.transports.link import LatestSlot, Message
+from sightline.protocol.transports.link_rules import INEXACT_KEY, LinkRules
+from sightline.protocol.transports.websocket.client import Client as Dialer
+from sightline.protocol.transports.websocket_dialects import PeerCodec, SightlineV1
+from sightline.protocol.transports.websocket_doorlog import BurstLimiter
+from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint, parse_websocket_endpoint
+from sightline.protocol.transports.websocket.framing import IncomingMessage
+from sightline.protocol.transports.websocket_legacy import LegacyClient, LegacyToRobot, LegacyToVision
+from sightline.protocol.transports.websocket_listen import KeyFolder, Server
+from sightline.protocol.transports.websocket.peer import Publication
+from sightline.protocol.transports.websocket_peer import Peer, Promote, exchange_hellos
+from sightline.protocol.transports.websocket.legacy import DriverSlot
+from sightline.protocol.transports.websocket_wants import Subscriptions
+from sightline.protocol.transports.websocket_wire import Connection
+
+CLOSE_S: Final = 1.5
+"""A close that takes longer is left to daemon threads, so that no process hangs on a dead peer."""
+
+
+def open_websocket(
+    robot: str,
+    *,
+    listen: str | Sequence[str] = (),
+    connect: str | Sequence[str] = (),
+    role: str = "",
+    timeout_s: float = 5.0,
+    max_frame_bytes: int = FRAME.max_payload_bytes,
+    secure: str = "",
+) -> WebSocketLink:
+    """Open a link to `robot`; use it in a `with`.
+
+    Endpoints are `ws://host:port`, `wss://` and `ws-legacy://` (`sightline.protocol.transports.websocket_endpoints`). Who listens
+    reaches `connect` in the background; a lost connection is made again by itself. `role` is the default source of what
+    is published towards the robot. `secure` is a folder of tokens and certificates (`websocket_keys`, `websocket_tls`).
+    Raises ConfigError for a robot id, endpoint, limit or folder that is none, for an endpoint open to anybody, and for
+    a missing `websockets`; LinkError for a port in use, if nobody answers within `timeout_s`, or if who answers will
+    not speak.
+    """
+    rules = LinkRules(robot, role, max_frame_bytes)
+    doors, far = [[parse_websocket_endpoint(text) for text in _listed(ends)] for ends in (listen, connect)]
+    if not doors and not far:
+        raise ConfigError("no endpoint: give one to listen on (--listen) or to connect to (--connect)")
+    try:
+        import websockets  # noqa: F401
+    except ImportError:
+        raise ConfigError("websockets is not installed: pip install 'sightline[websocket]'") from None
+    link = WebSocketLink(rules)
+    try:
+        link.open(doors, far, secure)
+        if not doors:
+            link.wait_connected(timeout_s)
+    except (LinkError, ConfigError):
+        link.close()
+        raise
+    return link
+
+
+def _listed(ends: str | Sequence[str]) -> Sequence[str]:
+    return (ends,) if isinstance(ends, str) else ends
+
+
+class WebSocketLink:
+    """A `Link` over any number of WebSocket connections. A link does not hear what it publishes itself."""
+
+    def __init__(self, rules: LinkRules) -> None:
+        """Made by `open_websocket`."""
+        self.robot = rules.robot
+        self._rules = rules
+        self._wants = Subscriptions(rules, secrets.token_hex(4))
+        # Who drives comes first. Replaced, never changed, so that publishing needs no lock.
+        self._peers: tuple[Peer, ...] = ()
+        self._joining = threading.Lock()
+        self._joined = threading.Event()
+        self._listeners: list[Server] = []
+        self._dialers: list[Dialer] = []
+        self._closed = False
+        self._in_callback = threading.local()
+        self._dropped: Counter[str] = Counter()
+        self._seat = DriverSlot()
+        self._log = BurstLimiter()
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Messages and peers turned away, by reason (`sightline.protocol.transports.link_rules`, `websocket_*`)."""
+        return self._rules.refused
+
+    @property
+    def callback_errors(self) -> int:
+        """How often a subscriber's callback raised."""
+        return self._rules.callback_errors
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Publications replaced by a newer one before a peer had room for them, by channel."""
+        return sum((peer.outbox.dropped for peer in self._peers), self._dropped)
+
+    @property
+    def connected(self) -> bool:
+        """Whether at least one peer is connected; never blocks. A silent peer counts for two seconds."""
+        return not self._closed and bool(self._peers)
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        """As `Link` says; towards the robot `source` defaults to the link's role."""
+        self._rules.check(channel, header, payload)
+        key = self._rules.key(channel, source)
+        if not self.connected:
+            return False
+        post = Publication(Message(channel, key.rpartition("/")[2] if channel.has_source else "", header, payload))
+        for peer in self._peers:
+            peer.offer(post)
+        return True
+
+    def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
+        """Call `callback`, on a peer's thread, for every message with the exact key and within bounds."""
+        with self._joining:
+            self._wants.add(channel, callback)
+            self._retell()
+
+    def ignore(self, channel: Channel) -> None:
+        """End every subscription to `channel`."""
+        with self._joining:
+            self._wants.drop(channel)
+            self._retell()
+
+    def latest(self, channel: Channel) -> LatestSlot[Message]:
+        """Subscribe with a slot that holds the newest message of `channel`."""
+        slot: LatestSlot[Message] = LatestSlot()
+        self.subscribe(channel, slot.put)
+        return slot
+
+    def has_listener(self, channel: Channel) -> bool:
+        """Whether a peer said that it wants `channel`; never blocks on the network."""
+        return self.connected and any(peer.hears(channel) for peer in self._peers)
+
+    def close(self) -> None:
+        """Tell the peers and end it; idempotent, over within two seconds, safe even inside a callback."""
+        with self._joining:
+            if self._closed:
+                return
+            self._closed = True
+        for dialer in self._dialers:
+            dialer.close()
+        reason, peers = f"this end of the link to robot {self.robot} is closing", self._peers
+        for peer in peers:
+            peer.close(reason)
+        for listener in self._listeners:
+            listener.close(reason)
+        deadline_s = time.monotonic() + CLOSE_S
+        for peer in () if getattr(self._in_callback, "now", False) else peers:  # a callback's own peer waits for it
+            peer.wait_gone(max(0.0, deadline_s - time.monotonic()))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # --- opening -------------------------------------------------------------------------------------------------
+
+    def open(self, doors: Sequence[WebSocketEndpoint], far: Sequence[WebSocketEndpoint], secure: str) -> None:
+        """Listen on `doors` and begin to connect to `far`. Raises what `open_websocket` does."""
+        refuse, keys = self._rules.refuse, KeyFolder(secure, self._rules.role)
+        for end in doors:
+            self._listeners.append(Server(end, partial(self._serve, end), refuse, self._tell, keys))
+        for end in far:
+            self._dialers.append(Dialer(end, partial(self._serve, end), refuse, keys))
+
+    def wait_connected(self, timeout_s: float) -> None:
+        """Wait for the first peer. Raises LinkError with the reason if there is none."""
+        deadline_s = time.monotonic() + timeout_s
+        while not self._joined.wait(0.01):
+            late = time.monotonic() > deadline_s
+            for dialer in self._dialers:
+                if dialer.trouble and (late or dialer.turned_away.is_set()):
+                    raise LinkError(f"{dialer.endpoint.text} refused: {dialer.trouble}")
+            if late:
+                where = " or ".join(dialer.endpoint.text for dialer in self._dialers)
+                raise LinkError(f"nobody answers at {where}; is the robot running? tried for {timeout_s:g} s")
+
+    # --- peers, on threads of their own ------------------------------------------------------------------------------
+
+    def _serve(self, end: WebSocketEndpoint, wire: Connection, settle: Promote | None = None) -> None:
+        """Speak with one peer until it is gone; `settle` gives it a place where this end listens.
+
+        Raises PeerError or ConnectionClosed if it says no proper hello.
+        """
+        dialect = self._dialect(end, settle is not None, "{}:{}".format(*wire.address))
+        with self._joining:
+            told, hello, wanted_bytes = self._wants.told, self._wants.hello(), self._wants.bound()
+        peer = Peer(wire, dialect, self._heed)
+        peer.limit(wanted_bytes)
+        if isinstance(dialect, SightlineV1):
+            exchange_hellos(wire, dialect, hello, settle)
+        elif settle is not None:
+            settle("")
+        if self._join(peer, told):
+            try:
+                peer.run(self._deliver, self._rules.refuse)
+            finally:
+                self._leave(peer)
+                dialect.note_gone()
+
+    def _join(self, peer: Peer, told: tuple[str, ...]) -> bool:
+        with self._joining:
+            if self._closed:
+                return False
+            self._peers = (*self._peers, peer)
+            if told != self._wants.told:
+                self._wants.tell(peer)
+            self._retell()
+        self._joined.set()
+        return True
+
+    def _leave(self, peer: Peer) -> None:
+        with self._joining:
+            self._peers = tuple(other for other in self._peers if other is not peer)
+            self._dropped += peer.outbox.dropped
+            self._retell()
+
+    def _heed(self) -> None:
+        """A peer wants something else now, which may be what another says only while it is watched."""
+        with self._joining:
+            self._retell()
+
+    def _retell(self) -> None:
+        """With the lock held."""
+        self._wants.retell(self._peers, bool(self._listeners))
+
+    def _put_first(self, peer: Peer) -> None:
+        """Who drives is sent everything before those who watch."""
+        with self._joining:
+            self._peers = (peer, *(other for other in self._peers if other is not peer))
+
+    def _pass_on(self, sender: Peer, message: Message) -> None:
+        """Where all connect, what one has found is for the others too."""
+        post = Publication(message)
+        for peer in self._peers:
+            if peer is not sender:
+                peer.offer(post)
+
+    def _dialect(self, end: WebSocketEndpoint, listening: bool, who: str) -> PeerCodec:
+        if end.legacy is None:
+            return SightlineV1(self.robot, self._rules.role)
+        if listening:
+            return LegacyToVision(self.robot, end.legacy, monotonic_us, LegacyClient(who, self._seat, self._tell))
+        bound = self._rules.payload_bound(FRAME)
+        return LegacyToRobot(self.robot, end.legacy, monotonic_us, secrets.token_hex(4), bound)
+
+    def _tell(self, text: str) -> None:
+        """One line to the log, of not too many."""
+        with self._joining:
+            line = self._log.line(text, monotonic_us())
+        if line:
+            log_line(line)
+
+    def _deliver(self, peer: Peer, packet: IncomingMessage) -> None:
+        parsed = parse_key(packet.key)
+        if parsed is None:
+            self._rules.refuse(INEXACT_KEY)
+            return
+        if not peer.admits(packet.key, self._rules.refuse, self._tell):
+            return
+        if parsed[1] is TWIST and self._peers[0] is not peer:
+            self._put_first(peer)
+        callbacks = self._wants.of(parsed[1])
+        if parsed[1].passed_on and self._listeners:
+            callbacks = (partial(self._pass_on, peer), *callbacks)
+        self._in_callback.now = True
+        try:
+            for callback in callbacks:
+                self._rules.deliver(parsed[1], packet.key, packet.header, packet.payload, callback)
+        finally:
+            self._in_callback.now = False

@@ -1,0 +1,141 @@
+"""Who is heard at an endpoint: robots by their status, everybody by presence; and where robots listen. Shell."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from sightline.protocol.channels import KEY_PREFIX, STATUS, parse_key
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.endpoints import check_zenoh_endpoints, parse_zenoh_endpoint
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.link_rules import LinkRules
+from sightline.protocol.transports.zenoh.presence import MAX_PEERS, QUERY_ROUNDS, PeerInfo, best_round_trips
+from sightline.protocol.transports.security import RoleKeys, load_role_keys
+from sightline.protocol.transports.zenoh.session import multicast_address
+from sightline.protocol.transports.zenoh_presence import REPLY_TIMEOUT_S, query_presence
+from sightline.protocol.transports.zenoh_session import open_session
+
+if TYPE_CHECKING:
+    import zenoh
+
+OPERATOR_ROLE: Final = "operator"
+VIEWER_ROLE: Final = "viewer"
+_BETWEEN_QUERIES_S: Final = 0.05
+
+MAX_LISTENERS: Final = 64
+"""Security limit: no more answers than this are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Discovered:
+    """The newest status of each robot, and everybody who answered."""
+
+    statuses: dict[str, Message]
+    peers: list[PeerInfo]
+
+
+def discover(connect: Sequence[str], seconds: float, secure: str = "") -> Discovered:
+    """Everybody heard at `connect` within `seconds`. Raises as `open_zenoh` does."""
+    check_zenoh_endpoints((), connect)
+    with ExitStack() as ending:
+        session = open_session((), connect, seconds, _own_keys(secure))
+        ending.callback(session.close)
+        return Discovered(_statuses(session, ending), _listen(session, seconds))
+
+
+def list_robots(connect: Sequence[str], seconds: float, secure: str = "") -> dict[str, Message]:
+    """The newest `status` of every robot heard within `seconds` at `connect`. Raises as `open_zenoh` does."""
+    return discover(connect, seconds, secure).statuses
+
+
+def peers_at(connect: Sequence[str], seconds: float, secure: str = "") -> list[PeerInfo]:
+    """Everybody who answers at `connect`, with the quickest of a few round trips. Raises as `open_zenoh` does."""
+    check_zenoh_endpoints((), connect)
+    with ExitStack() as ending:
+        session = open_session((), connect, seconds, _own_keys(secure))
+        ending.callback(session.close)
+        return _query_rounds(session, time.monotonic() + seconds)
+
+
+def _own_keys(folder: str) -> RoleKeys | None:
+    """An operator's, or a viewer's where there are only those: to look takes no more."""
+    only_viewer = folder and not _has(folder, OPERATOR_ROLE) and _has(folder, VIEWER_ROLE)
+    return load_role_keys(folder, VIEWER_ROLE if only_viewer else OPERATOR_ROLE)
+
+
+def _has(folder: str, role: str) -> bool:
+    return (Path(folder).expanduser() / f"{role}.key").is_file()
+
+
+def _listen(session: zenoh.Session, seconds: float) -> list[PeerInfo]:
+    ends_s = time.monotonic() + seconds
+    peers = _query_rounds(session, ends_s)
+    time.sleep(max(0.0, ends_s - time.monotonic()))
+    return peers
+
+
+def _query_rounds(session: zenoh.Session, ends_s: float) -> list[PeerInfo]:
+    rounds = []
+    for _ in range(QUERY_ROUNDS):
+        rounds.append(query_presence(session, max(0.1, min(REPLY_TIMEOUT_S, ends_s - time.monotonic()))))
+        time.sleep(_BETWEEN_QUERIES_S)
+    return best_round_trips(rounds)
+
+
+def _statuses(session: zenoh.Session, ending: ExitStack) -> dict[str, Message]:
+    """The newest status of every robot, kept up to date until `ending`."""
+    import zenoh
+
+    found: dict[str, Message] = {}
+
+    def note(sample: zenoh.Sample) -> None:
+        key, attachment = str(sample.key_expr), sample.attachment
+        parsed = parse_key(key)
+        if parsed is None or (parsed[0] not in found and len(found) >= MAX_PEERS):
+            return
+        robot, header = parsed[0], b"" if attachment is None else attachment.to_bytes()
+        LinkRules(robot).deliver(STATUS, key, header, sample.payload.to_bytes(),
+                                 lambda message: found.update({robot: message}))
+
+    handler = zenoh.handlers.Callback(note, indirect=False)
+    ending.callback(session.declare_subscriber(f"{KEY_PREFIX}/*/{STATUS.name}", handler).undeclare)
+    return found
+
+
+def _usable(locator: str) -> str:
+    text = str(locator).partition("?")[0].partition("#")[0]
+    try:
+        parse_zenoh_endpoint(text)
+    except ConfigError:
+        return ""
+    return text
+
+
+def find_listeners(seconds: float) -> list[str]:
+    """An endpoint of each listener that answers within `seconds`; none where multicast does not work.
+
+    Raises ConfigError if Zenoh is not installed.
+    """
+    try:
+        import zenoh
+    except ImportError:
+        raise ConfigError("Zenoh is not installed: pip install 'sightline[zenoh]'") from None
+    logging.getLogger("zenoh").addHandler(logging.NullHandler())
+    answers: zenoh.handlers.RingChannel[zenoh.Hello] = zenoh.handlers.RingChannel(MAX_LISTENERS)
+    config = {"scouting": {"multicast": {"enabled": True, "address": multicast_address()}}}
+    try:
+        with zenoh.scout(answers, zenoh.WhatAmIMatcher("router"), zenoh.Config.from_json5(json.dumps(config))) as scout:
+            time.sleep(seconds)
+            hellos = iter(scout.try_recv, None)
+            found = {str(hello.zid): [locator for text in hello.locators if (locator := _usable(text))]
+                     for hello in hellos}
+    except zenoh.ZError:  # no network at all
+        return []
+    return sorted(min(usable, key=lambda locator: "[" in locator) for usable in found.values() if usable)

@@ -1,0 +1,1 @@
+"""Modules of robot_side.driver."""

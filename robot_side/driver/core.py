@@ -1,0 +1,202 @@
+"""The driver process's own logic: messages in, wheel speeds and messages out. Pure; `driver.py` is its shell."""
+
+from collections import Counter
+from collections.abc import Iterator
+
+from sightline.protocol.channels import ODOMETRY, REPLY, SCAN, STATUS, Channel
+from sightline.protocol.codec import check_sizes, decode, encode, encode_ranges
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import (
+    STILL,
+    AnswerHeader,
+    Holder,
+    Odometry,
+    Planar,
+    Pose,
+    Reply,
+    Request,
+    RequestHeader,
+    ScanHeader,
+    Stamp,
+    Status,
+    StreamStatus,
+    WireModel,
+)
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
+from sightline.protocol.text import parse_twist
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.safety.guard import RangeGuard
+from sightline.robot_side.pipe import CommandAck, Motion
+from sightline.robot_side.kinematics import Odometer, wheel_speeds
+from sightline.robot_side.ports import Ranges, WheelAngles
+from sightline.robot_side.safety.gate import SafetyGate
+
+_PERIODS_US = {STATUS.name: 100_000, ODOMETRY.name: 50_000}
+_CITES_NOTHING_OF_OURS = (RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME, RejectReason.FROM_FUTURE)
+
+
+_WIRE_LIMIT = 1e6  # of every number on the wire: an encoder that wraps around must not end anything
+
+
+def _bounded(pair: Planar) -> Planar:
+    return _within(pair[0]), _within(pair[1])
+
+
+def _bounded_pose(pose: Pose) -> Pose:
+    return _within(pose[0]), _within(pose[1]), pose[2]
+
+
+def _within(value: float) -> float:
+    return max(-_WIRE_LIMIT, min(_WIRE_LIMIT, value))
+
+
+class DriverCore:
+    """One robot session. The shell hands in what arrives and calls `tick` at 50 Hz."""
+
+    def __init__(self, config: RobotConfig, session: str, *, stopped: bool = False) -> None:
+        self.config = config
+        self.session = session
+        self._guard = RangeGuard(config.guard) if config.ranging else None
+        self.gate = SafetyGate(config.safety, session, stopped=stopped, guard=self._guard)
+        self.odometer = Odometer(config.wheels)
+        self.stream = StreamStatus()
+        self.tick_late_max_us = 0
+        self.network_restarts = 0
+        self.turned_away: Counter[str] = Counter()
+        """By the transport, before the gate could judge it: how often, by reason."""
+        self._seqs: dict[str, int] = {}
+        self._due_us: dict[str, int] = {}
+        self._outbox: list[Message] = []
+
+    # --- what arrives --------------------------------------------------------------------------------------------
+
+    def on_issued(self, seq: int, t_us: int, fingerprint: int) -> None:
+        """The network process is about to publish frame `seq`, captured at `t_us`; 0 is no fingerprint."""
+        self.gate.issued.add("frame", seq, t_us)
+        self.gate.pictures.add(t_us, fingerprint)
+
+    def on_twist(self, message: Message, now_us: int) -> CommandAck | None:
+        """Decode and offer a command. Returns the credit it gives back: whatever answers a frame of ours does."""
+        try:
+            check_sizes(message.channel, message.header, message.payload)
+            header = decode(AnswerHeader, message.header) if message.header else None
+            twist = parse_twist(message.payload)
+        except WireError as error:
+            self.gate.refuse(message.source, error)
+            return None
+        verdict = self.gate.offer(message.source, header, twist, now_us)
+        if header is None or verdict.reason in _CITES_NOTHING_OF_OURS:
+            return None
+        sender = Holder(source=header.source, session=header.session)
+        return CommandAck(sender, header.echo.seq, header.compute_us, self.gate.holder(now_us))
+
+    def on_request(self, message: Message, now_us: int) -> None:
+        """Carry out a request; the reply waits in `messages`."""
+        try:
+            check_sizes(message.channel, message.header, message.payload)
+            header = decode(RequestHeader, message.header)
+            request = decode(Request, message.payload)
+        except WireError as error:
+            self.gate.refuse(message.source, error)
+            return
+        try:
+            if header.source != message.source:
+                raise WireError(RejectReason.UNKNOWN_SOURCE, "key and header disagree on the source")
+            detail, granted = self.gate.request(header, request, now_us), True
+        except WireError as error:
+            self.gate.refuse(message.source, error)
+            detail, granted = f"{error.reason}: {error.detail}"[:200], False
+        reply = Reply(to=header.session, id=request.id, ok=granted, state=self.gate.state, detail=detail)
+        self._post(REPLY, reply, now_us)
+
+    # --- what leaves ---------------------------------------------------------------------------------------------
+
+    def tick(self, now_us: int, wheels: WheelAngles | None, scan: Ranges | None) -> tuple[float, float]:
+        """Read the sensors' news, step the gate, and return (left, right) rad/s for the motors."""
+        if wheels is not None:
+            self.odometer.update(wheels)
+        if scan is not None:
+            self._on_scan(scan, now_us)
+        decision = self.gate.step(now_us)
+        return wheel_speeds(self.config.wheels, decision.twist)
+
+    def motion(self) -> Motion:
+        """The robot at this moment, for frame headers."""
+        applied = self.gate.applied
+        return Motion(
+            _bounded_pose(self.odometer.pose),
+            _bounded(self.odometer.moving),
+            (applied.linear_mps, applied.angular_rad_s),
+            self.gate.latency_us,
+        )
+
+    def messages(self, now_us: int) -> Iterator[Message]:
+        """What is to be published now: replies and scans at once, status and odometry at their rates."""
+        if self._is_due(ODOMETRY, now_us):
+            self._post(ODOMETRY, Odometry(pose=self.motion().pose, moving=self.motion().moving), now_us)
+        if self._is_due(STATUS, now_us):
+            self._post(STATUS, self.status(now_us), now_us)
+        outbox, self._outbox = self._outbox, []
+        yield from outbox
+
+    def status(self, now_us: int) -> Status:
+        """Everything a person needs to know why the robot moves or does not."""
+        gate, limits = self.gate, self.config.safety
+        return Status(
+            state=gate.state,
+            reason=gate.reason[:200],
+            holder=gate.holder(now_us),
+            applied=(gate.applied.linear_mps, gate.applied.angular_rad_s),
+            frame_age_us=gate.frame_age_us(now_us),
+            latency_us=gate.latency_us,
+            accepted=gate.accepted,
+            refused=dict(gate.counters + self.turned_away),
+            last_refusal=gate.last_refusal,
+            stream=self.stream,
+            auto_arm=gate.arms_itself,
+            tick_late_max_us=self.tick_late_max_us,
+            network_restarts=self.network_restarts,
+            max_linear_mps=limits.max_linear_mps,
+            max_angular_rad_s=limits.max_angular_rad_s,
+        )
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the wheels are told to stand still."""
+        return self.gate.applied == STILL
+
+    # --- inside --------------------------------------------------------------------------------------------------
+
+    def _on_scan(self, scan: Ranges, now_us: int) -> None:
+        if self._guard is not None:
+            self._guard.see(scan)
+        stamp = self._stamp(SCAN, now_us)
+        header = ScanHeader(
+            session=stamp.session,
+            seq=stamp.seq,
+            t_us=scan.t_us,
+            angle_min_rad=scan.angle_min_rad,
+            angle_increment_rad=scan.angle_increment_rad,
+            range_min_m=scan.range_min_m,
+            range_max_m=min(scan.range_max_m, _WIRE_LIMIT),
+        )
+        payload = encode_ranges(scan.ranges_m)
+        if len(payload) <= SCAN.max_payload_bytes:
+            self._outbox.append(Message(SCAN, "", encode(header), payload))
+
+    def _is_due(self, channel: Channel, now_us: int) -> bool:
+        due_us = self._due_us.get(channel.name, now_us)
+        if now_us < due_us:
+            return False
+        self._due_us[channel.name] = max(due_us + _PERIODS_US[channel.name], now_us)
+        return True
+
+    def _post(self, channel: Channel, payload: WireModel, now_us: int) -> None:
+        self._outbox.append(Message(channel, "", encode(self._stamp(channel, now_us)), encode(payload)))
+
+    def _stamp(self, channel: Channel, now_us: int) -> Stamp:
+        seq = self._seqs[channel.name] = self._seqs.get(channel.name, -1) + 1
+        if channel is STATUS:
+            self.gate.issued.add("status", seq, now_us)  # so that a request may cite it
+        return Stamp(session=self.session, seq=seq, t_us=now_us)

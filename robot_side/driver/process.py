@@ -1,0 +1,263 @@
+"""The driver process: owns gate and motors, is the parent of the network process, has no network. Shell.
+
+Motors latch, so whoever owns them must outlive every fault beside it. The network process may hang, die or hold its
+interpreter lock for ever; this loop still reads its own clock 50 times a second and brings the wheels to zero.
+"""
+
+import secrets
+import select
+import signal
+import struct
+from collections import Counter
+from contextlib import ExitStack, suppress
+from types import FrameType
+
+from sightline.protocol.channels import REQUEST, TWIST, check_robot_id
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import LastRejection, State, StreamStatus
+from sightline.robot_side import pipe as ipc
+from sightline.robot_side.child import DriverEnd
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.dead_zone import BlindZoneError, check_blind_zone
+from sightline.robot_side.driver.core import DriverCore
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
+from sightline.robot_side.driver.persistence import StopLatch
+from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
+from sightline.robot_side.plugins import build_device
+from sightline.robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
+from sightline.robot_side.refusal_log import RejectionLog
+from sightline.robot_side.scribe import BackgroundWriter
+from sightline.robot_side.supervision import SystemdNotifier, request_real_time
+
+_SHUTDOWN_US = 2_000_000
+_WATCHDOG_PERIOD_US = 100_000
+_WARNING = (
+    "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
+    "(docs/safety.md)"
+)
+
+
+def run(config: RobotConfig) -> int:
+    """Run the robot until one of the ENDING signals; the wheels are at zero when it returns.
+
+    Raises ConfigError, HardwareError or LinkError before anything could move.
+    """
+    check_robot_id(config.robot)
+    with ExitStack() as ending:
+        drive: Drive = build_device("drives", config.motors)
+        ending.callback(drive.close)
+        ranges: RangeSensor | None = build_device("range_sensors", config.ranging) if config.ranging else None
+        if ranges is not None:
+            ending.callback(ranges.close)
+        driver = Driver(config, drive, ranges)
+        ending.callback(driver.scribe.close)
+        ending.callback(driver.child.close)
+        ending.callback(_zero, drive)  # last in, first to run: however the loop ends, the motors are told zero
+        return driver.loop()
+
+
+def _zero(drive: Drive) -> None:
+    with suppress(Exception):  # nothing may keep what ends after it from ending
+        drive.set(0.0, 0.0)
+
+
+def zero_motors(config: RobotConfig) -> int:
+    """Tell the motors to stand still, without gate or network: for whoever cleans up after a dead driver."""
+    drive: Drive = build_device("drives", config.motors)
+    try:
+        drive.set(0.0, 0.0)
+    finally:
+        drive.close()
+    return 0
+
+
+class Driver:
+    """The loop and what it holds."""
+
+    def __init__(self, config: RobotConfig, drive: Drive, ranges: RangeSensor | None) -> None:
+        latch = StopLatch(config.state_dir, config.robot)
+        self.scribe = BackgroundWriter(latch)
+        self._drive = drive
+        self._ranges = ranges
+        self._driving = DriverCore(config, secrets.token_hex(4), stopped=latch.is_set())
+        self._shown = self._driving.gate.state
+        self._ending_since_us: int | None = None
+        self._manager = SystemdNotifier()
+        self._watchdog_due_us = self._ticked_us = 0
+        self._obeyed = False
+        self._sight: tuple[float, ...] = ()
+        self._verdicts: list[ipc.CommandAck] = []
+        self._refusals = RejectionLog()
+        self._counted: Counter[str] = Counter()
+        self.child = DriverEnd(config, self._driving.session, self.scribe.say)
+        for number in EXIT_SIGNALS:
+            signal.signal(number, self._on_signal)
+        for number in IGNORED_SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+
+    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
+        self._ending_since_us = self._ending_since_us or monotonic_us()
+
+    def loop(self) -> int:
+        """Tick at absolute 20 ms deadlines and whenever a command arrives, until the end is asked for and reached."""
+        self._greet()
+        deadline_us = monotonic_us()
+        while not self._ended():
+            self._wait(deadline_us)
+            arrived = self._drain()
+            now_us = monotonic_us()
+            if now_us >= deadline_us:
+                self._driving.tick_late_max_us = max(self._driving.tick_late_max_us, now_us - deadline_us)
+                deadline_us = max(deadline_us + TICK_US, now_us)
+                self._tick(now_us, punctual=True)
+            elif arrived and now_us - self._ticked_us >= MIN_TICK_US:
+                self._tick(now_us, punctual=False)
+            elif arrived:
+                self._answer()
+        self._manager.tell("STOPPING=1")
+        return self.child.exit_code
+
+    def _greet(self) -> None:
+        """What this robot lacks is said before it moves."""
+        missing = list(request_real_time())
+        for line in [*missing, *([] if self._manager.is_there else [_WARNING])]:
+            self.scribe.say(f"robot {self._driving.config.robot}: {line}")
+
+    def _ended(self) -> bool:
+        if self.child.failed_at_start:
+            self._ending_since_us = self._ending_since_us or monotonic_us()
+        if self._ending_since_us is None:
+            return False
+        self._driving.gate.disarm("shutting down")
+        return (self._driving.at_rest and self._obeyed) or monotonic_us() - self._ending_since_us > _SHUTDOWN_US
+
+    def _wait(self, deadline_us: int) -> None:
+        timeout_s = max(0, deadline_us - monotonic_us()) / 1e6
+        readable = [self.child.socket] if self.child.socket else []
+        select.select(readable, [], [], timeout_s)
+
+    def _tick(self, now_us: int, *, punctual: bool) -> None:
+        self._ticked_us = now_us
+        self._move()
+        self._answer()
+        if punctual:
+            for message in self._driving.messages(now_us):
+                self.child.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
+            self.child.keep_alive(now_us, self._driving.gate.issued.last_seq("frame") + 1)
+            self._driving.network_restarts = max(0, self.child.restarts)
+            self._show(self._driving.gate.state, self._driving.gate.reason)
+            self._feed_watchdog(now_us)
+
+    def _answer(self) -> None:
+        """Verdicts, once the wheels obey; motion first, for the frame that a verdict permits tells of it."""
+        self.child.send_aside(ipc.pack_motion(self._driving.motion()))
+        verdicts, self._verdicts = self._verdicts, []
+        for judged in verdicts:
+            self.child.send(ipc.pack_ack(judged))
+
+    def _feed_watchdog(self, now_us: int) -> None:
+        if now_us >= self._watchdog_due_us:
+            self._manager.tell("READY=1\nWATCHDOG=1")
+            self._watchdog_due_us = now_us + _WATCHDOG_PERIOD_US
+
+    def _move(self) -> None:
+        """Sensors, gate, motors. Whatever a device raises stops the robot, never the loop that stops it.
+
+        The gate's time is taken after the sensors': a scan that is stamped when it is read is not from the future.
+        """
+        wheels: WheelAngles | None = None
+        scan: Ranges | None = None
+        self._obeyed = False
+        try:
+            wheels = self._drive.wheels()
+            scan = self._scanned()
+            speeds = self._driving.tick(monotonic_us(), wheels, scan)
+        except BlindZoneError:  # with the first scan, and without one nothing moves
+            raise
+        except Exception as error:  # a plug-in is foreign code; a reading may be no number
+            self._driving.gate.fault(f"{error or type(error).__name__}")
+            speeds = self._without_sensors()
+        try:
+            self._drive.set(*speeds)
+            self._obeyed = True
+        except Exception as error:
+            self._driving.gate.fault(f"{error or type(error).__name__}")
+
+    def _without_sensors(self) -> tuple[float, float]:
+        """The gate's way to zero; zero at once if the gate cannot be stepped either, for this loop must not end."""
+        try:
+            return self._driving.tick(monotonic_us(), None, None)
+        except Exception as error:
+            self._driving.gate.halt(f"{error or type(error).__name__}")
+            return 0.0, 0.0
+
+    def _scanned(self) -> Ranges | None:
+        """The newest scan. Raises DeadZoneError for a sensor that the guard must not rely on."""
+        scan = self._ranges.read() if self._ranges else None
+        if scan is None:
+            return None
+        sight = (scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, float(len(scan.ranges_m)))
+        if sight != self._sight:
+            check_blind_zone(self._driving.config.guard, scan)
+            self._sight = sight
+        return scan
+
+    def _show(self, state: State, reason: str) -> None:
+        """One line per change of state; the latch is a level that the scribe keeps."""
+        shown, self._shown = self._shown, state
+        if state is shown or {state, shown} == {State.ACTIVE, State.DEGRADED}:
+            return  # on a lossy link these two alternate many times a second
+        self.scribe.keep(state is State.STOPPED)
+        self.scribe.say(f"robot {self._driving.config.robot}: {state} ({reason})")
+
+    # --- packets of the network process --------------------------------------------------------------------------
+
+    def _drain(self) -> bool:
+        """Handle what the child sent; True if a command was among it."""
+        commanded = False
+        for packet in self.child.packets():
+            with suppress(ValueError, KeyError, struct.error, WireError):  # a broken child is restarted, not obeyed
+                commanded |= self._on_packet(packet)
+        return commanded
+
+    def _on_packet(self, packet: bytes) -> bool:
+        kind = ipc.packet_kind(packet)
+        if kind is ipc.PacketKind.RAW:
+            return self._on_raw(packet)
+        if kind is ipc.PacketKind.ISSUED:
+            self._driving.on_issued(*ipc.unpack_issued(packet))
+        elif kind is ipc.PacketKind.STREAM:
+            self._driving.stream = decode(StreamStatus, packet[1:])
+        elif kind is ipc.PacketKind.REFUSED:
+            self._on_turned_away(ipc.unpack_rejected(packet))
+        elif kind is ipc.PacketKind.READY:
+            self._counted.clear()
+            self.child.on_ready()
+        return False
+
+    def _on_turned_away(self, counts: dict[str, int]) -> None:
+        """Counts of this network process, which begins at zero; ours go on over its restarts."""
+        more, self._counted = Counter(counts) - self._counted, Counter(counts)
+        self._driving.turned_away += more
+        for reason, count in more.items():
+            refusal = LastRejection(source="the network", reason=reason, detail="turned away by the transport")
+            self._tell(refusal, count)
+
+    def _on_raw(self, packet: bytes) -> bool:
+        message, refused_before = ipc.unpack_message(packet), self._driving.gate.last_refusal
+        if message.channel is TWIST:
+            judged = self._driving.on_twist(message, monotonic_us())
+            if judged is not None:
+                self._verdicts.append(judged)
+        elif message.channel is REQUEST:
+            self._driving.on_request(message, monotonic_us())
+        refusal = self._driving.gate.last_refusal
+        if refusal is not None and refusal is not refused_before:
+            self._tell(refusal)
+        return True
+
+    def _tell(self, refusal: LastRejection, times: int = 1) -> None:
+        if line := self._refusals.line(refusal, monotonic_us(), times):
+            self.scribe.say(f"robot {self._driving.config.robot}: {line}")

@@ -1,0 +1,156 @@
+"""How pictures are to be encoded so that they pass in time: a budget of bytes, then quality, then size. Pure.
+
+Down by a factor when the link shows that it is full, up by a little while it is calm. Only cameras that encode
+themselves can follow (`sightline.robot_side.ports.Adjustable`); for the others the wish is no more than that.
+"""
+
+from typing import Final, NamedTuple
+
+from sightline.robot_side.network.congestion_window import LinkCapacity
+
+PICTURE_US: Final = 28_000
+"""For how long a picture may occupy the link: its age grows by as much, and thirty a second pass with room to spare."""
+SCALES_PERCENT: Final = (100, 50)
+"""Side lengths. A half costs nothing that vision looks at: it decodes large pictures at half scale anyway."""
+LEAST_QUALITY_PERCENT: Final = 25
+"""Of the configured quality; below it blocks hide small targets, and fewer pixels are the better loss."""
+
+_LEAST_BYTES: Final = 2_000
+_STEP_BYTES: Final = 1_500
+_STEP_US: Final = 250_000
+_EXCESS_US: Final = 40_000
+"""Delay above the lowest of late, from which on less is sent; below half of it more may be."""
+_FACTOR: Final = 0.8
+_OVERDUE_FACTOR: Final = 0.5
+_FLOOR_US: Final = 5_000_000
+"""Each of the two spans whose lowest delay is kept: a link that has become longer is believed after the second."""
+_LAG_FRAMES: Final = 2
+"""Pictures that were already taken when the wish changed."""
+_JUDGED_BY: Final = 3
+"""Delays by which it is judged whether sending less helped."""
+_IN_VAIN: Final = 1.05
+_FROM_SCALE_US: Final = 3_000_000
+"""A new size makes vision begin anew, so it is not changed more often."""
+
+
+class EncodingTarget(NamedTuple):
+    """Shares of the configured quality and of the side lengths."""
+
+    quality_percent: int = 100
+    scale_percent: int = 100
+
+
+class _Cut(NamedTuple):
+    """Why less is sent: pictures of so many bytes took so long, and each byte seemed to take its share of that."""
+
+    delay_us: int
+    size_bytes: float
+    us_per_byte: float
+
+
+class BitrateControl:
+    """Told of what was sent and how it fared; `wish` is what the camera should do next."""
+
+    def __init__(self) -> None:
+        self.wish = EncodingTarget()
+        self._budget_bytes: float | None = None
+        self._bytes = 0.0
+        self._frames = 0
+        self._step_at_us = 0
+        self._scaled_at_us = -_FROM_SCALE_US
+        self._floors_us: list[int | None] = [None, None]
+        self._floor_until_us = 0
+        self._made: _Cut | None = None
+        self._since_us: list[int] = []
+
+    # --- what is heard -------------------------------------------------------------------------------------------
+
+    def on_sent(self, size_bytes: int, now_us: int) -> None:
+        """A picture of this size left; 0 for one whose size is not told, from which nothing is learnt."""
+        self._frames += 1
+        if self._frames <= _LAG_FRAMES or not size_bytes:
+            return
+        self._bytes = size_bytes if not self._bytes else 0.7 * self._bytes + 0.3 * size_bytes
+        self._choose(now_us)
+
+    def on_delay(self, delay_us: int, now_us: int) -> None:
+        """A frame took so long, the peer's computing apart, and did not wait behind another."""
+        self._judge_cut(delay_us)
+        excess_us = delay_us - self._floor(delay_us, now_us)
+        if now_us < self._step_at_us:
+            return
+        if excess_us > _EXCESS_US and self._bytes:
+            self._cut(self._current() * _FACTOR, delay_us, excess_us / self._bytes)
+            self._step_at_us = now_us + max(_STEP_US, delay_us)
+        elif self._budget_bytes is not None and 2 * excess_us < _EXCESS_US:
+            self._budget_bytes += _STEP_BYTES
+            self._step_at_us = now_us + _STEP_US
+
+    def on_full(self, full: LinkCapacity, now_us: int) -> None:
+        """No more than this gets through."""
+        self._cut(full.bytes_per_s * PICTURE_US / 1e6, full.delay_us, 1e6 / max(1.0, full.bytes_per_s))
+        self._step_at_us = now_us + _STEP_US
+
+    def on_overdue(self, now_us: int) -> None:
+        """Several answers in a row did not come in time."""
+        self._cut(self._current() * _OVERDUE_FACTOR)
+        self._step_at_us = now_us + _STEP_US
+
+    # --- what follows --------------------------------------------------------------------------------------------
+
+    def _current(self) -> float:
+        budget = self._budget_bytes
+        return min(self._bytes, budget) if budget is not None and self._bytes else budget or self._bytes
+
+    def _cut(self, wanted_bytes: float, delay_us: int = 0, us_per_byte: float = 0.0) -> None:
+        current = self._current()
+        if wanted_bytes < current:
+            self._budget_bytes = max(float(_LEAST_BYTES), wanted_bytes)
+            self._made = _Cut(delay_us, current, us_per_byte) if us_per_byte else None
+            self._since_us.clear()
+
+    def _judge_cut(self, delay_us: int) -> None:
+        """Had bytes been what took so long, then as many as before would now take no longer than they did."""
+        if self._made is None or not self._bytes or self._frames < _LAG_FRAMES + _JUDGED_BY:
+            return
+        self._since_us.append(delay_us)
+        if len(self._since_us) < _JUDGED_BY:
+            return
+        cut, self._made = self._made, None
+        spared_us = (cut.size_bytes - self._bytes) * cut.us_per_byte
+        if min(self._since_us) + spared_us > _IN_VAIN * cut.delay_us:
+            self._budget_bytes = cut.size_bytes
+            self._floors_us = [None, min(self._since_us)]
+
+    def _floor(self, delay_us: int, now_us: int) -> int:
+        if now_us >= self._floor_until_us:
+            self._floors_us = [self._floors_us[1], None]
+            self._floor_until_us = now_us + _FLOOR_US
+        newest = self._floors_us[1]
+        self._floors_us[1] = delay_us if newest is None else min(newest, delay_us)
+        return min(one for one in self._floors_us if one is not None)
+
+    def _choose(self, now_us: int) -> None:
+        """Nearer to the budget, by what the last pictures weighed."""
+        if self._budget_bytes is None:
+            return
+        quality, scale = self.wish
+        share = self._budget_bytes / self._bytes
+        if quality == 100 and scale == 100 and share > 1.5:
+            self._budget_bytes = None
+        elif quality == LEAST_QUALITY_PERCENT and share < 0.8 and scale != SCALES_PERCENT[-1]:
+            self._rescale(EncodingTarget(60, SCALES_PERCENT[-1]), now_us)
+        elif quality == 100 and share > 1.3 and scale != 100:
+            self._rescale(EncodingTarget(40, 100), now_us)
+        elif not 0.9 < share < 1.1:
+            self._set(EncodingTarget(max(LEAST_QUALITY_PERCENT, min(100, round(quality * share))), scale))
+
+    def _rescale(self, wish: EncodingTarget, now_us: int) -> None:
+        if now_us - self._scaled_at_us >= _FROM_SCALE_US:
+            self._scaled_at_us = now_us
+            self._set(wish)
+
+    def _set(self, wish: EncodingTarget) -> None:
+        if wish != self.wish:
+            self.wish = wish
+            self._frames, self._bytes = 0, 0.0

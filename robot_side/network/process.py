@@ -1,0 +1,221 @@
+"""The network process: camera and link; forwards raw commands to the driver, publishes for it. Shell.
+
+Started by `sightline.robot_side.child` with its ends of two socket pairs; it ends when the first closes.
+"""
+
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+import zlib
+from collections import Counter
+from contextlib import ExitStack, suppress
+
+from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import HardwareError, SightlineError, WireError
+from sightline.protocol.log import log_line, set_log_format
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.open import open_link
+from sightline.protocol.transports.relay import Relay
+from sightline.protocol.transports.zenoh_log import log_rejected_peers
+from sightline.robot_side import pipe as ipc
+from sightline.robot_side.addresses import reachable_endpoints
+from sightline.robot_side.network.core import CameraAdaptation
+from sightline.robot_side.child import NetworkSetup
+from sightline.robot_side.parent import NetworkEnd
+from sightline.robot_side.plugins import build_device
+from sightline.robot_side.ports import Camera, Picture
+from sightline.robot_side.sending import NetworkCore
+
+_STREAM_STATUS_US = 200_000
+_CAMERA_TIMEOUT_S = 0.2
+_CAMERA_RETRY_S = 0.5
+_LONGEST_NAP_S = 0.1
+_LEAVES_WITHIN_S = 3.0
+_KEYS = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP)  # Ctrl-C, Ctrl-\ and Ctrl-Z
+
+
+class Network:
+    """The camera loop (main thread), the driver's packets (a thread), the link's callbacks (its thread)."""
+
+    def __init__(self, setup: NetworkSetup, driver: NetworkEnd, link: Link, camera: Camera) -> None:
+        self._driver = driver
+        self._link = link
+        self._camera = camera
+        self._adjusting = CameraAdaptation(camera)
+        config = setup.config
+        self._sending = NetworkCore(config.stream, setup.session, setup.first_seq, config.max_frame_bytes)
+        self._lock = threading.Lock()
+        self._credit = threading.Event()
+        self._camera_fault = ""
+        self._refused_acks: Counter[str] = Counter()
+        self._refused_told: Counter[str] = Counter()
+        self.running = True
+
+    def run(self) -> None:
+        """Until the driver closes its end."""
+        self._driver.tell(bytes([ipc.PacketKind.READY]))
+        self._link.subscribe(TWIST, self._driver.forward)
+        self._link.subscribe(REQUEST, self._driver.forward)
+        self._link.subscribe(ACK, self._on_ack)
+        self._relay = Relay(self._link)
+        threading.Thread(target=self._read_driver, daemon=True).start()
+        while self.running:
+            self._stream_one()
+
+    # --- frames --------------------------------------------------------------------------------------------------
+
+    def _stream_one(self) -> None:
+        listening = self._link.has_listener(FRAME)
+        self._sending.motion = self._driver.motion(self._sending.motion)
+        with self._lock:
+            due = self._sending.may_capture(monotonic_us(), listening)
+            nap_s = self._sending.wait_us(monotonic_us()) / 1e6
+        if not due:
+            self._credit.wait(min(nap_s, _LONGEST_NAP_S) if listening and nap_s > 0 else _LONGEST_NAP_S)
+            self._credit.clear()
+            return
+        self._adjusting.follow(self._sending.wish)
+        picture = self._read_camera()
+        if picture is not None:
+            self._send(picture)
+
+    def _read_camera(self) -> Picture | None:
+        """A picture, or None; a camera that is gone is said once and tried again."""
+        try:
+            picture = self._camera.read(_CAMERA_TIMEOUT_S)
+        except HardwareError as error:
+            if not self._camera_fault:
+                log_line(f"camera: {error}")
+            self._camera_fault = str(error)
+            time.sleep(_CAMERA_RETRY_S)
+            return None
+        if self._camera_fault and picture is not None:
+            log_line("camera: back", sys.stdout)
+            self._camera_fault = ""
+        return picture
+
+    def _send(self, picture: Picture) -> None:
+        self._sending.motion = self._driver.motion(self._sending.motion)
+        with self._lock:
+            sent = self._sending.on_camera(picture, monotonic_us())
+            camera = self._sending.camera_message(self._adjusting.seen(picture), monotonic_us())
+        if camera is not None:  # before the first picture that it is the model of
+            self._link.publish(camera.channel, camera.header, camera.payload)
+        if sent is None:
+            return
+        header, message = sent
+        # The driver must know a frame before anybody can answer it.
+        fingerprint = zlib.crc32(picture.jpeg) if self._camera.live else 0
+        if self._driver.tell_aside(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
+            self._link.publish(message.channel, message.header, message.payload)
+
+    # --- the driver ----------------------------------------------------------------------------------------------
+
+    def _read_driver(self) -> None:
+        """Until the driver closes its end; then the camera loop ends, or the whole process if it hangs."""
+        status_due_us = 0
+        try:
+            while packet := self._driver.receive():
+                self._driver.retry()
+                with suppress(ValueError):  # a message over its bounds: one lost message
+                    self._on_packet(packet)
+                now_us = monotonic_us()
+                if now_us >= status_due_us:
+                    status_due_us = now_us + _STREAM_STATUS_US
+                    self._report(now_us)
+        finally:
+            self.running = False
+            self._credit.set()
+            time.sleep(_LEAVES_WITHIN_S)
+            os._exit(1)
+
+    def _on_packet(self, packet: bytes) -> None:
+        kind = ipc.packet_kind(packet)
+        if kind is ipc.PacketKind.VERDICT:
+            with self._lock:
+                self._sending.on_judged(ipc.unpack_ack(packet), monotonic_us())
+            self._credit.set()
+        elif kind is ipc.PacketKind.PUBLISH:
+            message = ipc.unpack_message(packet)
+            self._link.publish(message.channel, message.header, message.payload)
+
+    def _report(self, now_us: int) -> None:
+        """Tell the driver how the stream does, and everybody what the camera is."""
+        with self._lock:
+            status = self._sending.status(now_us, self._driver.dropped_commands)
+            status = self._adjusting.shown_in(status, getattr(self._link, "dropped", {}))
+            camera = self._sending.camera_message(self._adjusting.model, now_us)
+        self._driver.tell(bytes([ipc.PacketKind.STREAM]) + encode(status))
+        self._relay.look()
+        self._report_refused()
+        if camera is not None:
+            self._link.publish(camera.channel, camera.header, camera.payload)
+
+    def _report_refused(self) -> None:
+        """What never reached the driver is shown in `status` too."""
+        by_link: dict[str, int] = dict(getattr(self._link, "refused", {}))  # copied at once: other threads count in it
+        refused = Counter(dict(self._refused_acks)) + Counter(by_link)
+        if refused != self._refused_told and self._driver.tell(ipc.pack_rejected(refused)):
+            self._refused_told = refused
+
+    def _on_ack(self, message: Message) -> None:
+        try:
+            with self._lock:
+                self._sending.on_ack(message, monotonic_us())
+        except WireError as error:
+            self._refused_acks[error.reason] += 1
+            return
+        self._credit.set()
+
+
+def _say(robot: str, line: str) -> None:
+    print(f"robot {robot}: {line}", flush=True)
+
+
+def _run(driver: NetworkEnd) -> None:
+    setup = NetworkSetup.model_validate_json(driver.receive())
+    config = setup.config
+    with ExitStack() as ending:
+        camera: Camera = build_device("cameras", config.camera)
+        ending.callback(camera.close)
+        ending.enter_context(log_rejected_peers(config.doors, config.secure, lambda line: _say(config.robot, line)))
+        link = ending.enter_context(
+            open_link(
+                config.robot, listen=config.doors, connect=config.connect, role="robot", secure=config.secure,
+                session=setup.session,
+            )
+        )
+        where = ", ".join(config.listen) or "no port of its own"
+        where += f", connected to {', '.join(config.connect)}" if config.connect else ""
+        print(f"robot {config.robot}: on {where}, camera {config.camera.kind}", flush=True)
+        if reached := reachable_endpoints(config.listen):
+            _say(config.robot, f"others reach it at {', '.join(reached)}")
+        Network(setup, driver, link, camera).run()
+
+
+def main() -> None:
+    """Entry of the child process: argv[1] and argv[2] are the sockets' descriptors."""
+    set_log_format(None, "robot")
+    for number in _KEYS:  # they reach the whole group; the driver ends us, after zero
+        signal.signal(number, signal.SIG_IGN)
+    driver = NetworkEnd(*(socket.socket(fileno=int(number)) for number in sys.argv[1:3]))
+    code = 1
+    try:
+        _run(driver)
+        code = 0
+    except SightlineError as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        code = error.exit_code
+    except Exception as error:
+        print(f"error: network process: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+    finally:
+        os._exit(code)  # daemon threads of a transport must not keep a finished process
+
+
+if __name__ == "__main__":
+    main()

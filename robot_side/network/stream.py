@@ -1,0 +1,229 @@
+"""What to send, when and how much: credit, its timeout, the window, the rate, the encoding. Pure.
+
+A frame is captured only while there is credit, so it is young when it leaves and nothing queues behind it. An answer (a
+twist accepted or refused, or an ack) returns credit. The window starts at one frame in flight and widens only for the
+link's own delay (`window.py`), never for a slow detector: with an 80 ms detector one frame in flight is 81-83 ms old
+where two are 141-175. What does not fit through the link in time is encoded smaller (`encoding.py`).
+"""
+
+from collections import OrderedDict, deque
+from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
+
+from sightline.protocol.config import Config
+from sightline.protocol.messages import Holder, StreamStatus
+from sightline.robot_side.network.bitrate_control import BitrateControl, EncodingTarget
+from sightline.robot_side.network.congestion_window import AckSample, CongestionWindow
+
+_FIRST_TIMEOUT_US = 120_000
+_REMEMBERED = 64
+_TIMEOUT_SLACK_US = 12_000  # with a quick peer, below one interval at 30 fps: a loss then costs one frame, not two
+_PENDING_US = 1_000_000  # a frame that is neither answered nor overtaken for this long was lost
+_OVERDUE_IN_A_ROW = 2
+"""Once may be loss, however many frames it took. Twice is a frame sent after it that is overdue too: a queue."""
+
+
+class StreamConfig(Config):
+    """Flow of frames."""
+
+    max_fps: Annotated[float, Field(gt=0, le=240)] = 30.0
+    max_window: Annotated[int, Field(ge=1, le=32)] = 12
+    """Most frames in flight, on a link however long."""
+    max_credit_timeout_ms: Annotated[int, Field(ge=20, le=5_000)] = 500
+    owner_life_ms: Annotated[int, Field(ge=100, le=10_000)] = 1_000
+    """Silence after which another peer's answers may return credit."""
+    adapt: bool = True
+    """Whether a camera that encodes itself is told to lower quality and size where the link is thin."""
+
+
+@dataclass(slots=True)
+class _Sent:
+    at_us: int
+    size_bytes: int
+    behind: bool
+    held_back: bool
+    followed: bool = False
+
+
+class Stream:
+    """Decides for one camera. The caller asks `may_capture`, tells `on_sent`, and hands every answer in."""
+
+    def __init__(self, config: StreamConfig) -> None:
+        self._config = config
+        self._interval_us = round(1e6 / config.max_fps)
+        self._in_flight: dict[int, int] = {}  # seq -> when its credit times out
+        self._sent_frames: OrderedDict[int, _Sent] = OrderedDict()  # also of frames whose credit has timed out
+        self._owner: Holder | None = None
+        self._owner_until_us = 0
+        self._window = CongestionWindow(self._interval_us, config.max_window)
+        self._encoding = BitrateControl()
+        self._answer_us: float | None = None
+        self._spread_us = 0.0
+        self._answered_at_us = 0
+        self._overdue = self._overdue_at_us = 0
+        self._may_probe = False
+        self._held_back = False
+        self._next_us = 0
+        self._sent = self._credit_timeouts = self._overtaken = 0
+        self._sent_us: deque[int] = deque(maxlen=256)
+
+    @property
+    def window(self) -> int:
+        """Frames that may be in flight."""
+        return self._window.frames
+
+    @property
+    def _has_credit(self) -> bool:
+        """While answers are overdue, one frame for each time that nothing came back: what is under way comes first."""
+        if self._overdue:
+            return self._may_probe or not self._in_flight
+        return len(self._in_flight) < self.window
+
+    @property
+    def wish(self) -> EncodingTarget:
+        """How the next picture should be encoded."""
+        return self._encoding.wish if self._config.adapt else EncodingTarget()
+
+    # --- sending -------------------------------------------------------------------------------------------------
+
+    def may_capture(self, now_us: int, listening: bool) -> bool:
+        """Whether to take the next picture now: somebody listens, it is time, and there is credit."""
+        self._expire(now_us)
+        if not listening or now_us < self._next_us:
+            return False
+        free = self._has_credit
+        self._held_back |= not free
+        return free
+
+    def wait_us(self, now_us: int) -> int:
+        """How long until time or a credit timeout could change `may_capture`; an answer may change it sooner."""
+        blocked_until_us = min(self._in_flight.values(), default=0) if not self._has_credit else 0
+        return max(0, max(self._next_us, blocked_until_us) - now_us)
+
+    def on_sent(self, seq: int, t_us: int, now_us: int, size_bytes: int = 0) -> None:
+        """A frame captured at `t_us` left. The next is due by capture time: a late send costs no rate."""
+        self._in_flight[seq] = now_us + self._timeout_us()
+        self._may_probe = False
+        pending = [one for one in self._sent_frames.values() if now_us - one.at_us <= _PENDING_US]
+        for one in pending:
+            one.followed = True
+        self._sent_frames[seq] = _Sent(now_us, size_bytes, bool(pending), self._held_back)
+        self._held_back = False
+        if len(self._sent_frames) > _REMEMBERED:
+            self._sent_frames.popitem(last=False)
+        # A tenth of slack: a camera that ticks a hair faster than `max_fps` must not be asked one tick too late.
+        self._next_us = t_us + self._interval_us * 9 // 10
+        self._sent += 1
+        self._sent_us.append(now_us)
+        self._encoding.on_sent(size_bytes, now_us)
+
+    # --- answers -------------------------------------------------------------------------------------------------
+
+    def on_answer(self, who: Holder, seq: int, compute_us: int, now_us: int) -> bool:
+        """An answer to frame `seq` came. Returns whether it gave credit back: only its owner's answers do."""
+        if not self._owns(who, now_us):
+            return False
+        # Newest wins at the peer: whatever is older than the answered frame will never be answered.
+        passed = {old: self._sent_frames.pop(old) for old in tuple(self._sent_frames) if old <= seq}
+        if seq in passed:
+            self._overtaken += len(passed) - 1
+            self._measure(passed[seq], list(passed.values()), compute_us, now_us)
+        answered = [old for old in self._in_flight if old <= seq]
+        for old in answered:
+            del self._in_flight[old]
+        return bool(answered)
+
+    def on_holder(self, holder: Holder | None, now_us: int) -> None:
+        """The lease changed hands: credit goes to who drives."""
+        if holder is not None and holder != self._owner:
+            self._hand_over(holder)
+            self._owner_until_us = now_us + self._config.owner_life_ms * 1000
+            self._in_flight.clear()
+
+    def _owns(self, who: Holder, now_us: int) -> bool:
+        if who != self._owner and (self._owner is None or now_us >= self._owner_until_us):
+            self._hand_over(who)
+        if who != self._owner:
+            return False
+        self._owner_until_us = now_us + self._config.owner_life_ms * 1000
+        return True
+
+    def _hand_over(self, owner: Holder) -> None:
+        """A slow successor must not be held to a quick one's times, nor to what the way to that one carried."""
+        self._owner = owner
+        self._answer_us, self._spread_us, self._overdue = None, 0.0, 0
+        self._window = CongestionWindow(self._interval_us, self._config.max_window)
+
+    def _measure(self, sent: _Sent, passed: list[_Sent], compute_us: int, now_us: int) -> None:
+        answer_us = now_us - sent.at_us
+        delay_us = max(0, answer_us - compute_us)
+        if self._answer_us is None or answer_us <= self._usual_us():
+            self._overdue = self._overdue_at_us = 0
+        self._remember_answer(answer_us)
+        carrying_since_us = max(self._answered_at_us, passed[0].at_us)
+        carried = sum(one.size_bytes for one in passed)
+        self._answered_at_us = now_us
+        gap_us = now_us - carrying_since_us
+        answered = AckSample(
+            delay_us, sent.behind, sent.followed, sent.held_back, gap_us, len(passed), carried, compute_us
+        )
+        full = self._window.on_answer(answered, now_us)
+        if full is None:
+            self._encoding.on_delay(delay_us, now_us)
+        else:
+            self._encoding.on_full(full, now_us)
+
+    def _remember_answer(self, answer_us: int) -> None:
+        """Mean and spread, as RFC 6298 keeps them for the same purpose."""
+        if self._answer_us is None:
+            self._answer_us, self._spread_us = float(answer_us), answer_us / 8
+            return
+        self._spread_us = 0.75 * self._spread_us + 0.25 * abs(answer_us - self._answer_us)
+        self._answer_us = 0.875 * self._answer_us + 0.125 * answer_us
+
+    # --- timeouts ------------------------------------------------------------------------------------------------
+
+    def _timeout_us(self) -> int:
+        """Doubled each further time that nothing came back: what is late may be waiting behind what was sent."""
+        longest_us = self._config.max_credit_timeout_ms * 1000
+        return min(longest_us, round(self._usual_us() * (1 << min(max(0, self._overdue - 1), 8))))
+
+    def _usual_us(self) -> float:
+        """What takes longer is overdue."""
+        if self._answer_us is None:
+            return float(_FIRST_TIMEOUT_US)
+        patient_us = max(1.5 * self._answer_us, self._answer_us + 4 * self._spread_us)
+        return min(patient_us, 2 * self._answer_us) + _TIMEOUT_SLACK_US
+
+    def _sent_at_us(self, seq: int) -> int:
+        sent = self._sent_frames.get(seq)
+        return 0 if sent is None else sent.at_us
+
+    def _expire(self, now_us: int) -> None:
+        late = [seq for seq, expires_us in self._in_flight.items() if now_us >= expires_us]
+        for seq in late:
+            del self._in_flight[seq]
+            self._credit_timeouts += 1
+        if self._answer_us is not None and any(self._sent_at_us(seq) >= self._overdue_at_us for seq in late):
+            self._overdue += 1
+            self._overdue_at_us = now_us
+            self._may_probe = True
+            if self._overdue >= _OVERDUE_IN_A_ROW:
+                self._window.on_timeout(now_us)
+                self._encoding.on_overdue(now_us)
+
+    def status(self, now_us: int, dropped_commands: int = 0) -> StreamStatus:
+        """Counters and the rate over the last second."""
+        recent = sum(1 for sent_us in self._sent_us if now_us - sent_us <= 1_000_000)
+        return StreamStatus(
+            sent=self._sent,
+            credit_timeouts=self._credit_timeouts,
+            window=self.window,
+            fps=float(recent),
+            dropped_commands=dropped_commands,
+            overtaken=self._overtaken,
+            quality_percent=self.wish.quality_percent,
+            scale_percent=self.wish.scale_percent,
+        )

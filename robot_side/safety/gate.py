@@ -1,0 +1,316 @@
+"""The SafetyGate: the only road to the wheels. Pure.
+
+`offer` judges a command once, on arrival; `step` decides, each tick and with the age judged again, what the wheels do.
+Liveness is the accepted command: refused commands, acks and open connections refresh nothing.
+"""
+
+import math
+from collections import Counter
+
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import (
+    STILL,
+    AnswerHeader,
+    Holder,
+    LastRejection,
+    Request,
+    RequestHeader,
+    State,
+    Twist,
+    Verb,
+)
+from sightline.protocol.refusals import CLAMPED, RejectReason
+from sightline.robot_side.safety.guard import RangeGuard
+from sightline.robot_side.safety.validation import (
+    AcceptedCommand,
+    CommandResult,
+    Decision,
+    FreshnessRecord,
+    IssuedRecord,
+    SequenceRecord,
+)
+from sightline.robot_side.safety.lease import HUMANS, RANKS, Lease
+from sightline.robot_side.safety.limits import Ramp, SafetyConfig, age_factor, clamp_twist
+from sightline.robot_side.safety.states import Event, is_armed, next_state
+
+_GUEST = Holder(source="guest", session="00000000")
+_MAX_REQUEST_AGE_US = 2_000_000  # an `arm` that a link kept back must not arm when it is delivered at last
+_NEEDS_NO_ECHO = (Verb.STOP, Verb.DISARM, Verb.RELEASE)
+
+
+class SafetyGate:
+    """See the module. Times are the robot's monotonic clock and never go back; the caller steps it at 50 Hz."""
+
+    def __init__(
+        self, config: SafetyConfig, session: str, *, stopped: bool = False, guard: RangeGuard | None = None
+    ) -> None:
+        self.config = config
+        self.issued = IssuedRecord(session)
+        self.pictures = FreshnessRecord()
+        self.counters: Counter[str] = Counter()
+        self.accepted = 0
+        self.last_refusal: LastRejection | None = None
+        self.latency_us: int | None = None
+        self.state = State.STOPPED if stopped else State.DISARMED
+        self.reason = "STOP was set before the restart" if stopped else "not armed"
+        self.applied = STILL
+        self._sequence = SequenceRecord()
+        self._lease = Lease(config.lease_ms * 1000)
+        self._ramp = Ramp(config)
+        self._guard = guard
+        self._command: AcceptedCommand | None = None
+        self._live_commands = 0
+        self.arms_itself = config.auto_arm and not stopped
+        self._last_step_us: int | None = None
+        self._hold_since_us = 0
+
+    # --- commands ------------------------------------------------------------------------------------------------
+
+    def offer(self, source: str, header: AnswerHeader | None, twist: Twist, now_us: int) -> CommandResult:
+        """Judge one command on arrival. Never raises; every refusal is typed, counted and kept in words."""
+        try:
+            age_us = self._judge(source, header, twist, now_us)
+        except WireError as error:
+            return self.refuse(source, error)
+        self.accepted += 1
+        return CommandResult(None, age_us=age_us)
+
+    def refuse(self, source: str, error: WireError) -> CommandResult:
+        """Count a refusal; also for what the decoder refused before it could be offered."""
+        self.counters[error.reason] += 1
+        self.last_refusal = LastRejection(source=source[:32], reason=error.reason, detail=error.detail[:200])
+        return CommandResult(error.reason, error.detail)
+
+    def _judge(self, source: str, header: AnswerHeader | None, twist: Twist, now_us: int) -> int:
+        if not (math.isfinite(twist.linear_mps) and math.isfinite(twist.angular_rad_s)):
+            raise WireError(RejectReason.NOT_FINITE, "twist is not finite")
+        who, age_us = self._identify(source, header, now_us)
+        if self.state in (State.STOPPED, State.FAULT):
+            raise WireError(RejectReason(self.state), self.reason)
+        self._notice_lost_human(now_us)
+        holder = self._lease.live_holder(now_us)
+        if not self._lease.may_take(who, now_us):
+            raise WireError(RejectReason.NOT_HOLDER, f"{holder.source} {holder.session} drives" if holder else "")
+        self._live_commands = self._live_commands + 1 if holder == who else 1
+        self._lease.take(who, now_us)
+        if not is_armed(self.state):
+            raise WireError(RejectReason.DISARMED, self.reason)
+        self._keep(source, twist, now_us, age_us)
+        return age_us
+
+    def _identify(self, source: str, header: AnswerHeader | None, now_us: int) -> tuple[Holder, int]:
+        """Who sends, and how old the frame behind it is."""
+        if source not in RANKS or (header is not None and header.source != source):
+            raise WireError(RejectReason.UNKNOWN_SOURCE, f"no driver is called {source!r}, or key and header disagree")
+        if source == "guest" and not self.config.guests:
+            raise WireError(RejectReason.UNKNOWN_SOURCE, "guests are switched off (safety.guests)")
+        if header is None:
+            if source != "guest":
+                raise WireError(RejectReason.MALFORMED, f"a twist of {source} needs a header that cites a frame")
+            return _GUEST, 0
+        if header.echo.channel == "status":
+            raise WireError(RejectReason.UNKNOWN_FRAME, "a twist must cite a frame, not a status")
+        self.issued.age_us(header.echo, now_us, self.config.max_age_us)
+        age_us = now_us - self.pictures.shown_since_us(header.echo.t_us)
+        if age_us > self.config.max_age_us:
+            raise WireError(RejectReason.STALE, f"the camera's picture has not changed for {age_us / 1e3:.0f} ms")
+        self._sequence.check(header)
+        return Holder(source=header.source, session=header.session), age_us
+
+    def _keep(self, source: str, twist: Twist, now_us: int, age_us: int) -> None:
+        config, guest = self.config, source == "guest"
+        limited = clamp_twist(
+            twist,
+            min(config.max_linear_mps, config.guest_max_linear_mps) if guest else config.max_linear_mps,
+            min(config.max_angular_rad_s, config.guest_max_angular_rad_s) if guest else config.max_angular_rad_s,
+        )
+        if limited != twist:
+            self.counters[CLAMPED] += 1
+        life_ms = min(config.silence_ms, config.guest_life_ms) if guest else config.silence_ms
+        self._command = AcceptedCommand(limited, now_us - age_us, now_us, life_ms * 1000)
+        if not guest:
+            self.latency_us = age_us
+
+    # --- the wheels ----------------------------------------------------------------------------------------------
+
+    def step(self, now_us: int) -> Decision:
+        """Decide what the wheels do from now until the next step. Limits hold per elapsed time, not per call."""
+        self._notice_lost_human(now_us)
+        self._arm_by_itself(now_us)
+        goal = self._goal(now_us) if is_armed(self.state) else STILL
+        elapsed_us = 0 if self._last_step_us is None else max(0, now_us - self._last_step_us)
+        self._last_step_us = now_us
+        twist = self._ramp.step(goal, elapsed_us)
+        if self._guard is not None:
+            twist = self._guarded(self._guard, twist, now_us)
+        self.applied = twist
+        return Decision(twist, self.state, self.reason)
+
+    def _guarded(self, guard: RangeGuard, twist: Twist, now_us: int) -> Twist:
+        limited = guard.limit(twist, now_us)
+        if limited != twist:
+            self._ramp.force(limited)
+            if is_armed(self.state):
+                self.reason = "an obstacle is near" if guard.is_fresh(now_us) else "the range sensor is silent"
+        return limited
+
+    def _goal(self, now_us: int) -> Twist:
+        """The commanded twist under the limit that the frame's age leaves; zero, and HOLD, without a young one."""
+        if self.pictures.unchanged_us() > self.config.max_age_us:
+            return self._hold("the camera's picture does not change", now_us)
+        command = self._command
+        if command is None:
+            return self._hold("armed; no command yet", now_us)
+        silent_us, age_us = now_us - command.arrival_us, now_us - command.echo_us
+        if silent_us > command.life_us:
+            return self._hold(f"no accepted command for more than {command.life_us // 1000} ms", now_us)
+        factor = age_factor(self.config, age_us)
+        if factor == 0.0:
+            return self._hold(f"the frame behind the command is {self.config.zero_speed_age_ms} ms old", now_us)
+        if factor == 1.0:
+            self._go(Event.FRESH, "driving")
+        else:
+            self._go(Event.AGEING, "the frames are ageing; slower")
+        return clamp_twist(command.twist, factor * self.config.max_linear_mps, factor * self.config.max_angular_rad_s)
+
+    def _hold(self, reason: str, now_us: int) -> Twist:
+        if self.state is not State.HOLD:
+            self._hold_since_us = now_us
+        self._go(Event.OLD, reason)
+        if now_us - self._hold_since_us > self.config.disarm_after_hold_s * 1e6:
+            reason = f"disarmed after {self.config.disarm_after_hold_s:g} s without commands"
+            self._leave(Event.EXPIRED, reason)
+        return STILL
+
+    # --- what people ask -----------------------------------------------------------------------------------------
+
+    def request(self, header: RequestHeader, request: Request, now_us: int) -> str:
+        """Carry out a request and return what happened, in words. Raises WireError with the reason if it may not be."""
+        if request.verb not in _NEEDS_NO_ECHO:
+            self.issued.check_request(header.echo, now_us, _MAX_REQUEST_AGE_US)
+        self._notice_lost_human(now_us)
+        who = Holder(source=header.source, session=header.session)
+        if request.verb is Verb.STOP:
+            return self.stop(f"STOP by {who.source}")
+        if request.verb is Verb.DISARM:
+            return self.disarm(f"disarmed by {who.source}")
+        ask = {Verb.ARM: self.arm, Verb.RESET: self.reset, Verb.ACQUIRE: self.acquire, Verb.RELEASE: self.release}
+        return ask[request.verb](who, now_us)
+
+    def stop(self, reason: str = "STOP") -> str:
+        """Latch STOPPED: wheels to zero and held until `reset`. Always granted."""
+        self._end(Event.STOP, reason)
+        return "STOPPED"
+
+    def fault(self, reason: str) -> None:
+        """The drive failed: wheels to zero until `reset`."""
+        if next_state(self.state, Event.FAULT) is not self.state:  # once: one that lasts does not stand against a reset
+            self._end(Event.FAULT, reason)
+
+    def halt(self, reason: str) -> None:
+        """As `fault`, and without a ramp: the caller, who could not step this, has told the wheels zero."""
+        self.fault(reason)
+        self._ramp.force(STILL)
+        self.applied = STILL
+
+    def disarm(self, reason: str = "disarmed") -> str:
+        """Wheels to zero; commands are judged but not obeyed. Always granted."""
+        self._end(Event.DISARM, reason)
+        return "disarmed"
+
+    def reset(self, who: Holder, now_us: int) -> str:
+        """Leave STOPPED or FAULT for DISARMED: permits motion, never starts it."""
+        self._refuse_beside_human(who, now_us)
+        if self.state not in (State.STOPPED, State.FAULT):
+            return f"nothing to reset: {self.state}"
+        if self.applied != STILL:
+            raise WireError(RejectReason.NOT_ALLOWED, "the wheels are not at zero yet; ask again")
+        self._leave(Event.RESET, f"reset by {who.source}; not armed")
+        return "reset; arm to drive"
+
+    def arm(self, who: Holder, now_us: int) -> str:
+        """Let the lease holder drive, once its commands are live and the wheels at zero."""
+        self._refuse_beside_human(who, now_us)
+        if is_armed(self.state):
+            return "already armed"
+        if self.state is not State.DISARMED:
+            raise WireError(RejectReason(self.state), f"{self.reason}; reset first")
+        missing = self._missing_to_arm(now_us)
+        if missing:
+            raise WireError(RejectReason.NOT_ALLOWED, missing)
+        self.arms_itself = self.config.auto_arm
+        self._begin(f"armed by {who.source}", now_us)
+        return "armed"
+
+    def acquire(self, who: Holder, now_us: int) -> str:
+        """Take the lease ahead of the first command. It is not renewed so: only commands do that."""
+        if who.source not in RANKS or not self._lease.may_take(who, now_us):
+            holder = self._lease.live_holder(now_us)
+            raise WireError(RejectReason.NOT_HOLDER, f"{holder.source if holder else 'nobody'} drives")
+        if self._lease.live_holder(now_us) == who:
+            return "already held"
+        self._live_commands, self._command = 0, None  # the driver before neither arms nor drives for this one
+        self._lease.take(who, now_us)
+        return "acquired"
+
+    def release(self, who: Holder, now_us: int) -> str:
+        """Give the lease back. A human who lets go stops the robot; it must be armed again."""
+        if self._lease.live_holder(now_us) != who:
+            return "not held"
+        self._lease.drop()
+        self._command = None
+        if who.source in HUMANS:
+            self._end(Event.HUMAN_LOST, "the person driving let go; arm again")
+        return "released"
+
+    def holder(self, now_us: int) -> Holder | None:
+        """The driver of the moment."""
+        return self._lease.live_holder(now_us)
+
+    def frame_age_us(self, now_us: int) -> int | None:
+        """Age of the frame behind the command in force; None without one."""
+        return None if self._command is None else max(0, now_us - self._command.echo_us)
+
+    def _refuse_beside_human(self, who: Holder, now_us: int) -> None:
+        holder = self._lease.live_holder(now_us)
+        if holder is not None and holder.source in HUMANS and holder != who:
+            raise WireError(RejectReason.NOT_ALLOWED, f"{holder.source} {holder.session} drives")
+
+    def _missing_to_arm(self, now_us: int) -> str:
+        """What still stands against arming, "" if nothing."""
+        needed = self.config.live_commands_to_arm
+        if self._lease.live_holder(now_us) is None:
+            return "nobody sends valid commands yet; is vision running?"
+        if self._live_commands < needed:
+            return f"{self._live_commands} of {needed} live commands seen; ask again"
+        return "" if self.applied == STILL else "the wheels are not at zero yet; ask again"
+
+    def _notice_lost_human(self, now_us: int) -> None:
+        """Before anybody else may take the lease: a tick later a successor's command would have hidden the loss."""
+        if self._lease.lost_human(now_us):
+            self._lease.drop()
+            self._end(Event.HUMAN_LOST, "the person driving was lost; arm again")
+
+    def _arm_by_itself(self, now_us: int) -> None:
+        if self.arms_itself and self.state is State.DISARMED and not self._missing_to_arm(now_us):
+            self._begin("armed by itself (auto_arm)", now_us)
+
+    def _begin(self, reason: str, now_us: int) -> None:
+        self._command, self._hold_since_us = None, now_us
+        self._go(Event.ARM, reason)
+
+    def _end(self, event: Event, reason: str) -> None:
+        """As `_leave`; and, armed or not, neither a request from before nor auto_arm takes it up again."""
+        self._leave(event, reason)
+        self.issued.deny_earlier()
+        self.arms_itself = False
+
+    def _leave(self, event: Event, reason: str) -> None:
+        """Go where the wheels are off; auto_arm, where it is on, may take it up again."""
+        if next_state(self.state, event) is not self.state:
+            self._command, self._live_commands = None, 0
+            self._go(event, reason)
+
+    def _go(self, event: Event, reason: str) -> None:
+        self.state = next_state(self.state, event)
+        self.reason = reason

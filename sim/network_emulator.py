@@ -1,0 +1,179 @@
+"""A bad network, one direction at a time: delay, jitter, loss, bursts, rate, copies, reorder, corrupt, cut. Pure.
+
+Packets in and out in the time it is told, chance from a seed. `sim/tun_emulator.py` carries real packets through it.
+"""
+
+import heapq
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from random import Random
+from typing import Annotated, Final
+
+from pydantic import Field
+
+from sightline.protocol.config import Config
+
+IP_HEADER_BYTES: Final = 20
+MAX_WAITING: Final = 400
+"""Packets under way on one leg; more are dropped and counted, as a radio's queue does."""
+
+Chance = Annotated[float, Field(ge=0, le=1)]
+Milliseconds = Annotated[float, Field(ge=0, le=60_000)]
+
+
+class LinkShape(Config):
+    """What one direction does to packets. The default is a perfect wire."""
+
+    delay_ms: Milliseconds = 0
+    jitter_ms: Milliseconds = 0
+    """Uniform, either way; order is kept."""
+    loss: Chance = 0
+    burst_start: Chance = 0
+    """Chance per packet that a burst begins, in which everything is lost ..."""
+    burst_end: Chance = 1
+    """... and that it ends again."""
+    rate_bit_s: Annotated[float, Field(ge=0, le=1e10)] = 0
+    """0: unlimited."""
+    queue_packets: Annotated[int, Field(ge=1, le=MAX_WAITING)] = 200
+    duplicate: Chance = 0
+    reorder: Chance = 0
+    """Chance that a packet overtakes all that wait: it skips delay and queue."""
+    corrupt: Chance = 0
+    """Chance that one bit after the IP header flips."""
+    cut: bool = False
+    """Nothing passes, and what was under way is lost."""
+
+
+class LinkShapes(Config):
+    """Both directions: from A to B and back. `half_duplex`: one medium, on which both spend their time."""
+
+    ab: LinkShape = LinkShape()
+    ba: LinkShape = LinkShape()
+    half_duplex: bool = False
+    seed: Annotated[int, Field(ge=0)] | None = None
+    """From now on chance is drawn from this seed."""
+
+
+@dataclass(slots=True)
+class Counts:
+    """What one direction did so far."""
+
+    taken: int = 0
+    delivered: int = 0
+    delivered_bytes: int = 0
+    delayed: int = 0
+    lost: int = 0
+    cut: int = 0
+    overflow: int = 0
+    duplicated: int = 0
+    reordered: int = 0
+    corrupted: int = 0
+
+
+@dataclass(slots=True)
+class Medium:
+    """What packets are sent on, one after the other; legs that share it are half duplex."""
+
+    free_us: float = 0.0
+
+
+class Leg:
+    """One direction. The caller puts packets in and takes out what is due; times never go back."""
+
+    def __init__(self, seed: str) -> None:
+        self.shape = LinkShape()
+        self.medium = Medium()
+        self.counts = Counts()
+        self.random = Random(seed)
+        self._waiting: list[tuple[float, int, bytes]] = []
+        self._order = 0
+        self._last_us = 0.0
+        self._in_burst = False
+
+    def put(self, packet: bytes, now_us: int) -> None:
+        """A packet enters; whether and when it comes out is drawn now."""
+        self.counts.taken += 1
+        if self.shape.cut:
+            self.counts.cut += 1
+        elif self._is_lost():
+            self.counts.lost += 1
+        elif len(self._waiting) >= self.shape.queue_packets:
+            self.counts.overflow += 1
+        else:
+            self._accept(packet, now_us)
+
+    def _is_lost(self) -> bool:
+        shape, draw = self.shape, self.random.random
+        chance = shape.burst_end if self._in_burst else shape.burst_start
+        if chance and draw() < chance:
+            self._in_burst = not self._in_burst
+        return self._in_burst or draw() < shape.loss
+
+    def _accept(self, packet: bytes, now_us: int) -> None:
+        shape, draw = self.shape, self.random.random
+        due_us = self._due_us(len(packet), now_us)
+        if draw() < shape.corrupt and len(packet) > IP_HEADER_BYTES:
+            packet = _flipped(packet, self.random)
+            self.counts.corrupted += 1
+        self._wait(packet, due_us)
+        if draw() < shape.duplicate:
+            self.counts.duplicated += 1
+            self._wait(packet, due_us)
+
+    def _due_us(self, size_bytes: int, now_us: int) -> float:
+        shape = self.shape
+        if self.random.random() < shape.reorder:
+            self.counts.reordered += bool(self._waiting)
+            return now_us
+        sent_us = float(now_us)
+        if shape.rate_bit_s:
+            sent_us = self.medium.free_us = max(sent_us, self.medium.free_us) + size_bytes * 8e6 / shape.rate_bit_s
+        jitter_ms = self.random.uniform(-shape.jitter_ms, shape.jitter_ms)
+        self._last_us = max(self._last_us, sent_us + max(0.0, shape.delay_ms + jitter_ms) * 1000)
+        self.counts.delayed += self._last_us > now_us
+        return self._last_us
+
+    def _wait(self, packet: bytes, due_us: float) -> None:
+        self._order += 1
+        heapq.heappush(self._waiting, (due_us, self._order, packet))
+
+    def take_due(self, now_us: int) -> Iterator[bytes]:
+        """What comes out by now, in order; on a cut wire it is lost instead."""
+        while self._waiting and self._waiting[0][0] <= now_us:
+            packet = heapq.heappop(self._waiting)[2]
+            if self.shape.cut:
+                self.counts.cut += 1
+            else:
+                self.counts.delivered += 1
+                self.counts.delivered_bytes += len(packet)
+                yield packet
+
+    @property
+    def next_us(self) -> float | None:
+        """When the next packet is due; None when none waits."""
+        return self._waiting[0][0] if self._waiting else None
+
+
+def _flipped(packet: bytes, random: Random) -> bytes:
+    changed = bytearray(packet)
+    changed[random.randrange(IP_HEADER_BYTES, len(changed))] ^= 1 << random.randrange(8)
+    return bytes(changed)
+
+
+class EmulatedLink:
+    """Two legs and one medium, or two."""
+
+    def __init__(self, seed: int = 1) -> None:
+        self.ab, self.ba = Leg(f"{seed} ab"), Leg(f"{seed} ba")
+
+    def shape(self, shapes: LinkShapes) -> None:
+        """From now on packets fare so."""
+        self.ab.shape, self.ba.shape = shapes.ab, shapes.ba
+        if shapes.seed is not None:
+            self.ab.random, self.ba.random = Random(f"{shapes.seed} ab"), Random(f"{shapes.seed} ba")
+        if shapes.half_duplex != (self.ab.medium is self.ba.medium):
+            self.ba.medium = self.ab.medium if shapes.half_duplex else Medium()
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Of each direction, since the start."""
+        return {"ab": asdict(self.ab.counts), "ba": asdict(self.ba.counts)}

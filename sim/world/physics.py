@@ -1,0 +1,164 @@
+"""One PyBullet client and the bodies in it. Shell (PyBullet); reads no clock, draws no numbers.
+
+Traps that this file steps round: wheels must be implicit cylinders (faceted ones err by percents); the caster must
+have no friction; a body's position is that of its inertial frame; a body without a visual shape is drawn all the same.
+"""
+
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from sightline.protocol.errors import ConfigError
+from sightline.sim.body import UrdfBody, urdf_body
+from sightline.sim.world.engine import pybullet
+from sightline.sim.frames import Transform
+from sightline.sim.path import Place
+from sightline.sim.robot import RobotModel
+from sightline.sim.scenario import Wall
+
+FLOOR, ROBOT, TARGET, WALL = 1, 2, 4, 8
+"""Collision groups; rays choose by them what they may hit."""
+GRAVITY_MPS2 = 9.81
+
+Vector = tuple[float, float, float]
+
+
+def open_client(step_us: int) -> int:
+    """A new empty world; returns PyBullet's client number."""
+    client = int(pybullet.connect(pybullet.DIRECT))
+    pybullet.setGravity(0, 0, -GRAVITY_MPS2, physicsClientId=client)
+    pybullet.setPhysicsEngineParameter(
+        fixedTimeStep=step_us / 1e6, numSubSteps=0, deterministicOverlappingPairs=1, enableFileCaching=0,
+        physicsClientId=client,
+    )
+    return client
+
+
+def _unseen(client: int) -> int:
+    """A shape that costs the renderer nothing; a body without any is drawn in its collision shape."""
+    speck = [0.001, 0.001, 0.001]
+    return int(pybullet.createVisualShape(
+        pybullet.GEOM_BOX, halfExtents=speck, rgbaColor=[0, 0, 0, 0], physicsClientId=client
+    ))
+
+
+def add_floor(client: int) -> int:
+    """An endless floor, unseen: the camera paints its own (TinyRenderer's costs 8 ms a picture)."""
+    shape = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
+    floor = int(pybullet.createMultiBody(0, shape, _unseen(client), physicsClientId=client))
+    pybullet.changeDynamics(floor, -1, lateralFriction=1.0, restitution=0.0, physicsClientId=client)
+    group(client, floor, FLOOR, ROBOT | TARGET)
+    return floor
+
+
+def add_wall(client: int, wall: Wall) -> int:
+    """A slab between the wall's two points, unseen as the floor is."""
+    (x0, y0), (x1, y1) = wall.start_m, wall.end_m
+    half = [math.hypot(x1 - x0, y1 - y0) / 2, wall.thickness_m / 2, wall.height_m / 2]
+    turn = pybullet.getQuaternionFromEuler([0, 0, math.atan2(y1 - y0, x1 - x0)])
+    shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
+    middle = [(x0 + x1) / 2, (y0 + y1) / 2, half[2]]
+    body = int(pybullet.createMultiBody(0, shape, _unseen(client), middle, turn, physicsClientId=client))
+    # FLOOR too, though the two never meet: PyBullet gives every ray group 1, and a body must admit that to be hit.
+    group(client, body, WALL, FLOOR | ROBOT | TARGET)
+    return body
+
+
+def add_robot(client: int, robot: RobotModel, at: Place) -> "RobotBody":
+    """The robot with its axle's midpoint at `at`, motors off. Raises ConfigError for a URDF that PyBullet refuses."""
+    body = urdf_body(robot)
+    loaded = _load(client, robot, body, at)
+    moving = {
+        str(pybullet.getJointInfo(loaded, joint, physicsClientId=client)[1], "utf-8"): joint
+        for joint in range(pybullet.getNumJoints(loaded, physicsClientId=client))
+    }
+    wheels = [moving[name] for name in body.joints]
+    for link in (-1, *moving.values()):
+        friction = robot.wheels.friction if link in wheels else 0.0
+        pybullet.changeDynamics(
+            loaded, link, lateralFriction=friction, spinningFriction=0, rollingFriction=0, restitution=0,
+            linearDamping=0, angularDamping=0, jointDamping=0, physicsClientId=client,
+        )
+    if robot.urdf:
+        _loosen(client, loaded, [joint for joint in moving.values() if joint not in wheels])
+    group(client, loaded, ROBOT, FLOOR | TARGET | WALL)
+    return RobotBody(client, loaded, wheels, body, robot.wheels.max_torque_nm)
+
+
+def _load(client: int, robot: RobotModel, body: UrdfBody, at: Place) -> int:
+    """PyBullet reads files only."""
+    place, turn = (at.x_m, at.y_m, 0.0), pybullet.getQuaternionFromEuler([0, 0, at.heading_rad])
+    if body.foot is not None:
+        place, turn = pybullet.multiplyTransforms(place, turn, *_as_bullet(body.foot.inverse()))
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf", delete=False) as file:
+        file.write(body.text)
+    try:
+        return int(pybullet.loadURDF(
+            file.name, place, turn,
+            flags=pybullet.URDF_USE_IMPLICIT_CYLINDER | pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client,
+        ))
+    except pybullet.error:
+        raise ConfigError(f"{robot.urdf}: PyBullet cannot load it; check its links with `check_urdf`") from None
+    finally:
+        Path(file.name).unlink()
+
+
+def _loosen(client: int, body: int, joints: list[int]) -> None:
+    """A user's casters and levers: PyBullet brakes every joint until it is told not to. And none of it is drawn."""
+    for joint in joints:
+        pybullet.setJointMotorControl2(body, joint, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=client)
+    for link in range(-1, pybullet.getNumJoints(body, physicsClientId=client)):
+        pybullet.changeVisualShape(body, link, rgbaColor=[0, 0, 0, 0], physicsClientId=client)
+
+
+def _as_bullet(frame: Transform) -> tuple[Vector, tuple[float, float, float, float]]:
+    """A level frame as position and quaternion."""
+    return frame.at, pybullet.getQuaternionFromEuler([0, 0, frame.yaw_rad])
+
+
+def group(client: int, body: int, own: int, meets: int) -> None:
+    """Put a body, all its links, into a collision group."""
+    links = pybullet.getNumJoints(body, physicsClientId=client)
+    for link in range(-1, links):
+        pybullet.setCollisionFilterGroupMask(body, link, own, meets, physicsClientId=client)
+
+
+class RobotBody:
+    """The robot's pose, speed and wheels in one client."""
+
+    def __init__(self, client: int, body: int, wheels: list[int], drawn: UrdfBody, max_torque_nm: float) -> None:
+        self.body = body
+        self._client = client
+        self._wheels, self._signs = wheels, drawn.signs
+        self._torques = [max_torque_nm, max_torque_nm]
+        self._driven: tuple[float, float] | None = None
+        info = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)
+        self._from_mass = pybullet.invertTransform(info[3], info[4])
+        if drawn.foot is not None:
+            self._from_mass = pybullet.multiplyTransforms(*self._from_mass, *_as_bullet(drawn.foot))
+
+    def drive(self, left_rad_s: float, right_rad_s: float) -> None:
+        """Let the wheels' motors strive for these speeds."""
+        if self._driven == (left_rad_s, right_rad_s):
+            return
+        self._driven = (left_rad_s, right_rad_s)
+        speeds = [speed * sign for speed, sign in zip(self._driven, self._signs, strict=True)]
+        pybullet.setJointMotorControlArray(
+            self.body, self._wheels, pybullet.VELOCITY_CONTROL, targetVelocities=speeds, forces=self._torques,
+            physicsClientId=self._client,
+        )
+
+    def wheel_angles(self) -> tuple[float, float]:
+        """How far each wheel has rolled, rad."""
+        left, right = pybullet.getJointStates(self.body, self._wheels, physicsClientId=self._client)
+        return float(left[0]) * self._signs[0], float(right[0]) * self._signs[1]
+
+    def pose(self) -> tuple[Vector, Any]:
+        """Axle midpoint on the floor and orientation (quaternion x, y, z, w)."""
+        place, turn = pybullet.getBasePositionAndOrientation(self.body, physicsClientId=self._client)
+        return pybullet.multiplyTransforms(place, turn, *self._from_mass)  # type: ignore[no-any-return]
+
+    def velocity(self) -> tuple[Vector, Vector]:
+        """(linear m/s, angular rad/s) in the world's frame."""
+        return pybullet.getBaseVelocity(self.body, physicsClientId=self._client)  # type: ignore[no-any-return]

@@ -1,0 +1,213 @@
+"""The simulated world: robot, target, whatever else there is, one clock. Shell (PyBullet); reads no clock of its own.
+
+Bit for bit the same for the same scenario, robot, seed and calls. Lockstep steps it; the real-time service steps it
+against deadlines.
+"""
+
+import math
+from types import TracebackType
+from typing import Any, Self
+
+from sightline.robot_side.ports import Ranges, WheelAngles
+from sightline.sim.body import outline
+from sightline.sim.camera import Defects, SceneCamera
+from sightline.sim.world.engine import pybullet
+from sightline.sim.label_bus import Label
+from sightline.sim.labels import leg_labels
+from sightline.sim.world.sensors import Lidar
+from sightline.sim.light_bodies import LightBodies
+from sightline.sim.motors import Motor
+from sightline.sim.path import Place
+from sightline.sim.world.physics import WALL, Vector, add_floor, add_robot, add_wall, open_client
+from sightline.sim.robot import RobotModel
+from sightline.sim.scenario import Scenario
+from sightline.sim.world.start import light_begin, robot_start
+from sightline.sim.target import Mover, begin, begin_thing
+from sightline.sim.world.bodies import ThingBodies
+from sightline.sim.truth import Truth
+
+STEP_US = 4000
+"""250 Hz: every time in the world is a whole number of these."""
+STANDING_MPS = 0.01  # a robot slower than this touches nothing by its own doing
+CLEARANCE_SEEN_M = 1.0
+"""Further away nothing counts as near."""
+
+
+class World:
+    """One run of a scenario."""
+
+    def __init__(self, scenario: Scenario, robot: RobotModel, seed: int) -> None:
+        self.scenario, self.robot, self.seed = scenario, robot, seed
+        self.walls = scenario.walls
+        self.camera_model = robot.camera.camera_model()
+        self.now_us = 0
+        self._client = client = open_client(STEP_US)
+        self._obstacles: list[int] = []
+        self._movers: list[tuple[Mover, ThingBodies]] = []
+        self._add_things()
+        self._light = LightBodies(client, scenario.light, light_begin(scenario.light, seed)) if scenario.light else None
+        self._obstacles += self._light.bodies if self._light else ()
+        self._front_m = outline(robot).front_m
+        self._motors = [Motor(robot.wheels, STEP_US / 1e6, f"{seed} {side}") for side in ("left", "right")]
+        self._scene = SceneCamera(client, self.camera_model, scenario.walls, seed)
+        self._defects = Defects(scenario.look, robot.camera.width_px, robot.camera.height_px, seed)
+        self._lidar = Lidar(client, robot.lidar, seed)
+        self._target_velocity: Vector = (0.0, 0.0, 0.0)
+        self._wall_contacts = self._target_contacts = self._target_contacts_by_robot = 0
+
+    def _add_things(self) -> None:
+        """Floor, walls, target, robot, then the rest."""
+        client, scenario, robot = self._client, self.scenario, self.robot
+        self._floor = add_floor(client)
+        self._obstacles += [add_wall(client, wall) for wall in scenario.walls]
+        mover, target_at, way_m = begin(client, scenario.target, self.seed)
+        self._target = ThingBodies(client, scenario.target, target_at, way_m, is_target=True)
+        self._target_at = self._target.middle
+        self._movers.append((mover, self._target))
+        at = robot_start(scenario.start, target_at, robot.camera.x_m, self.seed)
+        self._body = add_robot(client, robot, at)
+        for number, thing in enumerate(scenario.things, start=1):
+            self._add_thing(*begin_thing(thing, number, self.seed), number - 1)
+
+    def _add_thing(self, mover: Mover, at: Place, way_m: float, index: int) -> None:
+        bodies = ThingBodies(self._client, self.scenario.things[index], at, way_m, is_target=False)
+        self._movers.append((mover, bodies))
+        self._obstacles += bodies.bodies
+
+    def set_wheels(self, left_rad_s: float, right_rad_s: float) -> None:
+        """Give wheel speeds, forward positive; they hold until others are given. Raises ValueError unless finite."""
+        self._motors[0].set(left_rad_s)
+        self._motors[1].set(right_rad_s)
+
+    def step(self) -> None:
+        """Advance by `STEP_US`."""
+        for mover, bodies in self._movers:
+            mover.move(bodies, self.now_us + STEP_US)
+        if self._light:
+            self._light.move(self.now_us + STEP_US)
+        self._body.drive(self._motors[0].step(), self._motors[1].step())
+        pybullet.stepSimulation(physicsClientId=self._client)
+        self.now_us += STEP_US
+        for motor, angle_rad in zip(self._motors, self._body.wheel_angles(), strict=True):
+            motor.rolled(angle_rad)
+        self._follow_target()
+        self._count_contacts()
+
+    def _follow_target(self) -> None:
+        before, self._target_at = self._target_at, self._target.middle
+        rate = 1e6 / STEP_US
+        x, y, z = ((now - then) * rate for now, then in zip(self._target_at, before, strict=True))
+        self._target_velocity = (x, y, z)
+
+    def _count_contacts(self) -> None:
+        touched = {
+            point[2]
+            for point in pybullet.getContactPoints(self._body.body, physicsClientId=self._client)
+            if point[8] <= 0
+        } - {self._floor, self._body.body}
+        target = touched.intersection(self._target.bodies)
+        self._wall_contacts += bool(touched - target)
+        if target:
+            self._target_contacts += 1
+            self._target_contacts_by_robot += self._is_robots_doing()
+
+    def _is_robots_doing(self) -> bool:
+        """Whether the robot moves towards the target faster than the target towards the robot."""
+        (x_m, y_m, _), _ = self._body.pose()
+        ahead_x_m, ahead_y_m = self._target_at[0] - x_m, self._target_at[1] - y_m
+        gap_m = math.hypot(ahead_x_m, ahead_y_m)
+        mine, _ = self._body.velocity()
+        other = self._target_velocity
+        mine_mps = (mine[0] * ahead_x_m + mine[1] * ahead_y_m) / gap_m
+        other_mps = -(other[0] * ahead_x_m + other[1] * ahead_y_m) / gap_m
+        return mine_mps > max(other_mps, STANDING_MPS)
+
+    def wheel_angles(self) -> WheelAngles:
+        """What the encoders count."""
+        return WheelAngles(self._motors[0].angle_rad, self._motors[1].angle_rad, self.now_us)
+
+    def wheels_turned(self) -> tuple[float, float]:
+        """How far each wheel has rolled over the floor, rad; not quantised, for logs."""
+        return self._body.wheel_angles()
+
+    def scan(self) -> Ranges:
+        """What the lidar sees now."""
+        lidar = self.robot.lidar
+        place, turn = self._mounted(lidar.x_m, lidar.z_m)
+        return self._lidar.scan(place, _yaw(turn), self.now_us)
+
+    def render(self, quality_percent: int = 100, scale_percent: int = 100) -> bytes:
+        """What the camera sees now, as JPEG; shares of the look's quality and of the side lengths."""
+        camera = self.robot.camera
+        picture = self._scene.draw(*self._mounted(camera.x_m, camera.z_m))
+        return self._defects.jpeg(picture, quality_percent, scale_percent)
+
+    def labels(self) -> tuple[Label, ...]:
+        """What the simulation labels in a picture drawn now, if the scenario wants it labelled."""
+        people = [bodies for _, bodies in self._movers if bodies.thing.shape == self.scenario.labels]
+        camera = self.robot.camera
+        return leg_labels(self._client, people, self.camera_model, *self._mounted(camera.x_m, camera.z_m))
+
+    def _mounted(self, x_m: float, z_m: float) -> tuple[Vector, Any]:
+        """Position and orientation of something mounted on the robot."""
+        return pybullet.multiplyTransforms(*self._body.pose(), (x_m, 0, z_m), (0, 0, 0, 1))  # type: ignore[no-any-return]
+
+    def truth(self) -> Truth:
+        """What is really so now."""
+        place, turn = self._body.pose()
+        yaw_rad = _yaw(turn)
+        linear, angular = self._body.velocity()
+        lens, _ = self._mounted(self.robot.camera.x_m, self.robot.camera.z_m)
+        x_m, y_m = self._target_at[0] - lens[0], self._target_at[1] - lens[1]
+        bearing_rad = math.remainder(math.atan2(y_m, x_m) - yaw_rad, math.tau)
+        return Truth(
+            t_us=self.now_us, x_m=place[0], y_m=place[1], yaw_rad=yaw_rad,
+            linear_mps=linear[0] * math.cos(yaw_rad) + linear[1] * math.sin(yaw_rad), angular_rad_s=angular[2],
+            target_x_m=self._target_at[0], target_y_m=self._target_at[1], target_z_m=self._target_at[2],
+            bearing_rad=bearing_rad, distance_m=math.hypot(x_m, y_m), visible=self._sees(lens, bearing_rad),
+            wall_contacts=self._wall_contacts, target_contacts=self._target_contacts,
+            target_contacts_by_robot=self._target_contacts_by_robot,
+            clearance_m=self._clearance_m() if self.scenario.goals_m else None,
+            light=self._light.state if self._light else "",
+            past_line_m=self._past_line_m(place, yaw_rad),
+        )
+
+    def _clearance_m(self) -> float:
+        """From the robot's body to the nearest thing that is in its way; no more than `CLEARANCE_SEEN_M`."""
+        nearest_m = CLEARANCE_SEEN_M
+        for obstacle in self._obstacles:
+            for point in pybullet.getClosestPoints(
+                self._body.body, obstacle, nearest_m, physicsClientId=self._client
+            ):
+                nearest_m = min(nearest_m, point[8])
+        return nearest_m
+
+    def _past_line_m(self, place: Vector, yaw_rad: float) -> float | None:
+        """How far the robot's front is beyond the light's stop line."""
+        if self.scenario.light is None:
+            return None
+        front = (place[0] + self._front_m * math.cos(yaw_rad), place[1] + self._front_m * math.sin(yaw_rad))
+        return self.scenario.light.past_line_m(*front)
+
+    def _sees(self, lens: Vector, bearing_rad: float) -> bool:
+        if abs(bearing_rad) > math.radians(self.robot.camera.hfov_deg) / 2:
+            return False
+        hit = pybullet.rayTest(lens, self._target_at, collisionFilterMask=WALL, physicsClientId=self._client)[0]
+        return bool(hit[0] < 0)
+
+    def close(self) -> None:
+        """Free PyBullet's memory; idempotent."""
+        if pybullet.isConnected(self._client):
+            pybullet.disconnect(self._client)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _yaw(turn: Any) -> float:
+    return float(pybullet.getEulerFromQuaternion(turn)[2])

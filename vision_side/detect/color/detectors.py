@@ -1,0 +1,59 @@
+"""Detectors of one decoded picture, behind the port: who made the result, and how long it took. Shell (a clock)."""
+
+from collections.abc import Sequence
+from typing import Final
+
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.messages import MAX_DETECTED_BOXES
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.adaptive import AdaptiveConfig, AdaptiveTracker
+from sightline.vision_side.detect.per_robot import PerSession
+from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.labels import Label
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
+from sightline.vision_side.detect.timing import timed
+
+_CPU: Final = "cpu"
+
+
+class Hsv:
+    """The colour detector; it remembers nothing from frame to frame."""
+
+    class Config(Settings):
+        """The section `hsv` of vision's configuration, and what its detections are called."""
+
+        hsv: HsvConfig = HsvConfig()
+        label: Label = "target"
+
+    maker = Maker("hsv", device=_CPU)
+
+    def __init__(self, config: Config) -> None:
+        self._eye = HsvDetector(config.hsv, config.label)
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
+        """A result for each; it takes well under a millisecond, whatever the deadline."""
+        return [timed(frame, self.maker, self._largest) for frame in frames]
+
+    def _largest(self, picture: Picture) -> tuple[Detection, ...]:
+        return self._eye.detect(picture)[:MAX_DETECTED_BOXES]
+
+
+class Adaptive:
+    """The colour detector that learns the target's colour as it goes, one memory for each robot."""
+
+    Config = AdaptiveConfig
+    maker = Maker("adaptive", device=_CPU)
+
+    def __init__(self, config: AdaptiveConfig) -> None:
+        self._eyes = PerSession(lambda: AdaptiveTracker(config))
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
+        """A result for each; one takes two or three times as long as by plain colour, whatever the deadline."""
+        return [self._look(frame) for frame in frames]
+
+    def _look(self, frame: DetectFrame) -> DetectionResult | None:
+        eye, t_us = self._eyes.of(frame.robot, frame.header.session), frame.header.t_us
+        return timed(frame, self.maker, lambda picture: eye.detect(picture, t_us))
+
+

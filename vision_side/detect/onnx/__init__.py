@@ -1,0 +1,1 @@
+"""Modules of vision_side.detect.onnx."""

@@ -1,0 +1,212 @@
+"""The detector `onnx:PATH`: any model that gives boxes, on the CPU or a GPU of this machine. Shell (files, a clock).
+
+Without a path it is the model that comes with Sightline. Before the first frame it has run warm, and shown on a known
+picture that it gives here what it should.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import numpy as np
+from pydantic import Field
+
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.vision_side.config import Device
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
+from sightline.vision_side.detect.onnx_engine import Engine, open_engine
+from sightline.vision_side.detect.onnx.engine import OnnxHeader, read_onnx_header
+from sightline.vision_side.detect.onnx.tensors import (
+    ModelFormat,
+    fit_picture,
+    model_format,
+    own_labels,
+    read_outputs,
+    split_batch,
+)
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
+from sightline.vision_side.detect.color.refine import refined
+from sightline.vision_side.detect.timing import timed_together
+
+SHIPPED: Final = Path(__file__).parent.parent.parent / "models" / "sightline.onnx"
+HASH_DIGITS: Final = 16
+MAX_BYTES: Final = 2**31
+"""A protocol buffer can be no larger."""
+_WARM_UP: Final = 3
+_OTHERWISE: Final = 0.25  # the least score that counts, for a model that does not say
+_NAME_LENGTH: Final = 48
+_MOST_AT_ONCE: Final = 32
+"""Pictures in one run: bounds a GPU's memory."""
+
+
+class OnnxDetector:
+    """One model."""
+
+    class Config(Settings):
+        """What to run, on what, and what of its answers counts."""
+
+        address: str = ""
+        """The file; empty for the model that comes with Sightline."""
+        device: Device = "auto"
+        threads: Annotated[int, Field(ge=1, le=64)] = 1
+        """Of the CPU. A small picture only loses by being split."""
+        min_score: Annotated[float | None, Field(ge=0, le=1)] = None
+        """None: what the model's metadata say as `min_score`, or else 0.25."""
+        names: Annotated[tuple[str, ...], Field(max_length=1000)] = ()
+        """The labels, in order; empty for those of the model's metadata."""
+        colour: Literal["auto", "bgr", "rgb"] = "auto"
+        """The order of an input's channels; `auto`: bytes are BGR, floats RGB."""
+        refine: Annotated[tuple[str, ...], Field(max_length=64)] = ("ball",)
+        """Things with these labels are round: their edge is looked for in the picture."""
+
+    def __init__(self, config: Config) -> None:
+        """Raises ConfigError for a file that is no such model, HardwareError for a device that is not there."""
+        model = read_onnx_model(config)
+        path, self._form, self._min_score = model.path, model.form, model.min_score
+        self.labels = model.form.labels
+        """All that it can call a thing; empty where the model has only numbers."""
+        self._refine = frozenset(config.refine)
+        self._engine = open_engine(path, model.header, config.device, config.threads)
+        self._news = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
+        self.maker = Maker(f"onnx:{path.name}"[:_NAME_LENGTH], model.digest, self._engine.device)
+        self._failed = False
+        self._at_once = _MOST_AT_ONCE if self._form.batched and self._engine.batches else 1
+        self._warm_up(model, config)
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        """A result for each frame for which there is still time; all at once where the model takes that."""
+        return self._in_parts(frames, deadline_us, self._at_once)
+
+    def news(self) -> list[str]:
+        """What it runs on, where that is not what one may think; the first failure."""
+        news, self._news = self._news, []
+        return news
+
+    def _in_parts(self, frames: Sequence[DetectFrame], deadline_us: int, most: int) -> list[DetectionResult | None]:
+        results: list[DetectionResult | None] = []
+        while len(results) < len(frames):
+            some = frames[len(results) : len(results) + most]
+            is_late = monotonic_us() > deadline_us
+            results += [None] * len(some) if is_late else self._looked(some, deadline_us)
+        return results
+
+    def _looked(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        try:
+            return timed_together(frames, self.maker, self._seen)
+        except Exception as error:  # an engine that fails on a picture gives no answer, and says so once
+            if len(frames) > 1:
+                return self._fewer_at_once(frames, deadline_us, error)
+            if not self._failed:
+                self._news.append(f"{self.maker.detector} gives no answer: {str(error)[:160]}")
+            self._failed = True
+            return [None]
+
+    def _fewer_at_once(
+        self, frames: Sequence[DetectFrame], deadline_us: int, error: Exception
+    ) -> list[DetectionResult | None]:
+        """Too many for its memory, or more than the model's inside takes; where that helps, it stays so."""
+        fewer = len(frames) // 2
+        results = self._in_parts(frames, deadline_us, fewer)
+        if any(results) and fewer < self._at_once:
+            self._at_once = fewer
+            self._news.append(f"{self.maker.detector} fails on {len(frames)} pictures at once, from now on at most "
+                              f"{fewer}: {str(error)[:120]}")
+        return results
+
+    def _seen(self, pictures: Sequence[Picture]) -> list[Sequence[Detection]]:
+        together = _found(self._engine, pictures, self._form, self._min_score)
+        return [tuple(refined(picture, one) if one.label in self._refine else one for one in found)
+                for picture, found in zip(pictures, together, strict=True)]
+
+    def _warm_up(self, model: "OnnxModel", config: Config) -> None:
+        """Run warm, on the known picture, and compare: with what the model brought, or with itself on the CPU."""
+        picture, path, expected = Picture(golden_picture(), 1), model.path, model.expected
+        form, least = model.own_form, model.own_min_score
+        try:
+            for _ in range(_WARM_UP):
+                (found,) = _found(self._engine, [picture], form, least)
+            if expected is None and self._engine.device != "cpu":
+                on_cpu = open_engine(path, model.header, "cpu", config.threads)
+                expected = list(_found(on_cpu, [picture], form, least)[0])
+        except Exception as error:  # whatever an engine raises
+            raise ConfigError(f"model {path} does not run: {' '.join(str(error).split())}"[:200]) from None
+        wrong = difference(expected, found, least) if expected is not None else ""
+        if wrong:
+            where = f"{self._engine.device} ({self._engine.name})"
+            raise HardwareError(f"model {path.name} on {where} does not give what it should for its test picture: "
+                                f"{wrong}; try --device cpu, or fetch the file again")
+
+
+@dataclass(frozen=True, slots=True)
+class OnnxModel:
+    """A model's file and what it says of itself."""
+
+    path: Path
+    header: OnnxHeader
+    form: ModelFormat
+    min_score: float
+    expected: list[Detection] | None
+    """What it should find in the known picture, if it says: by its own labels, from its own least score on."""
+    own_form: ModelFormat
+    own_min_score: float
+    digest: str
+
+
+def read_onnx_model(config: OnnxDetector.Config) -> OnnxModel:
+    """The model, without running it. Raises ConfigError for a file that is none, or none of a form known here."""
+    path = Path(config.address).expanduser() if config.address else SHIPPED
+    data = _bytes_of(path)
+    digest = hashlib.sha256(data).hexdigest()[:HASH_DIGITS]
+    try:
+        header = read_onnx_header(data)
+        form, least = model_format(header, config.names, config.colour), _least(config.min_score, header)
+        if KEY not in header.metadata:
+            return OnnxModel(path, header, form, least, None, form, _least(None, header), digest)
+        own = replace(form, labels=own_labels(header.metadata))
+        return OnnxModel(path, header, form, least, read_golden(header.metadata[KEY]), own, _least(None, header), digest)
+    except ValueError as error:
+        raise ConfigError(f"model {path}: {error}; see docs/detectors.md") from None
+
+
+def _found(engine: Engine, pictures: Sequence[Picture], form: ModelFormat, min_score: float) -> list[tuple[Detection, ...]]:
+    """In each picture; more than one only where form and engine take them."""
+    fitted = [fit_picture(picture, form) for picture in pictures]
+    if len(fitted) == 1:
+        each = [engine.run(fitted[0][0])]
+    else:
+        each = split_batch(engine.run(np.concatenate([pixels for pixels, _ in fitted])), len(pictures))
+    return [read_outputs(outputs, form, fitting, picture, min_score)
+            for outputs, (_, fitting), picture in zip(each, fitted, pictures, strict=True)]
+
+
+def shipped_digest() -> str:
+    """Of the model that comes with Sightline, as results carry it; empty where none does."""
+    return hashlib.sha256(SHIPPED.read_bytes()).hexdigest()[:HASH_DIGITS] if SHIPPED.is_file() else ""
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        size = path.stat().st_size
+        if not 0 < size < MAX_BYTES:
+            raise ConfigError(f"model {path} has {size} bytes; an ONNX file has between 1 and {MAX_BYTES}")
+        return path.read_bytes()
+    except OSError as error:
+        if path == SHIPPED:
+            raise ConfigError("this copy of Sightline comes without a model of its own: name one, e.g. --detector "
+                              "onnx:ball.onnx, or make it: docs/learned-detector.md") from None
+        why = error.strerror or "it cannot be read"
+        raise ConfigError(f"model {path}: {why}; name an ONNX file, e.g. --detector onnx:ball.onnx") from None
+
+
+def _least(given: float | None, header: OnnxHeader) -> float:
+    if given is not None:
+        return given
+    least = float(header.metadata.get("min_score", _OTHERWISE))
+    if not 0 <= least <= 1:
+        raise ValueError(f"its metadata want a least score of {least:g}; it is between 0 and 1")
+    return least

@@ -1,0 +1,204 @@
+"""Finds a detector by its name and builds it with its own `Config`. Shell (imports plug-ins).
+
+Names are those below, those of the entry points `sightline.detectors`, or, from a configuration or a command line only,
+`package.module:Name`. What stands after the name is the option `address`: `onnx:ball.onnx` gives "ball.onnx",
+`oip+http://box/ball` all of it. A `Config` is filled in from vision's where it has sections or fields of the same name.
+"""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from sightline.protocol.errors import ConfigError
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.around import plugin_guard
+from sightline.vision_side.detect.colour_filter import ColorFilter
+from sightline.vision_side.detect.filters import LabelFilter
+from sightline.vision_side.detect.port import Detector
+from sightline.vision_side.detect.remote.client import EXAMPLES
+from sightline.vision_side.detect.tracked import TrackIds
+from sightline.vision_side.missions.registry import check_missions, configured_mission
+from sightline.vision_side.plugins import PluginRegistry, config_model
+
+BUILT_IN: Final = {
+    "hsv": "sightline.vision_side.detect.color.detectors:Hsv",
+    "adaptive": "sightline.vision_side.detect.color.detectors:Adaptive",
+    "onnx": "sightline.vision_side.detect.onnx.detector:OnnxDetector",
+    "zenoh": "sightline.vision_side.detect.remote.zenoh_detector:ZenohDetector",
+    "oip+http": "sightline.vision_side.detect.remote.oip_http:OipHttp",
+    "oip+grpc": "sightline.vision_side.detect.remote.oip_grpc:OipGrpc",
+    "http+jpeg": "sightline.vision_side.detect.remote.http_jpeg:HttpJpeg",
+}
+"""Here and not as entry points, so that a checkout that nobody installed has them too."""
+GROUP: Final = "sightline.detectors"
+BOXES: Final = "boxes"
+"""No detector here: boxes that somebody else publishes, see vision_side/boxes_service.py."""
+REGISTRY: Final = PluginRegistry("detector", BUILT_IN, GROUP)
+_FILLED: Final = ("robot", "connect", "listen", "secure", "max_frame_bytes", "max_pixels")
+_MOST_NAMED: Final = 12
+_OF_DETECTOR: Final = ("device", "deadline_s")
+
+
+def is_plain(config: VisionConfig) -> bool:
+    """Whether the colour detector alone looks, which needs nothing around it."""
+    one = config.detector
+    return one.kind == "hsv" and not (one.options or one.labels or one.only_colour or one.tracked or one.fallback
+                                      or one.shadow)
+
+
+def configured_detector(config: VisionConfig) -> Detector | None:
+    """The detector of `config.detector` with all that is around it; None where the pipeline's own or nobody looks.
+
+    Raises ConfigError for an unknown one or a wrong option, HardwareError for a device that is not there.
+    """
+    one = config.detector
+    if one.kind == BOXES:
+        _check_no_detector(config)
+        return None
+    check_device(config)
+    _check_fallback(config)
+    if is_plain(config):
+        return None
+    detector = build_detector(one.kind, one.options, config)
+    if one.fallback:
+        from sightline.vision_side.detect.remote.fallback import Fallback
+
+        detector = Fallback(detector, build_detector(one.fallback, {}, config), max_pixels=config.max_pixels)
+    detector = _narrowed(detector, config)
+    if one.shadow:
+        from sightline.vision_side.detect.shadow import ShadowDetector
+
+        second = _narrowed(build_detector(one.shadow, one.shadow_options, config), config)
+        detector = ShadowDetector(detector, second, one.shadow, config.max_pixels, configured_mission(config).goes_by)
+    return detector
+
+
+def _check_no_detector(config: VisionConfig) -> None:
+    """Raise ConfigError for what only a detector of one's own can have."""
+    one = config.detector
+    given = ["device"] if one.device != "auto" else []
+    given += [name for name in ("options", "fallback", "shadow", "shadow_options", "labels", "only_colour", "tracked")
+              if getattr(one, name)]
+    if given:
+        raise ConfigError(f"detector.{given[0]} goes with a detector that runs here; {BOXES!r} are somebody else's")
+
+
+def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
+    one = config.detector
+    if one.labels:
+        _check_labels(one.kind, one.labels, getattr(detector, "labels", ()))
+        detector = LabelFilter(detector, one.labels)
+    if one.only_colour:
+        detector = ColorFilter(detector, config.hsv.ranges)
+    return TrackIds(detector) if one.tracked else detector
+
+
+def _check_labels(kind: str, wanted: Sequence[str], known: Sequence[str]) -> None:
+    """Raise ConfigError for a label that a detector, which says what it knows, never gives."""
+    for label in wanted if known else ():
+        if label not in known:
+            nearest = difflib.get_close_matches(label, known, n=1)
+            hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; it gives {', '.join(known[:_MOST_NAMED])}"
+            raise ConfigError(f"detector.labels: {kind} knows no {label!r}{hint}")
+
+
+def waits_for_service(config: VisionConfig) -> bool:
+    """Whether one of the configured detectors waits for somebody else, so that others should not wait for it."""
+    one = config.detector
+    kinds = [kind for kind in (one.kind, one.fallback, one.shadow) if kind and kind != BOXES]
+    return any(getattr(REGISTRY.load(split_kind(kind)[0]), "waits", False) for kind in kinds)
+
+
+def _check_fallback(config: VisionConfig) -> None:
+    """Raise ConfigError for a fallback that may itself be late or gone."""
+    kind = config.detector.fallback
+    if kind and getattr(REGISTRY.load(split_kind(kind)[0]), "waits", False):
+        raise ConfigError(f"detector.fallback {kind!r} waits for somebody else, too; it has to look here, e.g. hsv")
+
+
+def check_takes_pictures(kind: str) -> None:
+    """Raise ConfigError for a detector that does not look at what it is given, where there is no robot to hear of."""
+    if kind != BOXES and getattr(REGISTRY.load(split_kind(kind)[0]), "only_hears", False):
+        raise ConfigError(f"detector {kind!r} hears what a service says of a robot's own frames, of which there are "
+                          "none here; name what that service serves")
+
+
+def check_device(config: VisionConfig) -> None:
+    """Raise ConfigError where a device is asked for that nothing configured can run on."""
+    one = config.detector
+    if one.device == "auto":
+        return
+    kinds = [kind for kind in (one.kind, one.fallback, one.shadow) if kind]
+    if not any(_has_field(kind, "device") for kind in kinds):
+        raise ConfigError(f"detector {one.kind!r} has no device to choose: --device {one.device} is for detectors "
+                          "that run a model here, e.g. --detector onnx")
+
+
+def _has_field(kind: str, field: str) -> bool:
+    settings = config_model(REGISTRY.load(split_kind(kind)[0]))
+    return settings is not None and field in settings.model_fields
+
+
+def split_kind(kind: str) -> tuple[str, str]:
+    """A detector's name and its address; the name is all of it for `package.module:Name`."""
+    name, _, rest = kind.partition(":")
+    if name not in REGISTRY.names():
+        return kind, ""
+    return name, kind if rest.startswith("//") else rest
+
+
+def build_detector(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Detector:
+    """The detector called `kind`, by itself.
+
+    Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option, and
+    HardwareError for a device that is not there.
+    """
+    plugin, settings = _checked(kind, options, config)
+    with plugin_guard(f"{kind}, when it is made,"):
+        detector: Detector = plugin(settings)
+    return detector
+
+
+def check_vision(config: VisionConfig) -> None:
+    """Raise ConfigError for what can be known to be wrong with all that `config` names, before any of it is built."""
+    check_missions(config)
+    one = config.detector
+    if one.kind == BOXES:
+        _check_no_detector(config)
+        return
+    check_device(config)
+    _check_fallback(config)
+    for kind, options in ((one.kind, one.options), (one.fallback, {}), (one.shadow, one.shadow_options)):
+        if kind:
+            check_choice(kind, options, config)
+
+
+def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) -> None:
+    """Raise ConfigError for what can be known to be wrong before the detector is built: its name, options, model."""
+    _, settings = _checked(kind, options, config)
+    if split_kind(kind)[0] == "onnx":
+        from sightline.vision_side.detect.onnx.detector import read_onnx_model
+
+        read_onnx_model(settings)
+
+
+def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tuple[Any, Any]:
+    """The plug-in and its `Config`."""
+    if kind == BOXES:
+        raise ConfigError(f"{BOXES!r} are what somebody else finds; here a detector is needed that looks itself, "
+                          "e.g. hsv")
+    name, address = split_kind(kind)
+    plugin = REGISTRY.load(name)
+    settings = config_model(plugin)
+    fields = settings.model_fields if settings else {}
+    if address and "address" not in fields:
+        raise ConfigError(f"detector {name!r} takes nothing after its name, not {address!r}")
+    given: dict[str, Any] = {one: getattr(config, one) for one in _FILLED if one in fields}
+    given |= {one: getattr(config.detector, one) for one in _OF_DETECTOR if one in fields}
+    given |= {"address": address} if address else {}
+    if name in EXAMPLES and "address" not in {**given, **options}:
+        raise ConfigError(f"detector {name!r}: say where and what, e.g. {EXAMPLES[name]}")
+    own = REGISTRY.settings(name, plugin, given | dict(options), config)
+    if not callable(getattr(plugin, "detect", None)):
+        raise ConfigError(f"detector {kind!r}: the class has no method detect; see docs/detectors.md")
+    return plugin, own

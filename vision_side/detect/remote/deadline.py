@@ -1,0 +1,136 @@
+"""Newest only, by the deadline: any detector asked on a thread of its own, and not waited for any longer. Shell.
+
+Whatever hangs in there (a name server, a socket, a model) hangs alone. While it is busy, newer frames replace each
+other in one place; an answer that comes too late is nobody's.
+"""
+
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Final
+
+from pydantic import Field
+
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import SightlineError
+from sightline.protocol.transports.link import LatestSlot, Link
+from sightline.vision_side.detect.around import attach_detector, close_detector, notices_of
+from sightline.vision_side.detect.checking import NO_ANSWER_IN_TIME, checked_results
+from sightline.vision_side.detect.plugin_calls import Notices
+from sightline.vision_side.detect.own_decoders import DecoderPool
+from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
+from sightline.vision_side.detect.remote.asking import LONGEST_WAIT_S, seconds_left
+
+Results = list[DetectionResult | None]
+PixelBound = Annotated[int, Field(ge=256, le=4096 * 4096)]
+MAX_PIXELS: Final = 1920 * 1080
+FAILED: Final = "FAILED"
+"""Counted beside what the inner detector refuses: it raised or gave what is no answer, which no detector should."""
+_CLOSE_S: Final = 1.0
+
+
+class Pending:
+    """Frames that were asked about, and the place where their results will be."""
+
+    def __init__(self, frames: Sequence[DetectFrame], deadline_us: int) -> None:
+        self.frames, self.deadline_us = frames, deadline_us
+        self.begun = False
+        """Whether somebody began to look at them; newer ones may have taken their place before."""
+        self._place: LatestSlot[Results] = LatestSlot()
+
+    def answer(self, results: Results) -> None:
+        """They are there."""
+        self._place.put(results)
+
+    def take(self, wait: bool) -> Results | None:
+        """The results, once; None if they are not there, with `wait` by the deadline."""
+        return self._place.take(seconds_left(self.deadline_us) if wait else 0.0)
+
+    @property
+    def over(self) -> bool:
+        """Whether the deadline has passed."""
+        return monotonic_us() > self.deadline_us
+
+
+class DeadlineDetector:
+    """A `Detector` over another one, which is used on one thread only and closed there."""
+
+    waits: ClassVar[bool] = True
+
+    def __init__(self, inner: Detector, max_pixels: int = MAX_PIXELS) -> None:
+        """Security limit: pictures of more than `max_pixels` are not decoded."""
+        self._inner = inner
+        self._decoders = DecoderPool(max_pixels)
+        self._failed: Counter[str] = Counter()
+        self._news = Notices()
+        self._asked: LatestSlot[Pending | None] = LatestSlot()
+        self._ending = threading.Event()
+        self._ended_by: SightlineError | None = None
+        self._thread = threading.Thread(target=self._work, name="detector", daemon=True)
+        self._thread.start()
+
+    @property
+    def refused(self) -> Counter[str]:
+        """What the inner one refused, if it counts that, and how often it raised or gave what is no answer."""
+        return Counter(getattr(self._inner, "refused", Counter())) + self._failed
+
+    @property
+    def overtaken(self) -> int:
+        """How often newer frames took the place of older ones that nobody had looked at."""
+        return self._asked.dropped
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
+        """As the port says."""
+        results = self.ask(frames, deadline_us).take(wait=True) if frames else []
+        return [None for _ in frames] if results is None else results
+
+    def ask(self, frames: Sequence[DetectFrame], deadline_us: int) -> Pending:
+        """Begin to ask about `frames`, in place of any that wait."""
+        pending = Pending(frames, deadline_us)
+        self._asked.put(pending)
+        return pending
+
+    def attach(self, link: Link) -> None:
+        """Give the inner one a robot's link."""
+        attach_detector(self._inner, link)
+
+    def news(self) -> list[str]:
+        """What the inner one has to say, and that it failed."""
+        return [*notices_of(self._inner), *self._news.take()]
+
+    def close(self) -> None:
+        """End the thread; one that hangs is left behind. Raises ConfigError if the inner one's `close` fails."""
+        self._ending.set()
+        self._asked.put(None)
+        self._thread.join(_CLOSE_S)
+        if self._ended_by is not None:
+            raise self._ended_by
+
+    def _work(self) -> None:
+        while not self._ending.is_set():
+            pending = self._asked.take(LONGEST_WAIT_S)
+            if pending is not None and not pending.over:
+                pending.begun = True
+                try:
+                    self._answer(pending)
+                except Exception as error:  # no memory for another decoder: this thread must not end by it
+                    self._fail(f"{type(error).__name__}: {error}")
+        try:
+            close_detector(self._inner)
+        except SightlineError as error:
+            self._ended_by = error
+
+    def _answer(self, pending: Pending) -> None:
+        frames = [self._decoders.again(one, at) for at, one in enumerate(pending.frames)]
+        results = checked_results(self._inner, frames, pending.deadline_us, monotonic_us)
+        for why in results:
+            if isinstance(why, str) and why is not NO_ANSWER_IN_TIME:
+                self._fail(why)
+        if not pending.over:
+            pending.answer([None if isinstance(one, str) else one for one in results])
+
+    def _fail(self, why: str) -> None:
+        """Count it; the first is told."""
+        if not self._failed:
+            self._news.add(why)
+        self._failed[FAILED] += 1

@@ -1,0 +1,229 @@
+"""Reads traffic lights in a picture: which lamp of a housing is lit, or which colour a whole box has. Pure.
+
+A lamp counts when place and colour agree: the brightest of three places in a dark upright housing, and the hue that
+belongs there. The ranges are two-sided and do not touch, so that light of another tint makes no other colour of it.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from sightline.protocol.config import Config
+from sightline.vision_side.config import Fraction, HsvRange
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.color.hsv import color_table
+from sightline.vision_side.detect.edge import sharp_outline
+from sightline.vision_side.detect.port import Detection
+
+Box = tuple[float, float, float, float]
+"""left, top, right, bottom, in pixels of the decoded picture."""
+Bgr = NDArray[np.uint8]
+
+COLOURS: Final = ("red", "yellow", "green")
+"""From top to bottom."""
+UNKNOWN: Final = "unknown"
+_MAX_SHAPES = 24  # security limit: no more dark shapes than this are looked at, the largest first
+_MOST_TINT = 1.5  # no room's light is more coloured than this; what seems to be is a coloured thing that fills the view
+_PALEST = 0.08  # below it hue is noise; JPEG spreads the colour of a lamp of 5 pixels over 16
+_FLAT = 0.6  # rows of a housing that are narrower than this part of its widest are its pole
+_DISC = 0.85  # of a lamp's radius: its edge is mixed with the housing
+_BRIGHT_SHARE = 0.4  # of a lamp's pixels, the brightest: what tells its colour when it is only a few pixels wide
+
+
+class LampConfig(Config):
+    """The light's size and colours."""
+
+    housing_width_m: Annotated[float, Field(gt=0.01, le=3)] = 0.10
+    housing_height_m: Annotated[float, Field(gt=0.01, le=3)] = 0.26
+    housing_depth_m: Annotated[float, Field(ge=0, le=3)] = 0.06
+    lamp_radius_m: Annotated[float, Field(gt=0.005, le=1)] = 0.033
+    lamp_pitch_m: Annotated[float, Field(gt=0.005, le=1)] = 0.0867
+    """From the middle of one lamp to the next."""
+    box_width_m: Annotated[float, Field(gt=0.01, le=3)] = 0.317
+    box_height_m: Annotated[float, Field(gt=0.01, le=3)] = 0.281
+    box_depth_m: Annotated[float, Field(ge=0, le=3)] = 0.266
+    """Of a whole box that changes its colour."""
+    red: HsvRange = HsvRange(hue_low_deg=335, hue_high_deg=24, saturation_low=0.3, value_low=0.1)
+    yellow: HsvRange = HsvRange(hue_low_deg=34, hue_high_deg=72, saturation_low=0.3, value_low=0.1)
+    green: HsvRange = HsvRange(hue_low_deg=90, hue_high_deg=172, saturation_low=0.3, value_low=0.1)
+    dark: Fraction = 0.4
+    """The housing is darker than this part of the picture's middle brightness."""
+    contrast: Annotated[float, Field(gt=1, le=10)] = 1.3
+    """A lit lamp is so many times brighter than the next brightest."""
+    min_height_px: Annotated[float, Field(ge=6, le=500)] = 13.0
+    """Below it three lamps cannot be told apart."""
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """One light: its colour, and its box in pixels of the encoded picture."""
+
+    colour: str
+    box: Detection
+
+
+class HousingLightReader:
+    """Lights with three lamps in a dark housing."""
+
+    def __init__(self, config: LampConfig) -> None:
+        self._config = config
+        self._ranges = _ranges(config)
+        self._lit = color_table(tuple(self._ranges.values()))
+
+    def read(self, picture: Picture, not_these: Iterable[Detection] = ()) -> list[Light]:  # noqa: ARG002
+        """Every housing in view, largest first; the colour is unknown where place and hue do not agree."""
+        bgr = balanced(picture.bgr)
+        bright = bgr.max(axis=2)
+        dark = bright < self._config.dark * float(np.median(bright[::4, ::4]))
+        lights = [self._light(bgr, bright, box, picture.scale) for box in self._housings(bgr, dark)]
+        return sorted(lights, key=lambda one: one.box.y2_px - one.box.y1_px, reverse=True)
+
+    def _housings(self, bgr: Bgr, dark: NDArray[np.bool_]) -> list[Box]:
+        """Dark shapes of a housing's proportions: with the lamps in them, or without where a block joins a lamp."""
+        codes = cv2.cvtColor(bgr, cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
+        boxes = self._upright_shapes(dark | (cv2.LUT(codes, self._lit) > 0), dark)
+        alone = self._upright_shapes(dark, dark)
+        return boxes + [one for one in alone if not any(_overlap(one, other) for other in boxes)]
+
+    def _upright_shapes(self, mask: NDArray[np.bool_], dark: NDArray[np.bool_]) -> list[Box]:
+        closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        shapes, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        largest = sorted(shapes, key=len, reverse=True)[:_MAX_SHAPES]
+        boxes = (self._upright(shape, closed.shape) for shape in largest)
+        return [box for box in boxes if box is not None and self._is_dark(box, dark)]
+
+    def _upright(self, shape: NDArray[Any], size: tuple[int, ...]) -> Box | None:
+        """The housing that `shape` is, less its pole; its top is put back where the picture's border cut it off."""
+        x, y, width, height = cv2.boundingRect(shape)
+        if height < self._config.min_height_px:
+            return None
+        drawn = np.zeros((height, width), np.uint8)
+        cv2.drawContours(drawn, [shape], -1, 1, cv2.FILLED, offset=(-x, -y))
+        across = drawn.sum(axis=1)
+        rows = np.flatnonzero(across >= _FLAT * across.max())
+        part = drawn[rows[0] : rows[-1] + 1]
+        columns = np.flatnonzero(part.sum(axis=0) >= len(part) / 2)
+        if not len(columns):
+            return None
+        left, right = x + int(columns[0]), x + int(columns[-1]) + 1
+        top, bottom = y + int(rows[0]), y + int(rows[-1]) + 1
+        tall = self._config.housing_height_m / self._config.housing_width_m
+        if top <= 0:
+            top = min(0, round(bottom - tall * (right - left)))
+        if bottom - top < self._config.min_height_px:
+            return None
+        if bottom >= size[0] or not 0.6 * tall <= (bottom - top) / (right - left) <= 1.5 * tall:
+            return None
+        return float(left), float(top), float(right), float(bottom)
+
+    def _is_dark(self, box: Box, dark: NDArray[np.bool_]) -> bool:
+        """Whether enough of it is dark, and what is beside it is not: a housing, and no shadow's corner."""
+        left, top, right, bottom = (round(side) for side in box)
+        inside = dark[max(0, top) : bottom, left:right]
+        margin = max(2, (right - left) // 3)
+        beside = np.hstack([dark[max(0, top) : bottom, max(0, left - margin) : max(0, left - 1)],
+                            dark[max(0, top) : bottom, right + 1 : right + margin]])
+        return bool(inside.size) and inside.mean() > 0.2 and (not beside.size or beside.mean() < 0.4)
+
+    def _light(self, bgr: Bgr, bright: Bgr, box: Box, scale: int) -> Light:
+        lamps = [self._lamp(bgr, bright, box, place) for place in (-1, 0, 1)]
+        shine = [one[0] for one in lamps]
+        order = sorted(range(3), key=lambda one: shine[one], reverse=True)
+        best = order[0]
+        stands_out = shine[best] > self._config.contrast * shine[order[1]]
+        sure = stands_out and _is(lamps[best][1], self._ranges[COLOURS[best]])
+        return Light(COLOURS[best] if sure else UNKNOWN, _detection(box, scale, "light"))
+
+    def _lamp(self, bgr: Bgr, bright: Bgr, box: Box, place: int) -> tuple[float, NDArray[np.float64]]:
+        """How bright the lamp at `place` (-1 top, 0 middle, 1 bottom) is, and its colour (B, G, R)."""
+        config, height = self._config, box[3] - box[1]
+        per_m = height / config.housing_height_m
+        cx, cy = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2 + place * config.lamp_pitch_m * per_m
+        radius = max(1.0, _DISC * config.lamp_radius_m * per_m)
+        left, top = max(0, int(cx - radius)), max(0, int(cy - radius))
+        rows, columns = slice(top, int(cy + radius) + 1), slice(left, int(cx + radius) + 1)
+        level, colours = bright[rows, columns].reshape(-1), bgr[rows, columns].reshape(-1, 3)
+        if not len(level) or cy < 0:
+            return 0.0, np.zeros(3)
+        count = max(1, round(_BRIGHT_SHARE * len(level)))
+        brightest = np.argpartition(level, -count)[-count:]
+        return float(level[brightest].mean()), colours[brightest].mean(axis=0)
+
+
+class BoxLightReader:
+    """Lights that are one box, which changes its colour as a whole."""
+
+    def __init__(self, config: LampConfig) -> None:
+        self._config = config
+        self._tables = {name: color_table((one,)) for name, one in _ranges(config).items()}
+
+    def read(self, picture: Picture, not_these: Iterable[Detection] = ()) -> list[Light]:
+        """Every box of one of the three colours, largest first, but for `not_these`."""
+        codes = cv2.cvtColor(balanced(picture.bgr), cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
+        others = [_middle(one) for one in not_these]
+        lights = [light for colour, table in self._tables.items()
+                  for light in self._boxes(codes, colour, table, picture)]
+        own = [one for one in lights if not any(_holds(one.box, spot) for spot in others)]
+        return sorted(own, key=lambda one: one.box.y2_px - one.box.y1_px, reverse=True)
+
+    def _boxes(self, codes: NDArray[np.uint16], colour: str, table: NDArray[np.uint8], picture: Picture) -> list[Light]:
+        mask = cv2.morphologyEx(cv2.LUT(codes, table), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        shapes, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        lights: list[Light] = []
+        for rough in sorted(shapes, key=len, reverse=True)[:_MAX_SHAPES]:
+            sharp = sharp_outline(picture.bgr, mask, cv2.boundingRect(rough))
+            shape = rough if sharp is None else sharp
+            x, y, width, height = cv2.boundingRect(shape)
+            is_box = cv2.contourArea(shape) > 0.7 * (width - 1) * (height - 1)
+            if height >= self._config.min_height_px and is_box and 0.4 < width / height < 2.0:
+                box = (float(x), float(y), float(x + width), float(y + height))
+                lights.append(Light(colour, _detection(box, picture.scale, "light")))
+        return lights
+
+
+def balanced(bgr: Bgr) -> Bgr:
+    """The picture in white light: most of a picture is floor and wall, so its middle tint is that of the light.
+
+    Without it a floor in lamplight is as yellow as a yellow lamp. Tints are compared pixel by pixel: a middle of each
+    channel alone would be the floor's in one and the sky's in another.
+    """
+    some = bgr[::8, ::8].reshape(-1, 3).astype(np.float64) + 1.0
+    tint = np.median(some[:, 1:2] / some, axis=0)
+    gains = np.clip(tint, 1 / _MOST_TINT, _MOST_TINT)
+    steps = np.clip(np.rint(np.arange(256)[:, None] * gains), 0, 255).astype(np.uint8).reshape(1, 256, 3)
+    return np.asarray(cv2.LUT(bgr, steps), np.uint8)
+
+
+def _overlap(one: Box, other: Box) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def _ranges(config: LampConfig) -> dict[str, HsvRange]:
+    return {"red": config.red, "yellow": config.yellow, "green": config.green}
+
+
+def _is(bgr: NDArray[np.float64], one: HsvRange) -> bool:
+    """Whether a colour is of a range's hue; paler than the range where a small lamp's colour ran into the housing."""
+    pixel = (bgr / 255).astype(np.float32)[None, None]
+    hue, saturation, value = cv2.cvtColor(pixel, cv2.COLOR_BGR2HSV)[0, 0].tolist()
+    above, below = hue >= one.hue_low_deg, hue <= one.hue_high_deg
+    turn = (above and below) if one.hue_low_deg <= one.hue_high_deg else (above or below)
+    return bool(turn and _PALEST <= saturation <= one.saturation_high and one.value_low <= value <= one.value_high)
+
+
+def _detection(box: Box, scale: int, label: str) -> Detection:
+    left, top, right, bottom = (side * scale for side in box)
+    return Detection(left, top, right, bottom, 1.0, label)
+
+
+def _middle(one: Detection) -> tuple[float, float]:
+    return (one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2
+
+
+def _holds(box: Detection, spot: tuple[float, float]) -> bool:
+    return box.x1_px <= spot[0] <= box.x2_px and box.y1_px <= spot[1] <= box.y2_px

@@ -1,0 +1,118 @@
+"""Finds a mission by its name and builds it with its own `Config`. Shell (imports plug-ins).
+
+Names are those below, those of the entry points `sightline.missions`, or, from a configuration or a command line only,
+`package.module:Name`. A mission whose `Config` has a section of vision's configuration by name and type (`target`,
+`track`, `steer`, `latency`, `search`, `boxes`) begins with that section; its options lie over it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import CameraModel
+from sightline.protocol.mission_messages import MissionRequest
+from sightline.vision_side.config import TargetConfig, VisionConfig
+from sightline.vision_side.detect.labels import is_followable
+from sightline.vision_side.missions.port import Mission
+from sightline.vision_side.plugins import PluginRegistry, config_model
+
+BUILT_IN: Final = {
+    "follow": "sightline.vision_side.missions.follow:Follow",
+    "band": "sightline.vision_side.missions.band:Band",
+    "pixel-pi": "sightline.vision_side.missions.pixel_pi:PixelPi",
+    "pixel-p": "sightline.vision_side.missions.pixel_p:PixelP",
+    "legs": "sightline.vision_side.missions.legs:Legs",
+    "legs-baseline": "sightline.evaluation.baselines.legs:LegsBaseline",
+    "traffic-light": "sightline.vision_side.missions.traffic_light:TrafficLight",
+    "traffic-light-boxes": "sightline.vision_side.missions.traffic_light:TrafficLightBoxes",
+    "goto": "sightline.vision_side.missions.goto:Goto",
+    "goto-baseline": "sightline.evaluation.baselines.goto:GotoBaseline",
+}
+"""Here and not as entry points, so that a checkout that nobody installed has them too."""
+GROUP: Final = "sightline.missions"
+REGISTRY: Final = PluginRegistry("mission", BUILT_IN, GROUP)
+
+
+@dataclass(frozen=True, slots=True)
+class MissionSpec:
+    """A mission that can be built, as often as is needed: for each session of the robot anew."""
+
+    name: str
+    plugin: Any
+    config: Any
+
+    @property
+    def wants_scan(self) -> bool:
+        """Whether it goes by range scans."""
+        return bool(getattr(self.plugin, "wants_scan", False))
+
+    @property
+    def needs_camera(self) -> bool:
+        """Whether another camera model means to begin anew."""
+        return bool(getattr(self.plugin, "needs_camera", True))
+
+    def goes_by(self, label: str) -> bool:
+        """Whether it may go by what has this label, as far as its configuration tells: a `label`, or a `target`."""
+        own, target = getattr(self.config, "label", None), getattr(self.config, "target", None)
+        if isinstance(own, str):
+            return own in ("", label)
+        return is_followable(label, target.label) if isinstance(target, TargetConfig) else True
+
+    def build(self, camera: CameraModel) -> Mission:
+        """A new one, that knows nothing yet."""
+        mission: Mission = self.plugin(self.config, camera)
+        return mission
+
+
+def configured_mission(config: VisionConfig) -> MissionSpec:
+    """The mission of `config.mission`. Raises ConfigError as `choose` does."""
+    return mission_spec(config.mission.kind, _own_options(config.mission.kind, config), config)
+
+
+def _own_options(kind: str, config: VisionConfig) -> dict[str, Any]:
+    """What `config` has for this mission."""
+    own = config.mission.options if kind == config.mission.kind else {}
+    return {**config.missions.get(kind, {}), **own}
+
+
+def check_missions(config: VisionConfig) -> None:
+    """Raise ConfigError, one line, for what is wrong with the configured mission, or with the options that others have
+    for when somebody asks for them: their waypoints come with the request."""
+    configured_mission(config)
+    for kind, options in config.missions.items():
+        settings = config_model(REGISTRY.load(kind))
+        missing = {"waypoints": [(0.0, 0.0)]} if settings and "waypoints" in settings.model_fields else {}
+        mission_spec(kind, {**missing, **options}, config)
+
+
+def requested_mission(request: MissionRequest, config: VisionConfig) -> MissionSpec:
+    """The mission that somebody asked for: its options over those that `config` has for the same one.
+
+    Raises ConfigError for an unknown one or a wrong option.
+    """
+    if ":" in request.name:  # the wire's model has no such name; should it ever, code is still not named by a message
+        raise ConfigError(f"no mission called {request.name!r}")
+    options = _own_options(request.name, config)
+    for name, value in request.options.items():
+        _lay(options, name.split("."), value)
+    if request.waypoints:
+        options["waypoints"] = request.waypoints
+    return mission_spec(request.name, options, config)
+
+
+def _lay(options: dict[str, Any], path: list[str], value: Any) -> None:
+    """Put `value` at `path`, leaving what is beside it and the given tables themselves as they are."""
+    for name in path[:-1]:
+        inner = options.get(name)
+        options[name] = options = dict(inner) if isinstance(inner, Mapping) else {}
+    options[path[-1]] = value
+
+
+def mission_spec(kind: str, options: Mapping[str, Any], config: VisionConfig) -> MissionSpec:
+    """The mission called `kind` with its checked configuration.
+
+    Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option.
+    """
+    plugin = REGISTRY.load(kind)
+    return MissionSpec(kind, plugin, REGISTRY.settings(kind, plugin, options, config))

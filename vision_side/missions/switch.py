@@ -1,0 +1,77 @@
+"""The mission in force, and the safe way to the next: a new one begins with wheels that stand still. Pure.
+
+A mission is somebody's plug-in: one that raises, or asks for what no robot does, is over, and the robot stands still.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+from sightline.protocol.messages import STILL, CameraModel
+from sightline.vision_side.detect.around import PLUGIN_ERRORS
+from sightline.vision_side.missions.registry import MissionSpec
+from sightline.vision_side.missions.port import Plan, View
+
+SETTLE_S: Final = 1.0
+"""A robot that still moves after this long is not moved by us; the new mission begins all the same."""
+STILL_MPS: Final = 0.01
+STILL_RAD_S: Final = 0.03
+MAX_COMMAND: Final = 1000.0
+"""m/s and rad/s; beyond it a mission computes nonsense, and its text might not fit a twist's 64 bytes."""
+
+
+class MissionSwitch:
+    """What is to be done. `step` always answers, whatever a mission does."""
+
+    def __init__(self, chosen: MissionSpec, camera: CameraModel) -> None:
+        self.chosen = chosen
+        """The newest chosen, also while the robot still comes to rest for it."""
+        self._switching = False
+        self._waited_s = 0.0
+        self._begin(camera)
+
+    def switch(self, chosen: MissionSpec) -> None:
+        """From the next frame on come to rest, then carry out `chosen`."""
+        self.chosen, self._switching, self._waited_s = chosen, True, 0.0
+
+    def step(self, view: View) -> Plan:
+        """The plan for one frame."""
+        if self._switching:
+            self._waited_s += view.dt_s
+            if not self._is_at_rest(view):
+                return Plan(STILL, "switching", f"standing still before {self.chosen.name}")
+            self._begin(view.camera)
+            view = replace(view, dt_s=0.0)  # the first of the new mission's own
+        if self._over is None:
+            return self._checked(view)
+        return self._over
+
+    def _is_at_rest(self, view: View) -> bool:
+        """Wheels at zero after a command of ours had the time to act, or waited for long enough."""
+        if self._waited_s >= SETTLE_S:
+            return True
+        speeds = (view.header.moving, view.header.applied)
+        quiet = all(abs(linear) < STILL_MPS and abs(angular) < STILL_RAD_S for linear, angular in speeds)
+        return quiet and self._waited_s >= view.latency_s
+
+    def _begin(self, camera: CameraModel) -> None:
+        self._switching = False
+        self._over: Plan | None = None
+        try:
+            self._mission = self.chosen.build(camera)
+        except PLUGIN_ERRORS as error:
+            self._over = _failed(error)
+
+    def _checked(self, view: View) -> Plan:
+        try:
+            plan = self._mission.step(view)
+            if max(abs(plan.twist.linear_mps), abs(plan.twist.angular_rad_s)) > MAX_COMMAND:
+                raise ValueError(f"asks for {plan.twist.linear_mps:g} m/s, {plan.twist.angular_rad_s:g} rad/s")
+        except PLUGIN_ERRORS as error:  # vision goes on, the robot stands still
+            plan = _failed(error)
+        if plan.done:
+            self._over = plan = replace(plan, twist=STILL, target=None)
+        return plan
+
+
+def _failed(error: BaseException) -> Plan:
+    return Plan(STILL, "failed", " ".join(f"{type(error).__name__}: {error}".split())[:200], done=True)

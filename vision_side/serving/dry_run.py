@@ -1,0 +1,184 @@
+"""Looks and tells, and drives nothing: a robot's pictures, or a camera of this machine without any robot. Shell.
+
+A robot's frames are acknowledged, so that it goes on sending; no twist is ever published.
+"""
+
+import secrets
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import HardwareError
+from sightline.protocol.messages import CameraModel, FrameHeader
+from sightline.protocol.transports.link import Link
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.around import notices_of
+from sightline.vision_side.detect.registry import configured_detector
+from sightline.vision_side.dispatch import MissionChannel
+from sightline.vision_side.pipeline import SOURCE, Frame, Observation, Pipeline, PipelineAnswer
+from sightline.vision_side.service import Service
+
+_TELL_EVERY_S = 0.5
+_WAIT_S = 0.2
+_RETRY_S = 0.5
+_DEGREES = 57.29577951308232
+LogLine = Callable[[str], None]
+
+
+class Capture(Protocol):
+    """One JPEG and when it was captured, in microseconds of a monotonic clock."""
+
+    @property
+    def jpeg(self) -> bytes: ...
+
+    @property
+    def t_us(self) -> int: ...
+
+
+class LocalCamera(Protocol):
+    """Any camera plug-in of the robot side."""
+
+    model: CameraModel
+
+    def read(self, timeout_s: float) -> Capture | None:
+        """The next capture, None if none came in time; raises HardwareError while there is no camera."""
+        ...
+
+
+def watch_robot(config: VisionConfig, say: LogLine, seconds: float | None = None) -> int:
+    """Tell what is seen in the robot's pictures, until Ctrl-C or for `seconds`; returns the exit code 0.
+
+    Raises ConfigError for an endpoint that is none, LinkError if the link cannot be opened.
+    """
+    from sightline.protocol.transports.open import open_link
+
+    opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
+                       max_frame_bytes=config.max_frame_bytes, secure=config.secure)
+    with opened as link:
+        say(f"vision: dry run with robot {config.robot}; nothing is driven")
+        service = AckingService(config, link, say)
+        return _repeat(lambda: service.turn(_WAIT_S), seconds)
+
+
+def watch_camera(config: VisionConfig, camera: LocalCamera, say: LogLine, seconds: float | None = None) -> int:
+    """Tell what is seen by a camera of this machine, until Ctrl-C or for `seconds`; returns the exit code 0."""
+    model = camera.model
+    lens = "calibrated" if model.calibrated else "not calibrated, so distances are a guess"
+    watching = LocalRun(config, camera, say)
+    say(f"vision: dry run, camera {model.width_px}x{model.height_px}, {lens}; nothing is driven")
+    return _repeat(watching.turn, seconds)
+
+
+def _repeat(turn: Callable[[], None], seconds: float | None) -> int:
+    ends_s = time.monotonic() + seconds if seconds is not None else None
+    try:
+        while ends_s is None or time.monotonic() < ends_s:
+            turn()
+    except KeyboardInterrupt:
+        return 0
+    return 0
+
+
+class AckingService(Service):
+    """The vision service as it is, but every answer goes out as an acknowledgement."""
+
+    def __init__(self, config: VisionConfig, link: Link, say: LogLine) -> None:
+        super().__init__(config, link, say)
+        self._dispatch = ScansOnly(config, link, self._tell, self._refuse)
+        self._dispatch.tell_news(self._eyes)
+        self._telling = ProgressPrinter(say)
+
+    def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
+        super()._publish(header, PipelineAnswer(None, answer.seen), compute_us)
+        self._telling.step(answer, time.monotonic())
+
+
+class ScansOnly(MissionChannel):
+    """Takes no missions and reports nothing: what the robot does is not this one's doing."""
+
+    def before(self, pipeline: Pipeline, frame: FrameHeader) -> None:  # noqa: ARG002
+        """Give `pipeline` the newest scan."""
+        if pipeline.mission.wants_scan:
+            self._look(pipeline)
+
+    def after(
+        self, now_s: float, pipeline: Pipeline | None, frame: FrameHeader | None, seen: Observation  # noqa: ARG002
+    ) -> None:
+        """Say only what the detector has to say."""
+        if pipeline is not None:
+            self.tell_news(pipeline.eyes)
+
+
+class LocalRun:
+    """A local camera straight into the pipeline, as if its robot stood still."""
+
+    def __init__(self, config: VisionConfig, camera: LocalCamera, say: LogLine) -> None:
+        self._camera, self._say = camera, say
+        self._patience_us = round(config.detector.deadline_s * 1e6)
+        self._pipeline = Pipeline(config, camera.model, eyes=configured_detector(config))
+        self._telling = ProgressPrinter(say)
+        self._tell_news()
+        self._session = secrets.token_hex(4)
+        self._seq = 0
+        self._fault = ""
+
+    def turn(self) -> None:
+        """Look at the next picture; a camera that is gone is said once and tried again."""
+        try:
+            picture = self._camera.read(_WAIT_S)
+        except HardwareError as error:
+            self._complain(str(error))
+            time.sleep(_RETRY_S)
+            return
+        if picture is not None:
+            self._complain("")
+            self._seq += 1
+            header = FrameHeader(session=self._session, seq=self._seq, t_us=picture.t_us)
+            frame = Frame(header, picture.jpeg, monotonic_us() + self._patience_us)
+            self._telling.step(self._pipeline.step(frame), time.monotonic())
+            self._tell_news()
+
+    def _tell_news(self) -> None:
+        for line in notices_of(self._pipeline.eyes):
+            self._say(f"vision: {line}")
+
+    def _complain(self, fault: str) -> None:
+        if fault != self._fault:
+            self._say(f"camera: {fault or 'back'}")
+        self._fault = fault
+
+
+class ProgressPrinter:
+    """One line at most every half second, with the pictures per second since the last."""
+
+    def __init__(self, say: LogLine) -> None:
+        self._say = say
+        self._told_s: float | None = None
+        self._pictures = 0
+
+    def step(self, answer: PipelineAnswer, now_s: float) -> None:
+        """Count a picture; tell of it if it is time."""
+        self._pictures += 1
+        if self._told_s is None:
+            self._tell(answer, "", now_s)
+        elif now_s - self._told_s >= _TELL_EVERY_S:
+            self._tell(answer, f" ({self._pictures / (now_s - self._told_s):.0f} pictures/s)", now_s)
+
+    def _tell(self, answer: PipelineAnswer, rate: str, now_s: float) -> None:
+        self._say(f"{seen_text(answer.seen)}{_would_text(answer)}{rate}")
+        self._told_s, self._pictures = now_s, 0
+
+
+def seen_text(seen: Observation) -> str:
+    """One line for a person: phase, bearing (left positive), distance."""
+    if seen.bearing_rad is None or seen.distance_m is None:
+        return f"{seen.phase}: {seen.note or 'no target in sight'}"
+    return f"{seen.phase}: bearing {seen.bearing_rad * _DEGREES:+.1f} degrees, distance {seen.distance_m:.2f} m"
+
+
+def _would_text(answer: PipelineAnswer) -> str:
+    twist = answer.twist
+    if twist is None or answer.seen.bearing_rad is None:
+        return ""
+    return f"; would steer {twist.linear_mps:+.2f} m/s, {twist.angular_rad_s:+.2f} rad/s"

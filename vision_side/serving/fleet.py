@@ -1,0 +1,161 @@
+"""Several robots, one vision: a pipeline for each, newest frames only, in fair turns. Shell.
+
+    sightline vision --robot 'r*' --listen tcp/0.0.0.0:7447
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Protocol, Self
+
+from sightline.protocol.channels import Channel
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.serving.service import Counts
+from sightline.vision_side.detect.around import close_detector
+from sightline.vision_side.detect.registry import configured_detector, waits_for_service
+from sightline.vision_side.detect.port import Detector
+from sightline.vision_side.service import LogLine, Service, open_service
+
+_LONGEST_WAIT_S = 0.2
+
+
+class FleetLink(Protocol):
+    """Where robots are met."""
+
+    def robots(self) -> list[str]:
+        """Ids of all heard so far."""
+        ...
+
+    def on_news(self, callback: Callable[[], None]) -> None:
+        """Call `callback` when another one is heard."""
+        ...
+
+    def link(self, robot: str) -> Link:
+        """A link to one of them."""
+        ...
+
+
+class _NotifyingLink:
+    """A link whose slots ring `bell` when something is put into them; all else is the link's own."""
+
+    def __init__(self, link: Link, bell: threading.Event) -> None:
+        self._link, self._bell = link, bell
+        self.robot = link.robot
+
+    def latest(self, channel: Channel) -> LatestSlot[Message]:
+        slot: LatestSlot[Message] = LatestSlot()
+        self.subscribe(channel, slot.put)
+        return slot
+
+    def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
+        def ring(message: Message) -> None:
+            callback(message)
+            self._bell.set()
+
+        self._link.subscribe(channel, ring)
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        return self._link.publish(channel, header, payload, source)
+
+    def ignore(self, channel: Channel) -> None:
+        self._link.ignore(channel)
+
+    def has_listener(self, channel: Channel) -> bool:
+        return self._link.has_listener(channel)
+
+    def close(self) -> None:
+        self._link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Fleet:
+    """A service for each robot that is heard. One turn gives every robot with something new its turn.
+
+    Where they look through eyes elsewhere, each robot has its own, on a thread of its own: an answer that one of them
+    waits for keeps no other waiting.
+    """
+
+    def __init__(self, config: VisionConfig, site: FleetLink, say: LogLine, eyes: Detector | None = None) -> None:
+        """`eyes` look for every robot, or for the first of those with their own; None for those of `config`."""
+        self._config, self._site, self._say = config, site, say
+        self._apart = waits_for_service(config)
+        self._eyes = eyes or configured_detector(config)
+        self._bell, self._ending = threading.Event(), threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._failed: Exception | None = None
+        self.services: dict[str, Service] = {}
+        site.on_news(self._bell.set)
+
+    def serve(self, ending: threading.Event) -> None:
+        """Until `ending` is set."""
+        try:
+            while not ending.is_set():
+                self._bell.wait(_LONGEST_WAIT_S)
+                self._bell.clear()
+                self.turn()
+        finally:
+            self._end()
+        if self._failed is not None:  # in closing
+            raise self._failed
+        for robot, service in self.services.items():
+            skipped = dict(service.skipped) or "none"
+            self._say(f"vision: {robot}: ended after {service.answered} frames; skipped: {skipped}")
+
+    def counts(self) -> list[Counts]:
+        """What is done so far for each robot; from any thread."""
+        return [service.counts() for service in list(self.services.values())]
+
+    def turn(self) -> None:
+        """Welcome who is new, and answer at most one frame of each robot that has no thread of its own: whatever came
+        meanwhile waits one round, whoever sends more."""
+        for robot in self._site.robots():
+            if robot not in self.services:
+                self._welcome(robot)
+            if not self._apart:
+                self.services[robot].turn(0.0)
+        if self._failed is not None:
+            raise self._failed
+
+    def _welcome(self, robot: str) -> None:
+        config = self._config.model_copy(update={"robot": robot})
+        link = self._site.link(robot)
+        if not self._apart:
+            self.services[robot] = open_service(config, _NotifyingLink(link, self._bell), self._of(robot), self._eyes)
+            return
+        own = configured_detector(config) if self.services else None
+        service = self.services[robot] = open_service(config, link, self._of(robot), own or self._eyes)
+        self._threads.append(threading.Thread(target=self._serve_one, args=(service, own), name=robot, daemon=True))
+        self._threads[-1].start()
+
+    def _serve_one(self, service: Service, own: Detector | None) -> None:
+        """What a robot's thread does, its `own` eyes closed at its end. What fails ends all."""
+        try:
+            with ExitStack() as ending:
+                ending.callback(close_detector, own)
+                while not self._ending.is_set():
+                    service.turn(_LONGEST_WAIT_S)
+        except Exception as error:
+            self._failed = error
+            self._bell.set()
+
+    def _end(self) -> None:
+        """Robots' threads end together; one whose eyes hang is left behind."""
+        self._ending.set()
+        until_s = time.monotonic() + _LONGEST_WAIT_S + self._config.detector.deadline_s
+        for thread in self._threads:
+            thread.join(max(0.0, until_s - time.monotonic()))
+
+    def _of(self, robot: str) -> LogLine:
+        return lambda line: self._say(line.replace("vision: ", f"vision: {robot}: ", 1))

@@ -1,0 +1,95 @@
+"""Runs the vision service as a process: opens the link, serves one robot or a fleet, ends on a signal. Shell."""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from sightline.protocol.transports.link import Link
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.serving.service import Observe
+from sightline.vision_side.detect.around import close_detector
+from sightline.vision_side.detect.registry import configured_detector
+from sightline.vision_side.detect.port import Detector
+from sightline.vision_side.missions.registry import configured_mission
+from sightline.vision_side.pipeline import SOURCE
+from sightline.vision_side.service import LogLine, endpoints_text, open_service
+
+_WAIT_S = 0.2  # how long a stop signal may go unnoticed
+
+
+@contextmanager
+def ends_on_signal(ending: threading.Event) -> Iterator[None]:
+    """SIGTERM and SIGINT set `ending` while inside."""
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        ending.set()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _say(line: str) -> None:
+    print(f"{line}\n", end="", flush=True)  # as one piece: several threads may have something to say
+
+
+def run(config: VisionConfig, observe: Observe | None = None) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code 0. `observe` is told how to look at what is done.
+
+    Raises ConfigError for an endpoint or a mission that is none, LinkError if the link cannot be opened.
+    """
+    from sightline.protocol.transports.zenoh_log import log_rejected_peers
+
+    configured_mission(config)  # a mission that there is not is said before anything is opened
+    ending, eyes = threading.Event(), configured_detector(config)
+    run_it = _run_fleet if set("*?") & set(config.robot) else _run_one
+    try:
+        with log_rejected_peers(config.listen, config.secure, lambda line: _say(f"vision: {line}")):
+            return run_it(config, ending, observe, eyes)
+    finally:
+        close_detector(eyes)
+
+
+def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | None, eyes: Detector | None) -> int:
+    from sightline.protocol.transports.open import open_link
+
+    opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
+                        max_frame_bytes=config.max_frame_bytes, secure=config.secure)
+    # Signals are caught only from here on: until the link is open, they end the process by themselves.
+    with opened as link, ends_on_signal(ending):
+        _say(f"vision: looking for robot {config.robot} at {endpoints_text(config)}")
+        serve(config, link, ending, _say, observe, eyes=eyes)
+    return 0
+
+
+def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe | None, eyes: Detector | None) -> int:
+    from sightline.protocol.transports.zenoh_site import open_fleet
+    from sightline.vision_side.serving.fleet import Fleet
+
+    opened = open_fleet(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
+                       max_frame_bytes=config.max_frame_bytes, secure=config.secure)
+    with opened as site, ends_on_signal(ending):
+        _say(f"vision: looking for robots {config.robot} at {endpoints_text(config)}")
+        fleet = Fleet(config, site, _say, eyes)
+        if observe is not None:
+            observe(fleet.counts)
+        fleet.serve(ending)
+    return 0
+
+
+def serve(
+    config: VisionConfig, link: Link, ending: threading.Event, say: LogLine, observe: Observe | None = None, *,
+    eyes: Detector | None = None,
+) -> None:
+    """Answer frames that come over `link` until `ending` is set."""
+    service = open_service(config, link, say, eyes)
+    if observe is not None:
+        observe(lambda: [service.counts()])
+    while not ending.is_set():
+        service.turn(_WAIT_S)
+    say(f"vision: ended after {service.answered} frames; skipped: {dict(service.skipped) or 'none'}")
