@@ -4,7 +4,7 @@ import pytest
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import Holder, State, Twist, Verb
-from tests.safety_rig import HUMAN, VISION, Rig
+from tests.fixtures.safety import HUMAN, VISION, Rig
 
 VISION_HOLDER, HUMAN_HOLDER = Holder(source="vision", session=VISION), Holder(source="teleop", session=HUMAN)
 GUEST = Holder(source="guest", session="00000000")

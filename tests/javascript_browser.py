@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from tests.link_rigs import until
+from tests.fixtures.links import until
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome")
 _START_S = 30.0

@@ -5,7 +5,7 @@ import pytest
 from sightline.operator_side.client.messages import MAX_WAITING, ChannelInbox
 from sightline.protocol.channels import CHANNELS, JPEG
 from sightline.protocol.transports.memory import MemoryNetwork
-from tests.test_channel_text import usual
+from tests.operator_side.client.test_messages import usual
 
 PICTURES = [name for name, one in CHANNELS.items() if one.encoding == JPEG]
 

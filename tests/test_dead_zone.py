@@ -14,8 +14,8 @@ from sightline.robot_side.dead_zone import BlindZoneError, check_blind_zone
 from sightline.robot_side.safety.guard import GuardConfig
 from sightline.robot_side.ports import Ranges
 from sightline.sim.robot import load_robot
-from tests.link_rigs import until
-from tests.robot_process import RobotProcess
+from tests.fixtures.links import until
+from tests.fixtures.robot_process import RobotProcess
 
 # Binary fractions: front 0.5, rear 1, half as wide 0.25, so that "just" is just.
 BOX = {"front_m": 0.5, "rear_m": 1.0, "half_width_m": 0.25, "sensor_x_m": 0.0, "stop_m": 0.25}

@@ -6,8 +6,8 @@ import pytest
 
 from sightline.protocol.channels import OVERLAY, PREVIEW
 from sightline.protocol.transports.open import open_link
-from tests.link_rigs import free_endpoint, until
-from tests.robot_process import RobotProcess
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.robot_process import RobotProcess
 
 pytestmark = pytest.mark.slow
 JPEG = b"\xff\xd8" + bytes(100_000)

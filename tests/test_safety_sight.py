@@ -12,7 +12,7 @@ from sightline.protocol.messages import STILL, State, Twist, Verb
 from sightline.protocol.refusals import RejectReason
 from sightline.robot_side.safety.guard import GuardConfig, RangeGuard
 from sightline.robot_side.ports import Ranges
-from tests.safety_rig import MS, Rig
+from tests.fixtures.safety import MS, Rig
 
 
 def refusal(rig, verb, **kwargs):

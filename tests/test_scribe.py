@@ -11,7 +11,7 @@ import pytest
 from sightline.protocol.log import JsonLineStream
 from sightline.robot_side.driver.persistence import StopLatch
 from sightline.robot_side.scribe import BackgroundWriter
-from tests.link_rigs import until
+from tests.fixtures.links import until
 
 
 class Refusing(io.StringIO):

@@ -17,8 +17,8 @@ from sightline.protocol.transports.link_rules import OVERSIZE
 from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket_dialects import BAD_FRAMING
 from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint
-from tests.link_rigs import until
-from tests.test_websocket_legacy import JPEG, TEXT, free_legacy
+from tests.fixtures.links import until
+from tests.protocol.transports.websocket.test_legacy import JPEG, TEXT, free_legacy
 
 
 class OldRobot:

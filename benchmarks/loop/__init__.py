@@ -1,1 +1,1 @@
-"""Modules of benchmarks.loop."""
+"""Modules of sightline.benchmarks.loop."""

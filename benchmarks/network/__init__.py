@@ -1,1 +1,1 @@
-"""Modules of benchmarks.network."""
+"""Modules of sightline.benchmarks.network."""

@@ -1,1 +1,1 @@
-"""Modules of conformance.robot."""
+"""Modules of sightline.conformance.robot."""

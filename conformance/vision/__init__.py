@@ -1,1 +1,1 @@
-"""Modules of conformance.vision."""
+"""Modules of sightline.conformance.vision."""

@@ -1,1 +1,1 @@
-"""Modules of evaluation.baselines."""
+"""Modules of sightline.evaluation.baselines."""

@@ -1,1 +1,1 @@
-"""Modules of evaluation.demo."""
+"""Modules of sightline.evaluation.demo."""

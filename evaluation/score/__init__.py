@@ -1,1 +1,1 @@
-"""Modules of evaluation.score."""
+"""Modules of sightline.evaluation.score."""

@@ -1,1 +1,1 @@
-"""Modules of operator_side.calibrate."""
+"""Modules of sightline.operator_side.calibrate."""

@@ -1,1 +1,1 @@
-"""Modules of operator_side.cli."""
+"""Modules of sightline.operator_side.cli."""

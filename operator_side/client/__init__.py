@@ -1,1 +1,1 @@
-"""Modules of operator_side.client."""
+"""Modules of sightline.operator_side.client."""

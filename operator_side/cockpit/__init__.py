@@ -1,1 +1,1 @@
-"""Modules of operator_side.cockpit."""
+"""Modules of sightline.operator_side.cockpit."""

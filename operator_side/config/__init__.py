@@ -1,1 +1,1 @@
-"""Modules of operator_side.config."""
+"""Modules of sightline.operator_side.config."""

@@ -1,1 +1,1 @@
-"""Modules of operator_side.recording."""
+"""Modules of sightline.operator_side.recording."""

@@ -1,1 +1,1 @@
-"""Modules of operator_side.setup."""
+"""Modules of sightline.operator_side.setup."""

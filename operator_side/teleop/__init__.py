@@ -1,1 +1,1 @@
-"""Modules of operator_side.teleop."""
+"""Modules of sightline.operator_side.teleop."""

@@ -1,1 +1,1 @@
-"""Modules of protocol.spec."""
+"""Modules of sightline.protocol.spec."""

@@ -1,6 +1,6 @@
 """The seam between services and transports: `Link`, `Message`, `LatestSlot`. Shell (locks).
 
-A `Link` belongs to one robot id. It promises what `tests/test_link_spec.py` checks on every transport: newest wins,
+A `Link` belongs to one robot id. It promises what `tests/protocol/transports/test_link.py` checks on every transport: newest wins,
 memory is bounded, both ends may restart, nothing raised in a callback ends anything, `close` does not hang.
 """
 

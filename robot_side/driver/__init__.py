@@ -1,1 +1,1 @@
-"""Modules of robot_side.driver."""
+"""Modules of sightline.robot_side.driver."""

@@ -1,1 +1,1 @@
-"""Modules of robot_side.network."""
+"""Modules of sightline.robot_side.network."""

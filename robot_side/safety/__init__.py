@@ -1,1 +1,1 @@
-"""Modules of robot_side.safety."""
+"""Modules of sightline.robot_side.safety."""

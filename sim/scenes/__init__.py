@@ -1,1 +1,1 @@
-"""Modules of sim.scenes."""
+"""Modules of sightline.sim.scenes."""

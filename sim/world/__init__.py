@@ -1,1 +1,1 @@
-"""Modules of sim.world."""
+"""Modules of sightline.sim.world."""

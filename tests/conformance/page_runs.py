@@ -14,9 +14,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from sightline.operator_side.setup import keys
-from tests.javascript_rig import EXAMPLES, ROOT, JsRobot, JsVision, free_port, node
-from tests.link_rigs import free_endpoint, until
-from tests.robot_process import RobotProcess
+from tests.fixtures.javascript import EXAMPLES, ROOT, JsRobot, JsVision, free_port, node
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.robot_process import RobotProcess
 
 SIGHTLINE = [sys.executable, "-m", "sightline.operator_side.cli.app"]
 KEPT = ROOT / "runs" / "conformance"

@@ -14,21 +14,21 @@ from tests.mutation.mutants import Mutant, mutants
 from tests.mutation.trial import Outcome, finish, start
 
 _GATE = (
-    "tests/test_safety_commands_boundaries.py",
-    "tests/test_safety_step_boundaries.py",
-    "tests/test_safety_requests_boundaries.py",
-    "tests/test_safety_lease_boundaries.py",
+    "tests/robot_side/safety/test_gate_commands.py",
+    "tests/robot_side/safety/test_gate_step.py",
+    "tests/robot_side/safety/test_gate_requests.py",
+    "tests/robot_side/safety/test_gate_lease.py",
 )
 TABLES = {
     "robot_side/safety/gate.py": _GATE,
     "robot_side/safety/states.py": _GATE,
-    "robot_side/safety/validation.py": ("tests/test_record_boundaries.py",),
-    "robot_side/safety/lease.py": ("tests/test_lease_boundaries.py",),
-    "robot_side/safety/limits.py": ("tests/test_limits_boundaries.py", "tests/test_limits_ramp_boundaries.py"),
-    "robot_side/safety/guard.py": ("tests/test_guard_boundaries.py",),
+    "robot_side/safety/validation.py": ("tests/robot_side/safety/test_validation.py",),
+    "robot_side/safety/lease.py": ("tests/robot_side/safety/test_lease.py",),
+    "robot_side/safety/limits.py": ("tests/robot_side/safety/test_limits.py", "tests/test_limits_ramp_boundaries.py"),
+    "robot_side/safety/guard.py": ("tests/robot_side/safety/test_guard.py",),
     "robot_side/kinematics.py": ("tests/test_kinematics_boundaries.py",),
-    "protocol/text.py": ("tests/test_wire_boundaries.py",),
-    "protocol/jpeg.py": ("tests/test_wire_boundaries.py",),
+    "protocol/text.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
+    "protocol/jpeg.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
 }
 """Each judged file and the tables that must notice any change to it."""
 EQUIVALENTS = Path(__file__).parent / "equivalents.toml"

@@ -1,1 +1,1 @@
-"""Modules of vision_side.serving."""
+"""Modules of sightline.vision_side.serving."""

@@ -1,1 +1,1 @@
-"""Modules of vision_side.tracking."""
+"""Modules of sightline.vision_side.tracking."""

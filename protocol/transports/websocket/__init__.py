@@ -1,1 +1,1 @@
-"""Modules of protocol.transports.websocket."""
+"""Modules of sightline.protocol.transports.websocket."""

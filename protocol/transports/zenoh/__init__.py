@@ -1,1 +1,1 @@
-"""Modules of protocol.transports.zenoh."""
+"""Modules of sightline.protocol.transports.zenoh."""

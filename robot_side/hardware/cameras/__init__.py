@@ -1,1 +1,1 @@
-"""Modules of robot_side.hardware.cameras."""
+"""Modules of sightline.robot_side.hardware.cameras."""

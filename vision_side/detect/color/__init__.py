@@ -1,1 +1,1 @@
-"""Modules of vision_side.detect.color."""
+"""Modules of sightline.vision_side.detect.color."""

@@ -1,1 +1,1 @@
-"""Modules of vision_side.detect.onnx."""
+"""Modules of sightline.vision_side.detect.onnx."""

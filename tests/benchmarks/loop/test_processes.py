@@ -1,0 +1,161 @@
+"""`sightline bench loop`, `watchers` and `camera`: short runs of real processes and sockets; nothing is timed."""
+
+import json
+import math
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import typer
+
+from sightline.benchmarks.camera import measure_camera
+from sightline.benchmarks.loop.race import run_race
+from sightline.benchmarks.loop.processes import free_port
+from sightline.benchmarks.loop.vision import PipelineVision
+from sightline.benchmarks.loop.counters import children_of
+from sightline.benchmarks.loop.pictures import COUNT, camera_of, write_pictures
+from sightline.benchmarks.loop.figures import FLOOR, OUR_DETECTOR, OURS, PEERS, TCP, WITH_OUR_DETECTOR, LoopSetting
+from sightline.benchmarks.loop_sockets import carried_between, carried_bytes
+from sightline.benchmarks.peers.classic_detector import ClassicVision
+from sightline.benchmarks.watchers import measure_watchers
+from sightline.operator_side.cli_bench_loop import register_loop_benches
+from sightline.protocol.errors import HardwareError
+from sightline.robot_side.hardware.cameras.files import FolderCamera, FolderCameraConfig
+from tests.fixtures.links import until
+
+SMALL = LoopSetting(Path(), 160, 120, fps=30.0, seconds=2.0, tries=1)
+
+
+def test_the_pictures_are_those_of_the_camera_and_every_one_is_answered(tmp_path):
+    mean_bytes = write_pictures(tmp_path, 640, 480)
+    assert 40_000 < mean_bytes < 52_000
+    camera = FolderCamera(FolderCameraConfig(path=tmp_path))
+    assert camera.model == camera_of(640, 480)
+    eyes = PipelineVision(640, 480, 0.0)
+    answers = {eyes.answer(33_333 * at, path.read_bytes()) for at, path in enumerate(sorted(tmp_path.iterdir()), 1)}
+    assert len(answers) > 20  # the ball goes round, and the command with it
+
+
+def test_a_users_own_eyes_see_the_same_ball(tmp_path):
+    write_pictures(tmp_path, 640, 480)
+    turned = 0
+    for number, path in enumerate(sorted(tmp_path.iterdir())):
+        linear, angular = map(float, ClassicVision(0.0, 0.0).answer(1, path.read_bytes()).split("|"))
+        right = math.cos(math.tau * number / COUNT)  # that is how the ball goes round
+        assert linear > 0 and angular * right <= 0
+        turned += angular != 0
+    assert turned > COUNT // 2
+
+
+def test_a_users_own_eyes_see_nothing_where_nothing_is_and_say_what_does_not_decode(tmp_path):
+    import cv2
+    import numpy as np
+
+    plain = cv2.imencode(".jpg", np.full((120, 160, 3), 130, np.uint8))[1].tobytes()
+    assert ClassicVision(0.0, 0.0).answer(1, plain) == "0|0"
+    with pytest.raises(ValueError, match="decode"):
+        ClassicVision(0.0, 0.0).answer(1, b"no picture")
+
+
+def test_the_kernel_counts_the_bytes_of_a_connection():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with socket.create_connection(("127.0.0.1", port)) as client, server.accept()[0] as accepted:
+            before = carried_bytes([port])
+            accepted.sendall(bytes(5000))
+            received = client.recv(5000, socket.MSG_WAITALL)
+            client.sendall(bytes(70))
+            received += accepted.recv(70, socket.MSG_WAITALL)
+            assert len(received) == 5070
+            assert carried_between(before, carried_bytes([port])) == 5070
+        assert carried_bytes([free_port()]) == {}
+
+
+def test_of_several_connections_to_a_port_the_busiest_counts():
+    assert carried_between({(1, 5): 10}, {(1, 5): 30, (1, 6): 4, (2, 7): 100}) == 120
+    assert carried_between({}, {}) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("transport", ["zenoh", "websocket"])
+def test_a_short_race_of_the_services_over_each_transport(transport):
+    race = run_race(replace(SMALL, transport=transport, peers=()), lambda _: None)
+    assert list(race.figures) == [FLOOR, OURS]
+    ours = race.figures[OURS]
+    assert ours.captured > 20
+    assert ours.answered_percent > 50
+    assert set(ours.cpu_ms) == {"driver", "network", "vision"}
+    assert ours.bytes_per_picture > race.jpeg_bytes
+    assert race.figures[FLOOR].hot_ms is not None
+
+
+@pytest.mark.kit
+def test_every_peer_answers(tmp_path):
+    pytest.importorskip("zmq")
+    race = run_race(replace(SMALL, detector_delay_ms=40.0), lambda _: None)
+    assert set(race.figures) == {FLOOR, OURS, TCP, *PEERS, *(name + OUR_DETECTOR for name in WITH_OUR_DETECTOR)}
+    for name, one in race.figures.items():
+        assert one.captured > 10, name
+        assert one.p50_ms >= 40, name
+        assert name == FLOOR or one.bytes_per_picture > 1000, name
+
+
+@pytest.mark.slow
+def test_viewers_come_and_stall_and_the_loop_goes_on():
+    checks = {check.name: check for check in measure_watchers(replace(SMALL, tries=1), 3, lambda _: None)}
+    assert checks["not accepted"].value < 50
+    assert checks["memory, more"].value < 50
+
+
+@pytest.mark.slow
+def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkeypatch):
+    app = typer.Typer()
+    register_loop_benches(app)
+    monkeypatch.setattr("sightline.benchmarks.loop_sample.TAKEN_BOUND_PERCENT", 100.0)
+    asked = ["--size", "160x120", "--seconds", "2", "--peers", "none", "--out", str(tmp_path / "new"), "--json"]
+    code = app(["loop", *asked], standalone_mode=False)
+    printed = json.loads(capsys.readouterr().out)
+    assert code == (0 if printed["ok"] else 5)
+    assert [one["name"] for one in printed["contestants"]] == [FLOOR, OURS]
+    assert json.loads((tmp_path / "new" / "loop.json").read_text()) == printed
+    assert (tmp_path / "new" / "loop.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.slow
+def test_terminated_it_leaves_no_process_and_no_folder(tmp_path):
+    code = """
+from pathlib import Path
+from sightline.benchmarks.loop.race import run_race
+from sightline.benchmarks.loop.figures import LoopSetting
+run_race(LoopSetting(Path(), 160, 120, seconds=60.0, peers=(), tries=1), print)
+"""
+    bench = subprocess.Popen(
+        [sys.executable, "-c", code], env={**os.environ, "TMPDIR": str(tmp_path)}, stderr=subprocess.DEVNULL
+    )
+    try:
+        assert until(lambda: "first answer" in "".join(path.read_text() for path in tmp_path.rglob("floor.log")), 20)
+        (floor,) = children_of(bench.pid)
+        bench.terminate()
+        assert bench.wait(10) != 0
+    finally:
+        bench.kill()
+    assert not Path(f"/proc/{floor}").exists()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_process_that_cannot_start_is_said_in_its_own_words(monkeypatch):
+    monkeypatch.setattr("sightline.benchmarks.loop_sample._MODULE", "benchmarks.no_such_module")
+    with pytest.raises(HardwareError, match="No module named"):
+        run_race(replace(SMALL, peers=()), lambda _: None)
+
+
+@pytest.mark.slow
+def test_a_cameras_pictures_are_passed_through_and_counted():
+    seen = measure_camera(3.0)
+    assert 40_000 < seen.jpeg_bytes < 52_000
+    assert 0 < seen.cpu_ms < seen.ready_ms
+    assert seen.missed < 30

@@ -1,0 +1,186 @@
+"""Robots that are wrong about who drives. Pure."""
+
+from sightline.protocol.messages import Holder, State, Twist
+from sightline.robot_side.safety.lease import RANKS, Lease
+from tests.conformance.robot.broken.breaking import bend_out, breaks, fields_of, wrap
+
+STILL = Twist(linear_mps=0.0, angular_rad_s=0.0)
+
+
+def lease_of(robot, **methods):
+    """The gate's lease as a class of its own, with other methods."""
+    gate = robot.driving.gate
+    gate._lease = type("BrokenLease", (Lease,), methods)(gate._lease.life_us)
+
+
+def who_sends(message):
+    """The holder that a message's header names."""
+    fields = fields_of(message.header) or {}
+    try:
+        return Holder(source=fields["source"], session=fields["session"])
+    except (KeyError, ValueError):
+        return None
+
+
+@breaks("R-LEASE-01")
+def tells_no_holder(robot):
+    bend_out(robot, "status", lambda _header, payload: payload.pop("holder", None))
+
+
+@breaks("R-LEASE-02")
+def lets_two_drive(robot):
+    def may_take(self, who, now_us):
+        holder = self.live_holder(now_us)
+        return Lease.may_take(self, who, now_us) or who.source == holder.source == "vision"
+
+    lease_of(robot, may_take=may_take)
+
+
+@breaks("R-LEASE-03")
+def loser_is_not_told(robot):
+    def bend(_header, payload):
+        if (payload.get("last_refusal") or {}).get("reason") == "NOT_HOLDER":
+            payload["last_refusal"]["detail"] = "somebody drives"
+
+    bend_out(robot, "status", bend)
+
+
+@breaks("R-LEASE-04")
+def lease_lasts_two_seconds(robot):
+    robot.driving.gate._lease.life_us = 2_000_000
+
+
+@breaks("R-LEASE-05")
+def lease_ends_at_once(robot):
+    robot.driving.gate._lease.life_us = 480_000
+
+
+@breaks("R-LEASE-06")
+def refused_commands_renew(robot):
+    def around(inner, message):
+        gate, who = robot.driving.gate, who_sends(message)
+        before = gate.counters["UNKNOWN_FRAME"]
+        inner(message)
+        if gate.counters["UNKNOWN_FRAME"] > before and gate.holder(robot.now()) == who:
+            gate._lease.take(who, robot.now())
+
+    wrap(robot, "on_twist", around)
+
+
+@breaks("R-LEASE-07")
+def acks_renew(robot):
+    def around(inner, message):
+        inner(message)
+        gate, who = robot.driving.gate, who_sends(message)
+        if who is not None and gate.holder(robot.now()) == who:
+            gate._lease.take(who, robot.now())
+
+    wrap(robot, "on_ack", around)
+
+
+@breaks("R-LEASE-08")
+def acks_take(robot):
+    def around(inner, message):
+        inner(message)
+        gate, who = robot.driving.gate, who_sends(message)
+        if who is not None and who.source in RANKS and not gate.counters and gate.holder(robot.now()) is None:
+            gate._lease.take(who, robot.now())
+
+    wrap(robot, "on_ack", around)
+
+
+@breaks("R-LEASE-09")
+def humans_wait_in_line(robot):
+    def may_take(self, who, now_us):
+        holder = self.live_holder(now_us)
+        outranks = holder is not None and holder.source == "guest" and who.source != "guest"
+        return holder is None or holder == who or outranks
+
+    lease_of(robot, may_take=may_take)
+
+
+@breaks("R-LEASE-10")
+def vision_takes_from_humans(robot):
+    gate = robot.driving.gate
+
+    def may_take(self, who, now_us):
+        holder = self.live_holder(now_us)
+        stolen = holder is not None and holder.source == "teleop" and gate.state is State.DISARMED
+        return Lease.may_take(self, who, now_us) or (stolen and who.source == "vision")
+
+    lease_of(robot, may_take=may_take)
+
+
+@breaks("R-LEASE-11")
+def lost_humans_are_not_noticed(robot):
+    robot.driving.gate._notice_lost_human = lambda now_us: None
+
+
+@breaks("R-LEASE-12")
+def humans_let_go_without_effect(robot):
+    gate = robot.driving.gate
+
+    def around(inner, who, now_us):
+        if who.source != "teleop" or gate.holder(now_us) != who:
+            return inner(who, now_us)
+        gate._lease.drop()
+        return "released"
+
+    wrap(gate, "release", around)
+
+
+@breaks("R-LEASE-13")
+def acquire_is_a_word(robot):
+    gate = robot.driving.gate
+
+    def around(inner, who, now_us):
+        if who.source in RANKS and gate._lease.may_take(who, now_us):
+            return "acquired"
+        return inner(who, now_us)
+
+    wrap(gate, "acquire", around)
+
+
+@breaks("R-LEASE-14")
+def acquire_renews(robot):
+    gate = robot.driving.gate
+
+    def around(inner, who, now_us):
+        detail = inner(who, now_us)
+        gate._lease.take(who, now_us)
+        return detail
+
+    wrap(gate, "acquire", around)
+
+
+@breaks("R-LEASE-15")
+def release_is_a_word(robot):
+    wrap(
+        robot.driving.gate, "release",
+        lambda inner, who, now_us: "released" if who.source == "vision" else inner(who, now_us),
+    )  # fmt: skip
+
+
+@breaks("R-LEASE-16")
+def anybody_releases(robot):
+    gate = robot.driving.gate
+    wrap(gate, "release", lambda inner, who, now_us: inner(gate.holder(now_us) or who, now_us))
+
+
+@breaks("R-LEASE-17")
+def acquire_of_an_equal(robot):
+    gate = robot.driving.gate
+
+    def around(inner, who, now_us):
+        holder = gate.holder(now_us)
+        return "acquired" if holder and holder.source == who.source else inner(who, now_us)
+
+    wrap(gate, "acquire", around)
+
+
+@breaks("R-LEASE-18")
+def acquire_of_a_watcher(robot):
+    wrap(
+        robot.driving.gate, "acquire",
+        lambda inner, who, now_us: inner(who, now_us) if who.source in RANKS else "acquired",
+    )  # fmt: skip

@@ -1,0 +1,182 @@
+"""Robots whose wheels do something wrong: limits and silence. Pure."""
+
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import State, Twist
+from sightline.protocol.refusals import CLAMPED, RejectReason
+from sightline.robot_side.safety.validation import AcceptedCommand
+from tests.conformance.robot.broken.breaking import bend_out, breaks, fields_of, wrap
+from tests.conformance.robot.broken.lease import who_sends
+
+STILL = Twist(linear_mps=0.0, angular_rad_s=0.0)
+
+
+def keeps(robot, change):
+    """`change(command, asked)` gives the command in force in place of the accepted one."""
+    gate = robot.driving.gate
+
+    def around(inner, source, twist, now_us, age_us):
+        inner(source, twist, now_us, age_us)
+        gate._command = change(gate._command, twist)
+
+    wrap(gate, "_keep", around)
+
+
+def goal(robot, change):
+    """`change(twist, asked)` gives the goal of the wheels; `asked` is what the driver asked for last."""
+    gate, asked = robot.driving.gate, [STILL]
+    wrap(gate, "_keep", lambda inner, *a: asked.__setitem__(0, a[1]) or inner(*a))
+
+    def around(inner, now_us):
+        twist = inner(now_us)
+        return twist if twist == STILL else change(twist, asked[0])
+
+    wrap(gate, "_goal", around)
+
+
+@breaks("R-LIM-01")
+def does_not_know_backwards(robot):
+    goal(robot, lambda twist, _asked: Twist(linear_mps=abs(twist.linear_mps), angular_rad_s=twist.angular_rad_s))
+
+
+@breaks("R-LIM-02")
+def tells_no_limits(robot):
+    bend_out(robot, "status", lambda _header, payload: payload.update(max_linear_mps=0.0, max_angular_rad_s=0.0))
+
+
+@breaks("R-LIM-03")
+def does_not_clamp(robot):
+    goal(robot, lambda twist, asked: Twist(linear_mps=1.0, angular_rad_s=0.0) if asked.linear_mps > 40 else twist)
+
+
+@breaks("R-LIM-04")
+def does_not_clamp_turns(robot):
+    goal(robot, lambda twist, asked: Twist(linear_mps=0.0, angular_rad_s=-5.0) if asked.angular_rad_s < -40 else twist)
+
+
+@breaks("R-LIM-05")
+def clamps_unsaid(robot):
+    bend_out(robot, "status", lambda _header, payload: payload["refused"].pop(CLAMPED, None))
+
+
+@breaks("R-LIM-06")
+def clamps_each_axis_by_itself(robot):
+    limits = robot.config.safety
+
+    def change(twist, asked):
+        linear_mps = max(-limits.max_linear_mps, min(limits.max_linear_mps, asked.linear_mps))
+        return Twist(linear_mps=linear_mps, angular_rad_s=asked.angular_rad_s) if asked.linear_mps < 40 else twist
+
+    def both(asked):
+        return asked.linear_mps > 1 and asked.angular_rad_s > 1
+
+    goal(robot, lambda twist, asked: change(twist, asked) if both(asked) else twist)
+
+
+@breaks("R-LIM-07")
+def no_ramp(robot):
+    robot.driving.gate._ramp.step = lambda goal, elapsed_us: goal
+
+
+# --- silence --------------------------------------------------------------------------------------------------------
+
+
+@breaks("R-SIL-01")
+def brakes_slowly(robot):
+    gate, speed = robot.driving.gate, [0.0]
+
+    def around(inner, goal, elapsed_us):
+        twist = inner(goal, elapsed_us)
+        if gate.state is State.HOLD and speed[0] > twist.linear_mps:
+            linear_mps = max(twist.linear_mps, speed[0] - 0.3 * elapsed_us / 1e6)
+            twist = Twist(linear_mps=linear_mps, angular_rad_s=twist.angular_rad_s)
+        speed[0] = twist.linear_mps
+        return twist
+
+    wrap(gate._ramp, "step", around)
+
+
+def revive(robot):
+    """The command in force begins anew."""
+    gate = robot.driving.gate
+    if gate._command is not None:
+        gate._command = AcceptedCommand(gate._command.twist, robot.now(), robot.now(), gate._command.life_us)
+
+
+def revived_by(robot, reason):
+    """Twists refused for `reason` keep the wheels turning."""
+
+    def around(inner, source, error):
+        if error.reason == reason:
+            revive(robot)
+        return inner(source, error)
+
+    wrap(robot.driving.gate, "refuse", around)
+
+
+@breaks("R-SIL-02")
+def refused_commands_keep_it_going(robot):
+    revived_by(robot, "UNKNOWN_FRAME")
+
+
+@breaks("R-SIL-03")
+def anybodys_commands_keep_it_going(robot):
+    revived_by(robot, "NOT_HOLDER")
+
+
+@breaks("R-SIL-04")
+def judges_age_by_arrival(robot):
+    last = [None]
+
+    def around(inner, message):
+        echo = (fields_of(message.header) or {}).get("echo")
+        before = robot.driving.gate.accepted
+        inner(message)
+        if robot.driving.gate.accepted > before and echo == last[0]:
+            revive(robot)
+        last[0] = echo
+
+    wrap(robot, "on_twist", around)
+
+
+@breaks("R-SIL-05")
+def full_speed_on_ageing_sight(robot):
+    gate = robot.driving.gate
+    gate.config = gate.config.model_copy(update={"full_speed_age_ms": 399})
+
+
+@breaks("R-SIL-06")
+def hold_is_not_said(robot):
+    def bend(_header, payload):
+        if payload["state"] == "HOLD" and robot.driving.gate._lease.holder.source != "guest":
+            payload["state"] = "DEGRADED"
+
+    bend_out(robot, "status", bend)
+
+
+@breaks("R-SIL-07")
+def holds_for_ever(robot):
+    gate = robot.driving.gate
+    gate.config = gate.config.model_copy(update={"disarm_after_hold_s": 600.0})
+
+
+@breaks("R-SIL-08")
+def hold_is_the_end(robot):
+    gate = robot.driving.gate
+
+    def around(inner, source, header, twist, now_us):
+        if gate.state is State.HOLD and now_us - gate._hold_since_us > 300_000 and source == "vision":
+            return gate.refuse(source, WireError(RejectReason.NOT_ALLOWED, "arm again"))
+        return inner(source, header, twist, now_us)
+
+    wrap(gate, "offer", around)
+
+
+@breaks("R-SIL-09")
+def acks_keep_it_going(robot):
+    def around(inner, message):
+        inner(message)
+        who = who_sends(message)
+        if who is not None and who == robot.driving.gate.holder(robot.now()):
+            revive(robot)
+
+    wrap(robot, "on_ack", around)

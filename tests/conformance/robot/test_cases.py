@@ -1,0 +1,209 @@
+"""The kit against our own robot and against one broken robot per case, in virtual time; and the kit's own parts."""
+
+import os
+from concurrent.futures import ProcessPoolExecutor
+
+import pytest
+
+from sightline.protocol.conformance.bench import KEPT_MESSAGES
+from sightline.conformance.case import GROUPS, Case, Level, Suite
+from sightline.conformance.robot.cases import CASES, prepare
+from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_cases
+from sightline.protocol.errors import ConfigError
+from tests.conformance.robot.broken import arming as broken_arming  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken import validation as broken_judging  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken import lease as broken_lease  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken import motion as broken_motion  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken import order as broken_order  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken import frames as broken_output  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken import requests as broken_requests  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken import credit as broken_traffic  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken.breaking import BROKEN
+from tests.conformance.clauses import clauses
+from tests.conformance.robot.reference import quicken, virtual_robot
+
+VIRTUAL = [case for case in CASES if not case.real]
+NAMES = [case.id for case in VIRTUAL]
+MOST_S = 300.0
+"""One broken robot at all cases takes 5 s of a processor, and waits for those before it."""
+
+
+def result_of(case, break_it=None):
+    bench, _robot = virtual_robot(break_it)
+    return run_case(case, bench, prepare)
+
+
+def failures_of(broken_id):
+    """The cases that fail at one broken robot; a fresh one for each."""
+    results = [result_of(case, BROKEN[broken_id]) for case in VIRTUAL]
+    return {one.case.id: one.reason for one in results if one.outcome is Outcome.FAILED}
+
+
+@pytest.fixture(scope="module")
+def matrix():
+    """Broken robot -> what will be found of it, so that each is reported when it is done and not all at the end."""
+    pool = ProcessPoolExecutor(os.cpu_count(), initializer=quicken)
+    yield {name: pool.submit(failures_of, name) for name in BROKEN}
+    pool.shutdown(cancel_futures=True)
+
+
+# --- our robot, and broken ones --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", VIRTUAL, ids=NAMES)
+def test_our_robot_passes(case):
+    result = result_of(case)
+    assert result.outcome is Outcome.PASSED, result.reason
+
+
+def test_every_case_has_its_broken_robot():
+    assert sorted(BROKEN) == sorted(NAMES)
+    assert len({broken.__name__ for broken in BROKEN.values()}) == len(BROKEN)
+
+
+@pytest.mark.parametrize("case", VIRTUAL, ids=NAMES)
+def test_each_case_finds_its_broken_robot(case):
+    assert result_of(case, BROKEN[case.id]).outcome is Outcome.FAILED
+
+
+@pytest.mark.kit
+@pytest.mark.parametrize("broken_id", BROKEN, ids=lambda name: f"{name} {BROKEN[name].__name__}")
+def test_a_broken_robot_fails_exactly_its_case(matrix, broken_id):
+    failed = matrix[broken_id].result(timeout=MOST_S)
+    assert set(failed) == {broken_id}, failed
+
+
+def test_one_robot_passes_all_cases_in_a_row():
+    bench, _robot = virtual_robot()
+    results = run_cases(VIRTUAL, bench, prepare)
+    assert {one.case.id: one.reason for one in results if one.outcome is Outcome.FAILED} == {}
+    assert {one.case.id: one.reason for one in results if one.outcome is Outcome.SKIPPED} == {}
+
+
+def test_a_robot_without_guests_passes_what_applies():
+    for case in VIRTUAL:
+        if case.id.startswith("R-DIAL"):
+            bench, _robot = virtual_robot(guests=False)
+            assert run_case(case, bench, prepare).outcome is not Outcome.FAILED, case.id
+
+
+def test_a_dead_robot_fails_everything():
+    bench, robot = virtual_robot()
+    robot.tick = lambda now_us: None
+    assert {one.outcome for one in run_cases(VIRTUAL[:20], bench, prepare)} == {Outcome.FAILED}
+
+
+# --- the cases themselves --------------------------------------------------------------------------------------------
+
+
+def test_there_are_enough_and_each_is_of_a_clause():
+    assert len(CASES) >= 60
+    assert {case.clause for case in CASES} <= set(clauses())
+    assert all(len(case.title) > 15 and case.title.endswith(".") for case in CASES)
+    assert {case.group for case in CASES} >= {
+        "framing", "causality", "sequence", "limits", "lease", "stop", "flow", "dialect", "hostile input", "reconnect",
+    }  # fmt: skip
+
+
+def test_a_case_needs_a_good_id():
+    suite = Suite("R")
+
+    def run(_bench):
+        """A title."""
+
+    for bad in ("R-NONE-01", "V-CAUS-01", "R-CAUS", "R-CAUS-x"):
+        with pytest.raises(ValueError, match="R-GROUP-NN"):
+            suite.must(bad, "Headers")(run)
+    suite.must("R-CAUS-01", "Headers")(run)
+    with pytest.raises(ValueError, match="twice"):
+        suite.should("R-CAUS-01", "Headers")(run)
+    assert suite.cases == [Case("R-CAUS-01", Level.MUST, "Headers", "A title.", run)]
+
+
+def test_cases_are_chosen_by_id_and_group():
+    assert {case.group for case in chosen(CASES, groups=["lease"])} == {"lease"}
+    assert [case.id for case in chosen(CASES, only=["r-stop-01"])] == ["R-STOP-01"]
+    assert chosen(CASES, only=["R-STOP"], groups=["lease"]) == []
+    with pytest.raises(ConfigError, match="no case begins so"):
+        chosen(CASES, only=["R-NONE"])
+    with pytest.raises(ConfigError, match="there are framing"):
+        chosen(CASES, groups=["leases"])
+    assert set(GROUPS.values()) >= {case.group for case in CASES}
+
+
+# --- the runner and the bench ----------------------------------------------------------------------------------------
+
+
+def outcome(run, level=Level.MUST):
+    bench, _robot = virtual_robot()
+    return run_case(Case("R-CAUS-99", level, "Headers", "A title.", run), bench)
+
+
+def test_whatever_a_case_raises_is_a_result():
+    assert outcome(lambda bench: bench.rest(1000)).outcome is Outcome.PASSED
+    failed = outcome(lambda bench: bench.expect(False, "why"))
+    assert (failed.outcome, failed.reason) == (Outcome.FAILED, "why")
+    skipped = outcome(lambda bench: bench.need(False, "what"))
+    assert (skipped.outcome, skipped.reason) == (Outcome.SKIPPED, "what")
+    late = outcome(lambda bench: bench.expect_within(lambda: False, 30_000, "it never came"))
+    assert (late.reason, late.took_us) == ("it never came (waited 0.03 s)", 30_000)
+    assert outcome(lambda _bench: {}["x"]).reason == "KeyError: 'x'"
+
+
+def test_a_case_may_be_tried_again_and_says_so():
+    bench, _robot = virtual_robot()
+    runs = []
+
+    def fails_once(bench):
+        runs.append(bench.now_us)
+        bench.expect(len(runs) > 1, "lost")
+
+    case = Case("R-CAUS-99", Level.MUST, "Headers", "A title.", fails_once)
+    once = run_cases([case], bench)
+    runs.clear()
+    twice = run_cases([case], bench, tries=2)
+    assert [one.outcome for one in (*once, *twice)] == [Outcome.FAILED, Outcome.PASSED]
+    assert twice[0].reason == "at try 2; before: lost"
+    always = Case("R-CAUS-98", Level.MUST, "Headers", "A title.", lambda bench: bench.expect(False, "never"))
+    assert run_cases([always], bench, tries=3)[0].reason == "never"
+    runs.clear()
+
+    def fails_then_lacks(bench):
+        runs.append(bench.now_us)
+        bench.expect(len(runs) > 1, "lost")
+        bench.need(False, "gone")
+
+    lacking = Case("R-CAUS-97", Level.MUST, "Headers", "A title.", fails_then_lacks)
+    assert run_cases([lacking], bench, tries=2)[0].outcome is Outcome.FAILED
+
+
+def test_a_peer_conforms_if_no_must_failed_and_something_was_tested():
+    good, weak = outcome(lambda bench: None), outcome(lambda bench: bench.expect(False, "x"), Level.SHOULD)
+    bad, nothing = outcome(lambda bench: bench.expect(False, "x")), outcome(lambda bench: bench.need(False, "x"))
+    assert passed([good, weak, nothing])
+    assert not passed([good, bad])
+    assert not passed([nothing])
+    assert not passed([])
+
+
+def test_time_passes_only_while_a_case_waits_and_callbacks_run_inside():
+    bench, _robot = virtual_robot()
+    began_us, rung = bench.now_us, []
+    bench.after(20_000, lambda: rung.append(bench.now_us - began_us))
+    bench.after(10_000, lambda: rung.append(bench.now_us - began_us))
+    assert bench.now_us == began_us and rung == []
+    assert not bench.wait(lambda: False, 50_000)
+    assert rung == [10_000, 20_000]
+    assert bench.now_us == began_us + 50_000
+
+
+def test_the_log_is_bounded_and_forgets_between_cases():
+    bench, robot = virtual_robot()
+    bench.rest(100_000)
+    status = next(iter(robot.driving.messages(bench.now_us + 500_000)))
+    for _ in range(KEPT_MESSAGES + 100):
+        robot.emit(status)
+    bench.rest(10_000)
+    assert len(bench.heard(status.channel)) == KEPT_MESSAGES
+    bench.forget()
+    assert bench.newest(status.channel) is None

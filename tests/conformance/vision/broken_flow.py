@@ -1,0 +1,255 @@
+"""Broken visions: queues, silences, losses, and robots in states they do not like. Pure."""
+
+import json
+from collections import deque
+
+from sightline.protocol.channels import FRAME
+from sightline.conformance.vision.flow import BROKEN_STATUS
+from tests.conformance.vision.broken import STANDING, BrokenVision, breaks
+from tests.conformance.vision.broken_answers import PerSession
+from sightline.vision_side.pipeline import Observation, PipelineAnswer
+
+
+class Queueing(BrokenVision):
+    """Keeps frames its own way: `queue` holds what came and was not looked at."""
+
+    def __init__(self, network, robot="r1"):
+        super().__init__(network, robot)
+        self.queue = deque(maxlen=30)
+        self.link.subscribe(FRAME, self.arrives)
+
+    def arrives(self, message):
+        self.queue.append(message)
+
+    def tick(self, now_us):
+        taken = self.next()
+        if taken is not None:
+            self._frames.put(taken)
+        super().tick(now_us)
+
+
+@breaks("V-FLOW-09", "answers everything in turn")
+class InTurn(Queueing):
+    def next(self):
+        return self.queue.popleft() if self.queue else None
+
+
+@breaks("V-FLOW-02", "takes the oldest of a burst")
+class OldestFirst(Queueing):
+    def next(self):
+        oldest = self.queue[0] if self.queue else None
+        self.queue.clear()
+        return oldest
+
+
+@breaks("V-CAUS-07", "looks at an older one after the newest of a burst")
+class LooksBack(Queueing):
+    older = None
+
+    def next(self):
+        older, self.older = self.older, None
+        if self.queue:
+            older = None
+        if len(self.queue) >= 10:
+            self.older = self.queue[len(self.queue) // 2]
+        self.queue.clear()
+        return older
+
+
+@breaks("V-FLOW-03", "works off a flood")
+class Flooded(Queueing):
+    frames = 0
+
+    def arrives(self, message):
+        self.frames += 1
+        if self.frames == 800:
+            self.busy_until_us = self.now_us + 3_000_000
+
+    def next(self):
+        return None
+
+
+class Gaps(BrokenVision):
+    """Knows how long it heard no frame before this one."""
+
+    last_us = None
+
+    def hears(self, header, jpeg):
+        gap_us = 0 if self.last_us is None else self.now_us - self.last_us
+        self.last_us = self.now_us
+        return (header, jpeg) if self.likes(gap_us) else None
+
+
+@breaks("V-FLOW-04", "is asleep after a second")
+class Sleepy(Gaps):
+    def likes(self, gap_us):
+        return not 1_200_000 < gap_us < 1_700_000
+
+
+@breaks("V-SIL-02", "is asleep after four seconds")
+class Sleeper(Gaps):
+    def likes(self, gap_us):
+        return gap_us < 4_000_000
+
+
+@breaks("V-FLOW-05", "tires of 30 frames a second")
+class Tired(Gaps):
+    steady = 0
+
+    def likes(self, gap_us):
+        self.steady = self.steady + 1 if 29_000 < gap_us < 41_000 else 0
+        return self.steady < 46
+
+
+@breaks("V-FLOW-01", "is silent about what is no JPEG")
+class Silent(BrokenVision):
+    def hears(self, header, jpeg):
+        return None if jpeg.startswith(b"no picture") else (header, jpeg)
+
+
+@breaks("V-FLOW-06", "is silent without a camera model")
+class NeedsCamera(BrokenVision):
+    def hears(self, header, jpeg):
+        return None if self._pipeline is None else (header, jpeg)
+
+
+@breaks("V-FLOW-07", "gives up on a late camera model")
+class Impatient(BrokenVision):
+    blind = 0
+
+    def hears(self, header, jpeg):
+        self.blind += self._pipeline is None
+        return header, jpeg
+
+    def _use(self, camera):
+        if self.blind < 20:
+            super()._use(camera)
+
+
+@breaks("V-FLOW-08", "keeps its first camera model")
+class FirstCamera(BrokenVision):
+    def _use(self, camera):
+        if self._pipeline is None:
+            super()._use(camera)
+
+
+@breaks("V-SIL-03", "drives on when pictures cease")
+class DrivesOn(BrokenVision):
+    bad = 0
+
+    def decides(self, header, answer):
+        self.bad = self.bad + 1 if answer.twist is None and self.tiny else 0
+        return STANDING if self.bad > 5 else answer
+
+    def hears(self, header, jpeg):
+        self.tiny = len(jpeg) == 4
+        return header, jpeg
+
+
+# --- states ----------------------------------------------------------------------------------------------------------
+
+
+class Stately(BrokenVision):
+    """Reads the status; `quiet` while it holds what this one does not like."""
+
+    quiet, heard_us = False, 0
+
+    def on_status(self, message):
+        self.heard_us = self.now_us
+        try:
+            status = json.loads(message.payload)
+        except ValueError:
+            status = {}
+        self.quiet = self.dislikes(status if isinstance(status, dict) else {}, message.payload)
+
+    def decides(self, header, answer):
+        return None if self.quiet else answer
+
+
+def stately(case, wrong, dislikes):
+    """Falls silent for a status."""
+    kind = type("Stately", (Stately,), {"dislikes": lambda self, status, payload: dislikes(status, payload)})
+    breaks(case, wrong)(kind)
+
+
+stately("V-STAT-02", "is silent while the robot is stopped", lambda it, _: it.get("state") == "STOPPED")
+stately("V-STAT-03", "sulks when refused", lambda it, _: it.get("refused", {}).get("STALE", 0) > 50)
+stately("V-STAT-04", "is silent while another drives", lambda it, _: bool(it.get("holder")))
+stately("V-STAT-05", "knows all fields of a status", lambda it, _: "battery" in it)
+for _id, (_title, _payload) in BROKEN_STATUS.items():
+    stately(_id, f"not so: {_title}", lambda _, payload, bad=_payload: payload == bad)
+
+
+@breaks("V-STAT-01", "only acknowledges while the robot is disarmed")
+class Waiting(Stately):
+    def dislikes(self, status, payload):
+        return status.get("state") == "DISARMED"
+
+    def decides(self, header, answer):
+        return PipelineAnswer(None, Observation("waiting")) if self.quiet else answer
+
+
+@breaks("V-STAT-06", "needs a status every 300 ms")
+class NeedsStatus(Stately):
+    def dislikes(self, status, payload):
+        return False
+
+    def decides(self, header, answer):
+        return answer if self.now_us - self.heard_us < 300_000 else None
+
+
+# --- connections -----------------------------------------------------------------------------------------------------
+
+
+@breaks("V-RECO-01", "does not come back after a third of a second")
+class GivesUp(BrokenVision):
+    def back(self):
+        self.dead = 200_000 < self.gap_us < 500_000
+
+
+@breaks("V-RECO-02", "does not know a robot that starts anew after a second")
+class OneRobot(PerSession):
+    gone, deaf = False, False
+
+    def back(self):
+        self.gone = self.gap_us > 900_000
+
+    def starts_anew(self):
+        self.deaf = self.deaf or self.gone
+
+    def decides(self, header, answer):
+        answer = super().decides(header, answer)
+        return None if self.deaf else answer
+
+
+@breaks("V-RECO-03", "gives up when it has lost three connections")
+class ThreeTimes(BrokenVision):
+    losses = 0
+
+    def lost(self):
+        self.losses += 1
+        self.dead = self.losses >= 3
+
+
+@breaks("V-RECO-04", "counts from one for every connection")
+class CountsPerConnection(BrokenVision):
+    def back(self):
+        self.answered = 0
+
+
+@breaks("V-RECO-05", "keeps answers back until somebody listens")
+class KeepsBack(BrokenVision):
+    kept = None
+
+    def puts(self, fields, text, **how):
+        if self.link.connected:
+            super().puts(fields, text, **how)
+        else:
+            self.kept = (fields, text)
+
+    def back(self):
+        if self.kept is not None:
+            super().puts(*self.kept)
+            self.kept = None
+
+

@@ -1,0 +1,84 @@
+"""Broken visions: those that steer where they should not. Pure."""
+
+from sightline.protocol.messages import Twist
+from tests.conformance.vision.broken import breaks
+from tests.conformance.vision.broken_answers import PerSession
+from sightline.vision_side.pipeline import PipelineAnswer
+
+
+class Steering(PerSession):
+    """Changes speeds; `saw` says what this session has shown."""
+
+    def starts_anew(self):
+        self.saw = set()
+
+    def decides(self, header, answer):
+        answer = super().decides(header, answer)
+        if answer.twist is None:
+            return answer
+        bearing = answer.seen.bearing_rad
+        beside = bearing is not None and abs(bearing) > 0.1
+        self.saw.add("nothing" if bearing is None else "ahead" if not beside else "left" if bearing > 0 else "right")
+        linear, angular = self.steers(answer.twist.linear_mps, answer.twist.angular_rad_s, bearing)
+        return PipelineAnswer(Twist(linear_mps=linear, angular_rad_s=angular), answer.seen)
+
+
+def steering(case, wrong):
+    """Decorator of a function (vision, linear, angular, bearing) -> (linear, angular)."""
+    def keep(steers):
+        breaks(case, wrong)(type("Steering", (Steering,), {"steers": steers}))
+    return keep
+
+
+@steering("V-STEER-01", "never turns left")
+def _(self, linear, angular, bearing):
+    return linear, min(angular, 0.0)
+
+
+@steering("V-STEER-02", "never turns right before it turned left")
+def _(self, linear, angular, bearing):
+    return linear, angular if "left" in self.saw else max(angular, 0.0)
+
+
+@steering("V-STEER-03", "pulls to the left on the straight")
+def _(self, linear, angular, bearing):
+    return linear, angular + 0.5 if linear > 0 and abs(angular) < 0.1 else angular
+
+
+@steering("V-STEER-04", "drives off to look for a target")
+def _(self, linear, angular, bearing):
+    return (0.2 if self.count > 20 and self.saw == {"nothing"} else linear), angular
+
+
+@steering("V-STEER-05", "drives on where the target was")
+def _(self, linear, angular, bearing):
+    return (0.3 if bearing is None and "ahead" in self.saw else linear), angular
+
+
+@steering("V-STEER-06", "turns left for ever once it did")
+def _(self, linear, angular, bearing):
+    return linear, abs(angular) if "left" in self.saw else angular
+
+
+@breaks("V-STEER-07", "takes time from its own clock")
+class OwnClock(Steering):
+    last_us = 0
+
+    def steers(self, linear, angular, bearing):
+        slow = self.now_us - self.last_us > 60_000
+        self.last_us = self.now_us
+        return linear * (0.9 if slow else 1.0), angular
+
+
+@breaks("V-STEER-08", "remembers what the robot's last start saw")
+class Remembers(Steering):
+    before = frozenset()
+
+    def starts_anew(self):
+        self.before = frozenset(getattr(self, "saw", ()))
+        self.saw = set()
+
+    def steers(self, linear, angular, bearing):
+        return (0.3 if bearing is None and self.count < 4 and "ahead" in self.before else linear), angular
+
+

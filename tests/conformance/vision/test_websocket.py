@@ -1,0 +1,117 @@
+"""The kit's cases with sockets of their own: ours passes, a plain client passes, each broken one fails its own case."""
+
+import socket
+import threading
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+
+from sightline.protocol.conformance.bench import Access
+from sightline.conformance.benches import LiveBench
+from sightline.conformance.runner import Outcome, run_case
+from sightline.protocol.conformance.virtual import TO_ROBOT
+from sightline.conformance.vision.cases import CASES
+from sightline.conformance.vision.websocket import _take
+from sightline.protocol.transports.open import open_link
+from tests.conformance.vision.sockets import SOCKETS, SocketVision
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.serving.process import serve
+
+REAL = [case for case in CASES if case.real]
+TOKEN = "0123456789abcdefABCDEF_-"
+
+
+def free_endpoint():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return f"ws://127.0.0.1:{one.getsockname()[1]}"
+
+
+@contextmanager
+def bench_with(vision, endpoint=None):
+    """A kit that listens, and `vision(endpoint)`, a context, that connects; it looks at the token and asks for none."""
+    endpoint = endpoint or free_endpoint()
+
+    def open_it(role):
+        return open_link("r1", listen=[endpoint], role=role)
+
+    options = {"roles": ("robot",), "endpoint": endpoint, "access": Access({"vision": TOKEN})}
+    with LiveBench("r1", open_it, TO_ROBOT, **options) as bench, vision(endpoint):
+        yield bench
+
+
+@contextmanager
+def our_vision(endpoint):
+    """The service as the command runs it, in a thread."""
+    ending = threading.Event()
+    with folder_of(TOKEN) as folder, open_link("r1", connect=[endpoint], role="vision", secure=folder) as link:
+        running = threading.Thread(target=serve, args=(VisionConfig(), link, ending, lambda line: None), daemon=True)
+        running.start()
+        yield
+        ending.set()
+        running.join(2)
+
+
+@contextmanager
+def folder_of(token):
+    with TemporaryDirectory() as folder:
+        (Path(folder) / "vision.token").write_text(token)
+        yield folder
+
+
+def plain_vision(endpoint, broken=""):
+    return SocketVision(endpoint, broken, TOKEN)
+
+
+@pytest.mark.parametrize("vision", [our_vision, plain_vision], ids=["ours", "plain"])
+def test_a_good_vision_passes_them_all(vision):
+    with bench_with(vision) as bench:
+        results = [run_case(case, bench) for case in REAL]
+    assert {one.case.id: one.reason for one in results if one.outcome is not Outcome.PASSED} == {}
+
+
+def failed_of(broken, cases):
+    """Each on a bench of its own: a vision that gave up would fail what follows."""
+    found = set()
+    for case in cases:
+        with bench_with(lambda endpoint: plain_vision(endpoint, broken)) as bench:
+            if run_case(case, bench).outcome is Outcome.FAILED:
+                found.add(case.id)
+    return found
+
+
+def test_every_case_has_its_broken_vision():
+    assert set(SOCKETS) == {case.id for case in REAL}
+
+
+@pytest.mark.parametrize("name", sorted(SOCKETS))
+def test_a_broken_vision_fails_its_case(name):
+    assert failed_of(name, [case for case in REAL if case.id == name]) == {name}
+
+
+@pytest.mark.kit
+@pytest.mark.parametrize("name", sorted(SOCKETS))
+def test_a_broken_vision_fails_no_other_case(name):
+    assert failed_of(name, REAL) == {name}
+
+
+def test_over_zenoh_they_are_not_applicable():
+    with bench_with(lambda endpoint: nullcontext()) as bench:
+        bench.endpoint = "tcp/127.0.0.1:7447"
+        outcomes = {run_case(case, bench).outcome for case in REAL}
+    assert outcomes == {Outcome.SKIPPED}
+
+
+@pytest.mark.parametrize("size", [0, 5, 125, 126, 300, 65_535, 65_536])
+def test_the_little_server_reads_frames_of_any_length_at_any_cut(size):
+    payload = bytes(number * 7 % 256 for number in range(size))
+    mask = bytes((1, 2, 3, 4))
+    masked = bytes(one ^ mask[place % 4] for place, one in enumerate(payload))
+    length = bytes((0x80 | size,)) if size < 126 else (
+        b"\xfe" + size.to_bytes(2) if size < 65_536 else b"\xff" + size.to_bytes(8))
+    whole = b"\x82" + length + mask + masked
+    for cut in {0, 1, 2, 3, 5, 9, 13, len(whole) // 2, len(whole) - 1} & set(range(len(whole))):
+        assert _take(whole[:cut]) is None
+    assert _take(whole + b"next") == (2, payload, b"next")

@@ -1,0 +1,167 @@
+"""What compose.yaml and the Dockerfile say, and the containers of one profile, run for real.
+
+A real run needs an engine (`docker version` answers) and docker-compose or `docker compose`; docs/compose.md says how
+to have one where no image can be pulled.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from tests.fixtures.links import free_endpoint, until
+
+ROOT = Path(__file__).parent.parent.parent.parent
+COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())
+SERVICES = COMPOSE["services"]
+HEAVY = {"numpy", "opencv-python-headless", "pybullet", "simplejpeg", "matplotlib", "av"}
+DEFAULT = "plain"
+IMAGES = {service["image"]: name for name, service in reversed(SERVICES.items())}
+"""Every image, and the first service that is made of it."""
+
+_TRUTH = """
+from sightline.sim.bus import TruthReader
+reader = TruthReader("/run/sightline")
+for _ in range(250):
+    truth = reader.read(1.0)
+    print(truth.bearing_rad, truth.distance_m, truth.linear_mps)
+"""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What a profile promises: which service is which robot, in which simulation, and who drives them all."""
+
+    name: str
+    robots: dict[str, tuple[str, str]]
+    driver: str
+    status: str = "status"
+    router: str = "router"
+    max_bearing_rad: float = 0.1
+
+    @property
+    def services(self) -> list[str]:
+        return [name for name, service in SERVICES.items() if self.name in service["profiles"]]
+
+
+PROFILES = [
+    Profile("plain", {"r1": ("robot", "sim")}, "vision"),
+    Profile("remote-detector", {"r1": ("robot", "sim")}, "boxes-vision"),
+    # Guests turn by at most 1 rad/s, and the older client steers by the ball's place alone.
+    Profile("legacy", {"r1": ("legacy-robot", "sim")}, "legacy-client", "legacy-status", max_bearing_rad=0.25),
+    Profile("secure", {"r1": ("secure-robot", "sim")}, "secure-vision", "secure-status", "secure-router"),
+    Profile("fleet", {"r1": ("robot", "sim"), "r2": ("robot-r2", "sim-r2"), "r3": ("robot-r3", "sim-r3")},
+            "fleet-vision"),
+]
+
+
+def ask(*command: str, timeout_s: float = 30.0) -> subprocess.CompletedProcess[str]:
+    """Run a command from the checkout, whatever its exit code."""
+    return subprocess.run(command, check=False, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s)
+
+
+def engine_missing() -> str:
+    """Why the containers cannot be run here; "" if they can."""
+    if not shutil.which("docker"):
+        return "docker is not installed"
+    asked = ask("docker", "version", "--format", "{{.Server.Version}}")
+    return "" if asked.returncode == 0 else f"no engine runs: {asked.stderr.strip()}"
+
+
+def changed_for(folder: Path, ports: dict[str, str]) -> dict:
+    """compose.yaml as it stands, but for free ports of this machine, the motors' logs in `folder`, and builds that ask
+    the machine's own name servers."""
+    changed = yaml.safe_load((ROOT / "compose.yaml").read_text())
+    for name, service in changed["services"].items():
+        service["build"]["network"] = "host"
+        if "ports" in service:
+            inside = service["ports"][0].rpartition(":")[2]
+            service["ports"] = [f"127.0.0.1:{ports[inside]}:{inside}"]
+        if service["image"] == "sightline-sim":
+            (log := folder / name).mkdir()
+            log.chmod(0o777)
+            # New lists: services that share an anchor share theirs.
+            service["environment"] = [*service["environment"], "SIGHTLINE_SIM__MOTOR_LOG=/log/motors.csv"]
+            service["volumes"] = [*service["volumes"], f"{log}:/log"]
+    return changed
+
+
+class Containers:
+    """The containers of one profile: `up`, what they do, `down`."""
+
+    def __init__(self, profile: Profile, folder: Path) -> None:
+        self.profile = profile
+        self.ports = {inside: free_endpoint().rpartition(":")[2] for inside in ("7447", "9091")}
+        self._folder = folder
+        self._project = f"sightline-test-{profile.name}"
+        self._containers: dict[str, str] = {}
+        self._file = folder / "compose.yaml"
+        self._file.write_text(yaml.safe_dump(changed_for(folder, self.ports)))
+        self.reached = ["--connect", f"tcp/127.0.0.1:{self.ports['7447']}"]
+
+    def compose(self, *arguments: str, check: bool = True) -> str:
+        """Run docker-compose for this profile and return what it printed."""
+        program = ["docker-compose"] if shutil.which("docker-compose") else ["docker", "compose"]
+        where = ["-p", self._project, "-f", str(self._file), "--project-directory", str(ROOT)]
+        named = [] if self.profile.name == DEFAULT else ["--profile", self.profile.name]
+        done = ask(*program, *where, *named, *arguments, timeout_s=1200)
+        assert done.returncode == 0 or not check, done.stderr[-3000:]
+        return done.stdout
+
+    def up(self) -> None:
+        """Start them. Where the profile is secured, also fetch the operator's keys for commands from outside."""
+        self.compose("up", "-d", "--no-build")
+        if self.profile.name == "secure":
+            ask("docker", "cp", f"{self.container('secure-status')}:/keys/operator", str(self._folder / "keys"))
+            secure = ["--secure", str(self._folder / "keys")]
+            self.reached = ["--connect", f"tls/127.0.0.1:{self.ports['7447']}", *secure]
+
+    def down(self) -> None:
+        """End and forget them."""
+        self.compose("down", "--volumes", "--timeout", "4", check=False)
+
+    def container(self, service: str) -> str:
+        """A service's container, ended or not; it stays the same over restarts."""
+        if service not in self._containers:  # asked of the engine, for all at once: docker-compose takes seconds each
+            listed = ask("docker", "ps", "--all", "--filter", f"label=com.docker.compose.project={self._project}",
+                         "--format", '{{.Label "com.docker.compose.service"}} {{.ID}}')
+            self._containers = {line.split()[0]: line.split()[1] for line in listed.stdout.splitlines()}
+        return self._containers[service]
+
+    def inside(self, service: str, *command: str) -> str:
+        """What a command prints inside a service's container."""
+        done = ask("docker", "exec", self.container(service), *command)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    def sightline(self, command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """A command of a person outside, through the published port."""
+        return ask(sys.executable, "-m", "sightline.operator_side.cli.app", command, *arguments, *self.reached)
+
+    def state(self, robot: str) -> str:
+        """A robot's state; "" if it is not heard."""
+        asked = self.sightline("status", robot, "--json")
+        return json.loads(asked.stdout)["state"] if asked.returncode == 0 else ""
+
+    def drives(self, robot: str) -> bool:
+        return until(lambda: self.state(robot) in ("ACTIVE", "DEGRADED"), 40)
+
+    def truth(self, sim: str) -> list[list[float]]:
+        """Five seconds of the world's own account: bearing, distance, the robot's speed."""
+        lines = self.inside(sim, "python", "-c", _TRUTH).splitlines()
+        return [[float(word) for word in line.split()] for line in lines]
+
+    def speeds(self, sim: str) -> list[tuple[float, float]]:
+        """(left, right) rad/s as the motors were told, oldest first."""
+        rows = [line.split(",") for line in (self._folder / sim / "motors.csv").read_text().splitlines()[1:]]
+        return [(float(row[1]), float(row[2])) for row in rows]
+
+    def health(self) -> dict[str, str]:
+        """What the engine says of every service that has something to ask."""
+        names = [name for name in self.profile.services if "healthcheck" in SERVICES[name]]
+        ask_each = ["docker", "inspect", "-f", "{{.State.Health.Status}}", *(self.container(name) for name in names)]
+        return dict(zip(names, ask(*ask_each).stdout.split(), strict=False))

@@ -1,0 +1,144 @@
+"""The JavaScript viewer in a real browser, at our own robot in a simulated world and at the JavaScript one."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from tests.javascript_browser import Browser, chromium
+from tests.fixtures.javascript import JsProcess, JsRobot, free_port, node
+from tests.fixtures.links import until
+
+pytestmark = pytest.mark.slow
+SIGHTLINE = [sys.executable, "-m", "sightline.operator_side.cli.app"]
+PATIENCE_S = 20.0
+# Brightness of the canvas at a grid of points: a picture has several, an empty canvas one.
+LEVELS = """(() => {
+  const canvas = document.getElementById("picture");
+  const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+  const found = new Set();
+  for (let at = 0; at < data.length; at += 4 * 997) found.add(data[at + 1] >> 4);
+  return [canvas.width, canvas.height, found.size];
+})()"""
+
+
+class Started:
+    """`with Started(folder, "sim", "--seed", "3") as sim`: a command of ours, ended at the end."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self._command = [*SIGHTLINE, *arguments]
+        self._log = (folder / f"{arguments[0]}.log").open("a+")
+
+    def __enter__(self) -> "Started":
+        self.process = subprocess.Popen(self._command, stdout=self._log, stderr=subprocess.STDOUT)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.terminate()
+        self.process.wait(10)
+        self._log.close()
+
+    def says(self, pattern: str, seconds: float = PATIENCE_S) -> bool:
+        """Whether it prints a line like `pattern` in time."""
+        return until(lambda: re.search(pattern, Path(self._log.name).read_text()), seconds)
+
+
+@pytest.fixture
+def our_viewer(tmp_path: Path) -> Iterator[tuple[Browser, Started]]:
+    """A page on our robot, which drives in the simulation, through the gateway; and that robot."""
+    chromium(), node()
+    sockets, port, page_port = f"/tmp/sl-{os.getpid()}-{free_port()}", free_port(), free_port()
+    device = f'{{kind = "sim", options = {{socket_dir = "{sockets}"}}}}'
+    (tmp_path / "robot.toml").write_text(
+        f'listen = ["ws://127.0.0.1:{port}"]\nstate_dir = "{tmp_path}/state"\ncamera = {device}\ndrive = {device}\n'
+    )
+    with ExitStack() as ending:
+        sim = ending.enter_context(
+            Started(tmp_path, "sim", "--scenario", "static", "--seed", "11", "--socket-dir", sockets)
+        )
+        assert sim.says("simulation ready")
+        robot = ending.enter_context(Started(tmp_path, "robot", "--config", str(tmp_path / "robot.toml")))
+        assert robot.says(rf"ws://127.0.0.1:{port}")
+        gateway = ("gateway.mjs", "--connect", f"ws://127.0.0.1:{port}", "--robot", "r1", "--port", str(page_port))
+        assert ending.enter_context(JsProcess(tmp_path, *gateway)).says("viewer of robot r1")
+        yield ending.enter_context(Browser(tmp_path, f"http://127.0.0.1:{page_port}/")), robot
+
+
+def answered(page: Browser) -> int:
+    """Frames that the page has drawn and answered, as it says itself."""
+    found = re.search(r"(\d+) answered here", page.text("pictures"))
+    return int(found[1]) if found else 0
+
+
+def is_drawn(page: Browser) -> bool:
+    """Whether the canvas shows a picture of some size and not one colour."""
+    width, _height, levels = page.run(LEVELS)
+    return bool(width >= 160 and levels >= 4)
+
+
+def is_armed(page: Browser) -> bool:
+    """Whether the robot drives; else asks it to, as a person would until it is allowed."""
+    driving = page.text("state") == "ACTIVE"
+    if not driving:
+        page.click("arm")
+    return driving
+
+
+def is_moving(page: Browser) -> bool:
+    """Whether the page shows wheels that turn."""
+    return re.search("^-?0.00 m/s.* 0.00 rad/s", page.text("wheels")) is None
+
+
+def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer: tuple[Browser, Started]) -> None:
+    page, robot = our_viewer
+    assert until(lambda: page.text("link") == "connected", PATIENCE_S), page.text("link")
+    assert until(lambda: is_drawn(page), PATIENCE_S), page.text("age")
+    assert until(lambda: answered(page) > 30, PATIENCE_S), page.text("pictures")
+    assert re.fullmatch(r"\d+ pictures/s, the newest \d+ ms ago", page.text("age"))
+    assert page.text("driver") == "nobody"  # it only watches until asked to
+
+    page.click("drive")
+    assert until(lambda: page.text("driver") == "this page", PATIENCE_S), page.text("driver")
+    assert until(lambda: is_armed(page), PATIENCE_S), page.text("news")
+    assert until(lambda: is_moving(page), PATIENCE_S), page.text("reason")
+    assert "ms old" in page.text("sight")
+    page.screenshot(tmp_path / "driving.png")
+    assert (tmp_path / "driving.png").stat().st_size > 10_000
+
+    page.press("Space", " ")
+    assert until(lambda: page.text("state") == "STOPPED", 3.0), page.text("news")
+    assert page.run("document.getElementById('drive').checked") is True  # the space bar pressed no button
+    assert robot.says(r"STOPPED \(STOP by vision\)")
+    assert page.errors == []
+
+
+def test_a_page_whose_robot_is_gone_says_so_and_finds_it_again(tmp_path: Path) -> None:
+    port = free_port()
+    with JsRobot(tmp_path, port=port) as robot, Browser(tmp_path, f"http://127.0.0.1:{port}/") as page:
+        assert until(lambda: answered(page) > 10, PATIENCE_S), page.text("pictures")
+        robot.kill()
+        assert until(lambda: page.text("age").startswith("no picture for"), 5.0), page.text("age")
+        assert until(lambda: page.text("link").startswith("no connection"), 5.0), page.text("link")
+        assert page.run("document.getElementById('figure').className") == "old"
+        with JsRobot(tmp_path, port=port):
+            assert until(lambda: page.text("link") == "connected", 8.0), page.text("link")
+            assert until(lambda: page.text("age").endswith("ms ago"), 8.0), page.text("age")
+        assert page.errors == []
+
+
+def test_a_page_behind_a_token_comes_in_with_the_one_behind_the_hash(tmp_path: Path) -> None:
+    (tmp_path / "token").write_text("0123456789abcdef")
+    with JsRobot(tmp_path, "--token-file", str(tmp_path / "token")) as robot:
+        address = f"http://127.0.0.1:{robot.port}/"
+        with Browser(tmp_path, address + "#0123456789abcdef") as page:
+            assert until(lambda: is_drawn(page), PATIENCE_S), page.text("link")
+        stranger = tmp_path / "stranger"
+        stranger.mkdir()
+        with Browser(stranger, address) as page:
+            assert until(lambda: page.text("link").startswith("no connection"), PATIENCE_S), page.text("link")
+            assert answered(page) == 0

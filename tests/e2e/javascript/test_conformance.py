@@ -1,0 +1,57 @@
+"""The conformance kit, as a stranger runs it, on the JavaScript peers: every MUST and SHOULD passes."""
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from tests.fixtures.javascript import EXAMPLES, JsRobot, JsVision, free_port, node
+
+CONFORM = [sys.executable, "-m", "sightline.operator_side.cli.app", "conform"]
+NOT_APPLICABLE = (
+    "the kit has no way to send on this transport",
+    "this robot publishes no scans",
+    "no port of the older dialect was named",
+)
+
+
+def report(*arguments: str, seconds: float) -> dict[str, Any]:
+    """The kit's JSON."""
+    run = subprocess.run([*CONFORM, *arguments], check=False, capture_output=True, text=True, timeout=seconds)
+    assert run.stdout.startswith("{"), run.stdout + run.stderr
+    return dict(json.loads(run.stdout))
+
+
+def failed(told: dict[str, Any]) -> list[str]:
+    """Cases that failed, and those that did not apply for a reason that is not known."""
+    return [
+        f"{one['name']} {one['level']}: {one['title']} {one['reason']}"
+        for one in told["checks"]
+        if one["value"] != "passed" and not one["reason"].startswith(NOT_APPLICABLE)
+    ]
+
+
+def test_their_codec_conforms():
+    told = report("codec", "--json", "--", node(), str(EXAMPLES / "codec_adapter.mjs"), seconds=120)
+    assert failed(told) == []
+    assert told["ok"] and len(told["checks"]) >= 390
+
+
+@pytest.mark.kit
+def test_their_robot_conforms(tmp_path):
+    with JsRobot(tmp_path, "--guests") as robot:
+        told = report("robot", robot.endpoint, "--robot", "js1", "--json", seconds=580)
+    assert failed(told) == []
+    assert told["ok"] and len(told["checks"]) >= 60
+
+
+@pytest.mark.kit
+def test_their_vision_conforms(tmp_path):
+    endpoint = f"ws://127.0.0.1:{free_port()}"
+    with JsVision(tmp_path, endpoint, "r1") as vision:
+        told = report("vision", endpoint, "--json", seconds=580)
+        assert vision.process.poll() is None, vision.output()
+    assert failed(told) == []
+    assert told["ok"] and len(told["checks"]) >= 60

@@ -1,0 +1,162 @@
+"""Who may come in at the JavaScript robot, what strangers cost it, and how its programs say that an option is wrong."""
+
+import base64
+import os
+import socket
+import ssl
+import urllib.error
+import urllib.request
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+import trustme
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from tests.fixtures.javascript import JsProcess, JsRobot, hello
+from tests.fixtures.links import until
+
+
+@pytest.fixture(scope="module")
+def quiet_robot(tmp_path_factory):
+    with JsRobot(tmp_path_factory.mktemp("robot")) as robot:
+        yield robot
+
+
+@pytest.mark.parametrize(
+    ("first", "code", "reason"),
+    [
+        (hello("r2"), 1008, "this is robot js1, not r2"),
+        ("0.2|0.1", 1008, "no hello"),
+        (b"\x00\x02{}", 1003, "as text"),
+        ("x" * 2000, 1009, "over"),
+    ],
+)
+def test_who_says_no_hello_is_told_why(quiet_robot, first, code, reason):
+    with connect(quiet_robot.endpoint, subprotocols=["sightline.v1"]) as stranger:
+        stranger.send(first)
+        with pytest.raises(ConnectionClosed) as closed:
+            stranger.recv(5)
+    assert closed.value.rcvd.code == code and reason in closed.value.rcvd.reason
+
+
+def test_who_says_nothing_is_dropped_after_two_seconds(quiet_robot):
+    with (
+        connect(quiet_robot.endpoint, subprotocols=["sightline.v1"]) as stranger,
+        pytest.raises(ConnectionClosed) as closed,
+    ):
+        stranger.recv(4)
+    assert closed.value.rcvd.code == 1008
+
+
+@pytest.mark.parametrize(
+    ("options", "status_code"),
+    [
+        ({"subprotocols": ["sightline.v1"], "origin": "http://evil.example"}, 403),
+        ({"subprotocols": ["sightline.v9"]}, 400),
+        ({}, 400),
+    ],
+)
+def test_who_may_not_come_in_is_told_by_http(quiet_robot, options, status_code):
+    with pytest.raises(InvalidStatus) as refused:
+        connect(quiet_robot.endpoint, **options)
+    assert refused.value.response.status_code == status_code
+
+
+def test_the_seventeenth_client_waits_outside(tmp_path):
+    with JsRobot(tmp_path) as robot, ExitStack() as clients:
+        for _ in range(16):
+            clients.enter_context(connect(robot.endpoint, subprotocols=["sightline.v1"]))
+        with pytest.raises(InvalidStatus) as refused:
+            connect(robot.endpoint, subprotocols=["sightline.v1"])
+        assert refused.value.response.status_code == 503
+
+
+def test_the_viewers_page_comes_from_the_robot_itself_and_nothing_else_does(quiet_robot):
+    base = quiet_robot.endpoint.replace("ws://", "http://")
+    with urllib.request.urlopen(f"{base}/", timeout=5) as page:
+        assert b"STOP" in page.read()
+        assert "default-src 'none'" in page.headers["Content-Security-Policy"]
+    for path in ("/robot_server.mjs", "/../../pyproject.toml", "/%2e%2e/x"):
+        with pytest.raises(urllib.error.HTTPError) as missing:
+            urllib.request.urlopen(base + path, timeout=5)
+        assert missing.value.code == 404
+    request = urllib.request.Request(f"{base}/", headers={"Host": "evil.example"})
+    with pytest.raises(urllib.error.HTTPError) as foreign:
+        urllib.request.urlopen(request, timeout=5)
+    assert foreign.value.code == 403
+
+
+def test_a_client_that_never_reads_is_gone_and_costs_nothing(quiet_robot):
+    with connect(quiet_robot.endpoint, subprotocols=["sightline.v1"]) as warm:  # the engine compiles as it goes
+        warm.send(hello("js1", wants=["frame", "status"]))
+        for _ in range(100):
+            warm.recv()
+    assert until(lambda: _open_sockets(quiet_robot) == 0, 5)
+    before_kb = _resident_kb(quiet_robot)
+    with socket.create_connection(("127.0.0.1", quiet_robot.port), 5) as silent:
+        silent.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        key = base64.b64encode(os.urandom(16)).decode()
+        silent.sendall(
+            "GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n"
+            "Sec-WebSocket-Protocol: sightline.v1\r\n\r\n".encode()
+        )
+        text = hello("js1", wants=["frame", "status"]).encode()
+        silent.sendall(bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text)
+        assert until(lambda: _open_sockets(quiet_robot) == 0, 5)
+    assert _resident_kb(quiet_robot) - before_kb < 5_000
+
+
+def _resident_kb(robot: JsRobot) -> int:
+    lines = Path(f"/proc/{robot.process.pid}/status").read_text().splitlines()
+    return int(next(line.split()[1] for line in lines if line.startswith("VmRSS")))
+
+
+def _open_sockets(robot: JsRobot) -> int:
+    """Established TCP connections of the robot's port, from /proc (state 01)."""
+    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()][1:]
+    return sum(1 for row in rows if int(row[1].split(":")[1], 16) == robot.port and row[3] == "01")
+
+
+@pytest.mark.parametrize(
+    ("script", "arguments", "said"),
+    [
+        ("robot_server.mjs", ["--port", "x"], "--port is a number"),
+        ("robot_server.mjs", ["--host", "0.0.0.0"], "--token-file"),
+        ("robot_server.mjs", ["--token-file", "/nowhere"], "--token-file /nowhere"),
+        ("robot_server.mjs", ["--pictures", "/nowhere"], "--pictures /nowhere"),
+        ("robot_server.mjs", ["--colour", "red"], "--colour"),
+        ("vision_client.mjs", ["--connect", "tcp/1", "--robot", "r1"], "ws://HOST:PORT"),
+    ],
+)
+def test_a_bad_option_is_one_line_and_code_2(tmp_path, script, arguments, said):
+    with JsProcess(tmp_path, script, *arguments) as process:
+        assert process.process.wait(10) == 2
+        assert process.output().startswith("error: ") and said in process.output()
+        assert process.output().count("\n") == 2 and "    at " not in process.output()
+
+
+def test_a_robot_with_a_token_and_a_certificate(tmp_path):
+    authority = trustme.CA()
+    certificate = authority.issue_cert("localhost", "127.0.0.1")
+    certificate.cert_chain_pems[0].write_to_path(str(tmp_path / "cert.pem"))
+    certificate.private_key_pem.write_to_path(str(tmp_path / "key.pem"))
+    authority.cert_pem.write_to_path(str(tmp_path / "ca.pem"))
+    (tmp_path / "token").write_text("0123456789abcdef\n")
+    keys = ("--token-file", str(tmp_path / "token"))
+    tls = ("--cert", str(tmp_path / "cert.pem"), "--key", str(tmp_path / "key.pem"))
+    with JsRobot(tmp_path, *keys, *tls) as robot:
+        secure = robot.endpoint.replace("ws://", "wss://")
+        believing = ssl.create_default_context(cafile=str(tmp_path / "ca.pem"))
+        for shown in ([], ["sightline.token.0123456789abcdeX"]):
+            with pytest.raises(InvalidStatus) as refused:
+                connect(secure, ssl=believing, subprotocols=["sightline.v1", *shown])
+            assert refused.value.response.status_code == 401
+        offered = ["sightline.token.0123456789abcdef", "sightline.v1"]
+        with connect(secure, ssl=believing, subprotocols=offered) as peer:
+            assert peer.subprotocol == "sightline.v1"
+        ca = ("--ca", str(tmp_path / "ca.pem"))
+        with JsProcess(tmp_path, "vision_client.mjs", "--connect", secure, "--robot", "js1", *keys, *ca) as vision:
+            assert vision.says("target seen"), vision.output()

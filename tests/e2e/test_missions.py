@@ -1,0 +1,107 @@
+"""Missions over real links: `sightline goto`, `mission` and `status` reach a real vision through a real robot."""
+
+import array
+import json
+import math
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.transports.open import open_link
+from sightline.robot_side.ports import Ranges
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.robot_process import RobotProcess
+from tests.fixtures.vision.vision import jpeg_of
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.serving.process import serve
+
+pytestmark = pytest.mark.slow
+QUIET = VisionConfig.model_validate({"search": {"enabled": False}})
+"""Its pictures are grey: without a search the robot stands."""
+
+
+class FarSensor:
+    """A range sensor in a wide empty hall."""
+
+    Config = Settings
+
+    def __init__(self, config):
+        self._due_s = 0.0
+
+    def read(self):
+        now_s = time.monotonic()
+        if now_s < self._due_s:
+            return None
+        self._due_s = now_s + 0.1
+        return Ranges(round(now_s * 1e6), -1.5, 0.1, 0.02, 3.0, array.array("f", [math.inf] * 31))
+
+    def close(self):
+        pass
+
+
+def grey_camera(folder):
+    """Pictures that decode, and hold nothing."""
+    path = folder / "grey"
+    path.mkdir()
+    (path / "0.jpg").write_bytes(jpeg_of(np.full((48, 64, 3), 140, np.uint8)))
+    return {"kind": "folder", "options": {"path": str(path)}}
+
+
+def sightline(*arguments):
+    """One command as a person gives it."""
+    return subprocess.run([sys.executable, "-m", "sightline.operator_side.cli.app", *arguments], capture_output=True, text=True,
+                          timeout=30, check=False)
+
+
+@pytest.mark.parametrize("transport", ["zenoh", "websocket"])
+def test_a_person_sends_a_robot_somewhere_and_calls_it_off(tmp_path, transport):
+    zenoh, web = free_endpoint(), free_endpoint().replace("tcp/", "ws://")
+    of_vision = zenoh if transport == "zenoh" else web
+    ending, said = threading.Event(), []
+    with (
+        RobotProcess(tmp_path, endpoint=zenoh, listen=[zenoh, web], camera=grey_camera(tmp_path),
+                     range_sensor={"kind": f"{__name__}:FarSensor"}) as robot,
+        open_link("r1", connect=[of_vision], role="vision", timeout_s=20) as link,
+    ):
+        serving = threading.Thread(target=serve, args=(QUIET, link, ending, said.append), daemon=True)
+        serving.start()
+        try:
+            _course(robot, ["--connect", of_vision], said)
+            other = web if transport == "zenoh" else zenoh
+            told = sightline("mission", "r1", "--connect", other)
+            assert "r1: follow: " in told.stdout, "across the transports of one robot too"
+        finally:
+            ending.set()
+            serving.join()
+
+
+def _course(robot, connect, said):
+    assert until(lambda: any("frames from robot r1" in line for line in said), 10)
+    told = sightline("mission", "r1", *connect)
+    assert told.returncode == 0 and "r1: follow: lost" in told.stdout and "detector: hsv, on cpu" in told.stdout
+    assert robot.speed() == 0.0
+    sent = sightline("goto", "r1", "30", "-10", *connect)  # so far that it still drives when all is said
+    assert (sent.returncode, sent.stderr) == (0, ""), sent
+    assert until(lambda: robot.speed() > 1.0, 10), "it drives"
+    state = json.loads(sightline("status", "r1", "--json", *connect).stdout)
+    assert state["mission"]["mission"] == "goto" and not state["mission"]["done"]
+    refused = sightline("mission", "r1", "folow", *connect)
+    assert refused.returncode == 5 and "no mission called 'folow'; did you mean 'follow'?" in refused.stderr
+    assert robot.speed() > 0.5, "what is refused changes nothing"
+    back = sightline("mission", "r1", "follow", "--json", *connect)
+    assert back.returncode == 0 and json.loads(back.stdout)["ok"] is True
+    assert until(lambda: robot.speed() == 0.0, 3), "nothing to follow: it stands"
+    assert "mission   follow: lost" in sightline("status", "r1", *connect).stdout
+
+
+def test_without_a_vision_nobody_is_left_waiting(tmp_path):
+    with RobotProcess(tmp_path) as robot:
+        assert until(lambda: "robot r1: on" in robot.output(), 8)
+        told = sightline("goto", "r1", "1", "1", "--connect", robot.endpoint)
+        assert (told.returncode, told.stdout) == (4, "")
+        assert "no vision of robot 'r1' is heard within 3 s" in told.stderr and len(told.stderr.splitlines()) == 1

@@ -1,0 +1,64 @@
+"""What peers say to one another goes through the robot once: to every other peer, of either transport, and not back."""
+
+import itertools
+import threading
+from contextlib import ExitStack
+
+import pytest
+
+from sightline.protocol.channels import CHANNELS, DETECTIONS, MISSION
+from sightline.protocol.transports.open import open_link
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.robot_process import RobotProcess
+
+pytestmark = pytest.mark.slow
+PAYLOADS = {DETECTIONS.name: b'{"width_px":640,"height_px":480}', MISSION.name: b'{"id":1,"mission":"follow"}'}
+QUIET_S = 0.4
+
+
+@pytest.fixture(scope="module")
+def peers(tmp_path_factory):
+    """Two peers on each transport of one robot, and what each has heard."""
+    ends = [free_endpoint(), free_endpoint().replace("tcp/", "ws://")]
+    with RobotProcess(tmp_path_factory.mktemp("robot"), listen=ends) as robot, ExitStack() as ending:
+        assert until(lambda: ends[1] in robot.output(), 20.0), robot.output()
+        found = {}
+        for name, end in (("zenoh 1", ends[0]), ("zenoh 2", ends[0]), ("web 1", ends[1]), ("web 2", ends[1])):
+            link = ending.enter_context(open_link("r1", connect=[end], role="operator", timeout_s=10))
+            heard = []
+            for channel in (DETECTIONS, MISSION):
+                link.subscribe(channel, lambda message, heard=heard: heard.append(message))
+            found[name] = link, heard
+        assert until(lambda: all(_arrives(found, link) for link, _ in found.values()), 10.0)
+        yield found
+
+
+NUMBERS = itertools.count(1)
+
+
+def _said(link, channel):
+    note = b'"seq":%d' % next(NUMBERS)
+    link.publish(channel, b'{"source":"operator","session":"0a0b0c0d",%b}' % note, PAYLOADS[channel.name], "operator")
+    return note
+
+
+def _arrives(found, link):
+    note = _said(link, DETECTIONS)
+    return until(lambda: all(_count(heard, note) for other, heard in found.values() if other is not link), 0.5)
+
+
+def _count(heard, note):
+    return sum(note in message.header for message in tuple(heard))
+
+
+@pytest.mark.parametrize("channel", [DETECTIONS, MISSION], ids=lambda channel: channel.name)
+@pytest.mark.parametrize("speaker", ["zenoh 1", "web 1"])
+def test_it_comes_once_to_every_other_peer(peers, speaker, channel):
+    assert CHANNELS[channel.name].passed_on
+    note = _said(peers[speaker][0], channel)
+    others = [name for name in peers if name != speaker]
+    assert until(lambda: all(_count(peers[name][1], note) for name in others), 3.0)
+    threading.Event().wait(QUIET_S)  # for what should not come
+    assert {name: _count(heard, note) for name, (_, heard) in peers.items()} == {
+        **dict.fromkeys(others, 1), speaker: 0,
+    }  # fmt: skip

@@ -1,0 +1,143 @@
+"""The robot service as real processes, judged from its motors' own log."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.messages import State
+from sightline.robot_side.driver.persistence import StopLatch
+from tests.fixtures.links import until
+from tests.fixtures.robot_process import RobotProcess, Vision, driving, stop_after
+
+BOUND_S, BOUND_M = 0.7, 0.25
+KEYS = [signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP]  # Ctrl-C, Ctrl-\, Ctrl-Z
+
+
+def test_it_drives_on_fresh_answers_and_stops_when_they_end(tmp_path):
+    with RobotProcess(tmp_path) as robot:
+        with Vision(robot.endpoint) as vision:
+            assert driving(robot)
+            assert until(lambda: vision.status().applied[0] == pytest.approx(0.4))
+            status = vision.status()
+            assert status.state is State.ACTIVE and status.holder.session == vision.session
+            assert until(lambda: vision.status().stream.fps >= 25)
+            frames = vision.headers
+        since = monotonic_us()
+        assert until(lambda: robot.speed() == 0.0, 3)
+        time.sleep(0.2)
+        seconds, metres = stop_after(robot.motor_rows(), since)
+        assert seconds <= BOUND_S and metres <= BOUND_M
+        assert [header.seq for header in frames] == sorted({header.seq for header in frames})
+        assert frames[-1].pose[0] > 0.05 and frames[-1].latency_us < 100_000
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_the_wheels_stop_when_the_network_process_dies_or_hangs(tmp_path, number):
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
+        assert driving(robot)
+        since = monotonic_us()
+        robot.kill_network(number)
+        time.sleep(1.0)
+        seconds, metres = stop_after(robot.motor_rows(), since)
+        assert seconds <= BOUND_S and metres <= BOUND_M
+        assert driving(robot), "it is started again, and the robot drives without help"
+
+
+@pytest.mark.parametrize("number", KEYS)
+def test_a_key_at_the_terminal_does_not_reach_the_network_process(tmp_path, number):
+    """The terminal tells every process of the group; the driver ends its child, after zero."""
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
+        assert driving(robot)
+        network, since = robot.network_pid(), monotonic_us()
+        robot.kill_network(number)
+        time.sleep(0.8)
+        assert robot.network_pid() == network
+        assert min(left for t, left, _ in robot.motor_rows() if t >= since) >= 10.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTTIN, signal.SIGTTOU])
+def test_a_terminal_that_it_is_in_the_background_of_does_not_stop_it(tmp_path, number):
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
+        assert driving(robot)
+        for pid in (robot.process.pid, robot.network_pid()):
+            os.kill(pid, number)
+        time.sleep(0.5)
+        assert vision.status().state is State.ACTIVE and robot.speed() >= 10.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, *KEYS])
+def test_shutdown_is_after_zero_and_leaves_nothing(tmp_path, number):
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
+        assert driving(robot)
+        network, since = robot.network_pid(), monotonic_us()
+        for pid in (robot.process.pid, network) if number in KEYS else (robot.process.pid,):
+            os.kill(pid, number)
+        assert robot.process.wait(3) == 0
+        assert robot.speed() == 0.0
+        seconds, metres = stop_after(robot.motor_rows(), since)
+        assert seconds <= BOUND_S and metres <= BOUND_M
+        with pytest.raises(ProcessLookupError):
+            os.kill(network, 0)
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(("127.0.0.1", int(robot.endpoint.rpartition(":")[2])))
+
+
+def test_the_stop_latch_survives_a_restart(tmp_path):
+    StopLatch(tmp_path / "state", "r1").keep(stopped=True)
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
+        assert until(lambda: vision.status().state is State.STOPPED)
+        assert until(lambda: vision.status().refused.get("STOPPED", 0) > 5)
+        assert robot.speed() == 0.0
+
+
+def test_refused_twists_say_why_and_move_nothing(tmp_path):
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint, twist=b"nan|0") as vision:
+        assert until(lambda: vision.status().refused.get("NOT_FINITE", 0) > 5)
+        status = vision.status()
+        assert status.last_refusal.reason == "NOT_FINITE" and status.last_refusal.source == "vision"
+        assert status.state is State.DISARMED and robot.speed() == 0.0
+
+
+def test_a_port_in_use_names_its_owner(tmp_path):
+    with RobotProcess(tmp_path) as first:
+        assert until(lambda: "on tcp/" in first.output(), 8)
+        (tmp_path / "second").mkdir()
+        with RobotProcess(tmp_path / "second", endpoint=first.endpoint) as second:
+            assert second.process.wait(10) == 4
+            assert str(first.network_pid()) in second.output() and "Traceback" not in second.output()
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "says"),
+    [
+        ({"camera": {"kind": "folder", "options": {"path": "/nowhere"}}}, 3, "no .jpg pictures in /nowhere"),
+        ({"camera": {"kind": "webcam"}}, 2, "no camera called 'webcam'"),
+        ({"camera": {"kind": "folders"}}, 2, "did you mean 'folder'?"),
+        ({"drive": {"kind": "log", "options": {"pth": "x"}}}, 2, "pth"),
+        ({"drive": {"kind": "sim", "options": {"socket_dir": "/nowhere"}}}, 3, "sightline sim"),
+        ({"listen": ["tcp:7447"]}, 2, "tcp:7447"),
+        ({"state_dir": "/proc/nowhere"}, 2, "state_dir"),
+        ({"drive": {"kind": "json:Nothing"}}, 2, "Nothing"),
+    ],
+)
+def test_bad_input_is_one_line_and_the_right_exit_code(tmp_path, change, code, says):
+    with RobotProcess(tmp_path, **change) as robot:
+        assert robot.process.wait(10) == code
+        output = robot.output()
+        assert says in output and "Traceback" not in output
+        assert len([line for line in output.splitlines() if line.startswith("error:")]) == 1
+
+
+def test_driving_needs_no_heavy_package(tmp_path):
+    """The modules that the driver and network processes import, watched in a real interpreter."""
+    code = "import sightline.robot_side.driver.process, sightline.robot_side.network.process, sightline.sim.bus, sys, json; print(json.dumps(sorted(sys.modules)))"
+    loaded = json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+    assert not {"numpy", "cv2", "pybullet", "simplejpeg", "typer", "rich"} & set(loaded)

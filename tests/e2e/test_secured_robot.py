@@ -1,0 +1,143 @@
+"""A real robot over mutual TLS: its own vision drives it, an operator commands it, strangers move nothing."""
+
+import re
+import secrets
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sightline.operator_side.setup import keys
+from sightline.protocol.channels import FRAME, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import LinkError
+from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader
+from sightline.protocol.transports.denied import WHY
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.robot_process import RobotProcess, Vision, driving
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def robot(tmp_path):
+    keys.make(tmp_path / "keys", [])
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    with RobotProcess(tmp_path, endpoint=endpoint, secure=str(tmp_path / "keys")) as running:
+        assert until(lambda: "robot r1: on" in running.output(), 8)
+        yield running
+
+
+def _sightline(*arguments):
+    command = [sys.executable, "-m", "sightline.operator_side.cli.app", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+
+
+def test_vision_drives_an_operator_stops_it_and_a_viewer_sees_that(robot, tmp_path):
+    folder = robot.config["secure"]
+    with Vision(robot.endpoint, secure=folder):
+        assert driving(robot)
+        stopped = _sightline("stop", "r1", "--connect", robot.endpoint, "--secure", folder)
+        assert stopped.returncode == 0 and "STOPPED" in stopped.stdout, stopped
+        assert until(lambda: robot.speed() == 0.0)
+    (tmp_path / "viewer").mkdir()
+    for name in ("ca.pem", "viewer.pem", "viewer.key"):
+        (tmp_path / "viewer" / name).write_bytes(Path(folder, name).read_bytes())
+    looked = _sightline("status", "r1", "--connect", robot.endpoint, "--secure", str(tmp_path / "viewer"))
+    assert "STOPPED" in looked.stdout, "to look, a viewer's keys are enough"
+    assert "refused a" not in robot.output(), "nobody was turned away"
+
+
+@pytest.mark.parametrize("role", ["viewer", "operator"])
+def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, role):
+    """It sees the frames and answers each of them correctly, under a certificate that is not vision's."""
+    with open_zenoh("r1", connect=[robot.endpoint], role=role, secure=robot.config["secure"]) as rogue:
+        frames, session, answered, told_s = rogue.latest(FRAME), secrets.token_hex(4), 0, None
+        began_s = time.monotonic()
+        ends_s = began_s + 1.5
+        while time.monotonic() < ends_s:
+            message = frames.take(0.2)
+            if message is None:
+                continue
+            frame = decode(FrameHeader, message.header)
+            echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
+            answer = AnswerHeader(source="vision", session=session, seq=answered, echo=echo)
+            rogue.publish(TWIST, encode(answer), b"0.4000|0.0000", "vision")
+            answered += 1
+            if told_s is None and "refused a message" in robot.output():
+                told_s = time.monotonic() - began_s
+        assert answered > 5, "it could have driven, had it been heard"
+        assert robot.speed() == 0.0 and told_s is not None and told_s < 1.0, robot.output()
+    told = [line for line in robot.output().splitlines() if "refused a message" in line]
+    assert told[0].startswith(f"robot r1: refused a message of {role} from 127.0.0.1 at {robot.endpoint}"), told
+    assert told[0].endswith(WHY) and len(told) <= 3, "a rogue does not fill the log"
+
+
+def test_without_keys_nobody_even_watches(robot):
+    with pytest.raises(LinkError, match="speaks TLS only"):
+        open_zenoh("r1", connect=[robot.endpoint.replace("tls/", "tcp/")], role="vision", timeout_s=1.0)
+    asked = _sightline("status", "r1", "--connect", robot.endpoint)
+    assert asked.returncode == 4
+    assert asked.stderr == f"error: refused at {robot.endpoint}: a tls/ endpoint needs keys; give --secure DIR\n"
+
+
+def _with_other_keys(folder, tmp_path):
+    keys.make(tmp_path / "other", [])
+    return tmp_path / "other"
+
+
+def _expired(folder, tmp_path):
+    for file in folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    keys.add(tmp_path, "vision", [], days=-0.5)
+    return tmp_path
+
+
+REFUSALS = {
+    "plain": (None, "it does not speak TLS: connect it to tls/... with --secure DIR"),
+    "other authority": (_with_other_keys, "authority: use keys of one `sightline keys init` on both"),
+    "expired": (_expired, "its certificate has expired: sightline keys add DIR ROLE"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_who_is_refused_is_named_in_the_robots_own_log_within_a_second(robot, name, tmp_path):
+    spoil, words = REFUSALS[name]
+    (tmp_path / "spoilt").mkdir()
+    secure = str(spoil(Path(robot.config["secure"]), tmp_path / "spoilt")) if spoil else ""
+    endpoint = robot.endpoint if secure else robot.endpoint.replace("tls/", "tcp/")
+    with pytest.raises(LinkError):
+        open_zenoh("r1", connect=[endpoint], role="vision", secure=secure, timeout_s=0.3)
+    assert until(lambda: words in robot.output(), 1.0), robot.output()
+    told = [line for line in robot.output().splitlines() if "refused a connection" in line]
+    # Whence is said where the kernel still knows it when Zenoh has told why.
+    where = rf"robot r1: refused a connection (from 127\.0\.0\.1 )?at {re.escape(robot.endpoint)}: "
+    assert re.match(where, told[0]), told
+    assert len(told) <= 4, "a peer that tries again does not fill the log"
+
+
+def test_who_asks_for_another_name_refuses_the_robot_and_both_say_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(keys, "LOOPBACK", ("elsewhere.local",))
+    keys.make(tmp_path / "keys", [])
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    with RobotProcess(tmp_path, endpoint=endpoint, secure=str(tmp_path / "keys")) as robot:
+        assert until(lambda: "robot r1: on" in robot.output(), 20)
+        with pytest.raises(LinkError, match="names other addresses"):
+            open_zenoh("r1", connect=[endpoint], role="vision", secure=str(tmp_path / "keys"), timeout_s=0.3)
+        assert until(lambda: "our certificate does not name the address" in robot.output(), 1.0), robot.output()
+
+
+def test_on_a_plain_network_a_rogue_gets_nothing_accepted_while_another_drives_and_that_is_said_at_once(tmp_path):
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as driver:
+        assert until(lambda: "robot r1: on" in robot.output(), 20) and driving(robot)
+        began_s, accepted_of = time.monotonic(), driver.status().holder
+        with Vision(robot.endpoint, twist=b"-0.4000|1.0000") as rogue:
+            assert until(lambda: "refused NOT_HOLDER from vision" in robot.output(), 1.0), robot.output()
+            assert time.monotonic() - began_s < 3.0
+            assert until(lambda: driver.status().refused.get("NOT_HOLDER", 0) > 10)
+            assert driver.status().holder == accepted_of
+            assert rogue.headers, "it could have driven, had it been obeyed"
+        assert all(left >= 0.0 <= right for _, left, right in robot.motor_rows())

@@ -1,0 +1,148 @@
+"""Peers that do not import Sightline, each in a process of its own, against ours: they drive, and stop when alone."""
+
+import re
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from sightline.operator_side.client.requests import Operator
+from sightline.protocol.messages import State
+from sightline.protocol.transports.open import open_link
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.robot_process import RobotProcess
+
+ROOT = Path(__file__).parent.parent.parent.parent
+PICTURES = str(ROOT / "examples/pictures")
+PAGE = (ROOT / "docs/implement-a-peer.md").read_text("utf-8")
+SCHEMES = {"ws": "ws://127.0.0.1:{}", "zenoh": "tcp/127.0.0.1:{}"}
+STILL = (0.0, 0.0)
+
+
+def program_of_the_page():
+    """The page's blocks of code, one after the other."""
+    return "\n".join(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL))
+
+
+class Process:
+    """A program that prints lines; ended at the end."""
+
+    def __init__(self, *command: str) -> None:
+        self.lines: list[str] = []
+        self._process = subprocess.Popen(
+            [sys.executable, *command], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        for line in self._process.stdout:
+            self.lines.append(line.strip())
+
+    def wheels(self) -> tuple[float, float] | None:
+        """What it last said that its wheels do."""
+        last = next((line for line in reversed(self.lines) if line.startswith("wheels ")), None)
+        return last and tuple(map(float, last.split()[1:]))
+
+    def end(self) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.wait()
+        self._reader.join()
+        self._process.stdout.close()
+
+    def __enter__(self) -> "Process":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+
+def vision(endpoint: str) -> Process:
+    """`sightline vision`, as a person starts it."""
+    return Process("-m", "sightline.operator_side.cli.app", "vision", "--connect", endpoint)
+
+
+def port_of(endpoint: str) -> str:
+    return endpoint.rpartition(":")[2]
+
+
+def check_driven(robot: Process, endpoint: str) -> None:
+    """Our vision drives `robot`, which stands still soon after vision is killed."""
+    with vision(endpoint) as eyes:
+        assert until(lambda: robot.wheels() not in (None, STILL), 15), (robot.lines[-5:], eyes.lines)
+        assert any("frames from robot r1" in line for line in eyes.lines)
+        linear, angular = robot.wheels()
+        assert abs(linear) <= 0.3 and abs(angular) <= 1.5
+        eyes.end()
+        assert until(lambda: robot.wheels() == STILL, 0.7), "0.7 s after its driver was killed it still moves"
+
+
+def test_the_robot_of_the_page_is_driven_by_our_vision(tmp_path):
+    code = program_of_the_page()
+    assert sum(bool(line.strip()) for line in code.splitlines()) < 70 and "sightline.v1" in code
+    (tmp_path / "robot.py").write_text(code, "utf-8")
+    port = port_of(free_endpoint())
+    with Process(str(tmp_path / "robot.py"), port, PICTURES) as robot:
+        assert until(lambda: robot.wheels() == STILL, 10), robot.lines
+        check_driven(robot, f"ws://127.0.0.1:{port}")
+
+
+@pytest.mark.parametrize("kind", SCHEMES)
+def test_the_minimal_robot_is_driven_by_our_vision_and_stopped_by_our_operator(kind):
+    port = port_of(free_endpoint())
+    endpoint = SCHEMES[kind].format(port)
+    with Process("examples/minimal_robot.py", kind, port, PICTURES) as robot:
+        check_driven(robot, endpoint)
+        with open_link("r1", connect=[endpoint], role="operator", timeout_s=10) as link:
+            assert Operator(link).stop(lambda: None).state is State.STOPPED
+        with vision(endpoint) as eyes:
+            assert until(lambda: any("target seen" in line for line in eyes.lines), 15), eyes.lines
+            assert robot.wheels() == STILL, "STOP is a latch"
+
+
+JUNK = {"deep": "[" * 2_000, "list": "[]", "empty": "{}", "twist": "0.1|0", "bytes": b"\x00\x00"}
+
+
+@pytest.mark.parametrize("junk", JUNK.values(), ids=JUNK)
+def test_junk_keeps_nobody_out_of_the_minimal_robot(junk):
+    port = port_of(free_endpoint())
+    url = SCHEMES["ws"].format(port)
+    options = {"subprotocols": ["sightline.v1"], "compression": None}
+    with Process("examples/minimal_robot.py", "ws", port, PICTURES) as robot:
+        assert until(lambda: answers(url), 10), robot.lines
+        with connect(url, **options) as stranger:
+            stranger.send(junk)
+            with suppress(ConnectionClosed):
+                stranger.recv(5)
+        assert until(lambda: answers(url), 5), robot.lines
+
+
+def answers(url: str) -> bool:
+    """Whether a proper hello is answered."""
+    with suppress(OSError, ConnectionClosed, TimeoutError), connect(url, subprotocols=["sightline.v1"]) as connection:
+        connection.send('{"robot": "r1", "session": "0000beef"}')
+        return "r1" in str(connection.recv(2))
+    return False
+
+
+@pytest.mark.parametrize("kind", SCHEMES)
+def test_the_minimal_vision_drives_our_robot(tmp_path, kind):
+    endpoint = SCHEMES[kind].format(port_of(free_endpoint()))
+    with RobotProcess(tmp_path, endpoint=endpoint) as robot:
+        assert until(lambda: f"robot r1: on {endpoint}" in robot.output(), 10)
+        with Process("examples/minimal_vision.py", endpoint) as eyes:
+            assert until(lambda: robot.speed() > 0.3, 10), (robot.output(), eyes.lines)
+        assert until(lambda: robot.speed() == 0.0, 0.7)
+
+
+@pytest.mark.parametrize("name", ["minimal_robot", "minimal_vision"])
+def test_they_do_not_import_ours(name):
+    text = (ROOT / f"examples/{name}.py").read_text("utf-8")
+    for code in (text, program_of_the_page()):
+        assert not re.search(r"^\s*(from|import) (protocol|\w+_side|sim)\b", code, re.MULTILINE)

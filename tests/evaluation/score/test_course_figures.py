@@ -1,0 +1,156 @@
+"""Figures of legs, waypoints and traffic lights, from truth made up for the purpose."""
+
+from dataclasses import replace
+
+import pytest
+
+from sightline.evaluation.score.figures import median_and_worst, score
+from sightline.operator_side.score_bounds import BOUNDS, UNITS, checks_of
+from sightline.operator_side.score_course import figures_of, goal_figures, legs_figures, light_figures
+from sightline.sim.scenario import load_scenario, scenario_names
+from tests.evaluation.score.test_figures import samples, truth
+
+
+def drive(light_of, way_of, speed_of=lambda _s: 0.3, count=600):
+    """Truth at 50 Hz of a robot near a light: functions of the time in seconds."""
+    return [
+        replace(truth(index / 50), light=light_of(index / 50), past_line_m=way_of(index / 50),
+                linear_mps=speed_of(index / 50))
+        for index in range(count)
+    ]
+
+
+def failed(name, run, said=(), called=None):
+    scenario = load_scenario(name)
+    checks = checks_of(called or name, score(run, scenario.stand_off_m, figures_of(scenario, run, said)))
+    return {check.name for check in checks if not check.ok}
+
+
+def test_every_shipped_scenario_is_judged_by_figures_that_have_units():
+    assert set(BOUNDS) == set(scenario_names())
+    assert {name for bounds in BOUNDS.values() for name in bounds} <= set(UNITS)
+
+
+# --- the light ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("light", "figures"), [
+    (lambda _s: "green", (1, 0, 0)), (lambda _s: "red", (1, 1, 0)),
+    (lambda s: "green" if s < 4.9 else "yellow", (1, 0, 0)),  # 3 cm left at 0.3 m/s: too late to stop
+    (lambda s: "green" if s < 3.0 else "yellow", (1, 0, 1)),  # 0.6 m left: it could have stopped
+])
+def test_crossings_count_by_what_the_light_showed_and_whether_it_could_stop(light, figures):
+    found = light_figures(drive(light, lambda s: -1.5 + 0.3 * s), ())
+    assert (found["least_crossings"], found["crossed_on_red"], found["crossed_late"]) == figures
+
+
+def test_never_crossing_is_no_way_to_obey():
+    run = drive(lambda _s: "green", lambda _s: -0.1, lambda _s: 0.0)
+    assert "least_crossings" in failed("traffic-light", run)
+
+
+@pytest.mark.parametrize(("goes_s", "start_s"), [(5.4, 0.4), (6.5, 1.5)])
+def test_a_robot_that_waited_is_timed_from_green(goes_s, start_s):
+    run = drive(lambda s: "red" if s < 5 else "green", lambda s: -0.1 + max(0.0, s - goes_s) * 0.3,
+                lambda s: 0.0 if s < goes_s else 0.3)
+    assert light_figures(run, ())["start_s"] == pytest.approx(start_s, abs=0.021)
+    assert ("start_s" in failed("traffic-light", run)) == (start_s > 0.7)
+
+
+def test_one_that_never_starts_is_timed_to_the_end_of_green():
+    run = drive(lambda s: "green" if 5 <= s < 10 else "red", lambda _s: -0.1, lambda _s: 0.0)
+    assert light_figures(run, ())["start_s"] == pytest.approx(5.0, abs=0.021)
+
+
+@pytest.mark.parametrize(("shift_s", "wrong"), [(0.0, 0.0), (0.3, 0.0), (1.0, None)])
+def test_a_colour_that_is_told_late_is_wrong(shift_s, wrong):
+    def light(at_s):
+        return "red" if at_s < 5 else "green"
+
+    run = drive(light, lambda _s: -1.0)
+    said = [(round(at * 2e4), "waiting", f"light {light(at / 50 - shift_s)}, line in 1 m") for at in range(600)]
+    percent = light_figures(run, said)["wrong_states_percent"]
+    assert percent == pytest.approx(wrong, abs=0.01) if wrong is not None else percent > 4
+
+
+@pytest.mark.parametrize("told", ["red", "green"])
+def test_a_frame_between_two_samples_of_different_light_is_of_neither(told):
+    run = drive(lambda at_s: "red" if at_s < 5 else "green", lambda _s: -1.0)
+    said = [(2_000_000, "", "light red"), (4_990_000, "", f"light {told}"), (7_000_000, "", "light green")]
+    assert light_figures(run, said)["wrong_states_percent"] == 0
+    wrong = [(2_000_000, "", "light red"), (4_970_000, "", "light green"), (7_000_000, "", "light green")]
+    assert light_figures(run, wrong)["wrong_states_percent"] > 0
+
+
+def test_unknown_is_not_right_and_far_away_is_not_asked():
+    near, far = drive(lambda _s: "red", lambda _s: -1.0), drive(lambda _s: "red", lambda _s: -3.0)
+    said = [(round(at * 2e4), "driving", "light unknown") for at in range(600)]
+    assert light_figures(near, said)["wrong_states_percent"] == 100
+    assert light_figures(far, said)["wrong_states_percent"] is None
+
+
+# --- waypoints ---------------------------------------------------------------------------------------------------
+
+
+def on_the_way(places, clearance_m=0.2):
+    return [replace(truth(at / 50), x_m=x, y_m=y, clearance_m=clearance_m) for at, (x, y) in enumerate(places)]
+
+
+def test_waypoints_count_in_their_order():
+    scenario = load_scenario("thymio").model_copy(update={"goals_m": ((1.0, 0.0), (0.0, 0.0))})
+    there = [(at / 100, 0.0) for at in range(101)]
+    assert goal_figures(scenario, on_the_way(there), ())["reached_s"] is None
+    back = goal_figures(scenario, on_the_way(there + there[::-1]), ())
+    assert back["reached_s"] == pytest.approx((202 - 7) / 50, abs=0.03)
+
+
+def test_the_nearest_it_came_is_judged_as_a_least():
+    there = [(1.5 * at / 100, 1.5 * at / 100) for at in range(101)]
+    assert failed("thymio", on_the_way(there, clearance_m=0.11)) == set()
+    assert failed("thymio", on_the_way(there, clearance_m=0.09)) == {"least_clearance_m"}
+    assert failed("thymio", on_the_way(there[:50])) == {"reached_s"}
+
+
+def test_a_closed_room_asks_for_the_answer_that_there_is_no_way():
+    run = on_the_way([(0.0, 0.0)] * 100)
+    assert failed("thymio-closed", run) == {"given_up_s"}
+    assert failed("thymio-closed", run, [(1_000_000, "cannot reach", "waypoint 1")]) == set()
+
+
+# --- legs and walls ----------------------------------------------------------------------------------------------
+
+
+def test_legs_are_kept_at_a_distance_from_acquisition_on():
+    run = samples(distance_m=lambda at: 1.4 - 0.012 * min(at, 50) + (0.25 if at == 80 else 0.0))
+    found = legs_figures(run, 0.8)
+    assert (found["least_distance_m"], found["most_distance_m"]) == pytest.approx((0.8, 1.05))
+    assert found["least_ever_m"] == pytest.approx(0.8)
+
+
+def test_an_occluder_may_be_touched_for_less_than_a_tenth_of_a_second():
+    for steps, bad in ((25, set()), (26, {"wall_contact_s"})):
+        assert failed("occluder", samples(walls=lambda at, steps=steps: steps if at > 50 else 0)) == bad
+
+
+def test_driving_into_the_target_is_a_failure():
+    run = [replace(one, target_contacts_by_robot=1 if at > 50 else 0) for at, one in enumerate(samples())]
+    assert failed("ball", run) == {"target_contacts"}
+
+
+def test_the_worst_of_a_least_is_the_smallest():
+    results = [score(samples(), 0.8, {"least_clearance_m": value}) for value in (0.2, 0.1, 0.3)]
+    assert median_and_worst(results, "least_clearance_m") == (0.2, 0.1)
+
+
+@pytest.mark.parametrize("mine", ["my-course", "./mine.toml"])
+def test_a_scenario_of_ones_own_is_judged_by_what_its_kind_demands(mine):
+    """Not by a ball that is not in it."""
+    there = [replace(truth(index / 50, x_m=min(2.0, index / 50)), clearance_m=0.5) for index in range(300)]
+    scenario = load_scenario("thymio").model_copy(update={"goals_m": ((1.0, 0.0), (2.0, 0.0))})
+    for run, missed in ((there, set()), (there[:70], {"reached_s"})):
+        checks = checks_of(mine, score(run, scenario.stand_off_m, figures_of(scenario, run)))
+        assert {one.name for one in checks if not one.ok} == missed
+    run = drive(lambda _s: "red", lambda s: -1.5 + 0.3 * s)
+    assert "crossed_on_red" in failed("traffic-light", run, called=mine)
+    run = drive(lambda _s: "green", lambda s: -1.5 + 0.3 * s)
+    assert failed("traffic-light", run, called=mine) == failed("traffic-light", run)

@@ -1,0 +1,83 @@
+"""The mutation gate's own eyes: which changes it makes to a line, and that each is named once and compiles."""
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.mutation.mutants import mutants
+
+
+def changes(source):
+    return {(mutant.before, mutant.after) for mutant in mutants("example.py", source)}
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("a < b", {("a < b", "a <= b"), ("a < b", "a >= b")}),
+        ("a == b", {("a == b", "a != b")}),
+        ("a and b", {("a and b", "a or b"), ("a and b", "a"), ("a and b", "b")}),
+        ("not a", {("not a", "a")}),
+        ("-a", {("-a", "a")}),
+        ("a + b", {("a + b", "a - b")}),
+        ("a * b", {("a * b", "a / b")}),
+        ("f(7)", {("7", "6"), ("7", "8")}),
+        ("f(2.0)", {("2.0", "1.98"), ("2.0", "2.02")}),
+        ("f(0.0)", {("0.0", "-0.01"), ("0.0", "0.01")}),
+        ("f(True)", {("True", "False")}),
+        ("f('frame')", {("'frame'", "'framex'")}),
+        ("f('a sentence for people')", set()),
+        ("f(b'a?')", {("b'a?'", "b'a'"), ("b'a?'", "b'?'")}),
+        ("f(b'3')", {("b'3'", "b''"), ("b'3'", "b'2'"), ("b'3'", "b'4'")}),
+        ("min(a, b)", {("min(a, b)", "max(a, b)")}),
+        ("math.sin(a)", {("math.sin(a)", "math.cos(a)")}),
+        ("abs(a)", {("abs(a)", "a")}),
+        ("Field(gt=a)", {("Field(gt=a)", "Field(ge=a)")}),
+        ("a if b else c", {("a if b else c", "a"), ("a if b else c", "c")}),
+        ("Verb.RELEASE", {("Verb.RELEASE", "Verb.ARM")}),
+        ("[a for a in b if a]", {("for a in b if a", "for a in b")}),
+    ],
+)
+def test_each_kind_of_node_has_its_changes(source, expected):
+    stripped = {(before.strip(), after.strip()) for before, after in changes(source)}
+    assert stripped == expected
+
+
+def test_statements_are_removed_and_returns_emptied_inside_functions_only():
+    got = changes('"""Text."""\na = b\ndef f():\n    """Text."""\n    a = b\n    raise a\n    return b')
+    assert got == {("a = b", "pass"), ("raise a", "pass"), ("return b", "return None"), ("return b", "pass")}
+
+
+def test_equal_changes_in_one_place_are_told_apart():
+    names = [mutant.name for mutant in mutants("example.py", "def f(a):\n    return a(1, 1)")]
+    assert len(names) == len(set(names)) and {name[-1] for name in names if name[2] == "1"} == {1, 2}
+
+
+def test_where_is_the_qualified_name():
+    (mutant,) = mutants("example.py", "class A:\n    def f(self):\n        assert not a\n")
+    assert (mutant.where, mutant.line, mutant.file) == ("A.f", 3, "example.py")
+
+
+def test_the_gate_itself_imports_no_judged_file():
+    """Else every mutant of it counts as killed, though none was ever run."""
+    code = """
+import sys
+import tests.mutation.__main__ as gate
+from tests.mutation.trial import module_name
+print([file for file in gate.TABLES if module_name(file) in sys.modules])
+"""
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"
+
+
+def test_a_mutant_whose_module_is_there_already_is_no_trial():
+    code = """
+import sightline.protocol.jpeg
+from pathlib import Path
+from tests.mutation.mutants import mutants
+from tests.mutation.trial import start
+start(next(mutants("protocol/jpeg.py", Path("protocol/jpeg.py").read_text())), ["tests/protocol/test_text_and_jpeg_boundaries.py"])
+"""
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert told.returncode == 1 and "imported before its mutants" in told.stderr

@@ -1,0 +1,232 @@
+"""`sightline calibrate camera`: the truth of a drawn camera is found again; what cannot be measured is said."""
+
+import json
+import math
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+import typer
+
+from sightline.operator_side import cli_calibrate
+from sightline.operator_side.calibrate.camera import (
+    Ball,
+    Board,
+    Mounting,
+    ball_finder,
+    find_board,
+    from_balls,
+    from_boards,
+    is_new_view,
+)
+from sightline.operator_side.calibrate_pictures import collect
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.jpeg import JpegSize
+from sightline.robot_side.hardware.cameras.lens import guessed_model, read_model
+from sightline.robot_side.hardware.still_camera import StillCamera
+from tests.operator_side.calibrate.board import BOARD, TRUTH, draw_board, rays, tilted_views, turned
+from tests.fixtures.links import until
+from tests.fixtures.robot_process import RobotProcess
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
+from sightline.vision_side.config import HsvConfig
+
+SIZE = JpegSize(TRUTH.width_px, TRUTH.height_px, 3)
+EMPTY = jpeg_of(np.full((TRUTH.height_px, TRUTH.width_px, 3), 120, np.uint8))
+
+
+@cache
+def views() -> tuple[bytes, ...]:
+    return tuple(tilted_views())
+
+
+@cache
+def found() -> tuple[np.ndarray, ...]:
+    return tuple(corners for jpeg in views() if (corners := find_board(jpeg, BOARD)) is not None)
+
+
+def run(*arguments):
+    app = typer.Typer()
+    cli_calibrate.register_calibrate(app)
+    return app(["calibrate", "camera", *map(str, arguments)], standalone_mode=False)
+
+
+def folder(tmp_path, pictures):
+    for number, jpeg in enumerate(pictures):
+        (tmp_path / f"{number:02}.jpg").write_bytes(jpeg)
+    return tmp_path
+
+
+# --- chessboard --------------------------------------------------------------------------------------------------
+
+
+def test_a_chessboard_gives_the_true_camera():
+    assert len(found()) == len(views())
+    made = from_boards(found(), BOARD, SIZE, len(views()), Mounting(z_m=0.06, pitch_rad=0.1))
+    model = made.model
+    assert made.error < 0.3
+    assert model.fx_px == pytest.approx(TRUTH.fx_px, rel=0.005)
+    assert model.fy_px == pytest.approx(TRUTH.fy_px, rel=0.005)
+    # Half a pixel is what mixing up corner and middle of a pixel would cost.
+    assert model.cx_px == pytest.approx(TRUTH.cx_px, abs=0.4)
+    assert model.cy_px == pytest.approx(TRUTH.cy_px, abs=0.4)
+    assert (model.z_m, model.pitch_rad, model.calibrated) == (0.06, 0.1, True)
+
+
+def test_pixels_are_undistorted_to_within_one_pixel_where_boards_were():
+    model = from_boards(found(), BOARD, SIZE, len(views()), Mounting()).model
+    grid = np.array([[[x, y]] for x in range(90, 400, 50) for y in range(80, 290, 40)], float)
+
+    def rays_of(one):
+        matrix = np.array([[one.fx_px, 0, one.cx_px], [0, one.fy_px, one.cy_px], [0, 0, 1]])
+        return cv2.undistortPoints(grid, matrix, np.array(one.distortion))
+
+    assert np.abs(rays_of(model) - rays_of(TRUTH)).max() * TRUTH.fx_px < 0.6
+
+
+def test_too_few_boards_are_refused():
+    with pytest.raises(ConfigError, match=r"is in 4 of 9 pictures, at least 5"):
+        from_boards(found()[:4], BOARD, SIZE, 9, Mounting())
+
+
+@pytest.mark.parametrize("tilt_deg", [0, 4])
+def test_boards_that_all_face_the_camera_are_refused(tilt_deg):
+    seen = rays(TRUTH)
+    places = [np.array([x, y, 0.5]) for x in (-0.08, 0.08) for y in (-0.04, 0.0, 0.04)]
+    flat = [draw_board(seen, turned(tilt_deg, tilt_deg / 2), place) for place in places]
+    corners = [one for jpeg in flat if (one := find_board(jpeg, BOARD)) is not None]
+    assert len(corners) == 6
+    with pytest.raises(ConfigError, match="0 boards were tilted"):
+        from_boards(corners, BOARD, SIZE, 6, Mounting())
+
+
+def test_boards_that_do_not_fit_one_camera_are_refused():
+    rng = np.random.default_rng(3)
+    bent = [corners + rng.normal(0, 4, corners.shape).astype(np.float32) for corners in found()]
+    with pytest.raises(ConfigError, match=r"off by .* px RMS"):
+        from_boards(bent, BOARD, SIZE, len(bent), Mounting())
+
+
+@pytest.mark.parametrize("jpeg", [EMPTY, b"", b"\xff\xd8 no picture", EMPTY[:300]], ids=["empty", "none", "bad", "cut"])
+def test_no_board_is_found_where_none_is(jpeg):
+    assert find_board(jpeg, BOARD) is None
+
+
+def test_the_same_view_is_taken_once():
+    pictures = [views()[0]] * 5 + [views()[1]]
+    got = collect(iter(pictures), lambda _: lambda jpeg: find_board(jpeg, BOARD), is_new_view, 99, lambda _: None)
+    assert (len(got.found), got.given) == (2, 6)
+
+
+# --- ball --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pitch_rad", [0.0, -0.2])
+@pytest.mark.parametrize("y_m", [0.0, 0.25])
+def test_a_known_ball_gives_the_true_focal_length(pitch_rad, y_m):
+    truth = camera(640, 480, pitch_rad)
+    away_m = math.hypot(0.9 - truth.x_m, y_m)
+    detection = ball_finder(JpegSize(640, 480, 3), HsvConfig())(jpeg_of(scene(truth, 0.9, y_m)))
+    mounting = Mounting(truth.x_m, truth.y_m, truth.z_m, truth.pitch_rad)
+    made = from_balls([detection] * 3, Ball(0.1, away_m), JpegSize(640, 480, 3), 3, mounting)
+    assert made.model.fx_px == pytest.approx(truth.fx_px, rel=0.01)
+    assert made.model.fx_px == made.model.fy_px
+    assert (made.model.cx_px, made.model.cy_px, made.model.distortion) == (320.0, 240.0, ())
+
+
+def test_pictures_of_a_ball_that_moved_are_refused():
+    truth, finder = camera(640, 480), ball_finder(JpegSize(640, 480, 3), HsvConfig())
+    detections = [finder(jpeg_of(scene(truth, x_m, 0.0))) for x_m in (0.8, 0.9, 1.0)]
+    with pytest.raises(ConfigError, match="keep ball and camera still"):
+        from_balls(detections, Ball(0.1, 0.85), JpegSize(640, 480, 3), 3, Mounting(truth.x_m))
+
+
+def test_a_ball_that_cannot_be_that_far_is_refused():
+    truth = camera(640, 480)
+    detection = ball_finder(JpegSize(640, 480, 3), HsvConfig())(jpeg_of(scene(truth, 0.9, 0.0)))
+    with pytest.raises(ConfigError, match="no ball found in 1 pictures"):
+        from_balls([detection], Ball(0.1, 19.0), JpegSize(640, 480, 3), 1, Mounting())
+
+
+# --- a live robot ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_live_robot_is_measured_and_keeps_its_mounting(tmp_path, capsys):
+    (tmp_path / "boards").mkdir()
+    mounted = guessed_model(SIZE, 60.0).model_dump(mode="json") | {"z_m": 0.11, "pitch_rad": -0.05}
+    options = {"path": str(folder(tmp_path / "boards", views())), "model": mounted, "fps": 10}
+    with RobotProcess(tmp_path, camera={"kind": "folder", "options": options}) as robot:
+        assert until(lambda: "on tcp" in robot.output())
+        run("--robot", "r1", "--connect", robot.endpoint, "--board", "7x5", "--square-m", 0.03, "--views", 8,
+            "--out", tmp_path / "camera.toml", "--seconds", 30)
+    model = read_model(tmp_path / "camera.toml")
+    assert model.fx_px == pytest.approx(TRUTH.fx_px, rel=0.01)
+    assert (model.z_m, model.pitch_rad) == (0.11, -0.05)
+    assert "board 8 of 8" in capsys.readouterr().out
+
+
+# --- the command -------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_a_model_that_a_camera_takes(tmp_path, capsys):
+    pictures, out = folder(tmp_path, views()), tmp_path / "camera.toml"
+    run("--pictures", pictures, "--board", "7x5", "--square-m", 0.03, "--out", out, "--z-m", 0.12)
+    assert f"--set camera.options.model_file={out}" in capsys.readouterr().out
+    still = StillCamera(StillCamera.Config(path=pictures / "00.jpg", model_file=out))
+    assert still.model == read_model(out)
+    assert still.model.calibrated
+    assert still.model.z_m == 0.12
+    assert still.model.fx_px == pytest.approx(TRUTH.fx_px, rel=0.005)
+
+
+def test_a_ball_through_a_camera_plug_in(tmp_path, capsys):
+    (tmp_path / "ball.jpg").write_bytes(jpeg_of(scene(camera(640, 480), 0.855, 0.0)))
+    run("--camera", "still", "--camera-set", f"path={tmp_path / 'ball.jpg'}", "--camera-set", "fps=200",
+        "--ball-radius-m", 0.1, "--distance-m", 0.8, "--out", tmp_path / "camera.toml", "--json")
+    said = json.loads(capsys.readouterr().out)
+    assert said["ok"]
+    assert said["model"]["fx_px"] == pytest.approx(camera(640, 480).fx_px, rel=0.01)
+    assert read_model(tmp_path / "camera.toml").fx_px == said["model"]["fx_px"]
+
+
+def test_no_board_found_is_one_line(tmp_path):
+    out = tmp_path / "camera.toml"
+    with pytest.raises(ConfigError, match="no board found in 3 pictures: a chessboard of 9 x 6 inner corners") as error:
+        run("--pictures", folder(tmp_path, [EMPTY] * 3), "--out", out)
+    assert "\n" not in str(error.value)
+    assert not out.exists()
+
+
+def test_a_file_that_cannot_be_is_told_before_anything_is_looked_at(tmp_path):
+    pictures = folder(tmp_path, [EMPTY])
+    for out, words in ((tmp_path, "is a folder"), (tmp_path / "none" / "camera.toml", "there is no folder")):
+        with pytest.raises(ConfigError, match=words):
+            run("--pictures", pictures, "--out", out)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "say where the pictures come from"),
+        (("--pictures", ".", "--camera", "v4l2"), "say where the pictures come from"),
+        (("--pictures", ".", "--board", "9"), "is no board"),
+        (("--pictures", ".", "--board", "2x9"), "is no board"),
+        (("--pictures", ".", "--ball-radius-m", "0.1"), "both --ball-radius-m and --distance-m"),
+        (("--camera", "still", "--camera-set", "path"), "is no option"),
+        (("--camera", "v4l3"), "did you mean 'v4l2'"),
+    ],
+)
+def test_bad_usage_is_one_line(arguments, said):
+    with pytest.raises(ConfigError, match=said):
+        run(*arguments)
+
+
+def test_pictures_of_two_sizes_are_refused(tmp_path):
+    small = jpeg_of(np.full((240, 320, 3), 120, np.uint8))
+    with pytest.raises(ConfigError, match="are mixed"):
+        run("--pictures", folder(tmp_path, [EMPTY, small]))
+
+
+def test_the_board_is_counted_in_inner_corners():
+    assert Board(9, 6, 0.025).points_m().shape == (54, 3)

@@ -1,0 +1,152 @@
+"""Colour ranges are written into a vision configuration: every comment stays, all else too, or nothing is changed."""
+
+import json
+import stat
+import tomllib
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from sightline.operator_side.cli.app import run
+from sightline.operator_side.film import Film
+from sightline.operator_side.pick_color_file import check_config, write_ranges
+from sightline.operator_side.calibrate.color_file import ranges_toml, with_ranges
+from sightline.operator_side.service_settings import load_service
+from sightline.protocol.errors import ConfigError
+from tests.operator_side.calibrate.test_color import ball_picture
+from sightline.vision_side.config import HsvRange
+
+YELLOW = (HsvRange(hue_low_deg=41, hue_high_deg=57, saturation_low=0.42, value_low=0.4),)
+RED = (HsvRange(hue_low_deg=352, hue_high_deg=360), HsvRange(hue_low_deg=0, hue_high_deg=11))
+FILES = {
+    "empty": "",
+    "without": "# my robot\nrobot = 'r1'  # the small one\n",
+    "no line end": "robot = 'r1'",
+    "table": "[hsv]  # colour\n# shape of it\nshape = 'any'\n\n[target]\nradius_m = 0.05 # small\n",
+    "list": "[hsv]\nranges = [{hue_low_deg = 1, hue_high_deg = 2}] # old\n[target]\nradius_m = 0.05\n",
+    "long list": "[hsv]\nranges = [ # first\n  # second ]\n  {hue_low_deg = 1,  hue_high_deg = 2}, # third\n]# fourth\n"
+                 "shape='any'",
+    "blocks": "robot='r1'\n[[hsv.ranges]]\n# yellow\nhue_low_deg = 1 # low\nhue_high_deg = 2\n\n[[hsv.ranges]]\n"
+              "hue_low_deg = 3\nhue_high_deg = 4\n# end\n[target] # t\nradius_m = 0.05\n",
+    "dotted": "hsv.shape = 'any'\nhsv.ranges = [{hue_low_deg=1,hue_high_deg=2}]  # old\n[target]\nradius_m = 0.05\n",
+    "subtable first": "[missions.goto]\na = 1\n[hsv]\nmax_contours = 4\n",
+    "strings": "connect = ['tcp/[::1]:7447', \"tcp/a#b:1\"]\n[hsv]\nshape = \"\"\"any\"\"\" # ] [hsv]\n",
+    "crlf": "# one\r\n[hsv]\r\nshape = 'any' # two\r\n",
+}
+
+
+COMMENTS = ("# my robot", "# the small one", "# colour", "# shape of it", "# small", "# old", "# first", "# second ]",
+            "# third", "# fourth", "# yellow", "# low", "# end", "# t", "# ] [hsv]", "# one", "# two")
+
+
+def comments(text):
+    return [part for part in COMMENTS if part in text]
+
+
+@pytest.mark.parametrize("ranges", [YELLOW, RED], ids=["one", "two"])
+@pytest.mark.parametrize("name", FILES)
+def test_only_the_ranges_change_and_no_comment_is_lost(name, ranges):
+    before = FILES[name]
+    after = with_ranges(before, ranges)
+    read, was = tomllib.loads(after), tomllib.loads(before)
+    assert read["hsv"].pop("ranges") == tomllib.loads(f"r = {ranges_toml(ranges)}")["r"]
+    was.get("hsv", {}).pop("ranges", None)
+    assert {key: value for key, value in read.items() if value} == {key: value for key, value in was.items() if value}
+    assert comments(after) == comments(before)
+    again = with_ranges(after, ranges)
+    assert tomllib.loads(again) == tomllib.loads(after)
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("hsv = {shape = 'any'}\n", "put in by hand: ranges = [ { hue_low_deg = 41"),
+    ("hsv = 3\n", "put in by hand"),
+    ("x = [\n", "is no TOML"),
+])
+def test_what_cannot_be_changed_safely_is_left_alone(text, words, tmp_path):
+    file = tmp_path / "vision.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=words.replace("[", r"\[")) as why:
+        write_ranges(file, YELLOW)
+    assert file.read_text() == text and "\n" not in str(why.value) and str(file) in str(why.value)
+    assert [one.name for one in tmp_path.iterdir()] == ["vision.toml"]
+
+
+def test_vision_reads_what_was_written(tmp_path):
+    file = tmp_path / "vision.toml"
+    write_ranges(file, YELLOW)
+    file.chmod(0o640)
+    write_ranges(file, RED)
+    config = load_service("vision", file=str(file), environ={}).config
+    assert [(one.hue_low_deg, one.hue_high_deg) for one in config.hsv.ranges] == [(352, 360), (0, 11)]
+    assert stat.S_IMODE(file.stat().st_mode) == 0o640
+    (tmp_path / "bad.toml").write_text("hvs = 1\n")
+    with pytest.raises(ConfigError, match="unknown key"):
+        check_config(tmp_path / "bad.toml")
+    with pytest.raises(ConfigError, match="there is no folder"):
+        check_config(tmp_path / "none" / "vision.toml")
+
+
+# --- the command, without a browser --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def there(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("ball.png", ball_picture(210))
+    cv2.imwrite("wall.png", np.full((60, 80, 3), (30, 200, 40), np.uint8))
+    return tmp_path
+
+
+def test_a_click_in_a_picture_gives_range_mask_and_configuration(there, capsys):
+    (there / "vision.toml").write_text("# mine\n[hsv]\nshape = 'any' # all\n")
+    assert run(["pick-color", "--picture", "ball.png", "--at", "110,112", "--config", "vision.toml", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert 200 <= said["ranges"][0]["hue_low_deg"] <= 205 and said["trial"]["most_blobs"] == 1
+    assert said["written"] == "vision.toml" and cv2.imread(said["mask"]).shape == (240, 640, 3)
+    text = (there / "vision.toml").read_text()
+    assert "# mine" in text and "# all" in text and "hue_low_deg = 20" in text
+
+
+def test_a_video_is_tried_all_along(there, capsys):
+    with Film(there / "run.mp4", 10) as film:
+        for number in range(12):
+            film.add(ball_picture(210, 1.0, 0.2 - number * 0.02, seed=number), number * 100_000)
+    with av.open("run.mp4") as film:
+        assert sum(1 for _ in film.decode(video=0)) == 12
+    assert run(["pick-color", "--video", "run.mp4", "--box", "140,90,40,40", "--frames", "5", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["trial"]["pictures"] == 5 and said["trial"]["with_any"] == 5 and said["written"] is None
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    ("--picture ball.png --at 10,10", "there is no colour at 10,10: it is grey"),
+    ("--picture ball.png --at 400,10", "400,10 is outside the picture, which is 320x240"),
+    ("--picture wall.png --at 10,10", "marks 100% of a picture"),
+    ("--picture ball.png --at 1", "is no place: write X,Y"),
+    ("--picture ball.png --at -1,5", "is no place"),
+    ("--picture ball.png --at 1,٣", "is no place"),
+    ("--picture ball.png --box 1,2,3", "is no place: write X,Y,W,H"),
+    ("--picture ball.png --box 1,2,0,3", "is no place"),
+    ("--picture ball.png --box 1,2,00,3", "is no place"),
+    ("--picture ball.png --at 1,1 --box 1,1,2,2", "give one of them"),
+    ("r1 --picture ball.png --at 1,1", "ROBOT and --picture: pictures come from one of them"),
+    ("--picture none.png --at 1,1", "none.png: cannot be read: No such file"),
+    ("--picture vision.toml --at 1,1", "is no picture that can be read"),
+    ("--video none.mp4 --at 1,1", "is no file; name a video"),
+    ("--video vision.toml --at 1,1", "is no video that can be read"),
+    ("--picture ball.png --json", "add --at X,Y"),
+    ("--picture ball.png --at 110,112 --config bad.toml", "bad.toml"),
+    ("--picture ball.png --at 110,112 --mask none/mask.png", "none/mask.png: cannot be written"),
+    ("--at 1,1 --connect nowhere", "nowhere"),
+])
+def test_what_cannot_be_picked_is_one_line_and_nothing_is_written(there, capsys, arguments, words):
+    (there / "vision.toml").write_text("")
+    (there / "bad.toml").write_text("hvs = 1\n")
+    before = {one.name: one.read_bytes() for one in there.iterdir()}
+    assert run(["pick-color", *arguments.split()]) == 2
+    said = capsys.readouterr()
+    assert words in said.err and said.err.count("\n") == 1 and said.err.startswith("error: ")
+    after = {one.name: one.read_bytes() for one in there.iterdir() if one.name != "pick-color-mask.png"}
+    assert after == before

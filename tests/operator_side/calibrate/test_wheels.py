@@ -1,0 +1,193 @@
+"""`sightline robot test-wheels` and `sightline calibrate drive`: nothing turns unasked, every end is zero."""
+
+import io
+import signal
+import sys
+import tomllib
+
+import pytest
+
+from sightline.operator_side.cli import app as cli, calibrate as cli_robot_tools
+from sightline.operator_side.calibrate import wheels as wheel_test
+from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS
+from tests.fixtures.links import until
+from tests.fixtures.terminal import Terminal
+
+GPIO = PluginChoice(kind="sightline.robot_side.hardware.gpio_drive:GpioDrive", options={"wheel_radius_m": 0.0325})
+
+
+class Person:
+    """Answers by what the question contains; keeps all that was said."""
+
+    def __init__(self, **answers):
+        self.answers, self.said, self.asked = answers, [], []
+
+    def ask(self, question):
+        self.asked.append(question)
+        known = ("off_the_ground", "was_it_so", "what_turned", "one_of")
+        key = next(key for key in known if key.replace("_", " ") in question)
+        answer = self.answers.get(key, "y")
+        return answer.pop(0) if isinstance(answer, list) else answer
+
+
+@pytest.fixture
+def robot(tmp_path, monkeypatch):
+    monkeypatch.setattr(wheel_test, "TURN_S", 0.01)
+    log = tmp_path / "drive.csv"
+    return RobotConfig(drive=PluginChoice(kind="log", options={"path": str(log)})), log
+
+
+def told(log):
+    """(left, right) of all that the motors were told."""
+    return [tuple(float(cell) for cell in line.split(",")[1:]) for line in log.read_text().splitlines()]
+
+
+def test_each_wheel_turns_by_itself_each_way_and_stops(robot):
+    config, log = robot
+    person = Person()
+    assert wheel_test.try_wheels(config, person.ask, person.said.append)
+    speed = 0.25 / 0.035
+    turns = [(speed, 0), (-speed, 0), (0, speed), (0, -speed)]
+    expected = [pair for turn in turns for pair in (turn, (0, 0))] + [(0, 0)]
+    assert told(log) == [pytest.approx(pair, abs=1e-4) for pair in expected]
+    text = "\n".join(person.said)
+    assert "left wheel, forward: its top moves away from you" in text and text.endswith("all as it should be")
+    assert person.asked[0] == "are its wheels off the ground? y/n" and len(person.asked) == 5
+
+
+@pytest.mark.parametrize("answer", ["n", "", "no", "maybe", " "])
+def test_nothing_moves_unless_the_wheels_are_off_the_ground(robot, answer):
+    config, log = robot
+    person = Person(off_the_ground=answer)
+    assert not wheel_test.try_wheels(config, person.ask, person.said.append)
+    assert not log.exists()
+    assert person.said[-1] == "nothing has moved"
+
+
+@pytest.mark.parametrize(("options", "turn", "wrong", "says"), [
+    ({}, 0, "w", "set drive.options.left_reversed = true"), ({}, 2, "w", "set drive.options.right_reversed = true"),
+    ({"left_reversed": True}, 1, "w", "set drive.options.left_reversed = false"),
+    ({"swapped": True}, 0, "w", "set drive.options.right_reversed = true"),
+    ({}, 0, "o", "set drive.options.swapped = true"), ({"swapped": True}, 3, "o", "set drive.options.swapped = false"),
+    ({}, 0, "b", "two wires of different motors"), ({}, 0, "n", "is the motors' supply on"),
+])  # fmt: skip
+def test_a_wheel_that_turned_otherwise_names_what_to_change(options, turn, wrong, says):
+    choice = PluginChoice(kind=GPIO.kind, options={**GPIO.options, **options})
+    assert says in wheel_test._advice(choice, wheel_test.TURNS[turn], wrong)
+
+
+def test_a_drive_without_such_options_is_wired_differently(robot):
+    config, _ = robot
+    person = Person(was_it_so=["n", "y", "n", "y"], what_turned=["?", "o"], one_of="w")
+    assert not wheel_test.try_wheels(config, person.ask, person.said.append)
+    text = "\n".join(person.said)
+    assert "left wheel, forward: it turned the wrong way: exchange the two wires of the left motor" in text
+    assert "right wheel, forward: the other wheel turned: exchange the motors' plugs" in text
+
+
+def test_a_drive_that_fails_in_the_middle_is_told_zero_and_closed(monkeypatch, robot):
+    config, log = robot
+    monkeypatch.setattr(wheel_test.time, "sleep", lambda _s: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        wheel_test.try_wheels(config, None, lambda _line: None)
+    assert told(log)[-1] == (0.0, 0.0) and len(told(log)) == 3
+
+
+@pytest.mark.parametrize("number", EXIT_SIGNALS)
+def test_whatever_a_key_or_a_terminal_sends_ends_with_zero(monkeypatch, robot, number):
+    config, log = robot
+    before = signal.getsignal(number)
+    monkeypatch.setattr(wheel_test.time, "sleep", lambda _s: signal.raise_signal(number))
+    with pytest.raises(KeyboardInterrupt):
+        wheel_test.try_wheels(config, None, lambda _line: None)
+    assert told(log)[-1] == (0.0, 0.0) and signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize(("arguments", "says"), [
+    (["robot", "test-wheels"], "lift the robot, then add --yes"),
+    (["robot", "test-wheel"], "no task called 'test-wheel'; did you mean 'test-wheels'?"),
+    (["robot", "r7"], "--robot r7"),
+    (["calibrate", "drive", "--set", "drive.kind=log"], "add --yes"),
+    (["calibrate", "drive", "--duty", "0.4,0.3"], "rising numbers"),
+    (["calibrate", "drive", "--duty", "0.4,x"], "--duty"),
+    (["calibrate", "drive", "--duty", "0.4,1.4"], "up to 1"),
+    (["calibrate", "drive", "--yes", "--set", "drive.kind=log"], "drive 'log' does not work by duty"),
+    (["calibrate", "drive", "--yes", "--out", "/nowhere/drive.toml"], "there is no folder /nowhere"),
+])  # fmt: skip
+def test_a_mistake_is_one_line_and_nothing_moves(capsys, monkeypatch, arguments, says):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    monkeypatch.setattr(wheel_test, "turn_for", lambda *_given: pytest.fail("it moved"))
+    assert cli.run(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.startswith("error: ") and captured.err.count("\n") == 1
+    assert says in captured.err
+
+
+# --- in a terminal ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def opened():
+    terminals = []
+
+    def run(*arguments):
+        terminals.append(Terminal(*arguments))
+        return terminals[-1]
+
+    yield run
+    for terminal in terminals:
+        terminal.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
+def test_a_signal_in_the_middle_of_a_turn_is_zero_first(tmp_path, opened, number):
+    log = tmp_path / "drive.csv"
+    terminal = opened("robot", "test-wheels", "--set", "drive.kind=log", "--set", f"drive.options.path={log}")
+    assert terminal.shows("off the ground? y/n")
+    assert not log.exists() or told(log) == []
+    terminal.types("y\n")
+    assert until(lambda: log.exists() and told(log) and told(log)[-1][0] > 0)
+    terminal.process.send_signal(number)
+    assert terminal.process.wait(3) == 130
+    assert told(log)[-1] == (0.0, 0.0)
+
+
+@pytest.mark.slow
+def test_a_drive_is_calibrated_at_a_terminal(tmp_path, opened, monkeypatch):
+    pytest.importorskip("gpiozero")
+    monkeypatch.setenv("CAR_TEST_BOARD", str(tmp_path / "board.csv"))
+    out = tmp_path / "drive.toml"
+    terminal = opened(
+        "calibrate", "drive", "--set", "drive.kind=tests.fixtures.gpio:BoardDrive", "--duty", "0.3,0.4,0.8",
+        "--set", "drive.options.wheel_radius_m=0.03", "--seconds", "0.5", "--out", str(out),
+    )  # fmt: skip
+    for duty, answers in (("0.3", ["0"]), ("0.4", ["much", "0,05"]), ("0.8", ["0.1"])):
+        assert terminal.shows(f"duty {duty} for 0.5 s"), terminal.text()
+        terminal.types("\n")
+        assert terminal.shows(f"duty {duty}: how far"), terminal.text()
+        for answer in answers:
+            terminal.types(f"{answer}\n")
+            assert answer != "much" or terminal.shows("'much' is no distance")
+    assert terminal.process.wait(10) == 0, terminal.text()
+    assert tomllib.loads(out.read_text())["table"] == [[0.4, 0.1], [0.8, 0.2]]
+    events = (tmp_path / "board.csv").read_text()
+    assert ",10,0.8000" in events and ",8,0.8000" in events
+
+
+def test_measurements_that_make_no_table_are_not_written(tmp_path, capsys, monkeypatch):
+    out = tmp_path / "drive.toml"
+    monkeypatch.setattr(cli_robot_tools, "_measured_rows", lambda *_a, **_k: [(0.4, 0.2), (0.6, 0.1)])
+    assert cli.run(["calibrate", "drive", "--yes", "--out", str(out), "--duty", "0.4,0.6"]) == 2
+    said = capsys.readouterr().err
+    assert "both must rise" in said and not out.exists()
+    assert "[0.4, 0.2]" in said, "what was measured is not lost"
+
+
+def test_only_who_confirmed_or_sits_at_a_terminal_may_turn_wheels():
+    wheel_test.check_confirmed(True, False, "x")
+    wheel_test.check_confirmed(False, True, "x")
+    with pytest.raises(ConfigError):
+        wheel_test.check_confirmed(False, False, "x")

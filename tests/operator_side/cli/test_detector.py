@@ -1,0 +1,192 @@
+"""`sightline detector list | check | promote`, `vision --detector`: what is printed and the exit codes."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side import cli_detector
+from tests.fixtures.vision.onnx import brightness_model, without_gpu
+from sightline.vision_side import detector_service
+from sightline.vision_side.detect.onnx import detector as onnx_detector
+from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.remote import oip_grpc
+
+BROKEN = '''
+from sightline.vision_side.detect.color.detectors import Hsv
+
+
+class Late(Hsv):
+    def detect(self, frames, deadline_us):
+        return super().detect(frames, deadline_us)[:-1]
+'''
+
+
+class Blind:
+    """A class that is no detector."""
+
+    Config = Hsv.Config
+
+
+class Leaves(Hsv):
+    """What was a program of its own."""
+
+    def __init__(self, config: object) -> None:
+        sys.exit(7)
+
+
+@pytest.fixture(autouse=True)
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is said of a missing device is the same on a machine that has one."""
+    without_gpu(monkeypatch)
+
+
+def run(capsys, *arguments: str) -> tuple[int, str, str]:
+    code = cli.run(arguments)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_every_detector_is_listed_with_whether_it_can_be_used(capsys) -> None:
+    code, out, _ = run(capsys, "detector", "list", "--json")
+    listed = {one["name"]: one for one in json.loads(out)["detectors"]}
+    assert code == 0 and {"hsv", "adaptive", "onnx", "zenoh"} <= set(listed)
+    assert listed["hsv"] == {"name": "hsv", "usable": True, "why": ""}
+    code, out, _ = run(capsys, "detector", "list")
+    assert code == 0 and "adaptive     ok" in out
+
+
+def test_a_list_says_what_has_to_be_installed_first(capsys, monkeypatch) -> None:
+    monkeypatch.setattr(oip_grpc, "find_spec", lambda name: None)
+    code, out, _ = run(capsys, "detector", "list")
+    assert code == 0 and "oip+grpc     grpcio is not installed: pip install 'sightline[grpc]'" in out
+
+
+def test_a_detector_that_keeps_its_promises_passes(capsys) -> None:
+    code, out, _ = run(capsys, "detector", "check", "hsv", "--json")
+    report = json.loads(out)
+    assert code == 0 and report["ok"] and len(report["checks"]) >= 8
+    assert [one["size"] for one in report["times"]] == ["320x240", "640x480"]
+    assert all(0 < one["p50_ms"] <= one["p95_ms"] for one in report["times"])
+
+
+def test_a_plug_in_of_ones_own_that_does_not_is_told_where(capsys, tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "late_eyes.py").write_text(BROKEN)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    code, out, _ = run(capsys, "detector", "check", "late_eyes:Late")
+    assert code == 5
+    assert "FAIL  A batch gets as many results" in out
+
+
+def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0])
+    code, out, _ = run(capsys, "detector", "check", f"onnx:{path}", "--set", "min_score=0.9", "--device", "cpu")
+    assert code == 0 and "320x240:" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("detector", "check", "hsw"), 2, "did you mean 'hsv'"),
+        (("detector", "check", "hsv", "--device", "cuda"), 2, "no device to choose"),
+        (("detector", "check", "hsv", "--device", "gpu"), 2, "device"),
+        (("detector", "check", "onnx:/nowhere.onnx"), 2, "No such file"),
+        (("detector", "--serve", "hsv", "list"), 2, "runs by itself"),
+        (("vision", "--detector", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
+        (("vision", "--shadow", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
+        (("vision", "--dry-run", "--detector", "boxes"), 2, "own eyes"),
+        (("vision", "--detector", "boxes", "--device", "cuda", "--connect", "tcp/127.0.0.1:1"), 2, "somebody else's"),
+        (("detector", "check", "boxes"), 2, "that looks itself"),
+        (("detector", "check", "zenoh"), 2, "name what that service serves"),
+        (("score", "detectors", "zenoh", "--frames", "1"), 2, "name what that service serves"),
+        (("detector", "--serve", "zenoh"), 2, "serve one that looks itself"),
+        (("vision", "--dry-run", "--camera", "v4l2", "--detector", "zenoh"), 2, "name what that service serves"),
+        (("vision", "--dry-run", "--camera", "v4l2", "--detector", "hvs"), 2, "did you mean 'hsv'"),
+        (("vision", "--dry-run", "--camera", "v4l2", "--mission", "folow"), 2, "did you mean 'follow'"),
+        (("vision", "--set", "detector.fallback=zenoh", "--connect", "tcp/127.0.0.1:1"), 2, "it has to look here"),
+        (("detector", "check", "http+jpeg"), 2, "say where and what, e.g. http+jpeg://"),
+        (("detector", "check", "oip+http://127.0.0.1:99999/ball"), 2, "there is no port 99999"),
+        (("detector", "check", "tests.operator_side.cli.test_detector:Blind"), 2, "no method detect"),
+        (("detector", "check", "tests.operator_side.cli.test_detector:Leaves"), 2, "raises SystemExit: 7"),
+        (("vision", "--dry-run", "--detector", "onnx", "--set", "detector.labels=[\"bal\"]", "--camera", "folder",
+          "--camera-set", "path=examples/pictures"), 2, "onnx knows no 'bal'; did you mean 'ball'?"),
+        (("score", "detectors", "hsv", "--sheet", "/nowhere/x.png"), 2, "there is no folder /nowhere"),
+        (("detector", "check", "hsv", "--set", "hsv.min_radius_px=900"), 2, "'hsv.min_radius_px'"),
+        (("detector", "check", "hsv", "--set", "label=a", "--set", "label.b=1"), 2, "'label' has a value"),
+        (("demo", "--detector", "hsw", "--out", "/nowhere/made"), 2, "did you mean 'hsv'"),
+        (("demo", "--detector", "onnx:/nowhere.onnx", "--out", "/nowhere/made"), 2, "/nowhere.onnx: No such file"),
+        (("demo", "--mission", "folow", "--out", "/nowhere/made"), 2, "did you mean 'follow'"),
+        (("demo", "--mission", "goto", "--out", "/nowhere/made"), 2, "waypoints"),
+        (("demo", "--detector", "boxes", "--out", "/nowhere/made"), 2, "nobody finds boxes in circle"),
+    ],
+)
+def test_every_mistake_is_one_line(capsys, arguments: tuple[str, ...], code: int, words: str) -> None:
+    found, out, err = run(capsys, *arguments)
+    assert (found, out) == (code, "")
+    assert words in err and err.count("\n") == 1
+
+
+def test_what_a_detector_says_while_it_is_checked_is_shown(capsys) -> None:
+    code, out, _ = run(capsys, "detector", "check", "http+jpeg://127.0.0.1:1/eyes")
+    assert code == 5 and "FAIL  Every picture" in out and "it says: " in out and "UNREACHABLE" in out
+
+
+def test_an_option_of_a_section_is_set_by_a_dot() -> None:
+    given = {"hsv.shape": "any", "hsv.max_contours": 3, "label": "cup"}
+    assert cli_detector._nested(given) == {"hsv": {"shape": "any", "max_contours": 3}, "label": "cup"}
+
+
+def test_a_copy_without_a_model_says_so(capsys, monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(onnx_detector, "SHIPPED", tmp_path / "sightline.onnx")
+    code, _, err = run(capsys, "detector", "check", "onnx")
+    assert code == 2 and "without a model of its own" in err and err.count("\n") == 1
+    assert "onnx         ok; comes without a model" in run(capsys, "detector", "list")[1]
+    brightness_model(tmp_path / "sightline.onnx", [[1, 1, 9, 9]], [0])
+    assert f"onnx         ok, comes with model {onnx_detector.shipped_digest()}" in run(capsys, "detector", "list")[1]
+    assert json.loads(run(capsys, "detector", "list", "--json")[1])["model_hash"] == onnx_detector.shipped_digest()
+
+
+def test_a_device_that_is_not_there_ends_vision_with_3(capsys, tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0])
+    code, out, err = run(capsys, "vision", "--detector", f"onnx:{path}", "--device", "cuda",
+                         "--connect", "tcp/127.0.0.1:1")
+    assert (code, out) == (3, "") and "--device auto" in err and err.count("\n") == 1
+
+
+def test_a_device_that_is_not_there_ends_the_service_with_3(capsys, tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0])
+    code, out, err = run(capsys, "detector", "--serve", f"onnx:{path}", "--device", "cuda",
+                         "--connect", "tcp/127.0.0.1:1")
+    assert (code, out) == (3, "") and "--device auto" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "robot"), [((), "*"), (("--set", "robot=r2"), "r2"), (("--set", "robot=r2", "--robot", "r3*"), "r3*")]
+)
+def test_whom_it_serves_is_configured_as_all_else(capsys, monkeypatch, given: tuple[str, ...], robot: str) -> None:
+    served = []
+    monkeypatch.setattr(detector_service, "run", lambda config, *_: served.append(config.robot) or 0)
+    assert run(capsys, "detector", "--serve", "hsv", *given)[0] == 0 and served == [robot]
+
+
+def test_the_group_alone_shows_its_help(capsys) -> None:
+    code, out, _ = run(capsys, "detector")
+    assert code == 0 and "--serve NAME" in out and "promote" in out
+
+
+def test_listing_imports_nothing_heavy_before_it_is_needed() -> None:
+    """`detector --help` answers without OpenCV."""
+    code = "import sys; from sightline.operator_side.cli import app as cli; cli.run(['detector', '--help']); print('cv2' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.rstrip().endswith("False")
+
+
+def test_the_example_of_a_detector_keeps_the_promises(capsys, monkeypatch) -> None:
+    monkeypatch.chdir(Path(__file__).parent.parent.parent.parent / "examples")
+    monkeypatch.syspath_prepend(str(Path.cwd()))
+    code, out, _ = run(capsys, "detector", "check", "my_detector:BrightestSpot", "--set", "least=150", "--json")
+    assert code == 0, out

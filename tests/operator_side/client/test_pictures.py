@@ -1,0 +1,147 @@
+"""A viewer's pictures over real sessions: overlays while vision draws them, else acknowledged frames, else nothing."""
+
+import threading
+import time
+from contextlib import ExitStack
+
+import pytest
+
+from sightline.operator_side import pictures as pictures_module
+from sightline.operator_side.cockpit import frame_buffer as reel_module
+from sightline.operator_side.pictures import Pictures, viewer_role
+from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
+from sightline.protocol.channels import ACK, FRAME, OVERLAY, STATUS
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.spec.message_cases import jpeg
+from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader, Stamp
+from sightline.protocol.transports.open import open_link
+from tests.fixtures.links import free_endpoint, until
+
+PATIENCE_S = 0.3
+
+
+class Site:
+    """A robot, a vision that publishes what it is told to, and a viewer."""
+
+    def __init__(self, ending: ExitStack, end: str) -> None:
+        self.robot = ending.enter_context(open_link("r1", listen=[end], role="robot"))
+        self.vision = ending.enter_context(open_link("r1", connect=[end], role="vision"))
+        self.link = ending.enter_context(open_link("r1", connect=[end], role="viewer"))
+        self.acks = self.robot.latest(ACK)
+        self.seq = 0
+
+    def frame(self, payload: bytes = jpeg(320, 240)) -> None:
+        self.seq += 1
+        self.robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=self.seq, t_us=self.seq * 1000)), payload)
+
+    def overlay(self, payload: bytes = jpeg(640, 480)) -> None:
+        self.seq += 1
+        echo = Echo(channel="frame", session="0000abcd", seq=self.seq, t_us=self.seq * 1000)
+        about = DetectionsHeader(source="vision", session="0000beef", seq=self.seq, echo=echo)
+        self.vision.publish(OVERLAY, encode(about), payload)
+
+
+@pytest.fixture(params=["tcp", "ws"])
+def site(request, monkeypatch):
+    monkeypatch.setattr(pictures_module, "PATIENCE_S", PATIENCE_S)
+    end = free_endpoint().replace("tcp/", "ws://") if request.param == "ws" else free_endpoint()
+    with ExitStack() as ending:
+        yield Site(ending, end)
+
+
+def taken(pictures, publish, seconds=5.0):
+    """The first picture that comes while `publish` is called."""
+    found = []
+    assert until(lambda: publish() or found.append(pictures.take(0.05)) or found[-1], seconds)
+    return found[-1]
+
+
+def test_overlays_are_taken_and_nothing_else_is_asked_for(site):
+    pictures = Pictures(site.link, "viewer")
+    shot = taken(pictures, site.overlay)
+    assert (shot.channel, shot.session, shot.seq * 1000, shot.width_px) == (OVERLAY, "0000abcd", shot.t_us, 640)
+    assert not site.robot.has_listener(FRAME) and site.acks.take(0.1) is None
+
+
+def test_without_vision_frames_are_taken_and_acknowledged_until_it_is_back(site):
+    pictures = Pictures(site.link, "viewer")
+    shot = taken(pictures, site.frame)
+    assert shot.channel is FRAME and (shot.width_px, shot.height_px) == (320, 240)
+    ack = site.acks.take(2.0)
+    assert ack is not None and decode(AnswerHeader, ack.header).echo.session == "0000abcd"
+    assert taken(pictures, site.overlay).channel is OVERLAY
+    assert until(lambda: taken(pictures, site.overlay) and not site.robot.has_listener(FRAME))
+    site.vision.close()
+    assert until(lambda: taken(pictures, site.frame).channel is FRAME)
+
+
+def test_who_wants_frames_gets_frames(site):
+    pictures = Pictures(site.link, "viewer", FRAME)
+    assert taken(pictures, site.frame).channel is FRAME
+    assert not site.vision.has_listener(OVERLAY)
+
+
+def test_nobody_is_listened_to_while_nobody_looks(site):
+    pictures = Pictures(site.link, "viewer")
+    assert not site.vision.has_listener(OVERLAY)
+    taken(pictures, site.frame)
+    pictures.pause()
+    assert until(lambda: not site.vision.has_listener(OVERLAY) and not site.robot.has_listener(FRAME))
+    assert taken(pictures, site.overlay).channel is OVERLAY
+
+
+def test_what_is_no_picture_is_counted_and_waited_past(site):
+    pictures = Pictures(site.link, "viewer")
+    assert until(lambda: site.overlay(b"junk") or (pictures.take(0.05) is None and pictures.refused), 5.0)
+    assert taken(pictures, site.overlay).width_px == 640
+
+
+def test_the_robots_silence_is_noticed(site, monkeypatch):
+    monkeypatch.setattr(pictures_module, "SILENT_S", 0.3)
+    pictures = Pictures(site.link, "viewer")
+    assert not pictures.is_heard
+    said = encode(Stamp(session="0000abcd", seq=1, t_us=5_000_000))
+    assert until(lambda: site.robot.publish(STATUS, said, b"{}") and pictures.is_heard)
+    shot = taken(pictures, site.overlay)
+    assert pictures.age_us(shot) > 4_000_000
+    assert until(lambda: not pictures.is_heard, 2.0)
+
+
+def test_a_page_gets_the_next_picture_when_it_asks_and_none_is_fetched_for_nobody(site, monkeypatch):
+    monkeypatch.setattr(reel_module, "IDLE_S", 0.4)
+    pictures, reel, ending = Pictures(site.link, "viewer"), FrameBuffer(2), threading.Event()
+    filling = threading.Thread(target=fill, args=(reel, pictures, ending), daemon=True)
+    filling.start()
+    try:
+        assert reel.next(0, 0.05) is None
+        assert until(lambda: site.vision.has_listener(OVERLAY))
+        numbers = []
+        while len(numbers) < 5:
+            site.overlay()
+            found = reel.next(numbers[-1] if numbers else 0, 0.05)
+            numbers += [found.number] if found else []
+        assert numbers == [1, 2, 3, 4, 5]
+        assert [one.number for one in reel.shots] == [4, 5] and reel.of(3) is None and reel.of(5) is not None
+        site.overlay()
+        time.sleep(0.1)
+        assert reel.next(0, 0.0).number == 5  # nobody asked for a sixth
+        assert until(lambda: not site.vision.has_listener(OVERLAY), 3.0)
+        assert reel.next(99, 0.0).number == 5  # a page of an earlier run
+    finally:
+        ending.set()
+        filling.join(3.0)
+
+
+def test_the_reel_over_http_says_which_picture_it_is(site):
+    pictures, reel = Pictures(site.link, "viewer"), FrameBuffer(2, lambda shot: 7)
+    reel.add(taken(pictures, site.overlay))
+    answer = reel.route({"after": "0"}, b"")
+    assert answer.body == jpeg(640, 480)
+    assert answer.headers["X-Channel"] == "overlay" and answer.headers["X-Age-Us"] == "7"
+    assert reel.route({"number": "1"}, b"").status == 200 and reel.route({"number": "2"}, b"").status == 204
+
+
+def test_who_has_the_keys_of_an_operator_watches_as_one(tmp_path):
+    assert viewer_role("") == "viewer" and viewer_role(str(tmp_path)) == "viewer"
+    (tmp_path / "operator.token").write_text("x" * 16)
+    assert viewer_role(str(tmp_path)) == "operator"

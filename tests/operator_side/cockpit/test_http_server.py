@@ -1,0 +1,131 @@
+"""A small page on loopback: for this machine alone, bounded, and one clear word to who asks wrongly."""
+
+import http.client
+import json
+import socket
+from contextlib import contextmanager
+
+import pytest
+
+from sightline.operator_side.cockpit.http_server import MAX_CONNECTIONS
+from sightline.operator_side.loopback_page import MAX_BODY_BYTES, Answer, as_json, page, served
+from sightline.protocol.errors import ConfigError, LinkError
+from tests.fixtures.links import until
+
+
+def _refuse(ask, body):
+    raise ConfigError("not like this")
+
+
+ROUTES = {
+    "GET /": lambda ask, body: page("watch.html", robot="<b>r1</b>"),
+    "GET /echo": lambda ask, body: as_json(dict(ask)),
+    "POST /echo": lambda ask, body: Answer(body),
+    "POST /refuse": _refuse,
+    "POST /number": lambda ask, body: as_json(int(json.loads(body)["number"])),
+}
+
+
+@pytest.fixture
+def port():
+    with served(ROUTES, 0) as address:
+        yield int(address.rstrip("/").rpartition(":")[2])
+
+
+@contextmanager
+def asked(port, method, path, body=None, **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    named = {"Host": f"127.0.0.1:{port}", **({"Content-Type": "application/json"} if body is not None else {})}
+    given = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method, path, body, {**named, **given})
+    answer = connection.getresponse()
+    yield answer, answer.read()
+    connection.close()
+
+
+def test_a_page_is_served_with_its_words_as_text(port):
+    with asked(port, "GET", "/") as (answer, body):
+        assert answer.status == 200 and b"&lt;b&gt;r1&lt;/b&gt;" in body and b"{{" not in body
+        assert answer.getheader("Content-Security-Policy").startswith("default-src 'self'")
+        assert answer.getheader("Cross-Origin-Resource-Policy") == "same-origin"
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:{port}", "localhost:{port}", "[::1]:{port}", "localhost"])
+def test_this_machine_by_any_name(port, host):
+    with asked(port, "GET", "/echo?a=1", Host=host.format(port=port)) as (answer, body):
+        assert answer.status == 200 and json.loads(body) == {"a": "1"}
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:{port}", "127.0.0.1.evil.example:{port}", "", "192.168.1.7:1"]
+)
+def test_another_name_is_refused(port, host):
+    with asked(port, "GET", "/echo", Host=host.format(port=port)) as (answer, body):
+        assert answer.status == 403 and b"this machine alone" in body
+
+
+def test_what_changes_something_comes_from_the_page_itself(port):
+    with asked(port, "POST", "/echo", b"{}", Origin=f"http://127.0.0.1:{port}") as (answer, body):
+        assert (answer.status, body) == (200, b"{}")
+    for wrong in ({"Origin": "http://evil.example"}, {"Origin": "null"}, {"Content_Type": "text/plain"}):
+        with asked(port, "POST", "/echo", b"{}", **wrong) as (answer, _):
+            assert answer.status == 403
+
+
+@pytest.mark.parametrize("length", [str(MAX_BODY_BYTES + 1), "-1", "9" * 30, "x"])
+def test_a_body_has_a_bound(port, length):
+    with asked(port, "POST", "/echo", b"{}", Content_Length=length) as (answer, _):
+        assert answer.status == 413
+
+
+def test_who_asks_wrongly_is_told_and_served_again(port):
+    for path, body, words in (("/refuse", b"{}", "not like this"), ("/number", b"{", "not asked rightly"),
+                              ("/number", b"[]", "not asked rightly"), ("/number", b'{"number":"x"}', "not asked")):
+        with asked(port, "POST", path, body) as (answer, said):
+            assert answer.status == 400 and words in json.loads(said)["error"]
+    with asked(port, "GET", "/nothing") as (answer, _):
+        assert answer.status == 404
+    with asked(port, "POST", "/number", b'{"number":3}') as (answer, said):
+        assert (answer.status, said) == (200, b"3")
+
+
+def test_nonsense_ends_nothing(port):
+    for noise in (b"\0" * 100 + b"\r\n\r\n", b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 300 + b"\r\n", b""):
+        with socket.create_connection(("127.0.0.1", port), 5) as stranger:
+            stranger.sendall(noise)
+    with asked(port, "GET", "/echo") as (answer, _):
+        assert answer.status == 200
+
+
+def test_more_connections_than_a_person_needs_are_closed_and_places_come_back(port):
+    held = [socket.create_connection(("127.0.0.1", port), 5) for _ in range(MAX_CONNECTIONS)]
+    assert until(lambda: _is_closed(port), 5.0)
+    for one in held:
+        one.close()
+
+    def serves():
+        try:
+            with asked(port, "GET", "/echo") as (answer, _):
+                return answer.status == 200
+        except OSError:
+            return False
+
+    assert until(serves, 5.0)
+
+
+def _is_closed(port):
+    """Whether one more is turned away at once."""
+    with socket.create_connection(("127.0.0.1", port), 5) as one:
+        one.settimeout(0.2)
+        try:
+            return one.recv(1) == b""
+        except TimeoutError:
+            return False
+        except ConnectionError:
+            return True
+
+
+def test_a_port_in_use_is_said_in_one_line(port):
+    with pytest.raises(LinkError, match=f"port {port} is in use") as why, served(ROUTES, port):
+        pass
+    assert "\n" not in str(why.value)

@@ -1,0 +1,108 @@
+"""`sightline metrics` against a real robot, read with Prometheus' own parser; a robot that is gone is down."""
+
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families as parsed
+
+from sightline.operator_side.cli import app as cli
+from tests.fixtures.links import until
+from tests.fixtures.robot_process import RobotProcess, Vision, driving
+
+pytestmark = pytest.mark.slow
+
+
+def _free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def _samples(port):
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as answer:
+        text = answer.read().decode()
+    return {(s.name, *sorted(s.labels.values())): s.value for family in parsed(text) for s in family.samples}
+
+
+def _health(port):
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_a_robot_is_measured_and_its_end_is_seen(tmp_path):
+    port = _free_port()
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
+        command = [sys.executable, "-m", "sightline.operator_side.cli.app", "metrics", "r1", "--connect", robot.endpoint]
+        exporter = subprocess.Popen([*command, "--port", str(port)], stdout=subprocess.PIPE, text=True)
+        try:
+            assert exporter.stdout.readline() == f"metrics of r1: http://127.0.0.1:{port}/metrics\n"
+            assert driving(robot)
+            assert until(lambda: _health(port) == 200)
+            assert until(lambda: 0 < _samples(port).get(("sightline_frame_age_seconds", "r1"), 0) < 0.15)
+            vision.twist = b"nan|0"
+            assert until(lambda: _samples(port).get(("sightline_commands_refused_total", "NOT_FINITE", "r1"), 0) > 3)
+            samples = _samples(port)
+            assert samples["sightline_up", "r1"] == 1
+            assert samples["sightline_frames_sent_total", "r1"] > 10
+            assert samples["sightline_commands_accepted_total", "r1"] > 5
+            assert samples["sightline_frames_overtaken_total", "r1"] >= 0
+            assert 0 < samples["sightline_round_trip_seconds", "r1"] < 0.5
+            robot.kill_network()
+            assert until(lambda: _samples(port).get(("sightline_holds_total", "r1"), 0) > 0, 8)
+            samples = _samples(port)
+            assert sum(value for key, value in samples.items() if key[0] == "sightline_state") == 1
+            robot.process.terminate()
+            assert until(lambda: _samples(port) == {("sightline_up", "r1"): 0}, 6)
+            assert _health(port) == 503
+        finally:
+            exporter.terminate()
+            assert exporter.wait(20) == 0
+
+
+def test_a_busy_port_is_said_with_its_owner(tmp_path):
+    with RobotProcess(tmp_path) as robot, socket.create_server(("127.0.0.1", 0)) as taken:
+        command = [sys.executable, "-m", "sightline.operator_side.cli.app", "metrics", "--connect", robot.endpoint, "--port"]
+        assert until(lambda: "robot r1: on" in robot.output(), 20)
+        port = str(taken.getsockname()[1])
+        done = subprocess.run([*command, port], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 4
+    assert f"port {port} is in use by" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_vision_is_measured_and_its_health_is_whether_it_hears_a_robot(tmp_path):
+    port = _free_port()
+    with RobotProcess(tmp_path) as robot:
+        assert until(lambda: "robot r1: on" in robot.output(), 40)
+        command = [sys.executable, "-m", "sightline.operator_side.cli.app", "vision", "--connect", robot.endpoint]
+        vision = subprocess.Popen([*command, "--metrics", str(port)], stdout=subprocess.PIPE, text=True)
+        try:
+            assert until(lambda: _health_if_up(port) == 200, 40)
+            samples = _samples(port)
+            assert samples["sightline_vision_hears", "r1"] == 1
+            assert samples["sightline_vision_frames_answered_total", "r1"] > 0
+            assert until(lambda: _samples(port)["sightline_vision_compute_seconds", "r1"] > 0)
+            robot.process.terminate()
+            assert until(lambda: _health_if_up(port) == 503, 15)
+        finally:
+            vision.terminate()
+            assert vision.wait(20) == 0
+
+
+def _health_if_up(port):
+    try:
+        return _health(port)
+    except OSError:
+        return 0
+
+
+@pytest.mark.parametrize("where", ["", "x", "0", "70000", "1:2:3", "a b:9"])
+def test_a_place_that_is_none_is_refused(where, capsys):
+    assert cli.run(["vision", "--metrics", where]) == 2
+    assert capsys.readouterr().err.startswith(f"error: --metrics {where!r} is no place: write a port")

@@ -1,0 +1,210 @@
+"""`sightline doctor`: what it says of this machine, of a real robot, and of a way that leads nowhere."""
+
+import json
+import os
+import re
+import socket
+import sys
+
+import pytest
+
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side.setup import keys
+from sightline.operator_side.doctor import network as between, cameras, machine
+from sightline.operator_side.doctor.finding import Finding, as_object, histogram
+from sightline.protocol.transports.diagnosis import port_owner
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.robot_process import RobotProcess
+
+
+def _checks(capsys, *arguments):
+    code = cli.run(["doctor", "--json", *arguments])
+    report = json.loads(capsys.readouterr().out)
+    assert code == (0 if report["ok"] else 5)
+    return {check["name"]: check for check in report["checks"]}
+
+
+@pytest.mark.parametrize("values", [[1.0], [3.0, 3.0, 3.0], [0.1 * n for n in range(50)], []])
+def test_a_histogram_counts_every_value_once(values):
+    assert sum(int(line.rsplit(" ", 1)[1]) for line in histogram(values)) == len(values)
+
+
+def test_what_is_only_said_is_no_failure():
+    said, good, bad = Finding("a", None, "x", "do"), Finding("b", True, "y", "do"), Finding("c", False, "z", "do this")
+    assert as_object([said, good])["ok"] is True
+    assert as_object([said, bad])["ok"] is False
+    assert bad.line.endswith("fix: do this") and "fix" not in good.line
+
+
+def test_what_has_a_unit_is_a_number_for_scripts():
+    check = Finding("round trip", True, "12.5", "", "ms", "60").check
+    assert (check["value"], check["bound"]) == (12.5, 60.0)
+    assert Finding("a", True, "x", "do").check["fix"] == "" and Finding("a", False, "x", "do").check["fix"] == "do"
+    assert Finding("port 1", None, "12").check["value"] == "12"
+    assert Finding("odd", None, "n/a", "", "ms").check == {
+        "name": "odd", "ok": None, "value": "n/a", "fix": "", "unit": "ms", "bound": None,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("stat", "cpu", "ok"), [
+    ("nr_throttled 0\nthrottled_usec 0", "cpu 100 0 100 1000 0 0 0 5 0 0", True),
+    ("nr_throttled 12\nthrottled_usec 34000", "cpu 100 0 100 100 0 0 0 50 0 0", False),
+])  # fmt: skip
+def test_a_processor_that_is_held_back_is_told(monkeypatch, tmp_path, stat, cpu, ok):
+    (tmp_path / "cpu.stat").write_text(stat)
+    (tmp_path / "stat").write_text(f"{cpu}\ncpu0 1")
+    throttle = tmp_path / "cpu0" / "thermal_throttle"
+    throttle.mkdir(parents=True)
+    (throttle / "core_throttle_count").write_text("0" if ok else "3")
+    for name, path in (("CGROUP", tmp_path), ("CPUS", tmp_path), ("PROC_STAT", tmp_path / "stat")):
+        monkeypatch.setattr(machine, name, path)
+    found = {one.name: one for one in machine._slowed_down()}
+    assert {one.ok for one in found.values()} == {ok} and len(found) == 3
+    assert ok or found["throttled by quota"].value == "12 times, 34 ms in all"
+
+
+@pytest.mark.parametrize(("said", "ok"), [("Power save: on", False), ("Power save: off", True), ("", None)])
+def test_a_radio_that_saves_power_is_told_with_the_command_that_stops_it(monkeypatch, tmp_path, said, ok):
+    (tmp_path / "wlan0" / "wireless").mkdir(parents=True)
+    (tmp_path / "eth0").mkdir()
+    (tmp_path / "iw").write_text(f"#!/bin/sh\necho '{said}'\n")
+    (tmp_path / "iw").chmod(0o755)
+    monkeypatch.setattr(machine, "INTERFACES", tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    (found,) = machine._power_save()
+    assert (found.name, found.ok) == ("power save wlan0", ok)
+    assert found.fix == "sudo iw dev wlan0 set power_save off" if said else "apt install iw" in found.value
+
+
+_ARP = "IP address HW type Flags HW address Mask Device\n192.168.1.7 0x1 {} aa:bb:cc:dd:ee:ff * wlan0\n"
+
+
+@pytest.mark.parametrize(("flags", "host", "words"), [
+    ("0x0", "192.168.1.7", "client isolation"), ("0x2", "192.168.1.7", "it is a firewall"), ("0x2", "192.168.1.8", ""),
+    ("0x0", "no-such-name.invalid", ""),
+])  # fmt: skip
+def test_a_machine_that_is_kept_apart_is_told_from_a_firewall(tmp_path, flags, host, words):
+    (tmp_path / "arp").write_text(_ARP.format(flags))
+    said = between.neighbour(host, tmp_path / "arp")
+    assert words in said and bool(said) is bool(words)
+    assert between.neighbour(host, tmp_path / "absent") == ""
+
+
+@pytest.mark.parametrize(("offered", "ok", "said"), [
+    (["YUYV", "MJPG"], True, "passed through"), (["YUYV"], None, "each picture is encoded here"),
+    (["GREY"], False, "neither MJPG nor YUYV"),
+])  # fmt: skip
+def test_the_modes_of_a_camera_are_told_with_what_they_cost(capsys, monkeypatch, tmp_path, offered, ok, said):
+    (tmp_path / "video3").touch()
+    monkeypatch.setattr(cameras, "DEVICES", tmp_path)
+    assert list(cameras.modes()) == []  # a file that is no camera
+    monkeypatch.setattr(cameras, "formats", lambda device: offered)
+    check = _checks(capsys)["modes video3"]
+    assert check["ok"] is ok and said in check["value"] and (ok or check["fix"])
+
+
+def test_a_camera_that_cannot_be_opened_is_told(monkeypatch, tmp_path):
+    (tmp_path / "video0").mkdir()
+    monkeypatch.setattr(cameras, "DEVICES", tmp_path)
+    found = next(cameras.modes())
+    assert found.ok is False and found.fix
+
+
+def test_a_format_is_read_from_the_kernels_answer():
+    answer = cameras._FORMAT.pack(0, 1, 0, b"Motion-JPEG", int.from_bytes(b"MJPG", "little"), 0)
+    assert len(answer) == 64 and cameras.read_format(answer) == "MJPG"
+
+
+@pytest.mark.parametrize("transport", ["tcp", "udp"])
+def test_the_other_end_is_told_with_its_version_clock_and_round_trip(transport):
+    endpoint = free_endpoint().replace("tcp/", f"{transport}/")
+    with open_zenoh("r1", listen=[endpoint], role="robot"):
+        found = {one.name: one for one in between.findings(endpoint, "r1", "")}
+    assert found["version of robot"].ok and "sightline" in found["version of robot"].value
+    assert int(re.match(r"the robot's clock is (\d+) ms", found["clock skew"].value)[1]) < 100  # one machine, one clock
+    assert found["round trip p50"].ok and "#" in found["jitter"].value
+    assert found["link"].ok is False and "is not heard" in found["link"].value  # it says nothing of its state
+
+
+def test_a_busy_port_is_told_with_its_owner(capsys, monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        monkeypatch.setattr(machine, "PORTS", {server.getsockname()[1]: "mine"})
+        check = _checks(capsys)[f"port {server.getsockname()[1]}"]
+    assert "in use by" in check["value"] and f"(pid {os.getpid()})" in check["value"]
+    assert f"kill {os.getpid()}," in check["fix"]
+
+
+def test_a_package_of_the_same_name_is_told(capsys, monkeypatch):
+    monkeypatch.setattr(machine.metadata, "packages_distributions", lambda: {"protocol": ["sightline", "protocol"]})
+    check = _checks(capsys)["package names"]
+    assert not check["ok"] and check["fix"].startswith("pip uninstall protocol")
+
+
+def test_certificates_near_their_end_are_told_with_the_command(capsys, tmp_path):
+    keys.make(tmp_path / "k", [])
+    keys.add(tmp_path / "k", "vision", [], days=10)
+    checks = _checks(capsys, "--secure", str(tmp_path / "k"))
+    assert checks["key robot"]["ok"] and checks["key ca"]["ok"]
+    assert not checks["key vision"]["ok"]
+    assert checks["key vision"]["fix"] == f"sightline keys add {tmp_path / 'k'} vision"
+
+
+def test_certificates_that_cannot_be_read_here_are_told_with_the_extra(capsys, tmp_path, monkeypatch):
+    keys.make(tmp_path / "k", [])
+    for name in [one for one in sys.modules if one.partition(".")[0] == "cryptography"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    check = _checks(capsys, "--secure", str(tmp_path / "k"))["certificates"]
+    assert not check["ok"] and "pip install 'sightline[secure]'" in str(check)
+
+
+def test_nobody_listening_is_told_apart_from_no_such_name(capsys, monkeypatch):
+    monkeypatch.setattr(between, "neighbour", lambda host: "; it is a firewall")
+    refused = _checks(capsys, "--peer", free_endpoint())["reach"]
+    assert "firewall" not in refused["fix"], "who refuses is there"
+    unknown = _checks(capsys, "--peer", "tcp/no-such-name.invalid:7447")["reach"]
+    assert "nobody listens" in refused["fix"] and "no machine is called" in unknown["fix"]
+    assert not refused["ok"] and not unknown["ok"]
+
+
+def test_somebody_else_on_the_port_is_no_robot(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        checks = _checks(capsys, "--peer", f"tcp/127.0.0.1:{port}")
+    assert checks["round trip p50"]["ok"] and not checks["link"]["ok"]
+    assert checks["link"]["fix"] == (
+        f"there: sightline robot --listen tcp/0.0.0.0:{port}; what listens on the port now is something else"
+    )
+
+
+def test_what_mends_a_link_stands_apart_from_what_is_wrong():
+    (found,) = between.findings("quic/127.0.0.1:1", "r1", "")
+    assert found.value == "refused at quic/127.0.0.1:1: a quic/ endpoint needs keys"
+    assert found.fix == "give --secure DIR"
+
+
+def test_an_endpoint_that_is_none_is_refused(capsys):
+    assert cli.run(["doctor", "--json", "--peer", "foo"]) == 2
+    said = capsys.readouterr()
+    assert "error: endpoint 'foo' is none" in said.err and said.out == "", "before anything is looked at"
+
+
+def test_a_camera_that_is_not_there_says_so(capsys):
+    check = _checks(capsys, "--camera", "v4l2", "--camera-set", "device=/dev/video99")["camera v4l2"]
+    assert not check["ok"] and "is not there" in check["value"]
+
+
+def test_the_rate_that_a_camera_delivers_is_measured(capsys):
+    check = _checks(capsys, "--camera", "folder", "--camera-set", "path=examples/pictures", "--camera-set", "fps=10")
+    assert check["camera folder"]["ok"] and float(check["camera folder"]["value"]) == pytest.approx(10, rel=0.2)
+
+
+@pytest.mark.slow
+def test_a_robot_is_looked_at_and_its_frames_counted(capsys, tmp_path):
+    with RobotProcess(tmp_path) as robot:
+        assert until(lambda: port_owner(int(robot.endpoint.rpartition(":")[2])))
+        checks = _checks(capsys, "--peer", robot.endpoint)
+    assert checks["frames"]["ok"] and checks["round trip p95"]["ok"] and checks["stream"]["ok"]
+    assert checks["version of robot"]["ok"] and "robot's clock is" in checks["clock skew"]["value"]
+    assert "r1 is DISARMED" in checks["robot"]["value"]
+    assert float(checks["frames"]["value"].split()[0]) > 20

@@ -1,0 +1,90 @@
+"""What a vision was given besides frames (scans, missions) comes again from a recording, byte for byte."""
+
+import pytest
+
+from sightline.evaluation.lockstep import Conditions, Lockstep
+from sightline.operator_side.recording.recorder import Recorder, read_about, read_recording
+from sightline.operator_side.recording.replay import VISION_CONFIG, replay, replay_steps
+from sightline.evaluation.scenario_config import robot_config, vision_config
+from sightline.protocol.channels import CAMERA, MISSION, SCAN, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import AnswerHeader, Stamp
+from sightline.sim.robot import load_robot
+from sightline.sim.scenario import load_scenario
+from sightline.sim.world.world import World
+from tests.operator_side.recording.test_recorder import record
+from tests.vision_side.serving.test_mission_channel import FRAME_US, GOTO, MODEL, Bench, scan
+from tests.fixtures.vision.vision import camera
+from sightline.vision_side.config import MissionConfig
+
+
+def scanned(bench, count):
+    """Frames with a scan before every third, as a robot sends them."""
+    for at in range(count):
+        if at % 3 == 0:
+            bench.robot.publish(SCAN, *scan(bench.seq, t_us=bench.seq * FRAME_US))
+        bench.frames()
+
+
+def show_camera(bench, model):
+    bench.robot.publish(CAMERA, encode(Stamp(session="0000abcd", seq=2, t_us=bench.seq * FRAME_US)), encode(model))
+    bench.turn()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("missions") / "run.mcap"
+    bench = Bench(config=GOTO)
+    with Recorder(bench.network.link("r1"), path, {VISION_CONFIG: GOTO.model_dump_json()}):
+        show_camera(bench, MODEL)
+        scanned(bench, 20)
+        bench.ask("band", 1, options={"averaged": 2})
+        scanned(bench, 12)
+        bench.ask("bnad", 2).frames(2)
+        bench.ask("follow", 3)
+        scanned(bench, 12)
+        bench.ask("goto", 4, waypoints=((0.5, 1.0), (0.0, 0.0)))
+        scanned(bench, 12)
+        show_camera(bench, camera(pitch_rad=0.1))
+        scanned(bench, 6)
+        bench.frames(6, session="0000beef")
+    return path
+
+
+def answers(path):
+    return [decode(AnswerHeader, one.message.header) for one in read_recording(path) if one.message.channel is TWIST]
+
+
+def test_scans_and_switched_missions_come_again_byte_for_byte(recorded):
+    headers = answers(recorded)
+    assert [{one.mission.id for one in headers if one.mission} == {1, 3, 4}, headers[-1].mission] == [True, None]
+    assert len({one.scan for one in headers if one.scan is not None}) > 10
+    result = replay(recorded)
+    assert result.ok and result.total == len(headers) > 60, result
+    assert len({step.now for step in replay_steps(recorded)}) > 5, "it did different things"
+
+
+@pytest.mark.parametrize("channel", [SCAN, MISSION])
+def test_what_was_gone_by_and_not_recorded_is_missed(recorded, tmp_path, channel):
+    kept = [one.message for one in read_recording(recorded) if one.message.channel is not channel]
+    record(tmp_path / "run.mcap", kept, **read_about(recorded))
+    result = replay(tmp_path / "run.mcap")
+    assert not result.ok and result.gaps > 0
+
+
+def test_a_mission_that_goes_by_scans_is_repeated_from_the_whole_line(tmp_path):
+    scenario, model = load_scenario("circle"), load_robot("raspberry")
+    mission = MissionConfig(kind="goto", options={"waypoints": [[0.6, -0.4], [0.0, 0.0]]})
+    config = vision_config(scenario, model).model_copy(update={"mission": mission})
+    path = tmp_path / "run.mcap"
+    with World(scenario, model, 5) as world:
+        lockstep = Lockstep(world, robot_config(model, auto_arm=True), config, Conditions(latency_ms=30), 5)
+        with Recorder(lockstep.network.link("r1"), path, {VISION_CONFIG: config.model_dump_json()}):
+            lockstep.network.link("r1").publish(CAMERA, encode(Stamp(session="00000001", seq=0, t_us=0)),
+                                                encode(world.camera_model))
+            while world.now_us < 4_000_000:
+                lockstep.step()
+    scans = [one.scan for one in answers(path) if one.scan is not None]
+    assert len(set(scans)) > 25 and scans == sorted(scans)
+    result = replay(path)
+    assert result.ok and result.total > 60, result

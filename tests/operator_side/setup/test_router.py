@@ -1,0 +1,59 @@
+"""`sightline router` as a process: robot and vision meet at it; a busy port and a missing key are said in a line."""
+
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+
+import pytest
+
+from sightline.operator_side.setup import keys
+from sightline.protocol.channels import FRAME, TWIST
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from tests.fixtures.links import free_endpoint, until
+
+pytestmark = pytest.mark.slow
+
+
+@contextmanager
+def _router(*arguments):
+    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "router", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("secured", [False, True])
+def test_robot_and_vision_meet_at_a_router_that_ends_when_told(tmp_path, secured):
+    endpoint, secure = free_endpoint(), ""
+    if secured:
+        secure = str(tmp_path / "keys")
+        keys.make(tmp_path / "keys", [])
+        endpoint = endpoint.replace("tcp/", "tls/")
+    with _router("--listen", endpoint, *(["--secure", secure] if secured else [])) as router:
+        assert router.stdout.readline().startswith(f"router: on {endpoint}; ")
+        with (
+            open_zenoh("r1", connect=[endpoint], role="robot", secure=secure) as robot,
+            open_zenoh("r1", connect=[endpoint], role="vision", secure=secure) as vision,
+        ):
+            frames, twists = vision.latest(FRAME), robot.latest(TWIST)
+            until(lambda: robot.has_listener(FRAME))
+            robot.publish(FRAME, b"{}", b"jpeg")
+            assert frames.take(2.0).payload == b"jpeg"
+            until(lambda: vision.has_listener(TWIST))
+            vision.publish(TWIST, b"{}", b"0.1|0")
+            assert twists.take(2.0).source == "vision"
+            with _router("--listen", endpoint, *(["--secure", secure] if secured else [])) as second:
+                assert second.wait(10) == 4
+                assert "is in use by" in second.stderr.read()
+        router.send_signal(signal.SIGTERM)
+        assert router.wait(5) == 0
+        assert router.stderr.read() == ""
+
+
+def test_a_router_without_its_keys_says_what_is_missing(tmp_path):
+    with _router("--listen", "tls/127.0.0.1:7450", "--secure", str(tmp_path)) as router:
+        assert router.wait(10) == 2
+        assert router.stderr.read().startswith("error: ca.pem is missing in")

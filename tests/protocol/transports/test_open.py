@@ -1,0 +1,45 @@
+"""One robot on several endpoints of different kinds at once."""
+
+import pytest
+
+from sightline.protocol.channels import FRAME, STATUS, TWIST
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.open import LinkGroup, open_link
+from tests.fixtures.links import free_endpoint, until
+
+
+def free_web_endpoint():
+    return free_endpoint().replace("tcp/", "ws://")
+
+
+def test_peers_of_both_kinds_hear_and_are_heard():
+    zenoh, web = free_endpoint(), free_web_endpoint()
+    with open_link("r1", listen=[zenoh, web], role="robot") as robot:
+        twists = robot.latest(TWIST)
+        for endpoint in (zenoh, web):
+            with open_link("r1", connect=[endpoint], role="vision") as peer:
+                frames = peer.latest(FRAME)
+                assert until(lambda: robot.has_listener(FRAME))
+                assert until(lambda taken=frames.take: robot.publish(FRAME, b"{}", b"jpeg") and taken(0.05))
+                assert until(lambda say=peer.publish: say(TWIST, b"{}", b"0|0") and twists.take(0.05))
+            assert until(lambda: not robot.has_listener(FRAME))
+        assert not robot.publish(STATUS, b"{}", b"{}")
+
+
+def test_a_failure_on_one_endpoint_leaves_none_open():
+    zenoh, web = free_endpoint(), free_web_endpoint()
+    with open_link("r1", listen=[web]), pytest.raises(LinkError):
+        open_link("r1", listen=[zenoh, web])
+    with open_link("r1", listen=[zenoh, web]) as again:
+        assert isinstance(again, LinkGroup)
+
+
+@pytest.mark.parametrize("endpoint", ["ws:/127.0.0.1:1", "http://127.0.0.1:80", "wss//x:1", "ws://127.0.0.1:99999"])
+def test_an_endpoint_that_is_none_is_named(endpoint):
+    with pytest.raises(ConfigError, match="is none"):
+        open_link("r1", connect=[endpoint])
+
+
+def test_links_of_several_robots_are_not_joined():
+    with pytest.raises(ConfigError):
+        LinkGroup([])

@@ -1,0 +1,175 @@
+"""`wss://` with real TLS: certificates of a private authority, and everybody who does not agree on them."""
+
+import socket
+import ssl
+import time
+
+import pytest
+import trustme
+import websocket
+from websockets.sync.client import connect
+
+from sightline.operator_side.setup import keys
+from sightline.protocol.channels import FRAME, TWIST
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.websocket.link import open_websocket
+from sightline.protocol.transports.websocket_listen import NO_TLS
+from tests.fixtures.links import until
+from tests.fixtures.websocket import V1, address_of, free_ws
+
+AUTHORITY, STRANGER = trustme.CA(), trustme.CA()
+
+
+def folder_of(path, authority=AUTHORITY, host="127.0.0.1"):
+    """A robot's folder, which is here also that of its vision."""
+    path.mkdir(exist_ok=True)
+    certificate = authority.issue_cert(host)
+    certificate.private_key_pem.write_to_path(path / "robot.key")
+    certificate.cert_chain_pems[0].write_to_path(path / "robot.pem")
+    authority.cert_pem.write_to_path(path / "ca.pem")
+    (path / "vision.token").write_text("0123456789abcdef")
+    return str(path)
+
+
+@pytest.fixture
+def secured(tmp_path):
+    endpoint, folder = free_ws("wss"), folder_of(tmp_path / "keys")
+    with open_websocket("r1", listen=endpoint, role="robot", secure=folder) as robot:
+        yield robot, endpoint, folder
+
+
+def test_frames_and_twists_go_both_ways_whatever_their_size(secured):
+    robot, endpoint, folder = secured
+    twists = robot.latest(TWIST)
+    with open_websocket("r1", connect=endpoint, role="vision", secure=folder) as vision:
+        frames = vision.latest(FRAME)
+        assert until(lambda: robot.has_listener(FRAME) and vision.has_listener(TWIST))
+        for size in (0, 1, 16_384, 16_385, 65_536, 400_000, FRAME.max_payload_bytes):
+            assert robot.publish(FRAME, b"{}", bytes(size))
+            assert len(frames.take(3).payload) == size
+            assert vision.publish(TWIST, b"{}", b"%d|0" % size)
+            assert twists.take(3).payload == b"%d|0" % size
+
+
+def test_a_hundred_frames_while_many_twists_come_in(secured):
+    robot, endpoint, folder = secured
+    got = []
+    with open_websocket("r1", connect=endpoint, role="vision", secure=folder) as vision:
+        robot.subscribe(TWIST, lambda message: got.append(message.payload))
+        frames = vision.latest(FRAME)
+        assert until(lambda: robot.has_listener(FRAME) and vision.has_listener(TWIST))
+        for number in range(100):
+            robot.publish(FRAME, b"{}", number.to_bytes(4) + bytes(46_000))
+            for part in range(3):
+                vision.publish(TWIST, b"{}", b"%d|%d" % (number, part))
+            assert until(lambda: (frame := frames.take(0.5)) and frame.payload[:4] == number.to_bytes(4))  # noqa: B023
+        assert until(lambda: got[-1] == b"99|2")
+        assert robot.refused == vision.refused == {}
+
+
+def test_who_reads_nothing_over_tls_stays_and_delays_nobody(secured):
+    robot, endpoint, folder = secured
+    trust = ssl.create_default_context(cafile=f"{folder}/ca.pem")
+    token = {"Authorization": "Bearer 0123456789abcdef"}
+    with (
+        connect(endpoint, ssl=trust, max_queue=1, ping_interval=None, additional_headers=token, **V1) as stalled,
+        open_websocket("r1", connect=endpoint, role="vision", secure=folder) as vision,
+    ):
+        frames = vision.latest(FRAME)
+        stalled.send('{"robot":"r1","session":"0000beef","wants":["frame"]}')
+        assert until(lambda: [peer.hears(FRAME) for peer in robot._peers] == [True, True])
+        for number in range(100):
+            begin_s = time.monotonic()
+            robot.publish(FRAME, b"{}", number.to_bytes(4) + bytes(200_000))
+            assert frames.take(1).payload[:4] == number.to_bytes(4)
+            time.sleep(max(0.0, 1 / 30 - (time.monotonic() - begin_s)))
+        assert len(robot._peers) == 2
+        stalled.socket.close()
+
+
+def test_a_robot_whose_authority_is_not_trusted_is_refused_in_one_line(secured, tmp_path):
+    robot, endpoint, _ = secured
+    other = folder_of(tmp_path / "other", STRANGER)
+    for folder in (other, ""):
+        with pytest.raises(LinkError, match="no TLS with it: unable to get local issuer certificate; is the ca") as why:
+            open_websocket("r1", connect=endpoint, role="vision", secure=folder)
+        assert "\n" not in str(why.value)
+    assert until(lambda: robot.refused[NO_TLS] >= 2)
+
+
+def test_a_certificate_of_another_host_is_refused(tmp_path):
+    endpoint, folder = free_ws("wss"), folder_of(tmp_path / "keys", host="192.0.2.9")
+    with (
+        open_websocket("r1", listen=endpoint, role="robot", secure=folder),
+        pytest.raises(LinkError, match="no TLS with it: IP address mismatch"),
+    ):
+        open_websocket("r1", connect=endpoint, role="vision", secure=folder)
+
+
+def test_who_speaks_no_tls_is_counted_and_gone(secured, capfd):
+    robot, endpoint, folder = secured
+    with socket.create_connection(address_of(endpoint)) as near:
+        near.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert until(lambda: robot.refused == {NO_TLS: 1})
+    assert "turned 127.0.0.1 away: no TLS: HTTP_REQUEST" in capfd.readouterr().err
+    open_websocket("r1", connect=endpoint, role="vision", secure=folder).close()
+
+
+def test_a_handshake_that_is_dripped_is_not_waited_for(secured):
+    robot, endpoint, folder = secured
+    hello = ssl.MemoryBIO()
+    offer = ssl.create_default_context().wrap_bio(ssl.MemoryBIO(), hello, server_hostname="127.0.0.1")
+    with pytest.raises(ssl.SSLWantReadError):
+        offer.do_handshake()
+    begin_s = time.monotonic()
+    with socket.create_connection(address_of(endpoint)) as near:
+        for byte in hello.read():
+            if robot.refused[NO_TLS]:
+                break
+            near.send(bytes([byte]))
+            time.sleep(0.03)
+        assert until(lambda: robot.refused == {NO_TLS: 1}, 1)
+    assert 1.8 < time.monotonic() - begin_s < 3
+    open_websocket("r1", connect=endpoint, role="vision", secure=folder).close()
+
+
+def test_another_library_comes_in_over_tls_with_its_token(secured):
+    _, endpoint, folder = secured
+    stranger = websocket.create_connection(
+        endpoint, timeout=3, sslopt={"ca_certs": f"{folder}/ca.pem"},
+        subprotocols=["sightline.v1", "sightline.token.0123456789abcdef"],
+    )  # fmt: skip
+    stranger.send('{"robot":"r1","session":"0000beef"}')
+    assert '"robot":"r1"' in stranger.recv()
+    stranger.close()
+
+
+@pytest.mark.parametrize("missing", ["robot.pem", "robot.key"])
+def test_a_folder_without_what_is_needed_is_one_line(tmp_path, missing):
+    folder = folder_of(tmp_path / "keys")
+    (tmp_path / "keys" / missing).unlink()
+    with pytest.raises(ConfigError, match=r"wss:// needs robot\.pem and robot\.key in a folder: give it with --s"):
+        open_websocket("r1", listen=free_ws("wss"), role="robot", secure=folder)
+
+
+@pytest.mark.parametrize("broken", ["robot.pem", "robot.key", "ca.pem"])
+def test_a_broken_file_is_named_in_one_line(tmp_path, broken):
+    folder = folder_of(tmp_path / "keys")
+    (tmp_path / "keys" / broken).write_text("nonsense")
+    end, role = ("connect", "vision") if broken == "ca.pem" else ("listen", "robot")
+    with pytest.raises(ConfigError, match=broken.replace(".", r"\.")) as why:
+        open_websocket("r1", secure=folder, role=role, **{end: free_ws("wss")})
+    assert "\n" not in str(why.value)
+
+
+def test_the_folder_of_sightline_keys_is_all_that_both_ends_need(tmp_path):
+    keys.make(tmp_path, [])
+    endpoint = free_ws("wss").replace("127.0.0.1", "0.0.0.0")
+    with open_websocket("r1", listen=endpoint, role="robot", secure=str(tmp_path)) as robot:
+        twists = robot.latest(TWIST)
+        here = endpoint.replace("0.0.0.0", "127.0.0.1")
+        with open_websocket("r1", connect=here, role="vision", secure=str(tmp_path)) as vision:
+            assert until(lambda: vision.has_listener(TWIST))
+            vision.publish(TWIST, b"{}", b"0.1|0")
+            assert twists.take(2).source == "vision"
+        assert robot.refused == {}

@@ -1,0 +1,288 @@
+"""Who may come in by WebSocket beyond loopback: by token and as what, or in the older dialect by address."""
+
+import itertools
+import json
+import time
+
+import pytest
+from pydantic import ValidationError
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from sightline.protocol.channels import ACK, DETECTIONS, FRAME, REQUEST, STATUS, TWIST
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.websocket.link import open_websocket
+from sightline.protocol.transports.websocket_access import (
+    NO_TOKEN,
+    NOT_LISTED,
+    check_listening,
+    client_address_problem,
+    grants_of_role,
+    role_of_token,
+)
+from sightline.protocol.transports.websocket_doorlog import BurstLimiter
+from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint, with_allowed
+from sightline.protocol.transports.websocket_keys import own_token, read_tokens
+from sightline.protocol.transports.websocket_peer import NOT_GRANTED
+from sightline.protocol.transports.websocket.legacy import DRIVER_SLOT_US, DriverSlot
+from sightline.robot_side.config import RobotConfig
+from tests.fixtures.links import claim, until
+from tests.fixtures.websocket import V1, free_ws
+
+TOKENS = {"vision": "vision-0123456789abcdef", "operator": "operator_0123456789abc", "viewer": "viewerviewerviewer"}
+
+
+@pytest.fixture
+def keys(tmp_path):
+    for role, token in TOKENS.items():
+        (tmp_path / f"{role}.token").write_text(token + "\n")
+    return str(tmp_path)
+
+
+def everywhere(scheme: str = "ws") -> tuple[str, str]:
+    """An endpoint on all addresses of this machine, and how it is reached from here."""
+    here = free_ws(scheme)
+    return here.replace("127.0.0.1", "0.0.0.0"), here
+
+
+# --- beyond loopback -------------------------------------------------------------------------------------------------
+
+LOOPBACK = ("ws://127.0.0.1:9090", "ws://localhost:9090", "ws://[::1]:9090", "wss://127.0.0.7:1", "ws-legacy://127.0.0.1:1")
+BEYOND = ("ws://0.0.0.0:9090", "ws://[::]:9090", "wss://192.168.1.7:9090", "ws://robot.local:9090", "ws://127.0.0.1.x:1")
+
+
+@pytest.mark.parametrize("text", LOOPBACK)
+def test_on_loopback_nothing_is_asked_for(text):
+    check_listening(parse_websocket_endpoint(text), {})
+
+
+@pytest.mark.parametrize("text", BEYOND)
+def test_beyond_loopback_a_token_is_demanded_in_one_line(text):
+    with pytest.raises(ConfigError, match="beyond this machine, where anybody could drive: give --secure") as why:
+        open_websocket("r1", listen=text)
+    assert "\n" not in str(why.value)
+    assert text in str(why.value)
+    check_listening(parse_websocket_endpoint(text), {"a" * 16: "vision"})
+
+
+def test_beyond_loopback_the_older_dialect_demands_a_list_in_one_line():
+    here = "ws-legacy://0.0.0.0:9091?oneline"
+    with pytest.raises(ConfigError, match="clients that carry no token: list who may come in") as why:
+        open_websocket("r1", listen=here)
+    assert f'legacy.allow_from = ["192.168.1.7"] or {here}&from=192.168.1.7' in str(why.value)
+    check_listening(parse_websocket_endpoint(f"{here}&from=192.168.1.7"), {})
+
+
+# --- the list --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("address", "listed", "may"),
+    [
+        ("10.0.0.7", ["10.0.0.7"], True), ("10.0.0.8", ["10.0.0.7"], False), ("10.0.0.8", ["10.0.0.0/24"], True),
+        ("10.0.1.8", ["10.0.0.0/24"], False), ("10.0.1.8", ["10.0.0.0/24", "10.0.1.8/32"], True), ("1.2.3.4", [], True),
+        ("::ffff:10.0.0.7", ["10.0.0.7"], True), ("fe80::1%eth0", ["fe80::/10"], True), ("::1", ["127.0.0.1"], False),
+    ],
+)  # fmt: skip
+def test_addresses_and_networks(address, listed, may):
+    assert (client_address_problem(address, listed) == "") is may
+
+
+def test_the_list_stands_in_the_endpoint():
+    end = parse_websocket_endpoint("ws-legacy://0.0.0.0:9091?dashed&from=192.168.1.7,10.0.0.1/8")
+    assert end.allow_from == ("192.168.1.7/32", "10.0.0.0/8")
+    assert end.legacy.dashed
+    assert with_allowed("ws-legacy://h:1", ["a", "b"]) == "ws-legacy://h:1?from=a,b"
+    assert with_allowed("ws-legacy://h:1?oneline", ["a"]) == "ws-legacy://h:1?oneline&from=a"
+    for same in ("ws://h:1", "tcp/h:1", "ws-legacy://h:1?from=b"):
+        assert with_allowed(same, ["a"]) == same
+    assert with_allowed("ws-legacy://h:1", []) == "ws-legacy://h:1"
+
+
+def test_a_robots_list_is_written_into_its_endpoints():
+    given = {"listen": ["tcp/0.0.0.0:7447", "ws-legacy://0.0.0.0:9091"], "legacy": {"allow_from": ["10.0.0.7"]}}
+    config = RobotConfig.model_validate_json(json.dumps(given))
+    assert config.doors == ("tcp/0.0.0.0:7447", "ws-legacy://0.0.0.0:9091?from=10.0.0.7")
+    with pytest.raises(ValidationError, match="'robot' is no address or network"):
+        RobotConfig.model_validate_json(json.dumps({"legacy": {"allow_from": ["robot"]}}))
+
+
+@pytest.mark.parametrize(
+    "text", ["from=", "from=robot", "from=1.2.3", "from=10.0.0.0/33", "from=1.2.3.4,", "swapped", "loud"]
+)
+def test_a_bad_option_is_refused(text):
+    with pytest.raises(ConfigError):
+        parse_websocket_endpoint(f"ws-legacy://127.0.0.1:9091?{text}")
+
+
+def test_who_is_not_listed_is_told_why_and_the_log_tells_of_few(capfd):
+    endpoint, here = everywhere("ws-legacy")
+    plain = here.replace("ws-legacy", "ws")
+    with open_websocket("r1", listen=f"{endpoint}?from=10.1.2.3") as robot:
+        begin_s = time.monotonic()
+        for _ in range(40):
+            with pytest.raises(InvalidStatus) as refusal:
+                connect(plain, compression=None)
+            assert refusal.value.response.status_code == 403
+        assert refusal.value.response.body == (
+            b"127.0.0.1 is not listed in legacy.allow_from: the robot's owner lists who may come in here\n"
+        )
+        spent_s = time.monotonic() - begin_s
+        assert robot.refused == {NOT_LISTED: 40}
+    lines = capfd.readouterr().err.splitlines()
+    assert 1 <= len(lines) <= 10 * (1 + int(spent_s))
+    assert "turned 127.0.0.1 away: 127.0.0.1 is not listed" in lines[0]
+
+
+def test_who_is_listed_comes_in():
+    endpoint, here = everywhere("ws-legacy")
+    with open_websocket("r1", listen=f"{endpoint}?from=10.1.2.3,127.0.0.0/8") as robot:
+        twists = robot.latest(TWIST)
+        with connect(here.replace("ws-legacy", "ws"), compression=None) as client:
+            client.send("0.1|0")
+            assert twists.take(2).payload == b"0.1|0"
+
+
+def test_the_log_tells_of_ten_a_second_and_counts_the_rest():
+    log = BurstLimiter()
+    told = [line for now_us in range(0, 2_000_000, 10_000) if (line := log.line("knock", now_us))]
+    assert told == ["knock"] * 10 + ["knock (90 more before)"] + ["knock"] * 9
+
+
+# --- tokens ----------------------------------------------------------------------------------------------------------
+
+
+def test_tokens_are_read_from_a_folder_and_each_role_has_its_own(keys, tmp_path):
+    assert read_tokens(keys) == {token: role for role, token in TOKENS.items()}
+    assert read_tokens("") == {}
+    sources = {"vision": "vision", "teleop": "operator", "operator": "operator", "metrics": "viewer"}
+    assert {source: own_token(keys, source) for source in sources} == {s: TOKENS[r] for s, r in sources.items()}
+    assert own_token(keys, "robot") == own_token("", "vision") == ""
+    (tmp_path / "robot.token").write_text(TOKENS["vision"])
+    with pytest.raises(ConfigError, match="one token for two roles"):
+        read_tokens(keys)
+
+
+@pytest.mark.parametrize("text", ["", "short", "a" * 15, "a" * 129, "a b" * 9, "ü" * 16, "a" * 16 + "\nb"])
+def test_what_is_no_token_is_refused_with_its_file(keys, tmp_path, text):
+    (tmp_path / "vision.token").write_text(text)
+    with pytest.raises(ConfigError, match=r"vision\.token"):
+        read_tokens(keys)
+
+
+TOKEN = TOKENS["vision"]
+
+
+@pytest.mark.parametrize(
+    ("authorizations", "offers", "role"),
+    [
+        ([f"Bearer {TOKEN}"], [], "vision"), ([f"bearer  {TOKEN} "], ["sightline.v1"], "vision"),
+        ([], [f"sightline.v1, sightline.token.{TOKEN}"], "vision"),
+        ([], ["sightline.v1", f"sightline.token.{TOKENS['viewer']}"], "viewer"),
+        ([], [], None), ([f"Basic {TOKEN}"], [], None), ([TOKEN], [], None), ([f"Bearer {TOKEN}x"], [], None),
+        (["Bearer "], [], None), ([], ["sightline.token."], None), ([], [f"token.{TOKEN}"], None),
+        ([f"Bearer {TOKEN}"], [f"sightline.token.{TOKEN}"], None), ([f"Bearer {TOKEN}"] * 2, [], None),
+        (["Bearer \xfc" * 16], [], None),
+    ],
+)  # fmt: skip
+def test_a_token_is_shown_once_in_one_of_two_ways(authorizations, offers, role):
+    assert role_of_token({token: name for name, token in TOKENS.items()}, authorizations, offers) == role
+
+
+def test_a_token_opens_the_door_and_nothing_else_does(keys, capfd):
+    endpoint, here = everywhere()
+    with open_websocket("r1", listen=endpoint, secure=keys) as robot:
+        with open_websocket("r1", connect=here, role="vision", secure=keys) as peer:
+            frames = peer.latest(FRAME)
+            assert until(lambda: robot.has_listener(FRAME))
+            robot.publish(FRAME, b"{}", b"seen")
+            assert frames.take(2).payload == b"seen"
+        with pytest.raises(LinkError, match="show the token of your role: Authorization: Bearer TOKEN, or --sec"):
+            open_websocket("r1", connect=here, role="vision")
+        for bad in (here + f"/?token={TOKEN}", here):
+            with pytest.raises(InvalidStatus) as refusal:
+                connect(bad, additional_headers={"Authorization": f"Bearer {TOKEN[:-1]}"}, **V1)
+            assert refusal.value.response.status_code == 401
+        entries = ["sightline.v1", f"sightline.token.{TOKEN}"]
+        with connect(here, subprotocols=entries, compression=None, legacy=True) as browser:
+            assert browser.subprotocol == "sightline.v1"
+        assert robot.refused[NO_TOKEN] >= 3
+    told = capfd.readouterr().err
+    assert "turned 127.0.0.1 away: show the token" in told
+    assert TOKEN[:-1] not in told
+
+
+# --- roles -----------------------------------------------------------------------------------------------------------
+
+
+_OF_VISION = ("twist", "ack", "detections", "report", "overlay", "preview")
+
+
+def test_a_role_may_publish_what_the_table_of_channels_gives_it():
+    assert grants_of_role("vision") == {(name, "vision") for name in _OF_VISION}
+    said = {("twist", "teleop"), ("request", "operator"), ("request", "teleop"), ("mission", "operator")}
+    assert said < grants_of_role("operator")
+    assert ("report", "operator") not in grants_of_role("operator")
+    assert grants_of_role("viewer") == frozenset()
+    assert {("frame",), ("status",)} < grants_of_role("robot")
+
+
+@pytest.mark.parametrize("role", TOKENS)
+def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role, capfd):
+    endpoint, here = everywhere()
+    sources = ("vision", "teleop", "operator", "guest")
+    heard, sent = [], [*itertools.product(["twist", "ack", "request", "detections"], sources)]
+    with open_websocket("r1", listen=endpoint, secure=keys) as robot:
+        for channel in (TWIST, ACK, REQUEST, DETECTIONS):
+            robot.subscribe(channel, lambda message: heard.append((message.channel.name, message.source)))
+        with connect(here, additional_headers={"Authorization": f"Bearer {TOKENS[role]}"}, **V1) as client:
+            client.send('{"robot":"r1","session":"0000beef","role":"teleop","wants":["status"]}')
+            for channel, source in sent:
+                client.send(claim(f"sightline/r1/{channel}/{source}", b"", b""))
+            allowed = [pair for pair in sent if pair in grants_of_role(role)]
+            assert until(lambda: len(heard) == len(allowed) and robot.refused[NOT_GRANTED] == len(sent) - len(allowed))
+            assert heard == allowed
+            assert robot.has_listener(STATUS)  # everybody may watch
+            # Told once each, at once, ten a second; an acknowledgement that returns no credit is not worth a word.
+            forbidden = {"/".join(pair) for pair in sent if pair not in grants_of_role(role) and pair[0] != "ack"}
+            told = [line for line in capfd.readouterr().err.splitlines() if line.startswith("refused ")]
+            named = [line.split()[1] for line in told]
+            assert set(named) <= forbidden and len(set(named)) == len(named) >= min(10, len(forbidden))
+            assert all(" from 127.0.0.1: the role of its token may not say that" in line for line in told)
+
+
+# --- one of many -----------------------------------------------------------------------------------------------------
+
+
+def test_the_seat_is_the_first_s_until_it_leaves_or_is_silent_for_a_second():
+    seat = DriverSlot()
+    claims = ("a", 0), ("b", 1), ("a", 900_000), ("b", DRIVER_SLOT_US)
+    assert [seat.claim(who, now_us) for who, now_us in claims] == ["a"] * 4
+    assert seat.claim("b", 900_000 + DRIVER_SLOT_US - 1) == "a"
+    assert seat.claim("b", 900_000 + DRIVER_SLOT_US) == "b"
+    seat.leave("a")
+    assert seat.claim("a", 900_000 + DRIVER_SLOT_US) == "b"
+    seat.leave("b")
+    assert seat.claim("a", 900_000 + DRIVER_SLOT_US) == "a"
+
+
+def test_one_client_drives_and_the_rest_only_watch(capfd):
+    endpoint = free_ws("ws-legacy")
+    plain = endpoint.replace("ws-legacy", "ws")
+    with open_websocket("r1", listen=endpoint) as robot, connect(plain) as viewer, connect(plain) as driver:
+        twists, got = robot.latest(TWIST), []
+        viewer.send("left")  # not valid: takes no seat, and the robot says why it is refused
+        assert twists.take(2).payload == b"left"
+        for number in range(5):
+            driver.send(f"0.1|{number}")
+            got.append(twists.take(2).payload)
+            viewer.send(f"0.9|{number}")
+        assert got == [b"0.1|%d" % number for number in range(5)]
+        assert until(lambda: robot.refused == {"NOT_HOLDER": 5})
+        assert twists.take() is None
+        assert until(lambda: robot.publish(FRAME, b"", b"jpeg") and viewer.recv(1) == driver.recv(1))
+        driver.close()
+        assert until(lambda: viewer.send("0.9|0") or twists.take(0.05), 0.9)  # its seat is free at once
+    told = [line for line in capfd.readouterr().err.splitlines() if "drives" in line]
+    assert len(told) == 3
+    assert told[1] == f"{told[1].split()[0]} only watches: {told[0]}"

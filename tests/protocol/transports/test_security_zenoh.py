@@ -1,0 +1,248 @@
+"""Secured Zenoh links: who may say and hear what, by certificate; what is wrong between two ends, in words."""
+
+import threading
+import time
+from contextlib import closing
+from itertools import product
+
+import pytest
+
+from sightline.operator_side.setup import keys
+from sightline.protocol.channels import (
+    ACK,
+    CHANNELS,
+    FRAME,
+    MAX_HEADER_BYTES,
+    MISSION,
+    REPORT,
+    REQUEST,
+    STATUS,
+    TWIST,
+    Direction,
+)
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.security import (
+    ROLES,
+    SOURCES_OF_ROLE,
+    certificate_role,
+    load_role_keys,
+    may_publish,
+    may_subscribe,
+)
+from sightline.protocol.transports.websocket_keys import read_tokens
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.transports.zenoh.discovery import list_robots
+from sightline.protocol.transports.zenoh_session import MAX_MESSAGE_BYTES, open_session
+from tests.fixtures.links import free_endpoint, until
+
+SAID = (TWIST, ACK, REQUEST, MISSION, REPORT)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("keys") / "k"
+    keys.make(made, ["robot.local"])
+    return made
+
+
+@pytest.fixture
+def endpoint():
+    return free_endpoint().replace("tcp/", "tls/")
+
+
+def test_only_the_listed_may_publish():
+    assert may_publish("viewer") == []
+    assert "sightline/*/twist/vision" in may_publish("vision")
+    assert not any("request" in key for key in may_publish("vision"))
+    assert {"sightline/*/request/operator", "sightline/*/twist/teleop"} <= set(may_publish("operator"))
+    assert not any(key.endswith("/vision") for key in may_publish("operator"))
+    assert {"sightline/*/mission/operator", "sightline/*/mission/teleop"} <= set(may_publish("operator"))
+    assert "sightline/*/report/vision" in may_publish("vision")
+    assert {"sightline/*/overlay/vision", "sightline/*/preview/vision"} <= set(may_publish("vision"))
+    assert not any("/overlay/" in key or "/preview/" in key for key in may_publish("operator"))
+    assert not any("/report/" in key for key in may_publish("operator"))
+    assert may_publish("detector") == ["sightline/*/detections/detector"], "who looks drives nothing, nor gives credit"
+    assert not any("/mission/" in key for key in may_publish("vision"))
+    assert not any(key.endswith("/guest") for role in ROLES for key in may_publish(role))
+    assert {key.split("/")[2] for key in may_publish("robot")} == {
+        name for name, channel in CHANNELS.items() if channel.direction is Direction.FROM_ROBOT
+    }
+
+
+def test_what_is_said_towards_the_robot_is_heard_by_the_robot_alone():
+    assert all(key.endswith("/*") for key in may_subscribe("robot"))
+    assert not any("twist" in key for role in SOURCES_OF_ROLE for key in may_subscribe(role))
+    for passed_on in ("detections", "mission", "report", "overlay", "preview"):
+        assert all(f"sightline/*/{passed_on}/*" in may_subscribe(role) for role in (*SOURCES_OF_ROLE, "robot"))
+
+
+def test_a_role_that_is_none_is_a_viewer():
+    assert [certificate_role(name) for name in ("vision", "teleop", "operator", "robot", "detector", "guest", "")] == [
+        "vision", "operator", "operator", "robot", "detector", "viewer", "viewer",
+    ]  # fmt: skip
+
+
+def test_each_role_says_what_it_may_and_nothing_else(folder, endpoint):
+    heard = []
+    with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)) as robot:
+        for channel in SAID:
+            robot.subscribe(channel, lambda message: heard.append((message.channel.name, message.source)))
+        for role in SOURCES_OF_ROLE:
+            with open_zenoh("r1", connect=[endpoint], role=role, secure=str(folder)) as peer:
+                frames = peer.latest(FRAME)
+                until(lambda: robot.has_listener(FRAME))
+                robot.publish(FRAME, b"{}", b"jpeg")
+                assert frames.take(2.0) is not None, f"{role} may watch"
+                allowed = {key for key in may_publish(role) if CHANNELS[key.split("/")[2]] in SAID}
+                until(lambda peer=peer, allowed=allowed: says_all(peer) or said(heard) >= allowed)
+                says_all(peer)
+            time.sleep(0.1)  # what is denied must have had its chance
+            assert said(heard) == allowed
+            heard.clear()
+
+
+def test_what_is_over_its_channels_bound_ends_at_who_listens(folder, endpoint):
+    """At a router, so that it crosses no robot's radio; what is just within it passes."""
+    heard = []
+    with (
+        closing(open_session([endpoint], (), 5.0, load_role_keys(str(folder), "robot"))),
+        open_session((), [endpoint], 5.0, load_role_keys(str(folder), "robot")) as robot,
+        open_session((), [endpoint], 5.0, load_role_keys(str(folder), "vision")) as vision,
+    ):
+        robot.declare_subscriber("sightline/r1/twist/*", lambda sample: heard.append(len(sample.payload)))
+        bound = TWIST.max_payload_bytes
+        assert until(lambda: vision.put("sightline/r1/twist/vision", b"0", attachment=b"h") or heard)
+        heard.clear()
+        for size in (bound + 1, MAX_MESSAGE_BYTES // 2, bound):
+            vision.put("sightline/r1/twist/vision", bytes(size), attachment=bytes(MAX_HEADER_BYTES))
+        assert until(lambda: bound in heard)
+        assert set(heard) - {1} == {bound}
+
+
+def says_all(peer):
+    """Once on every key, and as every source; a peer that has just come in may not yet know who listens to what."""
+    for channel, source in product(SAID, ("vision", "operator", "teleop", "guest")):
+        peer.publish(channel, b"{}", b"", source)
+
+
+def said(heard):
+    return {f"sightline/*/{channel}/{source}" for channel, source in heard}
+
+
+@pytest.fixture
+def broken(tmp_path, folder):
+    """The folder's keys, to be spoiled."""
+    for file in folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    return tmp_path
+
+
+def _refusal(endpoint, robot_keys, peer_keys, plain_robot=False):
+    listen = endpoint.replace("tls/", "tcp/") if plain_robot else endpoint
+    with (
+        open_zenoh("r1", listen=[listen], role="robot", secure="" if plain_robot else str(robot_keys)) as robot,
+        pytest.raises(LinkError) as refusal,
+    ):
+        robot.subscribe(TWIST, lambda message: None)
+        target = endpoint if peer_keys else endpoint.replace("tls/", "tcp/")
+        open_zenoh("r1", connect=[target], role="vision", secure=str(peer_keys or ""), timeout_s=0.5)
+    assert "\n" not in str(refusal.value)
+    return str(refusal.value)
+
+
+def test_keys_of_another_authority_are_refused_with_the_cause(folder, endpoint, tmp_path):
+    keys.make(tmp_path / "other", [])
+    assert "of another authority" in _refusal(endpoint, folder, tmp_path / "other")
+
+
+def test_an_expired_certificate_is_named(folder, endpoint, broken):
+    keys.add(broken, "robot", [], days=-0.5)
+    assert "its certificate has expired" in _refusal(endpoint, broken, folder)
+
+
+def test_our_own_expired_certificate_is_named(folder, endpoint, broken):
+    keys.add(broken, "vision", [], days=-0.5)
+    assert "our certificate expired" in _refusal(endpoint, folder, broken)
+
+
+def test_a_certificate_of_another_host_is_named(folder, endpoint, broken, monkeypatch):
+    monkeypatch.setattr(keys, "LOOPBACK", ())
+    keys.add(broken, "robot", ["elsewhere.local"])
+    assert "names other addresses" in _refusal(endpoint, broken, folder)
+
+
+def test_plain_to_secured_and_secured_to_plain_are_refused_with_the_cause(folder, endpoint):
+    assert "speaks TLS only" in _refusal(endpoint, folder, None)
+    assert "plain link, not TLS" in _refusal(endpoint, folder, folder, plain_robot=True)
+
+
+def test_there_is_no_silent_way_back_to_a_plain_link(folder):
+    with pytest.raises(ConfigError, match="is not secured"):
+        open_zenoh("r1", connect=["tcp/127.0.0.1:7447"], role="vision", secure=str(folder))
+
+
+def test_a_machine_without_its_keys_is_told_which(broken):
+    (broken / "vision.key").unlink()
+    with pytest.raises(ConfigError, match=r"vision\.key is missing in .*copy ca\.pem, vision\.pem and vision\.key"):
+        open_zenoh("r1", connect=["tls/127.0.0.1:7447"], role="vision", secure=str(broken))
+
+
+@pytest.mark.parametrize("role", ["operator", "viewer"])
+def test_robots_are_listed_over_a_secured_link(folder, endpoint, role, tmp_path):
+    for name in ("ca.pem", f"{role}.pem", f"{role}.key"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)) as robot:
+        found = {}
+        deadline_s = time.monotonic() + 5
+        secure = str(tmp_path)
+        listing = threading.Thread(target=lambda: found.update(list_robots([endpoint], 0.6, secure)), daemon=True)
+        listing.start()
+        while listing.is_alive() and time.monotonic() < deadline_s:
+            robot.publish(STATUS, b"{}", b"{}")
+            time.sleep(0.02)
+        listing.join()
+    assert set(found) == {"r1"}
+
+
+def test_keys_are_for_their_owner_only_and_never_overwritten(folder):
+    kept = [file for file in folder.iterdir() if file.suffix in (".key", ".token")]
+    assert len(kept) == 1 + 2 * len(ROLES)
+    assert all(file.stat().st_mode & 0o077 == 0 for file in kept)
+    with pytest.raises(ConfigError, match="holds keys already"):
+        keys.make(folder, [])
+
+
+def test_a_new_token_is_another_and_is_read_as_its_role(broken):
+    before = read_tokens(str(broken))
+    keys.add(broken, "operator", [])
+    after = read_tokens(str(broken))
+    assert sorted(before.values()) == sorted(after.values()) == sorted(ROLES)
+    assert len(set(before) & set(after)) == len(ROLES) - 1
+
+
+def test_certificates_are_told_with_their_hosts_and_end(folder):
+    shown = {certificate.role: certificate for certificate in keys.look(folder)}
+    assert set(shown) == {"sightline authority", *ROLES}
+    assert shown["robot"].hosts == ("localhost", "127.0.0.1", "robot.local")
+
+
+@pytest.mark.parametrize("host", ["a b", "röbot", "http://x", ""])
+def test_a_host_that_is_none_is_refused(folder, host):
+    with pytest.raises(ConfigError, match="no name or address"):
+        keys.add(folder, "viewer", [host])
+
+
+def test_a_host_that_is_none_leaves_nothing_behind(tmp_path):
+    with pytest.raises(ConfigError):
+        keys.make(tmp_path / "new", ["a b"])
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_without_an_authority_cannot_sign(tmp_path):
+    with pytest.raises(ConfigError, match="no authority"):
+        keys.add(tmp_path, "robot", [])
+    with pytest.raises(ConfigError, match="no certificates"):
+        keys.look(tmp_path)
+    (tmp_path / "x.pem").write_text("rubbish")
+    with pytest.raises(ConfigError, match="is no certificate"):
+        keys.look(tmp_path)

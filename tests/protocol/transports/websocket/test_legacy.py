@@ -1,0 +1,247 @@
+"""The older text dialect over real sockets: the write-up's client, and vision against the write-up's robot."""
+
+import base64
+import random
+import socket
+import time
+from contextlib import contextmanager
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from sightline.protocol.channels import ACK, DETECTIONS, FRAME, STATUS, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import AnswerHeader, Detections, DetectionsHeader, FrameHeader
+from sightline.protocol.refusals import RejectReason
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.link_rules import OVERSIZE
+from sightline.protocol.transports.websocket.link import open_websocket
+from sightline.protocol.transports.websocket_dialects import BAD_FRAMING
+from sightline.protocol.transports.websocket_listen import CROSS_SITE
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.robot_process import JPEG as SMALL_JPEG
+from tests.fixtures.websocket import address_of, received, upgrade
+
+JPEG = bytes(range(256)) * 40
+TEXT = base64.encodebytes(JPEG).decode("ascii")
+OLD = {"compression": None, "legacy": True}
+
+
+def free_legacy() -> str:
+    return free_endpoint().replace("tcp/", "ws-legacy://")
+
+
+def plain(endpoint: str) -> str:
+    return endpoint.replace("ws-legacy://", "ws://").partition("?")[0]
+
+
+def header_of(seq: int) -> FrameHeader:
+    return FrameHeader(session="0a1b2c3d", seq=seq, t_us=1000 * seq)
+
+
+@contextmanager
+def robot_and_client(options: str = ""):
+    """A robot that listens for the older dialect, and one client that offers no sub-protocol."""
+    endpoint = free_legacy() + options
+    with open_websocket("r1", listen=endpoint, role="robot") as robot, connect(plain(endpoint), **OLD) as client:
+        assert until(lambda: robot.connected)
+        yield robot, client
+
+
+# --- the robot's end -------------------------------------------------------------------------------------------------
+
+
+def test_a_picture_goes_out_as_base64_lines_and_a_twist_comes_in_as_a_guests():
+    with robot_and_client() as (robot, client):
+        twists = robot.latest(TWIST)
+        assert robot.has_listener(FRAME)
+        assert not robot.has_listener(STATUS)
+        robot.publish(STATUS, b"", b"{}")  # nothing but pictures goes to such a client
+        robot.publish(FRAME, encode(header_of(1)), JPEG)
+        text = client.recv(2)
+        assert text == base64.encodebytes(JPEG).decode("ascii")
+        client.send("2.3028209556706964|0")
+        assert twists.take(2) == Message(TWIST, "guest", b"", b"2.3028209556706964|0")
+
+
+@pytest.mark.parametrize("picture_bytes", [12_000, 46_000])
+def test_on_the_socket_a_picture_costs_at_most_1_36_times_its_bytes(picture_bytes):
+    endpoint = free_legacy()
+    with open_websocket("r1", listen=endpoint) as robot, socket.create_connection(address_of(endpoint)) as near:
+        near.sendall(upgrade("127.0.0.1").replace(b"Sec-WebSocket-Protocol: sightline.v1\r\n", b""))
+        assert received(near).startswith(b"HTTP/1.1 101 ")
+        got = 0
+        for seq in range(5):
+            robot.publish(FRAME, encode(header_of(seq)), random.Random(seq).randbytes(picture_bytes))
+            got += len(received(near, 0.1))
+    assert 1.33 < got / (5 * picture_bytes) <= 1.36
+
+
+def test_one_line_and_dashed_twists_are_opt_in():
+    with robot_and_client("?oneline&dashed") as (robot, client):
+        twists = robot.latest(TWIST)
+        robot.publish(FRAME, b"", JPEG)
+        assert client.recv(2) == base64.b64encode(JPEG).decode("ascii")
+        for sent, got in (("0.2--0.35", b"0.2000|-0.3500"), ("0.2|-0.35", b"0.2|-0.35"), ("left", b"left")):
+            client.send(sent)
+            assert twists.take(2).payload == got
+
+
+def test_swapped_axes_are_another_option():
+    with robot_and_client("?dashed&swapped") as (robot, client):
+        twists = robot.latest(TWIST)
+        for sent, got in (("0.2--0.35", b"-0.3500|0.2000"), ("-1e-1-+2.5E-1", b"0.2500|-0.1000"), ("1|2", b"1|2")):
+            client.send(sent)
+            assert twists.take(2).payload == got
+
+
+def test_boxes_come_in_as_a_guests_detections_of_the_picture_it_was_sent_and_go_on_to_who_wants_them():
+    modern, older = free_endpoint().replace("tcp/", "ws://"), free_legacy() + "?boxes"
+    with open_websocket("r1", listen=[modern, older]) as robot, open_websocket("r1", connect=modern) as vision:
+        found, passed_on = robot.latest(DETECTIONS), vision.latest(DETECTIONS)
+        twists, acks = robot.latest(TWIST), robot.latest(ACK)
+        with connect(plain(older), **OLD) as client:
+            assert until(lambda: robot.has_listener(FRAME) and robot.has_listener(DETECTIONS))
+            for seq in (7, 8):  # which of the two was looked at is not known: the older one
+                robot.publish(FRAME, encode(header_of(seq)), SMALL_JPEG)
+                client.recv(2)
+            client.send("0.25,0.5,0.75,1.0-0,0,1,0.5")
+            message = found.take(2)
+            assert passed_on.take(2) == message
+            assert message.source == "guest"
+            header = decode(DetectionsHeader, message.header)
+            assert (header.source, header.session, header.echo.seq) == ("guest", "00000000", 7)
+            boxes = decode(Detections, message.payload, DETECTIONS.max_payload_bytes)
+            corners = [(box.x1_px, box.y1_px, box.x2_px, box.y2_px) for box in boxes.boxes]
+            assert (boxes.width_px, boxes.height_px, corners) == (16, 16, [(8, 4, 16, 12), (0, 0, 8, 16)])
+            assert decode(AnswerHeader, acks.take(2).header).echo.seq == 8
+            client.send("0.1,0,0.2,1")  # an answer to nothing
+            assert until(lambda: robot.refused == {RejectReason.UNKNOWN_FRAME: 1})
+            robot.publish(FRAME, encode(header_of(9)), SMALL_JPEG)
+            client.recv(2)
+            client.send("0.1,0,0.2,7")
+            assert until(lambda: robot.refused[RejectReason.MALFORMED] == 1)
+            robot.publish(FRAME, encode(header_of(10)), SMALL_JPEG)
+            client.recv(2)
+            client.send("")  # looked, and saw nothing
+            nothing = found.take(2)
+            assert decode(Detections, nothing.payload, DETECTIONS.max_payload_bytes).boxes == ()
+            assert decode(DetectionsHeader, nothing.header).echo.seq == 10
+            client.send("0.1|0")
+            assert twists.take(2).payload == b"0.1|0"
+
+
+def test_boxes_are_not_taken_where_nobody_asked_for_them():
+    with robot_and_client() as (robot, client):
+        twists, found = robot.latest(TWIST), robot.latest(DETECTIONS)
+        robot.publish(FRAME, encode(header_of(1)), SMALL_JPEG)
+        client.recv(2)
+        client.send("0.25,0.5,0.75,1.0")
+        assert twists.take(2).payload == b"0.25,0.5,0.75,1.0"  # the robot refuses it, and says why
+        assert found.take() is None
+
+
+def test_each_twist_also_acknowledges_the_newest_picture_once():
+    with robot_and_client() as (robot, client):
+        acks, twists = robot.latest(ACK), robot.latest(TWIST)
+        client.send("0|0")  # before any picture: answers nothing
+        assert twists.take(2)
+        assert acks.take() is None
+        for seq in (7, 8):
+            robot.publish(FRAME, encode(header_of(seq)), JPEG)
+            client.recv(2)
+        time.sleep(0.02)
+        client.send("0.1|0")
+        client.send("0.2|0")
+        ack = acks.take(2)
+        answer = decode(AnswerHeader, ack.header)
+        assert (ack.source, answer.source, answer.session) == ("guest", "guest", "00000000")
+        assert (answer.echo.session, answer.echo.seq, answer.echo.t_us) == ("0a1b2c3d", 8, 8000)
+        assert answer.compute_us >= 20_000  # all of it, so that none counts as the link's delay
+        assert until(lambda: (twist := twists.take()) and twist.payload == b"0.2|0")
+        assert acks.take() is None
+
+
+def test_a_frame_without_a_header_is_answered_by_a_twist_alone():
+    with robot_and_client() as (robot, client):
+        acks, twists = robot.latest(ACK), robot.latest(TWIST)
+        robot.publish(FRAME, b"", JPEG)
+        client.recv(2)
+        client.send("0|0")
+        assert twists.take(2)
+        assert acks.take() is None
+
+
+@pytest.mark.parametrize(
+    ("message", "code", "said", "counted"),
+    [
+        (b"0.1|0", 1003, "binary message; this port speaks text", BAD_FRAMING),
+        ("0" * 257, 1009, "", OVERSIZE),
+        (bytes(10_000_000), 1009, "", OVERSIZE),
+    ],
+)
+def test_what_is_no_short_text_ends_that_client_only(message, code, said, counted):
+    with robot_and_client() as (robot, client), connect(plain(endpoint_of(client)), **OLD) as other:
+        twists = robot.latest(TWIST)
+        with pytest.raises(ConnectionClosed) as closed:
+            client.send(message)
+            client.recv(2)
+        if closed.value.rcvd is not None:
+            assert (closed.value.rcvd.code, closed.value.rcvd.reason[: len(said)]) == (code, said)
+        assert until(lambda: robot.refused == {counted: 1})
+        other.send("0.3|0")
+        assert twists.take(2).payload == b"0.3|0"
+
+
+def endpoint_of(client) -> str:
+    host, port = client.remote_address
+    return f"ws://{host}:{port}"
+
+
+@pytest.mark.parametrize("text", ["nan|inf", "1|2|3", "1_0|2", "stop", "", "\u0661|0", "\0"])
+def test_nonsense_reaches_the_robot_that_says_why_it_is_refused(text):
+    with robot_and_client() as (robot, client):
+        twists = robot.latest(TWIST)
+        client.send(text)
+        assert twists.take(2) == Message(TWIST, "guest", b"", text.encode())
+
+
+def test_a_twist_over_64_bytes_is_counted_and_the_client_stays():
+    with robot_and_client() as (robot, client):
+        twists = robot.latest(TWIST)
+        client.send("0" * 65)
+        client.send("0|0")
+        assert twists.take(2).payload == b"0|0"
+        assert robot.refused == {OVERSIZE: 1}
+
+
+def test_a_client_silent_for_its_first_second_gets_the_newest_picture():
+    with robot_and_client() as (robot, client):
+        for number in range(30):
+            robot.publish(FRAME, b"", b"%02d" % number + JPEG)
+            time.sleep(1 / 30)
+        got = []
+        while not got or got[-1] != b"29":
+            got.append(base64.b64decode(client.recv(2))[:2])
+        assert got == sorted(got)
+
+
+def test_another_sites_page_cannot_drive_through_the_older_port():
+    endpoint = free_legacy()
+    with open_websocket("r1", listen=endpoint) as robot:
+        with pytest.raises(InvalidStatus):
+            connect(plain(endpoint), origin="http://evil.example", **OLD)
+        assert robot.refused == {CROSS_SITE: 1}
+        # What `websocket-client` sends by itself is the robot's own site.
+        connect(plain(endpoint), origin=plain(endpoint).replace("ws:", "http:"), **OLD).close()
+
+
+def test_both_dialects_may_be_listened_for_at_once():
+    modern, older = free_endpoint().replace("tcp/", "ws://"), free_legacy()
+    with open_websocket("r1", listen=[modern, older]) as robot, open_websocket("r1", connect=modern) as peer:
+        frames = peer.latest(FRAME)
+        with connect(plain(older), **OLD) as client:
+            assert until(lambda: len(robot._peers) == 2 and robot.has_listener(FRAME) and peer.connected)
+            assert until(lambda: robot.publish(FRAME, b"{}", JPEG) and frames.take(0.05))
+            assert base64.b64decode(client.recv(2)) == JPEG

@@ -1,0 +1,164 @@
+"""Opening `sightline.v1` over real sockets: endpoints, errors and what they say, and leaving nothing behind."""
+
+import gc
+import os
+import re
+import socket
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from sightline.operator_side.setup import keys
+from sightline.protocol.channels import FRAME, TWIST
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.websocket.link import open_websocket
+from sightline.protocol.transports.websocket_dialects import OTHER_ROBOT
+from tests.fixtures.links import until
+from tests.fixtures.websocket import Robot, free_ws
+
+
+@pytest.fixture
+def robot():
+    robot = Robot()
+    yield robot
+    robot.close()
+
+
+NO_ENDPOINTS = (
+    "", "foo", "ws", "ws://", "ws://127.0.0.1", "ws://:9090", "ws://127.0.0.1:0", "ws://127.0.0.1:65536", "wss://h:0",
+    "ws://127.0.0.1:-1", "ws://127.0.0.1:9090 ", "http://127.0.0.1:9090", "WS://127.0.0.1:9090", "ws://a b:9090",
+    "ws://127.0.0.1:9090/x", "127.0.0.1:9090", "ws://::1:9090", "ws://127.0.0.1:٧", "ws://me@h:1", "tcp/127.0.0.1:7447",
+    "ws://h:1?dashed", "wss://h:1?oneline",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("endpoint", NO_ENDPOINTS)
+@pytest.mark.parametrize("end", ["listen", "connect"])
+def test_an_endpoint_that_is_none_is_refused_with_the_right_form(endpoint, end):
+    with pytest.raises(ConfigError, match=re.escape("e.g. ws://127.0.0.1:9090")) as refusal:
+        open_websocket("r1", **{end: [endpoint]})
+    assert repr(endpoint) in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"robot": "r/1", "listen": "ws://127.0.0.1:9090"}, "robot id 'r/1'"),
+        ({"robot": "r1"}, "no endpoint"),
+        ({"robot": "r1", "listen": "ws://127.0.0.1:9090", "max_frame_bytes": 0}, "max_frame_bytes 0"),
+    ],
+)
+def test_bad_arguments_are_refused_before_anything_is_opened(arguments, said):
+    with pytest.raises(ConfigError, match=said):
+        open_websocket(arguments.pop("robot"), **arguments)
+
+
+def test_websockets_that_is_not_installed_is_one_line_with_the_fix(monkeypatch):
+    monkeypatch.setitem(sys.modules, "websockets", None)
+    with pytest.raises(ConfigError, match=re.escape("pip install 'sightline[websocket]'")):
+        open_websocket("r1", connect="ws://127.0.0.1:9090")
+
+
+@pytest.mark.parametrize(("kind", "other"), [("ws", "wss"), ("wss", "ws")])
+def test_who_hangs_up_unheard_is_tried_again(kind, other, tmp_path):
+    """As a listener does that has too many at once; over TLS its end may come before our hello or after."""
+    keys.make(tmp_path / "keys", [])
+    tried = []
+
+    def hang_up():
+        with suppress(OSError):
+            while True:
+                near, _ = door.accept()
+                tried.append(near)
+                near.close()
+
+    with socket.create_server(("127.0.0.1", 0)) as door:
+        threading.Thread(target=hang_up, daemon=True).start()
+        secure = {"secure": str(tmp_path / "keys")} if kind == "wss" else {}
+        endpoint = f"{kind}://127.0.0.1:{door.getsockname()[1]}"
+        with pytest.raises(LinkError, match=f"it hangs up without an answer: .* speaks {other}://|nobody answers"):
+            open_websocket("r1", connect=endpoint, timeout_s=1.5, **secure)
+        door.shutdown(socket.SHUT_RDWR)
+    assert len(tried) >= 3
+
+
+def test_nobody_answering_is_said_in_time():
+    endpoint, begin_s = free_ws(), time.monotonic()
+    said = f"nobody answers at {endpoint}; is the robot running? tried for 0.4 s"
+    with pytest.raises(LinkError, match=re.escape(said)):
+        open_websocket("r1", connect=endpoint, timeout_s=0.4)
+    assert 0.3 < time.monotonic() - begin_s < 2
+
+
+def test_an_address_of_another_machine_cannot_be_listened_on(tmp_path):
+    (tmp_path / "vision.token").write_text("a" * 16)
+    with pytest.raises(LinkError, match=r"cannot listen on ws://192\.0\.2\.1:9090: Cannot assign requested address;"):
+        open_websocket("r1", listen="ws://192.0.2.1:9090", secure=str(tmp_path))
+
+
+def test_a_port_in_use_is_said_with_who_has_it(robot):
+    said = rf"cannot listen on {robot.endpoint}: port \d+ is in use by .*\(pid {os.getpid()}\); end it or choose"
+    with pytest.raises(LinkError, match=said):
+        open_websocket("r1", listen=robot.endpoint)
+
+
+def test_who_answers_but_is_no_websocket_is_said():
+    with socket.create_server(("127.0.0.1", 0)) as door:
+        threading.Thread(target=_answer_with, args=(door, b"SSH-2.0-something\r\n"), daemon=True).start()
+        with pytest.raises(LinkError, match="refused: what answers there is no Sightline WebSocket"):
+            open_websocket("r1", connect=f"ws://127.0.0.1:{door.getsockname()[1]}", timeout_s=2)
+
+
+def _answer_with(door: socket.socket, text: bytes) -> None:
+    client = door.accept()[0]
+    client.recv(4096)
+    client.sendall(text)
+    client.close()
+
+
+def test_another_robots_listener_is_an_error_for_who_opens(robot):
+    with pytest.raises(LinkError, match=f"{robot.endpoint} refused: this is robot r1, not r2"):
+        open_websocket("r2", connect=robot.endpoint)
+    assert robot.refused == {OTHER_ROBOT: 1}
+    robot.still_serves()
+
+
+def test_a_robot_may_connect_to_a_listening_vision():
+    endpoint = free_ws()
+    with open_websocket("r1", listen=endpoint, role="vision") as vision:
+        frames = vision.latest(FRAME)
+        with open_websocket("r1", connect=endpoint, role="robot") as robot:
+            twists = robot.latest(TWIST)
+            assert until(lambda: robot.has_listener(FRAME) and vision.has_listener(TWIST))
+            for size in (0, 65_536, FRAME.max_payload_bytes):
+                assert robot.publish(FRAME, b"{}", bytes(size))
+                assert len(frames.take(2).payload) == size
+            assert vision.publish(TWIST, b"{}", b"0|0")
+            assert twists.take(2) == Message(TWIST, "vision", b"{}", b"0|0")
+
+
+def _count(what: str) -> int:
+    return len(list(Path("/proc/self", what).iterdir()))
+
+
+def test_no_thread_or_descriptor_is_left_behind():
+    endpoint = free_ws()
+
+    def open_and_close() -> None:
+        with open_websocket("r1", listen=endpoint) as robot, open_websocket("r1", connect=endpoint) as peer:
+            peer.latest(FRAME)
+            assert until(lambda: robot.has_listener(FRAME))
+
+    open_and_close()
+    gc.collect()
+    before = _count("fd"), _count("task")
+    for _ in range(5):
+        open_and_close()
+    # websockets leaves the selector of a closed server to the garbage collector.
+    assert until(lambda: gc.collect() >= 0 and _count("fd") <= before[0], 3)
+    assert until(lambda: _count("task") <= before[1], 3)

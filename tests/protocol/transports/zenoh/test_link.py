@@ -1,0 +1,266 @@
+"""Zenoh in one process: errors in words, bounds, what a frame costs on the wire, `list_robots`."""
+
+import re
+import socket
+import sys
+import threading
+import time
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from sightline.protocol.channels import DETECTIONS, FRAME, STATUS, TWIST
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.messages import FrameHeader
+from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
+from sightline.protocol.transports.link_rules import NOT_A_PUT
+from sightline.protocol.transports.diagnosis import port_owner
+from sightline.protocol.transports.zenoh.link import MAX_KEPT_PUBLISHERS, ZenohLink, open_zenoh
+from sightline.protocol.transports.zenoh.discovery import list_robots
+from sightline.protocol.transports.zenoh_session import open_session
+from sightline.protocol.transports.zenoh_site import open_fleet
+from tests.fixtures.links import free_endpoint, until
+
+NO_ENDPOINTS = (
+    "", "foo", "tcp", "tcp:/x", "tcp/", "tcp/127.0.0.1", "tcp/:7447", "tcp/127.0.0.1:", "tcp/127.0.0.1:0",
+    "tcp/127.0.0.1:99999", "tcp/127.0.0.1:65536", "tcp/127.0.0.1:-1", "tcp/127.0.0.1:7447 ", "http://127.0.0.1:7447",
+    "TCP/127.0.0.1:7447", "tcp/a b:7447", "tcp/127.0.0.1:7447/x", "127.0.0.1:7447", "tcp/::1:7447", "tcp/127.0.0.1:٧",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("endpoint", NO_ENDPOINTS)
+@pytest.mark.parametrize("end", ["listen", "connect"])
+def test_an_endpoint_that_is_none_is_refused_with_the_right_form(endpoint, end):
+    with pytest.raises(ConfigError, match=re.escape("e.g. tcp/127.0.0.1:7447")) as refusal:
+        open_zenoh("r1", **{end: [endpoint]})
+    assert repr(endpoint) in str(refusal.value)
+
+
+def test_well_formed_endpoints_and_their_send_buffer():
+    assert parse_zenoh_endpoint("tcp/[::1]:7447") == ("tcp", "::1", 7447)
+    assert parse_zenoh_endpoint("tls/robot.local:1#so_sndbuf=1") == ("tls", "robot.local", 1)
+    assert with_send_buffer("tcp/h:1") == "tcp/h:1#so_sndbuf=262144"
+    assert with_send_buffer("tcp/h:1#iface=wlan0") == "tcp/h:1#iface=wlan0"
+    assert with_send_buffer("udp/h:1") == "udp/h:1"
+
+
+def test_the_owner_of_a_free_port_is_nobody():
+    assert port_owner(parse_zenoh_endpoint(free_endpoint())[2]) == ""
+
+
+def test_nobody_answering_is_said_in_time():
+    endpoint, begin_s = free_endpoint(), time.monotonic()
+    said = f"nobody answers at {endpoint}; is the robot or router running? tried for 0.4 s"
+    with pytest.raises(LinkError, match=re.escape(said)):
+        open_zenoh("r1", connect=[endpoint], timeout_s=0.4)
+    assert 0.3 < time.monotonic() - begin_s < 2
+    with socket.create_server(("127.0.0.1", parse_zenoh_endpoint(endpoint)[2])):
+        more = f"{said}, and what listens there does not speak Zenoh"
+        with pytest.raises(LinkError, match=re.escape(more)):
+            open_zenoh("r1", connect=[endpoint], timeout_s=0.4)
+
+
+def test_an_address_of_another_machine_cannot_be_listened_on():
+    with pytest.raises(LinkError, match=r"cannot listen on tcp/192\.0\.2\.1:7447: Cannot assign requested address;"):
+        open_zenoh("r1", listen=["tcp/192.0.2.1:7447"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"robot": "r/1", "listen": ["tcp/127.0.0.1:7447"]}, "robot id 'r/1'"),
+        ({"robot": "*", "connect": ["tcp/127.0.0.1:7447"]}, "robot id '\\*'"),
+        ({"robot": "r1"}, "no endpoint"),
+        ({"robot": "r1", "listen": ["tcp/127.0.0.1:7447"] * 2}, "7447 is given twice to listen on"),
+        ({"robot": "r1", "listen": ["tcp/127.0.0.1:7447"], "max_frame_bytes": 0}, "max_frame_bytes 0"),
+    ],
+)
+def test_bad_arguments_are_refused_before_anything_is_opened(arguments, said):
+    with pytest.raises(ConfigError, match=said):
+        open_zenoh(arguments.pop("robot"), **arguments)
+
+
+def test_zenoh_that_is_not_installed_is_one_line_with_the_fix(monkeypatch):
+    monkeypatch.setitem(sys.modules, "zenoh", None)
+    with pytest.raises(ConfigError, match=re.escape("pip install 'sightline[zenoh]'")):
+        open_zenoh("r1", connect=["tcp/127.0.0.1:7447"])
+
+
+def test_a_smaller_bound_on_frames_holds_at_both_ends():
+    endpoint = free_endpoint()
+    with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint], max_frame_bytes=99) as peer:
+        frames = peer.latest(FRAME)
+        assert until(lambda: robot.has_listener(FRAME))
+        robot.publish(FRAME, b"", bytes(100))
+        robot.publish(FRAME, b"", bytes(99))
+        assert len(frames.take(2).payload) == 99
+        assert peer.refused["OVERSIZE"] == 1
+
+
+class _Counting:
+    """A TCP relay in front of `endpoint` that counts the bytes it passes on towards who connects."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.to = parse_zenoh_endpoint(endpoint)[1:]
+        self.passed = 0
+        self._door = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._door.getsockname()[1]}"
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        near, far = self._door.accept()[0], socket.create_connection(self.to)
+        threading.Thread(target=self._pass, args=(near, far, False), daemon=True).start()
+        self._pass(far, near, True)
+
+    def _pass(self, source: socket.socket, sink: socket.socket, counted: bool) -> None:
+        with suppress(OSError), source, sink:
+            while data := source.recv(65_536):
+                self.passed += len(data) * counted
+                sink.sendall(data)
+
+
+def test_a_frame_costs_at_most_320_bytes_more_than_its_picture():
+    endpoint, frames_sent, jpeg = free_endpoint(), 200, bytes(20_000)
+    precise = (0.123456789012345, -0.123456789012345)
+    header = FrameHeader(
+        session="0a1b2c3d", seq=9_999_999, t_us=10**14, pose=(*precise, -3.123456789012345), moving=precise,
+        applied=precise, latency_us=399_999,
+    )  # fmt: skip
+    with open_zenoh("r1", listen=[endpoint]) as robot:
+        relay = _Counting(endpoint)
+        with open_zenoh("r1", connect=[relay.endpoint]) as peer:
+            frames = peer.latest(FRAME)
+            assert until(lambda: robot.has_listener(FRAME))
+            before, got = relay.passed, 0
+            for _ in range(frames_sent):
+                robot.publish(FRAME, encode(header), jpeg)
+                got += frames.take(1) is not None
+            overhead = (relay.passed - before) / frames_sent - len(jpeg)
+    assert got == frames_sent
+    assert len(encode(header)) < overhead <= 320
+
+
+def test_a_delete_is_no_message():
+    endpoint = free_endpoint()
+    with open_zenoh("r1", listen=[endpoint]) as robot, open_session((), [endpoint], 5.0) as stranger:
+        twists = robot.latest(TWIST)
+        stranger.delete("sightline/r1/twist/vision")
+        assert until(lambda: robot.refused[NOT_A_PUT] == 1)
+        assert twists.take() is None
+
+
+def test_whoever_makes_up_sources_is_passed_on_and_leaves_little_behind():
+    endpoint, heard = free_endpoint(), []
+    with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as peer:
+        peer.subscribe(DETECTIONS, lambda message: heard.append(message.source))
+        robot.publish(DETECTIONS, b"", b"{}", "vision")
+        assert until(lambda: robot.publish(DETECTIONS, b"", b"{}", "vision") and heard)
+        heard.clear()
+        sources = [f"s{number}" for number in range(5 * MAX_KEPT_PUBLISHERS)]
+        for source in (*sources, "detector"):
+            assert robot.publish(DETECTIONS, b"", b"{}", source)
+        assert until(lambda: set(heard) >= {*sources, "detector"})
+        assert len(robot._outlets) == MAX_KEPT_PUBLISHERS + 1
+
+
+def test_list_robots_gives_the_newest_status_of_each():
+    endpoint = free_endpoint()
+    with open_zenoh("r1", listen=[endpoint]) as first, open_zenoh("r2", connect=[endpoint]) as second:
+        assert until(lambda: first.connected and second.connected)
+        begin_s = time.monotonic()
+        publisher = _Publishing([first, second])
+        publisher.start()
+        try:
+            found = list_robots([endpoint], 0.6)
+        finally:
+            publisher.stop()
+        assert time.monotonic() - begin_s < 2.5
+    assert {robot: message.payload[:2] for robot, message in found.items()} == {"r1": b"r1", "r2": b"r2"}
+    assert all(int(message.payload[2:]) > 5 for message in found.values())
+
+
+def test_list_robots_says_when_nobody_answers():
+    with pytest.raises(LinkError, match="nobody answers"):
+        list_robots([free_endpoint()], 0.3)
+
+
+class _Publishing:
+    """Publishes a counted `status` on each link until told to stop."""
+
+    def __init__(self, links) -> None:
+        self._links, self._stop = links, threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        number = 0
+        while not self._stop.wait(0.02):
+            number += 1
+            for link in self._links:
+                link.publish(STATUS, b"", f"{link.robot}{number}".encode())
+
+
+def _count(what: str) -> int:
+    return len(list(Path("/proc/self", what).iterdir()))
+
+
+def test_no_thread_or_descriptor_is_left_behind():
+    endpoint = free_endpoint()
+
+    def open_and_close() -> None:
+        with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as peer:
+            peer.latest(FRAME)
+            assert until(lambda: robot.has_listener(FRAME))
+
+    open_and_close()
+    before = _count("fd"), _count("task")
+    for _ in range(5):
+        open_and_close()
+    assert until(lambda: _count("fd") <= before[0] + 2, 3)
+    assert until(lambda: _count("task") <= before[1] + 2, 3)
+
+
+def test_a_close_while_others_publish_is_silent(monkeypatch):
+    """A publisher in use cannot be undeclared; that is no traceback on somebody's terminal."""
+    raised, over = [], threading.Event()
+    monkeypatch.setattr(threading, "excepthook", lambda args: raised.append(args.exc_value))
+    for _ in range(8):
+        endpoint = free_endpoint()
+        with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint], role="vision") as peer:
+            peer.latest(FRAME)
+            over.clear()
+            for _ in range(2):
+                threading.Thread(target=lambda: _publish_until(robot, over), daemon=True).start()
+            time.sleep(0.1)
+            robot.close()
+            over.set()
+    assert raised == []
+
+
+def _publish_until(link, over):
+    while not over.is_set():
+        link.publish(FRAME, b"{}", bytes(60_000))
+
+
+@pytest.mark.parametrize("opened", [partial(open_zenoh, "r1", role="robot"), partial(open_fleet, "r*", role="vision")])
+def test_who_closes_lets_go_of_the_session_at_once(opened):
+    """See `GONE` for what happens where the collector frees it instead."""
+    end = opened(listen=[free_endpoint()])
+    links = [end] if isinstance(end, ZenohLink) else [end.link("r1"), end.link("r2")]
+    for link in links:
+        link.latest(FRAME)
+        link.has_listener(TWIST)
+    session = end._session
+    end.close()
+    assert sys.getrefcount(session) == 2, "this test's own, and the question's"
+    assert not any(link.publish(STATUS, b"{}", b"{}") or link.has_listener(TWIST) or link.peers() for link in links)
+    end.close()

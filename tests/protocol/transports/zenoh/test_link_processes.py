@@ -1,0 +1,166 @@
+"""Zenoh between real processes that die, stall and come back; nothing is left hanging and nothing is printed."""
+
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from sightline.protocol.channels import FRAME, TWIST
+from sightline.protocol.errors import LinkError
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from tests.fixtures.links import free_endpoint, until
+
+PRELUDE = """
+import sys, time
+from sightline.protocol.channels import *
+from sightline.protocol.transports.zenoh.link import open_zenoh
+endpoint = sys.argv[1]
+"""
+ROBOT = """
+with open_zenoh("r1", listen=[endpoint]) as link:
+    twists = link.latest(TWIST)
+    print("ready", flush=True)
+    while True:
+        link.publish(FRAME, b"{}", b"x" * 50_000)
+        message = twists.take(0.01)
+        if message:
+            print("twist", message.payload.decode(), flush=True)
+"""
+CONSUMER = """
+with open_zenoh("r1", connect=[endpoint]) as link:
+    frames = link.latest(FRAME)
+    print("ready", flush=True)
+    while True:
+        message = frames.take(1.0)
+"""
+
+
+@pytest.fixture
+def start(tmp_path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start Python code in a process of its own; whatever still runs at the end is killed."""
+    started: list[subprocess.Popen[str]] = []
+
+    def run(code: str, *arguments: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", PRELUDE + textwrap.dedent(code), *arguments]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        started.append(process)
+        return process
+
+    yield run
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def _resident_kib() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4
+
+
+def test_a_port_in_use_is_named_with_who_uses_it(start):
+    endpoint = free_endpoint()
+    robot = start(ROBOT, endpoint)
+    robot.stdout.readline()
+    with pytest.raises(LinkError, match=rf"in use by python\S* \(pid {robot.pid}\)") as refusal:
+        open_zenoh("r1", listen=[endpoint])
+    assert endpoint in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_killed_robot_comes_back_to_the_same_link(start):
+    endpoint = free_endpoint()
+    robot = start(ROBOT, endpoint)
+    robot.stdout.readline()
+    with open_zenoh("r1", connect=[endpoint], role="vision") as link:
+        frames = link.latest(FRAME)
+        for _ in range(2):
+            assert frames.take(3) is not None
+            robot.send_signal(signal.SIGKILL)
+            assert until(lambda: not link.connected, 1)
+            assert not link.publish(TWIST, b"", b"0|0")
+            frames.take()
+            robot = start(ROBOT, endpoint)
+            robot.stdout.readline()
+            assert frames.take(4) is not None
+            assert until(lambda: link.has_listener(TWIST))
+            assert link.publish(TWIST, b"", b"0.1|0")
+            assert robot.stdout.readline() == "twist 0.1|0\n"
+
+
+def test_a_client_reconnects_after_being_away_longer_than_its_timeout(start):
+    endpoint = free_endpoint()
+    robot = start(ROBOT, endpoint)
+    robot.stdout.readline()
+    with open_zenoh("r1", connect=[endpoint], timeout_s=0.5) as link:
+        frames = link.latest(FRAME)
+        assert frames.take(3) is not None
+        robot.kill()
+        robot.wait()
+        assert until(lambda: not link.connected)
+        time.sleep(1.5)
+        frames.take()
+        start(ROBOT, endpoint).stdout.readline()
+        assert frames.take(4) is not None
+
+
+def test_a_stopped_peer_costs_neither_time_nor_memory_nor_others(start):
+    endpoint = free_endpoint()
+    with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as healthy:
+        frames = healthy.latest(FRAME)
+        stalled = start(CONSUMER, endpoint)
+        stalled.stdout.readline()
+        robot.publish(FRAME, b"", bytes(100_000))
+        assert frames.take(2) is not None
+        stalled.send_signal(signal.SIGSTOP)
+        before_kib, took_s, seen = _resident_kib(), [], 0
+        for number in range(150):  # 15 MB, more than any buffer on the way
+            begin_s = time.perf_counter()
+            robot.publish(FRAME, b"", number.to_bytes(2) + bytes(100_000))
+            took_s.append(time.perf_counter() - begin_s)
+            message = frames.take(0.02)
+            seen += message is not None and message.payload[:2] == number.to_bytes(2)
+        assert seen > 140
+        assert _resident_kib() - before_kib < 8_000
+        assert max(took_s) < 0.06
+        stalled.send_signal(signal.SIGCONT)
+
+
+def test_a_process_ends_by_itself_after_with(start):
+    endpoint = free_endpoint()
+    code = """
+    with open_zenoh("r1", listen=[endpoint]) as link, open_zenoh("r1", connect=[endpoint]) as peer:
+        frames = peer.latest(FRAME)
+        while not link.has_listener(FRAME):
+            time.sleep(0.01)
+        if sys.argv[2] == "raise":
+            raise SystemExit(7)
+    """
+    for how, exit_code in (("plain", 0), ("raise", 7)):
+        process = start(code, endpoint, how)
+        assert process.wait(10) == exit_code
+        assert process.stdout.read() + process.stderr.read() == ""
+
+
+def test_nothing_of_zenoh_reaches_the_terminal(start):
+    code = """
+    from sightline.protocol.errors import LinkError
+    with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as peer:
+        peer.subscribe(FRAME, lambda message: 1 / 0)
+        while not robot.has_listener(FRAME):
+            time.sleep(0.01)
+        robot.publish(FRAME, b"", b"x")
+        while not peer.callback_errors:
+            time.sleep(0.01)
+        for arguments in ({"listen": [endpoint]}, {"connect": ["tcp/127.0.0.1:1"], "timeout_s": 0.3}):
+            try:
+                open_zenoh("r1", **arguments)
+            except LinkError:
+                pass
+    """
+    process = start(code, free_endpoint())
+    assert process.communicate(timeout=15) == ("", "")
+    assert process.returncode == 0

@@ -1,0 +1,228 @@
+"""Presence: what an answer must be, whose id is taken, and who is heard at a real router."""
+
+import time
+
+import pytest
+
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side.setup import keys
+from sightline.operator_side.client.discovery import as_object, lines
+from sightline.protocol.channels import STATUS
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.messages import Stamp, State, Status
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.zenoh.presence import (
+    MAX_PEERS,
+    PeerInfo,
+    Presence,
+    best_round_trips,
+    parse_presence_reply,
+    presence_key,
+    robot_with_same_id,
+)
+from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.transports.zenoh.discovery import discover, peers_at
+from sightline.protocol.transports.zenoh_session import open_session
+from sightline.protocol.transports.zenoh_site import open_fleet
+from tests.fixtures.links import free_endpoint
+
+ROBOT = Presence(role="robot", robot="r1", session="0000abcd", software="sightline 9", host="shed", up_us=5_000_000)
+
+
+def _peer(presence=ROBOT, round_trip_us=2_000, **changes):
+    return PeerInfo(presence.model_copy(update=changes), round_trip_us, 0)
+
+
+# --- pure ------------------------------------------------------------------------------------------------------------
+
+
+def test_an_answer_gives_who_how_far_and_how_much_its_clock_is_ahead():
+    said = ROBOT.model_copy(update={"clock_us": 1_000_000_000})
+    peer = parse_presence_reply(presence_key("robot", "0000abcd"), encode(said), 50_000, 54_000, clock_us=999_000_000)
+    assert (peer.presence, peer.round_trip_us, peer.ahead_us) == (said, 4_000, 1_002_000)
+
+
+@pytest.mark.parametrize("payload", [
+    b"", b"{}", b"\xff", b"[1]", encode(ROBOT) + b" " * 600, encode(ROBOT).replace(b'"shed"', b'"a\\u001b[2J"'),
+    encode(ROBOT).replace(b"0000abcd", b"0000ABCD"), encode(ROBOT).replace(b'"r1"', b'"a/b"'),
+])  # fmt: skip
+def test_what_is_no_presence_is_nobody(payload):
+    assert parse_presence_reply(presence_key("robot", "0000abcd"), payload, 0, 1, 2) is None
+
+
+@pytest.mark.parametrize("role", ["vision", "operator", "teleop", "viewer"])
+def test_who_answers_under_another_role_than_its_own_is_nobody(role):
+    assert parse_presence_reply(presence_key(role, "0000abcd"), encode(ROBOT), 0, 1, 2) is None
+
+
+def test_each_is_listed_once_as_it_answered_quickest_robots_first():
+    vision = _peer(role="vision", session="00000002")
+    rounds = [[vision, _peer(round_trip_us=900)], [_peer(round_trip_us=300), vision], [_peer(round_trip_us=400)]]
+    assert best_round_trips(rounds) == [_peer(round_trip_us=300), vision]
+
+
+def test_a_flood_of_names_is_bounded():
+    assert len(best_round_trips([[_peer(session=f"{n:08x}") for n in range(3 * MAX_PEERS)]])) == MAX_PEERS
+
+
+@pytest.mark.parametrize(("other", "is_taken"), [
+    ({"session": "0000beef", "up_us": 9_000_000}, True),
+    ({"session": "0000beef", "up_us": 1_000_000}, False),  # who came later gives way, not we
+    ({"session": "0000abcd", "up_us": 9_000_000}, False),  # its own earlier self
+    ({"session": "0000beef", "up_us": 9_000_000, "robot": "r2"}, False),
+    ({"session": "0000beef", "up_us": 9_000_000, "role": "vision"}, False),
+])  # fmt: skip
+def test_an_id_is_taken_by_another_robot_that_was_there_before(other, is_taken):
+    taken = robot_with_same_id(ROBOT, [_peer(robot="r7", session="00000001", up_us=9_999_999), _peer(**other)])
+    assert (taken is not None) is is_taken
+
+
+def test_a_person_reads_state_version_machine_and_round_trip():
+    status = encode(Status(state=State.DISARMED, reason="waiting"))
+    heard = {"r1": Message(STATUS, "", encode(Stamp(session="0000abcd", seq=1, t_us=1)), status),
+             "js9": Message(STATUS, "", b"{", b"")}
+    peers = [_peer(), _peer(role="vision", session="00000002", robot="r*")]
+    assert list(lines(heard, peers)) == [
+        "robot     js9: not understood: Stamp: Invalid JSON: EOF while parsing an object at line 1 column 1"
+        "  (does not say what it is)",
+        "robot     r1: DISARMED (waiting)  sightline 9 on shed, round trip 2.0 ms",
+        "vision    of r*  sightline 9 on shed, round trip 2.0 ms",
+    ]
+    whole = as_object(heard, peers)
+    assert [row["role"] for row in whole["peers"]] == ["robot", "vision"]
+    assert whole["peers"][0]["round_trip_ms"] == 2.0 and "error" in whole["robots"][0]
+
+
+# --- over real sessions ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def router():
+    endpoint = free_endpoint()
+    session = open_session([endpoint], (), 5.0)
+    yield endpoint
+    session.close()
+
+
+def test_everybody_at_a_router_is_listed_within_two_seconds(router):
+    with (
+        open_zenoh("r1", connect=[router], role="robot") as robot,
+        open_zenoh("r1", connect=[router], role="vision"),
+        open_fleet("r*", connect=[router], role="vision"),
+        open_zenoh("r1", connect=[router], role="detector"),
+        open_zenoh("r1", connect=[router]),  # who has no role is not listed
+    ):
+        began_s = time.monotonic()
+        peers = peers_at([router], 1.0)
+        took_s = time.monotonic() - began_s
+        assert {peer.presence.host for peer in robot.peers()} == {peer.presence.host for peer in peers}
+    assert [(peer.presence.role, peer.presence.robot) for peer in peers] == [
+        ("robot", "r1"), ("vision", "r*"), ("vision", "r1"), ("detector", "r1"),
+    ]  # fmt: skip
+    assert took_s < 2.0
+    assert all(0 < peer.round_trip_us < 500_000 and peer.presence.software for peer in peers)
+    assert all(abs(peer.ahead_us) < 500_000 for peer in peers)  # one machine has one clock
+
+
+@pytest.mark.parametrize("role", ["Vision", "a b", "x" * 17, "r/1"])
+def test_a_role_that_is_none_is_refused_and_nothing_stays_open(router, role):
+    with pytest.raises(ConfigError, match="a role is 1 to 16 lower-case letters"):
+        open_zenoh("r1", connect=[router], role=role)
+
+
+def test_who_has_gone_is_not_listed(router):
+    with open_zenoh("r1", connect=[router], role="robot"):
+        assert len(peers_at([router], 0.6)) == 1
+    assert peers_at([router], 0.6) == []
+
+
+def test_a_robot_that_listens_is_listed_by_whoever_connects():
+    endpoint = free_endpoint()
+    with open_zenoh("r1", listen=[endpoint], role="robot"):
+        around = discover([endpoint], 0.4)
+    assert [peer.presence.robot for peer in around.peers] == ["r1"] and around.statuses == {}
+
+
+def test_a_second_robot_of_one_id_is_refused_with_who_has_it(router):
+    with (
+        open_zenoh("r1", connect=[router], role="robot", session="0000abcd"),
+        pytest.raises(LinkError, match=r"^robot id 'r1' is taken: a robot on \S+ has had it for .* \(session 0000abcd\)"
+                                       r"; give this one another with --robot$"),
+    ):
+        open_zenoh("r1", connect=[router], role="robot")
+    with open_zenoh("r1", connect=[router], role="robot"):
+        assert len(peers_at([router], 0.6)) == 1
+
+
+def test_a_robot_of_another_id_and_its_own_restarted_self_are_welcome(router):
+    with (
+        open_zenoh("r1", connect=[router], role="robot", session="0000abcd"),
+        open_zenoh("r2", connect=[router], role="robot"),
+        open_zenoh("r1", connect=[router], role="robot", session="0000abcd"),
+    ):
+        assert len(peers_at([router], 0.6)) == 2
+
+
+def test_a_robot_that_ends_while_its_successor_looks_is_no_namesake(router, monkeypatch):
+    first = open_zenoh("r1", connect=[router], role="robot")
+    monkeypatch.setattr("sightline.protocol.transports.zenoh_presence._SECOND_LOOK_S", 0.0)
+    monkeypatch.setattr("sightline.protocol.transports.zenoh_presence.time.sleep", lambda _seconds: first.close())
+    with open_zenoh("r1", connect=[router], role="robot") as second:
+        assert second.connected
+
+
+def test_when_secured_each_role_is_listed_as_what_its_certificate_says(tmp_path):
+    folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
+    keys.make(folder, [])
+    roles = ["vision", "operator", "teleop", "detector", "viewer3"]
+    with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)):
+        links = [open_zenoh("r1", connect=[endpoint], role=role, secure=str(folder)) for role in roles]
+        try:
+            listed = [peer.presence.role for peer in peers_at([endpoint], 1.0, str(folder))]
+        finally:
+            for link in links:
+                link.close()
+    assert sorted(listed) == sorted(["robot", *roles])
+    assert {certificate_role(role) for role in listed} == {"robot", *SOURCES_OF_ROLE}
+
+
+def test_when_secured_nobody_is_believed_to_be_a_robot_by_another_certificate(tmp_path):
+    """A viewer answers as robot r1, under a robot's key and under its own: neither is listed."""
+    folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
+    keys.make(folder, [])
+    with open_zenoh("r2", listen=[endpoint], role="robot", secure=str(folder)):
+        from sightline.protocol.transports.security import load_role_keys
+
+        rogue = open_session((), [endpoint], 5.0, load_role_keys(str(folder), "viewer"))
+        try:
+            for key in (presence_key("robot", "0000abcd"), presence_key("viewer", "0000abcd")):
+                rogue.declare_queryable(key, lambda query, key=key: query.reply(key, encode(ROBOT)))
+            listed = [peer.presence.robot for peer in peers_at([endpoint], 1.0, str(folder))]
+        finally:
+            rogue.close()
+    assert listed == ["r2"]
+
+
+def test_the_command_lists_them_for_people_and_scripts(router, capsys):
+    import json
+
+    with open_zenoh("r1", connect=[router], role="robot"), open_zenoh("r1", connect=[router], role="vision"):
+        assert cli.run(["robots", "--connect", router, "--seconds", "0.5"]) == 0
+        said = capsys.readouterr().out.splitlines()
+        assert cli.run(["robots", "--connect", router, "--seconds", "0.5", "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+    assert [line.split()[0] for line in said] == ["robot", "vision"]
+    assert "says nothing of its state" in said[0] and "round trip" in said[1]
+    assert [peer["role"] for peer in found["peers"]] == ["robot", "vision"] and found["places"] == [router]
+
+
+def test_nobody_at_a_router_is_said(router, capsys):
+    assert cli.run(["robots", "--connect", router, "--seconds", "0.3"]) == 4
+    assert capsys.readouterr().err.startswith(f"error: no robot is heard at {router} within 0.3 s")
+
+
+def test_an_endpoint_of_one_robot_is_told_from_a_place(capsys):
+    assert cli.run(["robots", "--connect", "ws://127.0.0.1:9090"]) == 2
+    assert "sightline status --connect ws://127.0.0.1:9090" in capsys.readouterr().err

@@ -1,0 +1,80 @@
+"""docs/build-the-car.md and docs/teleop.md: their commands parse, their tables are the code's, their files exist."""
+
+import re
+import shlex
+import xml.etree.ElementTree
+from pathlib import Path
+
+import pytest
+import typer
+
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side.service_settings import load_service
+from sightline.operator_side.teleop.terminal import KEYS
+from sightline.robot_side.hardware.gpio_drive import GpioDriveConfig
+
+ROOT = Path(__file__).parent.parent.parent
+DOCS = ROOT / "docs"
+CAR, TELEOP = ((DOCS / name).read_text() for name in ("build-the-car.md", "teleop.md"))
+
+
+def commands(page):
+    """The arguments of every `sightline ...` line in a block."""
+    for block in re.findall(r"^```\n(.*?)^```", page, re.DOTALL | re.MULTILINE):
+        for line in block.splitlines():
+            words = shlex.split(re.sub(r"^(car|laptop)\$ (sudo )?", "", line))
+            if words[:1] == ["sightline"]:
+                yield words[1:]
+
+
+@pytest.mark.parametrize("words", [*commands(CAR), *commands(TELEOP)], ids=" ".join)
+def test_every_command_is_one(words):
+    """Parsed by the program's own parser, and not run."""
+    command, context = typer.main.get_command(cli.app), None
+    while hasattr(command, "commands"):
+        name, *words = words
+        command = command.commands[name]
+    context = command.make_context("sightline", list(words))
+    assert context.params
+
+
+def test_the_wiring_is_the_configurations_own():
+    rows = re.findall(r"^\| GPIO (\d+) \| (\d+) \| .* \| (left|right) (forward|backward) \|", CAR, re.MULTILINE)
+    assert len(rows) == 4
+    defaults = GpioDriveConfig.model_fields
+    assert {f"{side}_{way}_pin": int(number) for number, _, side, way in rows} == {
+        name: defaults[name].default for name in defaults if name.endswith("ward_pin")
+    }
+    positions = {10: 19, 9: 21, 8: 24, 7: 26}
+    assert {int(number): int(position) for number, position, _, _ in rows} == positions
+    drawn = "".join(xml.etree.ElementTree.parse(DOCS / "car-wiring.svg").getroot().itertext())
+    for number, position in {**positions, 17: 11}.items():
+        assert f"GPIO {number} ({position})" in drawn
+
+
+def test_every_option_that_it_names_exists_and_none_is_left_out():
+    table = CAR[CAR.index("| `drive.options` |") : CAR.index("Speeds between rows")]
+    named = set(re.findall(r"`([a-z_]+)`", " ".join(row.split("|")[1] for row in table.splitlines() if row)))
+    own = {name for name in GpioDriveConfig.model_fields if not name.endswith("ward_pin")} - {"wheel_radius_m"}
+    assert named - {"left_forward_pin", "right_backward_pin"} == own
+
+
+def test_vision_is_told_the_cars_own_limits():
+    """What it asks for beyond them the gate cuts, but it steers better if it knows."""
+    car, eyes = (load_service(service, file=str(ROOT / "examples" / name), environ={}).config for service, name in (
+        ("robot", "raspberry-car.toml"), ("vision", "raspberry-car-vision.toml")))
+    assert eyes.steer.max_linear_mps == car.safety.max_linear_mps
+    assert eyes.steer.max_angular_rad_s == car.safety.max_angular_rad_s >= eyes.search.rate_rad_s
+    assert eyes.latency.linear_acceleration_mps2 == car.safety.max_acceleration_mps2
+
+
+def test_the_files_that_they_name_exist():
+    for page in (CAR, TELEOP):
+        for name in re.findall(r"\]\(([^)#]+)\)", page):
+            assert (DOCS / name).resolve().exists(), name
+        for name in re.findall(r"tests/test_\w+\.py|robot_side/systemd/[\w.-]+|examples/[\w.-]+", page):
+            assert (ROOT / name).exists(), name
+
+
+def test_the_keys_are_those_that_teleop_shows():
+    assert KEYS in TELEOP

@@ -1,0 +1,163 @@
+"""Whatever breaks beside the driver's loop, the wheels end at zero: devices, disk, terminal, the child's packets."""
+
+import math
+import os
+import signal
+import subprocess
+import time
+
+import pytest
+
+from sightline.protocol.config import Config
+from sightline.protocol.messages import Twist
+from sightline.robot_side import pipe as ipc
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver.process import Driver, run
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
+from sightline.robot_side.driver.persistence import StopLatch
+from sightline.robot_side.safety.limits import SafetyConfig
+from sightline.robot_side.ports import WheelAngles
+from sightline.robot_side.scribe import BackgroundWriter
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.robot_process import RobotProcess, Vision, driving
+
+
+class BrokenDrive:
+    """Fails as told; keeps what the motors were told last."""
+
+    class Config(Config):
+        """Nothing to set."""
+
+    told: tuple[float, float] | None = None
+    fails: Exception | None = None
+    reading: WheelAngles | None = None
+
+    def __init__(self, config=None):
+        BrokenDrive.told = (9.0, 9.0)  # as an earlier process left it
+
+    def set(self, left_rad_s, right_rad_s):
+        if BrokenDrive.fails and BrokenDrive.told == (0.0, 0.0):
+            raise BrokenDrive.fails
+        BrokenDrive.told = (left_rad_s, right_rad_s)
+
+    def wheels(self):
+        return BrokenDrive.reading
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def driver(tmp_path):
+    config = RobotConfig(
+        drive=PluginChoice(kind=f"{__name__}:BrokenDrive"),
+        listen=(free_endpoint(),),
+        state_dir=tmp_path,
+        safety=SafetyConfig(auto_arm=True),
+    )
+    handlers = {number: signal.getsignal(number) for number in (*EXIT_SIGNALS, *IGNORED_SIGNALS)}
+    BrokenDrive.fails = BrokenDrive.reading = None
+    made = Driver(config, BrokenDrive(), None)
+    yield made
+    made.scribe.close()
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(
+    "reading",
+    [
+        WheelAngles(math.nan, 0.0, 1),
+        WheelAngles(math.inf, -math.inf, 1),
+        WheelAngles(1e9, -1e9, 50_000),
+    ],
+)
+def test_a_reading_that_is_no_number_stops_the_robot_not_the_loop(driver, reading):
+    BrokenDrive.reading = WheelAngles(0.0, 0.0, 0)
+    driver._tick(20_000, punctual=False)
+    BrokenDrive.reading = reading
+    for tick in range(5):
+        driver._tick(1_000_000 + tick * 20_000, punctual=False)
+        list(driver._driving.messages(1_000_000 + tick * 20_000))
+    assert BrokenDrive.told == (0.0, 0.0)
+
+
+def test_a_gate_that_cannot_be_stepped_is_a_fault_with_the_wheels_at_zero(driver, monkeypatch):
+    """Neither with the sensors nor without: nothing that it holds may end the loop."""
+    driver._driving.gate.applied = Twist(linear_mps=0.3, angular_rad_s=0.0)
+    driver._driving.gate._ramp.force(driver._driving.gate.applied)
+    driver._tick(20_000, punctual=False)
+    assert BrokenDrive.told != (0.0, 0.0)
+
+    def breaks(*_):
+        raise ValueError("no such twist")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(driver._driving, "tick", breaks)
+        driver._tick(40_000, punctual=False)
+        assert BrokenDrive.told == (0.0, 0.0)
+        assert driver._driving.gate.state == "FAULT" and "no such twist" in driver._driving.gate.reason
+    driver._tick(60_000, punctual=False)
+    assert BrokenDrive.told == (0.0, 0.0), "it does not take up the speed of before"
+
+
+@pytest.mark.parametrize("error", [OSError("unplugged"), ValueError("what"), RuntimeError()])
+def test_a_drive_that_raises_anything_is_a_fault(driver, error):
+    driver._tick(20_000, punctual=False)
+    BrokenDrive.fails = error
+    driver._tick(40_000, punctual=False)
+    assert driver._driving.gate.state == "FAULT" and not driver._obeyed
+
+
+@pytest.mark.parametrize("packet", [b"\xff", b"\x01", b"\x02", b"\x03{", bytes([ipc.PacketKind.RAW]) + b"x" * 40])
+def test_a_packet_that_is_none_is_dropped(driver, packet):
+    driver.child.packets = lambda: iter([packet])
+    assert driver._drain() is False
+
+
+def test_however_the_loop_ends_the_motors_are_told_zero(tmp_path, monkeypatch):
+    config = RobotConfig(
+        drive=PluginChoice(kind=f"{__name__}:BrokenDrive"), listen=(free_endpoint(),), state_dir=tmp_path
+    )
+
+    def breaks(_self):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Driver, "loop", breaks)
+    handlers = {number: signal.getsignal(number) for number in (*EXIT_SIGNALS, *IGNORED_SIGNALS)}
+    with pytest.raises(ZeroDivisionError):
+        run(config)
+    assert BrokenDrive.told == (0.0, 0.0)
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def test_a_latch_that_cannot_be_written_is_tried_again_and_holds_nobody_up(tmp_path, capsys):
+    latch = StopLatch(tmp_path / "state", "r1")
+    (tmp_path / "state").rmdir()
+    scribe = BackgroundWriter(latch)
+    began_s = time.monotonic()
+    scribe.keep(stopped=True)
+    assert time.monotonic() - began_s < 0.1
+    assert until(lambda: "STOP mark is not kept" in capsys.readouterr().out)
+    (tmp_path / "state").mkdir()
+    assert until(latch.is_set)
+    scribe.close()
+
+
+def test_a_terminal_that_hangs_up_while_moving_ends_after_zero(tmp_path):
+    """The robot's output goes to a pipe whose reader has gone."""
+    reading, writing = os.pipe()
+    with RobotProcess(tmp_path) as robot:
+        robot.process.terminate()
+        robot.process.wait(5)
+        robot.drive_log.unlink(missing_ok=True)
+        command = [*robot.process.args]
+        robot.process = subprocess.Popen(command, stdout=writing, stderr=subprocess.STDOUT)
+        os.close(writing)
+        with Vision(robot.endpoint):
+            assert driving(robot)
+            os.close(reading)
+            robot.process.send_signal(signal.SIGHUP)
+            assert robot.process.wait(5) == 0
+        assert robot.speed() == 0.0

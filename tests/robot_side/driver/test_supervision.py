@@ -1,0 +1,62 @@
+"""The service manager's side: the unit file, the notifications, the motors zeroed by themselves."""
+
+import configparser
+import os
+import socket
+from pathlib import Path
+
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver.process import zero_motors
+from sightline.robot_side.supervision import SystemdNotifier
+from tests.fixtures.links import until
+from tests.fixtures.robot_process import RobotProcess
+
+UNIT = Path(__file__).parent.parent.parent.parent / "robot_side" / "systemd" / "sightline-robot.service"
+
+
+def test_the_unit_watches_restarts_and_zeroes():
+    unit = configparser.ConfigParser(interpolation=None, strict=True)
+    unit.optionxform = str
+    unit.read(UNIT)
+    service = unit["Service"]
+    assert service["Type"] == "notify" and service["NotifyAccess"] == "main"
+    assert 0 < float(service["WatchdogSec"]) <= 2 and service["Restart"] == "on-failure"
+    assert service["ExecStopPost"].endswith("--zero-motors")
+    assert service["ExecStart"].split(" --zero")[0] == service["ExecStopPost"].split(" --zero")[0]
+    assert float(service["TimeoutStopSec"]) > 2, "the driver may take 2 s to bring the wheels to zero"
+
+
+def test_the_driver_says_ready_and_feeds_the_watchdog_from_its_loop(tmp_path, monkeypatch):
+    address = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(address)
+        manager.settimeout(5)
+        monkeypatch.setenv("NOTIFY_SOCKET", address)
+        with RobotProcess(tmp_path) as robot:
+            assert b"READY=1" in manager.recv(256) and b"WATCHDOG=1" in manager.recv(256)
+            robot.process.terminate()
+            assert until(lambda: b"STOPPING=1" in manager.recv(256))
+            assert robot.process.wait(3) == 0
+
+
+def test_without_a_manager_nothing_is_told(monkeypatch):
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    manager = SystemdNotifier()
+    manager.tell("READY=1")
+    assert not manager.is_there
+
+
+def test_motors_are_zeroed_without_gate_or_network(tmp_path):
+    log = tmp_path / "drive.csv"
+    config = RobotConfig(drive=PluginChoice(kind="log", options={"path": log}))
+    assert zero_motors(config) == 0
+    assert log.read_text().strip().endswith(",0.0000,0.0000")
+
+
+def test_the_driver_keeps_its_scheduling_to_itself(tmp_path):
+    with RobotProcess(tmp_path) as robot:
+        assert until(lambda: "on tcp/" in robot.output(), 8)
+        assert os.sched_getscheduler(robot.network_pid()) == os.SCHED_OTHER
+        permitted = os.sched_getscheduler(robot.process.pid) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+        assert permitted != ("real-time scheduling is not permitted" in robot.output())
+        assert "hardware cut" in robot.output()

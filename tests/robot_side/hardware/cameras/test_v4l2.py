@@ -1,0 +1,307 @@
+"""The V4L2 camera: formats, times, damage, unplugging, freezing; and why a device cannot be used, on real nodes."""
+
+import os
+import stat
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import pytest
+
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.robot_side.config import PluginChoice
+from sightline.robot_side.hardware.cameras.timing import CaptureClock, Clocks
+from sightline.robot_side.hardware.v4l2_camera import V4l2Camera
+from sightline.robot_side.hardware.v4l2_device import whole_jpeg
+from sightline.robot_side.hardware.cameras.v4l2 import check_device, device_owner, open_error
+from sightline.robot_side.plugins import build_device
+from tests.contracts.cameras import next_picture
+from tests.fixtures.cameras import FakeDevice, jpeg
+
+
+@pytest.fixture
+def node(tmp_path):
+    """Stands for /dev/video0: there as long as the camera is plugged in."""
+    (tmp_path / "video0").touch()
+    return tmp_path / "video0"
+
+
+@pytest.fixture
+def opened(node):
+    cameras = []
+
+    def opening(device, **options):
+        cameras.append(V4l2Camera(V4l2Camera.Config(device=node, **options), device.open))
+        return cameras[-1]
+
+    yield opening
+    for camera in cameras:
+        camera.close()
+
+
+def eventually(condition, timeout_s=5.0):
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "did not happen"
+        time.sleep(0.01)
+
+
+def age_of(picture) -> float:
+    return time.monotonic() - picture.t_us / 1e6
+
+
+def fault_of(camera, timeout_s=5.0) -> str:
+    """The line of the next HardwareError."""
+    deadline_s = time.monotonic() + timeout_s
+    while time.monotonic() < deadline_s:
+        try:
+            camera.read(0.05)
+        except HardwareError as error:
+            return str(error)
+    raise AssertionError("no fault")
+
+
+# --- pictures ----------------------------------------------------------------------------------------------------
+
+
+def test_the_cameras_own_jpeg_passes_through_undecoded(opened):
+    given = []
+    device = FakeDevice(damage=lambda data: given.append(data) or data)
+    picture = next_picture(opened(device))
+    assert picture.jpeg in given
+
+
+def test_padding_after_the_picture_is_cut_off(opened):
+    picture = next_picture(opened(FakeDevice(damage=lambda data: data + bytes(5000))))
+    assert picture.jpeg.endswith(b"\xff\xd9")
+
+
+def test_a_damaged_picture_is_left_out(opened):
+    device = FakeDevice()
+    camera = opened(device)
+    device.damage = lambda data: data[:-200]
+    eventually(lambda: camera.read(0.05) is None)
+    device.damage = lambda data: data
+    assert next_picture(camera).jpeg.endswith(b"\xff\xd9")
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff\xd8", b"\xff\xd9", jpeg()[1:], jpeg()[:-2], bytes(100)])
+def test_what_lacks_its_beginning_or_end_is_no_picture(data):
+    assert whole_jpeg(data) is None
+
+
+def test_when_nobody_asks_nothing_is_copied(opened):
+    device = FakeDevice()
+    camera = opened(device)
+    next_picture(camera)
+    time.sleep(1.1)
+    before = device.retrieved, device.grabbed
+    eventually(lambda: device.grabbed > before[1] + 5)
+    assert device.retrieved == before[0]
+    assert age_of(next_picture(camera)) < 0.1
+
+
+# --- formats -----------------------------------------------------------------------------------------------------
+
+
+def test_yuyv_is_refused_unless_asked_for(opened):
+    device = FakeDevice(formats=["YUYV"])
+    with pytest.raises(HardwareError, match=r'gives YUYV, not MJPG: set camera\.options\.format = "YUYV"'):
+        opened(device)
+    assert device.is_released()
+    assert next_picture(opened(device, format="YUYV")).jpeg[:2] == b"\xff\xd8"
+
+
+def test_another_format_is_named(opened):
+    with pytest.raises(HardwareError, match="gives GREY, not MJPG"):
+        opened(FakeDevice(formats=["GREY"]))
+
+
+def test_a_size_that_the_camera_does_not_have_is_named(opened):
+    with pytest.raises(HardwareError, match="gives 640x480, not 800x600"):
+        opened(FakeDevice(), width_px=800, height_px=600)
+
+
+def test_a_model_of_another_size_is_refused_and_the_device_given_back(opened):
+    device = FakeDevice()
+    model = {"width_px": 320, "height_px": 240, "fx_px": 200.0, "fy_px": 200.0, "cx_px": 160.0, "cy_px": 120.0}
+    with pytest.raises(ConfigError, match="320x240 pictures, the camera gives 640x480"):
+        opened(device, model=model)
+    assert device.is_released()
+
+
+# --- times -------------------------------------------------------------------------------------------------------
+
+
+NOW = Clocks(monotonic_us=10_000_000, boot_us=500_000_000, day_us=1_700_000_000_000_000)
+
+
+@pytest.mark.parametrize("clock", [time.monotonic, time.time, lambda: time.clock_gettime(time.CLOCK_BOOTTIME)])
+def test_the_buffers_time_is_told_on_the_monotonic_clock(opened, clock):
+    camera = opened(FakeDevice(clock=lambda: clock() - 0.040))
+    age_s = age_of(next_picture(camera))
+    assert 0.040 <= age_s < 0.140
+
+
+def test_without_a_time_of_its_own_a_picture_is_as_old_as_configured(opened):
+    camera = opened(FakeDevice(clock=lambda: 0.0), delay_ms=70)
+    age_s = age_of(next_picture(camera))
+    assert 0.070 <= age_s < 0.170
+
+
+@pytest.mark.parametrize(
+    ("stamp_us", "expected_us"),
+    [
+        (9_900_000, 9_900_000),  # monotonic
+        (10_000_000, 10_000_000),  # this very moment
+        (8_000_000, 8_000_000),  # as old as is believed
+        (7_999_999, 9_970_000),  # older: by the configured delay
+        (10_000_001, 9_970_000),  # from the future
+        (0, 9_970_000),  # none
+        (500_000_000 - 50_000, 9_950_000),  # time since boot
+        (1_700_000_000_000_000 - 50_000, 9_950_000),  # time of the day
+    ],
+)
+def test_a_stamp_is_read_on_the_clock_it_was_taken_from(stamp_us, expected_us):
+    assert CaptureClock(30_000).captured_us(stamp_us, NOW) == expected_us
+
+
+@pytest.mark.parametrize("clock_us", [NOW.monotonic_us, NOW.boot_us, NOW.day_us])
+@pytest.mark.parametrize("age_us", [0, 2_000_000, 2_000_001, 9_000_000])
+def test_once_a_stamp_has_told_the_clock_it_is_believed_however_old(clock_us, age_us):
+    stamps = CaptureClock(30_000)
+    stamps.captured_us(clock_us - 10_000, NOW)
+    assert stamps.captured_us(clock_us - age_us, NOW) == NOW.monotonic_us - age_us
+    assert stamps.captured_us(clock_us - 10_000, NOW) == NOW.monotonic_us - 10_000, "and is not forgotten"
+
+
+def test_a_stamp_from_the_future_of_its_clock_is_of_another_or_tells_nothing():
+    """Monotonic time and time since boot are one until the machine is first put to sleep."""
+    stamps = CaptureClock(30_000)
+    awake = Clocks(monotonic_us=9_000_000, boot_us=9_000_000, day_us=1_700_000_000_000_000)
+    assert stamps.captured_us(8_990_000, awake) == 8_990_000
+    assert stamps.captured_us(NOW.boot_us - 10_000, NOW) == 9_990_000
+    assert stamps.captured_us(NOW.boot_us - 3_000_000, NOW) == 7_000_000
+    assert stamps.captured_us(NOW.boot_us + 1, NOW) == 9_970_000
+
+
+def test_pictures_that_waited_for_a_process_that_was_held_up_are_not_young(opened):
+    delay_s = [0.040]
+    camera = opened(FakeDevice(clock=lambda: time.monotonic() - delay_s[0]))
+    assert age_of(next_picture(camera)) < 0.140
+    delay_s[0] = 5.0
+    eventually(lambda: age_of(next_picture(camera)) > 4.9, 2.0)
+
+
+# --- faults while driving ----------------------------------------------------------------------------------------
+
+
+def test_unplugged_and_plugged_in_again(opened, node):
+    device = FakeDevice()
+    camera = opened(device)
+    next_picture(camera)
+    device.present = False
+    node.unlink()
+    assert fault_of(camera) == f"camera {node} was unplugged; plug it in again"
+    assert device.is_released()
+    device.present = True
+    node.touch()
+    eventually(lambda: fault_free(camera))
+    assert len(device.opened) == 2
+
+
+def fault_free(camera):
+    try:
+        return camera.read(0.1)
+    except HardwareError:
+        return None
+
+
+def test_a_frozen_camera_is_told_and_recovers(opened):
+    device = FakeDevice()
+    camera = opened(device)
+    next_picture(camera)
+    device.frozen = True
+    assert "gives no picture" in fault_of(camera)
+    device.frozen = False
+    eventually(lambda: fault_free(camera))
+
+
+def test_what_opencv_raises_is_told_and_ends_nothing(opened):
+    device = FakeDevice()
+    camera = opened(device)
+
+    def raising(data):
+        raise cv2.error("Bad input\nroi")
+
+    device.damage = raising
+    assert fault_of(camera).endswith("failed: Bad input roi")
+    device.damage = lambda data: data
+    eventually(lambda: fault_free(camera))
+
+
+def test_a_camera_that_sends_only_rubbish_is_told(opened):
+    device = FakeDevice()
+    camera = opened(device, frozen_after_s=0.3)
+    device.damage = lambda data: bytes(100)
+    assert "no usable picture for 0.3 s" in fault_of(camera)
+
+
+def test_a_camera_that_starts_slowly_is_waited_for(opened):
+    assert age_of(next_picture(opened(FakeDevice(starting_s=1.5)))) < 0.15
+
+
+def test_a_camera_frozen_from_the_start_is_no_camera(opened):
+    device = FakeDevice(frozen=True)
+    with pytest.raises(HardwareError, match="gives no picture"):
+        opened(device)
+    assert device.is_released()
+
+
+# --- why a device cannot be used: real nodes ---------------------------------------------------------------------
+
+
+def test_absent_device_lists_what_there_is(tmp_path):
+    with pytest.raises(HardwareError, match=r"video9 is not there \((there are|no /dev/video\*)"):
+        build_device("cameras", PluginChoice(kind="v4l2", options={"device": str(tmp_path / "video9")}))
+
+
+def test_a_plain_file_is_no_camera(tmp_path):
+    (tmp_path / "video0").write_bytes(b"x")
+    with pytest.raises(HardwareError, match="is no camera device"):
+        check_device(tmp_path / "video0")
+
+
+def test_a_device_that_is_no_camera_does_not_open():
+    with pytest.raises(HardwareError, match=r"/dev/full does not open"):
+        build_device("cameras", PluginChoice(kind="v4l2", options={"device": "/dev/full"}))
+
+
+def test_no_permission_names_the_group_and_the_command():
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        node = Path(folder) / "video0"
+        node.touch(0)
+        node.chmod(0)
+        uid = os.geteuid()
+        if uid == 0:  # root may open anything
+            os.seteuid(65534)
+        try:
+            with pytest.raises(HardwareError, match=r"group '(\w+)': sudo usermod -aG \1 \$USER"):
+                check_device(node)
+        finally:
+            os.seteuid(uid)
+        assert stat.S_IMODE(node.stat().st_mode) == 0
+
+
+def test_who_keeps_a_device_busy_is_named(node):
+    hold = f"import sys; held = open({str(node)!r}); print('held', flush=True); sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline()
+        assert device_owner(node).endswith(f"(pid {process.pid})")
+        assert f"(pid {process.pid}) has it open" in str(open_error(node))
+        process.stdin.close()
+    assert device_owner(node) == ""

@@ -1,0 +1,81 @@
+"""Every drive we ship, and the one to copy, keeps what a drive promises; `gpio` has its own file."""
+
+import time
+
+import pytest
+
+from examples.my_drive import MyDrive
+from sightline.operator_side.processes import Processes
+from sightline.robot_side.hardware.log_drive import LogDrive
+from sightline.robot_side.ports import WheelAngles
+from tests.contracts.drives import check_drive
+
+
+def test_the_log_drive(tmp_path):
+    check_drive(lambda: LogDrive(LogDrive.Config(path=tmp_path / "drive.csv")))
+
+
+def test_the_drive_to_copy(tmp_path):
+    check_drive(lambda: MyDrive(MyDrive.Config(port=tmp_path / "port")))
+
+
+@pytest.mark.slow
+def test_the_simulated_drive(tmp_path):
+    pytest.importorskip("pybullet")
+    from sightline.sim.bus import SimDrive
+
+    with Processes(tmp_path) as processes:
+        processes.start("sim", ["sim", "--scenario", "static", "--socket-dir", str(tmp_path)])
+        processes.wait_line("sim", "simulation ready", 20.0)
+        check_drive(lambda: SimDrive(SimDrive.Config(socket_dir=str(tmp_path))))
+
+
+class Broken(LogDrive):
+    """A drive with one thing wrong."""
+
+    def __init__(self) -> None:
+        super().__init__(LogDrive.Config())
+
+
+class Slow(Broken):
+    def set(self, left_rad_s, right_rad_s):
+        time.sleep(0.06)
+        super().set(left_rad_s, right_rad_s)
+
+
+class Forgets(Broken):
+    """Its speeds last a tenth of a second."""
+
+    def wheels(self):
+        reading = super().wheels()
+        if reading.t_us - self._angles.t_us > 100_000:
+            self._angles, self._speeds = reading, (0.0, 0.0)
+        return reading
+
+
+class Crossed(Broken):
+    def set(self, left_rad_s, right_rad_s):
+        super().set(right_rad_s, left_rad_s)
+
+
+class Coasts(Broken):
+    def set(self, left_rad_s, right_rad_s):
+        super().set(left_rad_s or 0.5, right_rad_s or 0.5)
+
+
+class Ahead(Broken):
+    def wheels(self):
+        reading = super().wheels()
+        return WheelAngles(reading.left_rad, reading.right_rad, reading.t_us + 1_000_000)
+
+
+class ClosesOnce(Broken):
+    def close(self):
+        assert not hasattr(self, "closed"), "closed twice"
+        self.closed = True
+
+
+@pytest.mark.parametrize("broken", [Slow, Forgets, Crossed, Coasts, Ahead, ClosesOnce])
+def test_what_breaks_a_promise_is_caught(broken):
+    with pytest.raises(AssertionError):
+        check_drive(broken)

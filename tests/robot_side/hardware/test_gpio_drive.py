@@ -1,0 +1,287 @@
+"""The drive on a Raspberry Pi's pins: duty by table, pins by gpiozero's own mock, every failure low."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+pytest.importorskip("gpiozero")
+from gpiozero import Device
+from gpiozero.pins.mock import MockFactory
+
+from sightline.operator_side.service_settings import load_service
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.messages import Twist
+from sightline.robot_side.hardware.gpio_drive import GpioDrive
+from sightline.robot_side.hardware.gpio import DutyTable, table_of, table_text
+from sightline.robot_side.kinematics import DiffDriveConfig, wheel_speeds
+from sightline.robot_side.plugins import load_device
+from tests.contracts.drives import check_drive
+from tests.fixtures.gpio import LEFT, RIGHT, NotingPin, both_ways, config
+
+ROOT = Path(__file__).parent.parent.parent.parent
+ROWS = ((0.4, 0.08), (0.6, 0.12), (1.0, 0.19))
+
+
+@pytest.fixture
+def board(monkeypatch):
+    """A factory of mock pins in gpiozero's own place; `events` is what happened to them, in order."""
+    factory = MockFactory(pin_class=NotingPin)
+    factory.events = []
+    monkeypatch.setattr(Device, "pin_factory", factory)
+    return factory
+
+
+@pytest.fixture
+def drive(board):
+    opened = GpioDrive(config())
+    yield opened
+    opened.close()
+
+
+def duties(board):
+    """Of all pins that were ever touched, but for those that are low."""
+    return {number: value for number, value in dict(board.events).items() if value}
+
+
+# --- the table -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("speed_mps", "duty"), [
+    (0.0, 0.0), (-0.0, 0.0), (0.039, 0.0), (0.041, 0.4), (0.08, 0.4), (0.10, 0.5), (0.12, 0.6), (0.155, 0.8),
+    (0.19, 1.0), (5.0, 1.0), (-0.10, -0.5), (-9.0, -1.0), (-0.039, 0.0),
+])  # fmt: skip
+def test_a_speed_is_the_duty_of_the_table(speed_mps, duty):
+    assert DutyTable(ROWS).duty(speed_mps) == pytest.approx(duty, abs=1e-12)
+
+
+@given(st.lists(st.tuples(st.floats(0.01, 1), st.floats(0.001, 3)), min_size=1, max_size=8), st.floats(-4, 4))
+def test_any_table_keeps_direction_stays_in_range_and_is_its_own_inverse(rows, speed_mps):
+    pairs = zip(sorted({round(d, 2) for d, _ in rows}), sorted({round(v, 3) for _, v in rows}), strict=False)
+    rising = [pair for pair in pairs if pair[0] > 0 and pair[1] > 0]
+    table = DutyTable(rising)
+    duty = table.duty(speed_mps)
+    assert duty == 0 or rising[0][0] <= abs(duty) <= rising[-1][0]
+    assert duty * speed_mps >= 0
+    if rising[0][1] <= abs(speed_mps) <= rising[-1][1]:
+        assert table.speed(duty) == pytest.approx(speed_mps, rel=1e-6)
+
+
+def test_a_written_table_reads_back():
+    assert table_of(table_text(ROWS, "measured"), "x.toml") == ROWS
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    ("table = [", "is no TOML"), ("table = [[0.4, 0.1], [0.4, 0.2]]", "both must rise"),
+    ("table = [[0.4, 0.2], [0.6, 0.1]]", "both must rise"), ("table = [[1.4, 0.2]]", "less than or equal to 1"),
+    ("table = [[0.4, nan]]", "finite"), ("tabel = [[0.4, 0.1]]", "tabel"), ("table = []", "at least 1"),
+    ("table = [[0.4]]", "table.0"), ("table = [[0.0, 0.1]]", "greater than 0"),
+])  # fmt: skip
+def test_a_broken_table_is_one_line_with_its_file(text, says):
+    with pytest.raises(ConfigError) as error:
+        table_of(text, "my.toml")
+    assert str(error.value).startswith("my.toml: ") and says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_table_file_takes_the_tables_place_and_one_that_is_not_there_is_said(board, tmp_path):
+    path = tmp_path / "drive.toml"
+    path.write_text("table = [[0.5, 0.2]]")
+    drive = GpioDrive(config(table_file=path))
+    drive.set(0.2 / 0.0325, 0.0)
+    assert duties(board) == {10: 0.5}
+    drive.close()
+    with pytest.raises(ConfigError, match="sightline calibrate drive"):
+        GpioDrive(config(table_file=tmp_path / "absent.toml"))
+
+
+# --- the configuration -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("options", "says"), [
+    ({"left_forward_pin": 9}, "pin 9 is named twice"), ({"enable_pins": (7,)}, "pin 7 is named twice"),
+    ({"right_forward_pin": 28}, "less than or equal to 27"), ({"right_forward_pin": 1}, "greater than or equal to 2"),
+    ({"pwm_hz": 20}, "400"), ({"trim": 0.5}, "0.3"), ({"table_file": "x", "table": [[0.5, 0.2]]}, "keep one"),
+    ({"left_forwad_pin": 10}, "left_forwad_pin"), ({"odometry": "encoders"}, "'table' or 'none'"),
+])  # fmt: skip
+def test_wrong_pins_and_options_are_refused(options, says):
+    with pytest.raises(ValidationError) as error:
+        config(**options)
+    assert says in str(error.value)
+
+
+def test_the_radius_comes_from_the_robots_own_wheels():
+    robot = load_service("robot", environ={}, sets=["drive.kind=gpio", "wheels.wheel_radius_m=0.05"]).config
+    assert robot.motors.options == {"wheel_radius_m": 0.05}
+
+
+def test_the_cars_file_is_valid_and_drives_as_the_write_up_did(board):
+    """60 % straight ahead and 40 % turning on the spot, at the limits of the file."""
+    robot = load_service("robot", file=str(ROOT / "examples/raspberry-car.toml"), environ={}).config
+    plugin, options = load_device("drives", robot.motors)
+    assert options.pins == (10, 9, 8, 7) and options.pwm_hz == 2000
+    drive, limits = plugin(options), robot.safety
+    straight = Twist(linear_mps=limits.max_linear_mps, angular_rad_s=0.0)
+    drive.set(*wheel_speeds(robot.wheels, straight))
+    assert duties(board) == {17: 1, 10: pytest.approx(0.6, abs=0.01), 8: pytest.approx(0.6, abs=0.01)}
+    turning = Twist(linear_mps=0.0, angular_rad_s=limits.max_angular_rad_s)
+    drive.set(*wheel_speeds(robot.wheels, turning))
+    assert duties(board) == {17: 1, 9: pytest.approx(0.4, abs=0.01), 8: pytest.approx(0.4, abs=0.01)}
+    drive.close()
+
+
+# --- the pins --------------------------------------------------------------------------------------------------------
+
+
+def test_every_pin_is_pwm_at_its_frequency_and_low_at_first(board, drive):
+    for number in (*LEFT, *RIGHT):
+        pin = board.pin(f"GPIO{number}")
+        assert (pin.function, pin.frequency, pin.state) == ("output", 2000, 0.0)
+
+
+@pytest.mark.parametrize(("options", "expected"), [
+    ({}, {10: 0.5, 7: 0.5}), ({"left_reversed": True}, {9: 0.5, 7: 0.5}), ({"right_reversed": True}, {10: 0.5, 8: 0.5}),
+    ({"swapped": True}, {9: 0.5, 8: 0.5}), ({"trim": 0.2}, {10: 0.4, 7: 0.5}), ({"trim": -0.2}, {10: 0.5, 7: 0.4}),
+])  # fmt: skip
+def test_left_forward_right_backward_is_what_the_options_make_of_it(board, options, expected):
+    drive = GpioDrive(config(**options))
+    drive.set(0.10 / 0.0325, -0.10 / 0.0325)
+    assert duties(board) == pytest.approx(expected)
+    drive.close()
+
+
+speeds = st.one_of(st.floats(-20, 20), st.sampled_from([0.0, -0.0, 1e-12, 1e6, -1e6]))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.tuples(speeds, speeds), max_size=40), st.booleans(), st.booleans())
+def test_no_motor_is_ever_driven_both_ways_at_once(twists, swapped, is_reversed):
+    factory = MockFactory(pin_class=NotingPin)
+    factory.events = []
+    Device.pin_factory, before = factory, Device.pin_factory
+    paused = []
+    try:
+        drive = GpioDrive(config(swapped=swapped, left_reversed=is_reversed), pause=paused.append)
+        for linear, angular in twists:
+            drive.set(*wheel_speeds(DiffDriveConfig(), Twist(linear_mps=linear, angular_rad_s=angular)))
+        drive.close()
+    finally:
+        Device.pin_factory = before
+    assert not both_ways(factory.events)
+    assert not any(dict(factory.events).values())
+    assert set(paused) <= {2 / 2000}
+
+
+def test_a_reversal_leaves_both_pins_low_for_two_periods(board):
+    during = []
+    drive = GpioDrive(config(), pause=lambda seconds: during.append((seconds, duties(board))))
+    drive.set(4.0, 4.0)
+    assert during == []
+    drive.set(-4.0, 4.0)
+    assert during == [(0.001, {8: pytest.approx(0.625, abs=0.05)})], "only the wheel that reverses lets go"
+    assert set(duties(board)) == {9, 8}
+    drive.close()
+
+
+def test_unchanged_speeds_write_nothing(board, drive):
+    drive.set(4.0, 4.0)
+    count = len(board.events)
+    for _ in range(50):
+        drive.set(4.0, 4.0)
+    assert len(board.events) == count
+
+
+@pytest.mark.parametrize("speeds", [(float("nan"), 1.0), (1.0, float("inf"))])
+def test_a_speed_that_is_no_number_leaves_all_low(board, drive, speeds):
+    drive.set(4.0, 4.0)
+    with pytest.raises(HardwareError, match="no numbers"):
+        drive.set(*speeds)
+    assert duties(board) == {}
+
+
+@pytest.mark.parametrize("broken", [10, 9, 8, 7])
+def test_a_pin_that_fails_brings_all_others_down_and_the_enable_line(board, monkeypatch, broken):
+    drive = GpioDrive(config(enable_pins=(17,)))
+    drive.set(4.0, -4.0)
+    assert dict(board.events)[17] == 1
+    pin, fail = board.pin(f"GPIO{broken}"), SimpleNamespace(now=True)
+
+    def failing(value, write=pin._set_state):
+        if fail.now:
+            raise OSError("bad line")
+        write(value)
+
+    monkeypatch.setattr(pin, "_set_state", failing)
+    with pytest.raises(HardwareError, match="bad line; the pins are low"):
+        drive.set(-4.0, 4.0)
+    assert set(duties(board)) <= {broken}
+    fail.now = False
+    with pytest.raises(HardwareError, match="until it is told zero"):
+        drive.set(-3.0, 3.0)
+    assert set(duties(board)) <= {broken}
+    drive.set(0.0, 0.0)
+    assert duties(board) == {}, "what could not be told before is told now"
+    drive.set(4.0, 4.0)
+    assert set(duties(board)) == {17, 10, 8}
+    drive.close()
+
+
+def test_the_enable_line_is_high_from_the_first_motion_to_the_end(board):
+    drive = GpioDrive(config(enable_pins=(17, 27)))
+    drive.set(0.0, 0.0)
+    assert duties(board) == {}
+    drive.set(4.0, 4.0)
+    drive.set(0.0, 0.0)
+    assert duties(board) == {17: 1, 27: 1}, "at zero the bridge brakes; cut off it would coast"
+    drive.close()
+    assert duties(board) == {}
+
+
+def test_the_end_leaves_no_output(board):
+    drive = GpioDrive(config())
+    drive.set(4.0, 4.0)
+    drive.close()
+    assert duties(board) == {}
+    assert {board.pin(f"GPIO{number}").function for number in (*LEFT, *RIGHT)} == {"input"}
+    with pytest.raises(HardwareError, match="closed"):
+        drive.set(1.0, 1.0)
+
+
+def test_the_end_is_low_before_the_pins_are_given_back_whoever_gives_them():
+    calls = []
+    pins = SimpleNamespace(
+        write=lambda number, duty: calls.append((number, duty)), enable=calls.append,
+        close=lambda: calls.append("close"),
+    )  # fmt: skip
+    drive = GpioDrive(config(), opening=lambda _config: pins)
+    drive.set(4.0, 4.0)
+    calls.clear()
+    drive.close()
+    drive.close()
+    assert calls == [False, *((number, 0.0) for number in (*LEFT, *RIGHT)), "close"]
+
+
+def test_the_expected_wheels_turn_as_the_table_says(drive, monkeypatch):
+    clock = SimpleNamespace(us=1_000_000)
+    monkeypatch.setattr("sightline.robot_side.hardware.gpio_drive.monotonic_us", lambda: clock.us)
+    drive.set(0.0, 0.0)
+    start = drive.wheels()
+    drive.set(0.05 / 0.0325, -1.0)  # less than the least duty gives: it turns at that
+    clock.us += 2_000_000
+    now = drive.wheels()
+    assert now.left_rad - start.left_rad == pytest.approx(2 * 0.08 / 0.0325)
+    assert now.right_rad == start.right_rad, "below half of the least speed nothing turns"
+    assert now.t_us == clock.us
+
+
+def test_without_odometry_there_is_no_reading(board):
+    drive = GpioDrive(config(odometry="none"))
+    drive.set(4.0, 4.0)
+    assert drive.wheels() is None
+    drive.close()
+
+
+def test_it_keeps_what_every_drive_promises(board):
+    check_drive(lambda: GpioDrive(config()), speed_rad_s=4.0)

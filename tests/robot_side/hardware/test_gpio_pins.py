@@ -1,0 +1,149 @@
+"""Where the pins come from and how they are left: gpiozero, lgpio, and machines that have neither."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("gpiozero")
+from gpiozero import Device
+from gpiozero.pins.mock import MockFactory
+
+from sightline.operator_side.service_settings import load_service
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.robot_side.hardware import gpio_low, gpio_pins
+from sightline.robot_side.hardware.gpio_drive import GpioDrive
+from sightline.robot_side.plugins import load_device
+from tests.fixtures.gpio import NotingPin, config
+
+ROOT = Path(__file__).parent.parent.parent.parent
+
+
+@pytest.fixture
+def board(monkeypatch):
+    """A factory of mock pins in gpiozero's own place; `events` is what happened to them, in order."""
+    factory = MockFactory(pin_class=NotingPin)
+    factory.events = []
+    monkeypatch.setattr(Device, "pin_factory", factory)
+    return factory
+
+
+@pytest.fixture
+def drive(board):
+    opened = GpioDrive(config())
+    yield opened
+    opened.close()
+
+
+@pytest.mark.parametrize("module", ["gpiozero", "lgpio"])
+def test_a_missing_package_names_its_extra(monkeypatch, module):
+    monkeypatch.setattr(Device, "pin_factory", None)
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delitem(sys.modules, "gpiozero.pins.lgpio", raising=False)
+    with pytest.raises(ConfigError, match=rf"needs {module}: pip install 'sightline\[robot-pi\]'"):
+        GpioDrive(config())
+
+
+def test_a_machine_without_pins_says_so(monkeypatch):
+    monkeypatch.setattr(Device, "pin_factory", None)
+    fake = SimpleNamespace(LGPIOFactory=lambda: 1 / 0)
+    monkeypatch.setitem(sys.modules, "gpiozero.pins.lgpio", fake)
+    with pytest.raises(HardwareError, match="no GPIO here: division by zero; this drive needs a Raspberry Pi"):
+        GpioDrive(config())
+
+
+def test_pins_that_another_holds_are_said(board, drive):
+    with pytest.raises(HardwareError, match="already in use"):
+        GpioDrive(config())
+    assert board.pin("GPIO10").function == "output", "the first one still has it"
+
+
+def test_spi_that_is_switched_on_is_warned_of(board, monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(gpio_pins, "_SPI_DEVICE", tmp_path)
+    GpioDrive(config()).close()
+    assert "pins 7, 8, 9, 10 are SPI0's" in capsys.readouterr().err
+    GpioDrive(config(left_forward_pin=17, left_backward_pin=27, right_forward_pin=22, right_backward_pin=23)).close()
+    assert capsys.readouterr().err == ""
+
+
+class FakeLgpio(SimpleNamespace):
+    """As much of lgpio as `gpio_low` uses; a Raspberry Pi 5 with an early kernel: the header is chip 4."""
+
+    SET_PULL_DOWN = 64
+
+    def __init__(self, busy=()):
+        self.calls, self.busy = [], busy
+
+    def gpiochip_open(self, chip):
+        if chip not in (0, 4):
+            raise OSError("no such chip")
+        return chip
+
+    def gpiochip_close(self, handle):
+        self.calls.append(("close", handle))
+
+    def gpio_get_chip_info(self, handle):
+        return [0, 54, f"gpiochip{handle}", "pinctrl-rp1" if handle == 4 else "gpio-brcmstb"]
+
+    def gpio_claim_output(self, handle, number, level, flags):
+        if number in self.busy:
+            raise OSError("GPIO busy")
+        self.calls.append((handle, number, level, flags))
+
+
+def test_pins_are_left_low_by_lgpio_alone(monkeypatch, capsys):
+    lgpio = FakeLgpio()
+    monkeypatch.setitem(sys.modules, "lgpio", lgpio)
+    assert gpio_low.main(["10", "9"]) == 0
+    assert lgpio.calls == [("close", 0), (4, 10, 0, 64), (4, 9, 0, 64), ("close", 4)]
+    lgpio = FakeLgpio(busy=(10,))
+    monkeypatch.setitem(sys.modules, "lgpio", lgpio)
+    assert gpio_low.main(["10", "9", "8"]) == 3
+    assert [call[1] for call in lgpio.calls if call[0] == 4] == [9, 8], "one that is busy does not keep the others up"
+    assert capsys.readouterr().err == "error: pins 10, 9, 8: GPIO busy\n"
+    for wrong in ([], ["ten"], ["28"], ["-1"], ["¹"]):
+        assert gpio_low.main(wrong) == 2
+
+
+def test_the_end_of_a_real_factory_leaves_the_pins_pulled_down(monkeypatch):
+    """With our own factory (not one that a test put there) its chip is closed and the pins are left by lgpio."""
+    factory, lgpio = MockFactory(pin_class=NotingPin), FakeLgpio()
+    factory.chip = 0
+    monkeypatch.setattr(Device, "pin_factory", None)
+    monkeypatch.setitem(sys.modules, "gpiozero.pins.lgpio", SimpleNamespace(LGPIOFactory=lambda: factory))
+    monkeypatch.setitem(sys.modules, "lgpio", lgpio)
+    GpioDrive(config(enable_pins=(17,))).close()
+    assert lgpio.calls == [(0, number, 0, 64) for number in (17, 10, 9, 8, 7)] + [("close", 0)]
+    assert Device.pin_factory is None
+
+
+def test_lgpio_leaves_no_pipe_where_it_is_imported_and_nobody_is_moved(tmp_path):
+    """The real one, in a process of its own: in a service's working directory it could not even be imported."""
+    pytest.importorskip("lgpio")
+    code = (
+        "import os; from sightline.robot_side.hardware.gpio_low import import_lgpio; import_lgpio();"
+        "print(os.getcwd(), os.listdir(), 'LG_WD' in os.environ)"
+    )
+    path = os.pathsep.join([str(ROOT), *filter(None, sys.path)])
+    environ = {**os.environ, "PYTHONPATH": path, "TMPDIR": str(tmp_path)}
+    here = tmp_path / "here"
+    here.mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=here, env=environ, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == f"{here} [] False"
+    assert list(tmp_path.iterdir()) == [here]
+
+
+def test_the_drop_in_puts_the_examples_pins_low_first_and_keeps_the_units_own_command():
+    systemd = ROOT / "robot_side/systemd"
+    lines = [line for line in (systemd / "gpio-low.conf").read_text().splitlines() if line[:1] != "#"]
+    own = next(line for line in (systemd / "sightline-robot.service").read_text().splitlines() if "StopPost" in line)
+    module, *numbers = lines[2].partition(" -m ")[2].split()
+    car = load_service("robot", file=str(ROOT / "examples/raspberry-car.toml"), environ={}).config
+    _, options = load_device("drives", car.motors)
+    assert lines[:2] == ["[Service]", "ExecStopPost="] and lines[3] == own
+    assert module == gpio_low.__name__ and [int(text) for text in numbers] == [*options.pins, *options.enable_pins]

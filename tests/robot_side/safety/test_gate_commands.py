@@ -1,0 +1,219 @@
+"""Every number and branch of the states' table and of what the gate makes of a command: inside, at it, outside."""
+
+import math
+
+import pytest
+
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import STILL, Echo, LastRejection, State, Twist, Verb
+from sightline.protocol.refusals import RejectReason
+from sightline.robot_side.safety.limits import SafetyConfig
+from sightline.robot_side.safety.gate import Decision, SafetyGate
+from sightline.robot_side.safety.states import TRANSITIONS, Event, is_armed, next_state
+from tests.gate_rig import GUEST, VISION_HOLDER, A, D, F, G, H, S, driving, guest, guest_driving
+from tests.fixtures.safety import HUMAN, OTHER, ROBOT, VISION, Rig
+
+# --- the table of states -----------------------------------------------------------------------------------------
+
+WHERE_TO = {
+    Event.ARM: {D: H},
+    Event.DISARM: {H: D, A: D, G: D},
+    Event.STOP: dict.fromkeys(State, S),
+    Event.RESET: {S: D, F: D},
+    Event.FAULT: {D: F, H: F, A: F, G: F, F: F},
+    Event.FRESH: {H: A, A: A, G: A},
+    Event.AGEING: {H: G, A: G, G: G},
+    Event.OLD: {H: H, A: H, G: H},
+    Event.EXPIRED: {H: D},
+    Event.HUMAN_LOST: {H: D, A: D, G: D},
+}
+
+
+def test_each_event_leads_from_each_state_where_it_should():
+    for event in Event:
+        for state in State:
+            assert next_state(state, event) is WHERE_TO[event].get(state, state), (state, event)
+    assert len(TRANSITIONS) == sum(map(len, WHERE_TO.values()))
+
+
+def test_the_wheels_may_turn_in_three_states():
+    assert [is_armed(state) for state in (D, H, A, G, S, F)] == [False, True, True, True, False, False]
+
+
+# --- a new gate --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("stopped", "state", "reason"), [(False, D, "not armed"), (True, S, "STOP was set before the restart")]
+)
+def test_a_new_gate_is_off(stopped, state, reason):
+    gate = SafetyGate(SafetyConfig(), ROBOT, stopped=stopped)
+    assert (gate.state, gate.reason, gate.applied) == (state, reason, STILL)
+    assert (gate.accepted, gate.last_refusal, gate.latency_us, dict(gate.counters)) == (0, None, None, {})
+    assert gate.holder(0) is None and gate.frame_age_us(0) is None
+    assert gate.step(5) == Decision(STILL, state, reason)
+    assert SafetyGate(SafetyConfig(), ROBOT).state is D
+
+
+def test_stopped_before_the_restart_does_not_arm_by_itself_after_the_reset():
+    rig = Rig(stopped=True, auto_arm=True)
+    rig.request(Verb.RESET)
+    assert rig.drive(400).gate.state is D
+
+
+# --- what is refused ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("axis", ["linear_mps", "angular_rad_s"])
+def test_either_axis_must_be_finite(axis, value):
+    rig = driving()
+    bad = Twist.model_construct(**{"linear_mps": 0.0, "angular_rad_s": 0.0, axis: value})
+    verdict = rig.gate.offer("vision", rig.header(), bad, rig.now_us)
+    assert (verdict.reason, verdict.accepted, verdict.age_us) == (RejectReason.NOT_FINITE, False, None)
+
+
+def test_a_refusal_is_counted_and_kept_in_words_and_an_acceptance_has_its_age():
+    rig = driving()
+    accepted = rig.gate.accepted
+    verdict = rig.offer(age_ms=12)
+    assert (verdict.reason, verdict.age_us, rig.gate.accepted) == (None, 12_000, accepted + 1)
+    assert rig.gate.latency_us == 12_000
+    stale = rig.offer(age_ms=401)
+    assert stale.detail == "frame 9 is 401 ms old, at most 400"
+    assert rig.gate.counters["STALE"] == 1 and rig.gate.accepted == accepted + 1
+    assert rig.gate.last_refusal == LastRejection(source="vision", reason="STALE", detail=stale.detail)
+    rig.offer(age_ms=402)
+    assert rig.gate.counters["STALE"] == 2 and rig.gate.latency_us == 12_000
+
+
+@pytest.mark.parametrize("size", [31, 32, 33, 199, 200, 201])
+def test_the_last_refusal_is_cut_to_what_a_status_holds(size):
+    rig = Rig()
+    verdict = rig.gate.refuse("s" * size, WireError(RejectReason.MALFORMED, "d" * size))
+    assert rig.gate.last_refusal == LastRejection(
+        source="s" * min(size, 32), reason="MALFORMED", detail="d" * min(size, 200)
+    )
+    assert verdict.detail == "d" * size and verdict.reason is RejectReason.MALFORMED
+
+
+@pytest.mark.parametrize("state", [S, F])
+def test_nothing_drives_in_stopped_and_fault_and_nobody_gets_the_lease(state):
+    rig = driving(state)
+    verdict = rig.offer()
+    assert (verdict.reason, verdict.detail) == (RejectReason(str(state)), rig.gate.reason)
+    assert rig.gate.holder(rig.now_us) is None
+
+
+def test_disarmed_commands_are_judged_and_form_the_lease():
+    rig = Rig()
+    verdict = rig.offer()
+    assert (verdict.reason, verdict.detail) == (RejectReason.DISARMED, "not armed")
+    assert rig.gate.holder(rig.now_us) == VISION_HOLDER
+    assert rig.gate.accepted == 0 and rig.gate.frame_age_us(rig.now_us) is None
+    assert rig.offer(age_ms=401).reason is RejectReason.STALE
+
+
+def test_the_loser_is_told_who_drives():
+    rig = driving()
+    assert rig.offer(session=OTHER).detail == f"vision {VISION} drives"
+    rig.drive(20, source="teleop", session=HUMAN)
+    verdict = rig.offer()
+    assert (verdict.reason, verdict.detail) == (RejectReason.NOT_HOLDER, f"teleop {HUMAN} drives")
+
+
+def test_key_and_header_name_one_known_driver():
+    rig = Rig(guests=True)
+    for source, header in [
+        ("operator", None),
+        ("operator", rig.header(source="operator")),
+        ("vision", rig.header(source="teleop")),
+    ]:
+        verdict = rig.gate.offer(source, header, STILL, rig.now_us)
+        assert verdict.reason is RejectReason.UNKNOWN_SOURCE and repr(source) in verdict.detail
+    for source in ("vision", "teleop"):
+        verdict = rig.gate.offer(source, None, STILL, rig.now_us)
+        assert verdict.reason is RejectReason.MALFORMED and source in verdict.detail
+    assert rig.gate.offer("guest", None, STILL, rig.now_us).reason is RejectReason.DISARMED
+    assert rig.gate.holder(rig.now_us) == GUEST
+    off = Rig().gate.offer("guest", None, STILL, 0)
+    assert off.reason is RejectReason.UNKNOWN_SOURCE and "safety.guests" in off.detail
+
+
+def test_a_status_is_no_frame_and_a_repeated_number_no_command():
+    rig = driving()
+    rig.gate.issued.add("status", 1, rig.now_us)
+    status = Echo(channel="status", session=ROBOT, seq=1, t_us=rig.now_us)
+    verdict = rig.offer(header=rig.header(status))
+    assert verdict.reason is RejectReason.UNKNOWN_FRAME and "status" in verdict.detail
+    rig.gate.issued.add("beat", 1, rig.now_us)
+    beat = rig.header(Echo(channel="beat", session=ROBOT, seq=1, t_us=rig.now_us))
+    assert rig.offer(header=beat).accepted
+    assert rig.offer(header=beat).reason is RejectReason.OUT_OF_ORDER
+
+
+# --- what is kept of a command -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("asked", "goal", "clamped"),
+    [
+        ((0.5, 2.5), (0.5, 2.5), 0),
+        ((0.51, 0.0), (0.5, 0.0), 1),
+        ((0.0, 2.51), (0.0, 2.5), 1),
+        ((1.0, 1.0), (0.5, 0.5), 1),
+        ((-1.0, -1.0), (-0.5, -0.5), 1),
+    ],
+)
+def test_a_command_is_cut_to_the_limits_and_counted(asked, goal, clamped):
+    rig = Rig().armed()
+    before = rig.gate.counters["CLAMPED"]
+    assert rig.offer(*asked).accepted
+    assert rig.gate.counters["CLAMPED"] == before + clamped
+    rig.drive(2_000, *asked)
+    assert (rig.gate.applied.linear_mps, rig.gate.applied.angular_rad_s) == pytest.approx(goal)
+
+
+@pytest.mark.parametrize(
+    ("config", "linear_mps", "angular_rad_s"),
+    [
+        ({}, 0.2, 1.0),
+        ({"guest_max_linear_mps": 0.3, "guest_max_angular_rad_s": 2.0}, 0.3, 2.0),
+        ({"guest_max_linear_mps": 3.0, "guest_max_angular_rad_s": 9.0}, 0.5, 2.5),
+    ],
+)
+def test_a_guest_is_slower_and_never_faster_than_anybody(config, linear_mps, angular_rad_s):
+    assert guest_driving(linear=9.0, **config).gate.applied.linear_mps == pytest.approx(linear_mps)
+    assert guest_driving(linear=0.0, angular=-9.0, **config).gate.applied.angular_rad_s == pytest.approx(-angular_rad_s)
+
+
+@pytest.mark.parametrize(
+    ("config", "life_us"),
+    [({}, 250_000), ({"guest_life_ms": 100}, 100_000), ({"guest_life_ms": 399, "silence_ms": 200}, 200_000)],
+)
+def test_a_guests_command_lives_its_own_time(config, life_us):
+    for late_us, state in [(-1, None), (0, None), (1, H)]:
+        rig = guest_driving(40, **config)
+        guest(rig)
+        rig.now_us += life_us + late_us
+        decision = rig.gate.step(rig.now_us)
+        assert (decision.state is H) == (state is H)
+        if state:
+            assert decision.reason == f"no accepted command for more than {life_us // 1000} ms"
+
+
+def test_a_long_silence_is_named_in_milliseconds():
+    rig = Rig(silence_ms=1000).armed()
+    rig.offer()
+    assert rig.step(2_000).reason == "no accepted command for more than 1000 ms"
+
+
+def test_the_age_of_the_frame_is_never_negative():
+    rig = driving(A)
+    rig.offer()
+    assert [rig.gate.frame_age_us(rig.now_us + later_us) for later_us in (-5, 0, 5)] == [0, 0, 5]
+
+
+def test_a_guest_has_no_latency():
+    rig = guest_driving(40)
+    assert rig.gate.latency_us is None and rig.gate.frame_age_us(rig.now_us + 7) == 20_007

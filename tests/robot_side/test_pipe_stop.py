@@ -1,0 +1,162 @@
+"""A STOP that reached the robot's machine reaches the gate: through a full socket, and past a process that dies."""
+
+import signal
+import socket
+import time
+
+import pytest
+
+from sightline.protocol.channels import REQUEST, STATUS, TWIST
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import Request, RequestHeader, Verb
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.robot_side.child import DriverEnd
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.held import MAX_PENDING, PendingRequests
+from tests.fixtures.links import until
+from tests.fixtures.robot_process import RobotProcess, Vision, driving
+
+
+def request(verb, source="operator", number=1):
+    header = RequestHeader(source=source, session="0a0a0a0a", seq=number)
+    return Message(REQUEST, source, encode(header), encode(Request(id=number, verb=verb)))
+
+
+class Room:
+    """A socket with so many places left."""
+
+    def __init__(self, places):
+        self.places, self.sent = places, []
+
+    def send(self, message):
+        self.places -= 1
+        if self.places >= 0:
+            self.sent.append(message)
+        return self.places >= 0
+
+
+def test_what_waits_is_sent_once_there_is_room_and_stop_first():
+    held = PendingRequests()
+    arm, stop = request(Verb.ARM), request(Verb.STOP)
+    assert held.hold(arm) and held.hold(stop) and len(held) == 2
+    room = Room(1)
+    assert not held.flush(room.send) and room.sent == [stop] and len(held) == 1
+    room = Room(5)
+    assert held.flush(room.send) and room.sent == [arm] and held.flush(room.send) and room.sent == [arm]
+
+
+def test_the_newest_of_one_source_and_verb_waits():
+    held, room = PendingRequests(), Room(9)
+    old, new = request(Verb.RESET, number=1), request(Verb.RESET, number=2)
+    assert held.hold(old) and held.hold(new) and held.flush(room.send)
+    assert room.sent == [new]
+
+
+@pytest.mark.parametrize("first", [Verb.ARM, Verb.STOP])
+def test_it_is_bounded_and_a_stop_still_finds_a_place(first):
+    held, room = PendingRequests(), Room(99)
+    for number in range(MAX_PENDING):
+        assert held.hold(request(first, f"source{number}"))
+    assert not held.hold(request(Verb.ARM, "another")) and len(held) == MAX_PENDING
+    assert held.hold(request(Verb.STOP, "another")) and len(held) == MAX_PENDING
+    assert held.flush(room.send) and room.sent[0].payload == request(Verb.STOP).payload
+    assert request(Verb.STOP, "another") in room.sent
+
+
+def test_what_is_no_request_is_not_kept():
+    held = PendingRequests()
+    assert not held.hold(Message(REQUEST, "operator", b"", b"{")) and len(held) == 0
+
+
+# --- the driver's end --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def child(tmp_path):
+    made = DriverEnd(RobotConfig(state_dir=tmp_path), "0a0a0a0a", lambda line: None)
+    yield made
+    made.close()
+
+
+def test_what_a_process_sent_before_it_died_is_read_even_if_it_left_packets_unread(child):
+    """The kernel tells of unread packets ahead of what waits, once."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setblocking(False)
+    child.socket = ours
+    child.send(b"never read")
+    theirs.send(b"STOP")
+    theirs.close()
+    assert list(child.packets()) == [b"STOP"]
+    assert child.socket is None
+
+
+def test_a_dead_process_is_not_forgotten_before_all_it_sent_is_read(child):
+    child.keep_alive(0, 0)
+    process, end = child._process, child.socket
+    child.on_ready()
+    process.kill()
+    process.wait()
+    child.keep_alive(1_000, 0)
+    assert child.socket is end, "its packets are still to be read"
+    assert list(child.packets()) == [] and child.socket is None
+    child.keep_alive(2_000, 0)
+    assert child._process is None
+
+
+def test_a_dead_process_whose_descendant_holds_the_socket_is_started_again_all_the_same(child):
+    child.keep_alive(0, 0)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setblocking(False)
+    child.socket.close()
+    child.socket = ours
+    child.on_ready()
+    child._process.kill()
+    child._process.wait()
+    for now_us in (1_000, 2_000_000):
+        child.keep_alive(now_us, 0)
+    assert child._process is None and child.socket is None
+    theirs.close()
+
+
+# --- whole -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stopped(tmp_path):
+    """A robot at speed, its driver process held up, and somebody who may say something to it."""
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
+        assert driving(robot)
+        with open_zenoh("r1", connect=[robot.endpoint], role="operator", timeout_s=10) as link:
+            assert link.latest(STATUS).take(5.0)
+            robot.process.send_signal(signal.SIGSTOP)
+            yield robot, vision, link
+
+
+def say_stop_once(link):
+    stop = request(Verb.STOP)
+    link.publish(REQUEST, stop.header, stop.payload)
+    time.sleep(0.3)  # until it has arrived: nothing that could be waited for says so while the driver is held up
+
+
+def test_a_stop_said_once_arrives_though_the_drivers_socket_is_full(stopped):
+    robot, vision, link = stopped
+    for _ in range(40):  # in pieces: what a busy machine cannot send at once is dropped before the robot sees it
+        for _ in range(50):
+            link.publish(TWIST, b"{", b"0.1|0", "vision")
+        time.sleep(0.02)
+    say_stop_once(link)
+    robot.process.send_signal(signal.SIGCONT)
+    assert until(lambda: vision.status().state == "STOPPED", 5)
+    full = until(lambda: vision.status().stream.dropped_commands > 0, 3)  # the next report of the network process
+    assert full, "the socket was never full: this proves nothing"
+    assert until(lambda: robot.speed() == 0.0, 2)
+
+
+def test_a_stop_said_once_is_obeyed_though_the_network_process_dies_right_after(stopped):
+    robot, _, link = stopped
+    say_stop_once(link)
+    robot.kill_network()
+    robot.process.send_signal(signal.SIGCONT)
+    assert until(lambda: "STOPPED (STOP by operator)" in robot.output(), 3)
+    assert until(lambda: robot.speed() == 0.0, 2)

@@ -1,0 +1,276 @@
+"""Training without PyTorch: the network's table, what is learned from a scene, and the ONNX graph."""
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pybullet")
+
+import cv2
+
+from sightline.operator_side.cli import app as cli
+from sightline.training.network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
+from sightline.training.schedule import SceneRange
+from sightline.operator_side.train_samples import CUT_PX, WHOLE_PX, sample
+from sightline.training.scenes import DrawnScenes, drawn_scenes
+from sightline.protocol.errors import ConfigError
+from sightline.sim.scenes.model import HEIGHT_PX, LABELS, WIDTH_PX, LabelledBox
+from tests.training.fixture import weights
+
+BALL = LabelledBox("ball", (100.0, 60.0, 141.0, 99.0), 1.0)
+
+
+def one_scene(truths=(BALL,), unclear=(), others=()):
+    picture = np.full((1, HEIGHT_PX, WIDTH_PX, 3), 120, np.uint8)
+    return DrawnScenes(picture, (tuple(truths),), (tuple(unclear),), (tuple(others),))
+
+
+def shown(scenes, seed, step, place, size_px):
+    """Any of all scenes."""
+    return sample(scenes, SceneRange(0, len(scenes.truths)), (seed, step, place), size_px)
+
+
+def test_the_table_is_a_network_of_the_agreed_size():
+    sizes = {"image": (HEIGHT_PX, WIDTH_PX)}
+    for layer in network():
+        rows, columns = sizes[layer.takes[0]]
+        assert rows % layer.stride == 0 and columns % layer.stride == 0, "halves evenly"
+        sizes[layer.name] = (rows // layer.stride, columns // layer.stride)
+        if layer.kind == "add-up":
+            assert sizes[layer.takes[0]] == tuple(2 * side for side in sizes[layer.takes[1]])
+    assert sizes["head"] == (HEIGHT_PX // STRIDE, WIDTH_PX // STRIDE)
+    assert network()[-1].channels == OUTPUTS == len(LABELS) + GEOMETRY
+    assert 100_000 <= sum(one.size for one in weights().values()) <= 180_000
+
+
+def decoded(one, row, column):
+    """The box that the geometry of a cell means."""
+    off_x, off_y, wide, high = one.geometry[:, row, column]
+    x, y = (column + 0.5 + off_x) * STRIDE, (row + 0.5 + off_y) * STRIDE
+    half_wide, half_high = np.exp(wide) * SIZE_PX / 2, np.exp(high) * SIZE_PX / 2
+    return x - half_wide, y - half_high, x + half_wide, y + half_high
+
+
+def test_the_cells_about_an_objects_middle_learn_its_box():
+    ones, mirrored = 0, 0
+    for place in range(20):
+        one = shown(one_scene(), 7, 0, place, WHOLE_PX)
+        assert one.image.shape == (3, HEIGHT_PX, WIDTH_PX) and one.image.dtype == np.uint8
+        box = BALL.box if one.heat[0, 19, 30] == 1.0 else (WIDTH_PX - 141, 60, WIDTH_PX - 100, 99)
+        mirrored += box is not BALL.box
+        assert np.argwhere(one.heat == 1.0).tolist() == [[0, 19, int((box[0] + box[2]) / 2 // STRIDE)]]
+        for row, column in np.argwhere(one.sure > 0):
+            assert decoded(one, row, column) == pytest.approx(box, abs=1e-3)
+            ones += 1
+        assert one.counts.min() == 1.0
+    assert ones >= 3 * 20 and 4 <= mirrored <= 16
+
+
+def test_the_same_numbers_give_the_same_sample():
+    first, again = (shown(one_scene(), 3, 11, 2, CUT_PX) for _ in range(2))
+    assert np.array_equal(first.image, again.image) and np.array_equal(first.heat, again.heat)
+    assert first.image.shape == (3, CUT_PX[1], CUT_PX[0])
+    assert not np.array_equal(first.image, shown(one_scene(), 3, 12, 2, CUT_PX).image)
+
+
+def four_scenes():
+    """Each of another label, which says which one was shown."""
+    pictures = np.full((4, HEIGHT_PX, WIDTH_PX, 3), 120, np.uint8)
+    return DrawnScenes(pictures, tuple((LabelledBox(label, BALL.box, 1.0),) for label in LABELS[:4]), ((),) * 4,
+                       (((4.0, 180.0, 44.0, 220.0),),) * 4)
+
+
+def times_shown(which, count):
+    """How many times each of the four was."""
+    heats = [sample(four_scenes(), which, (1, 0, place), WHOLE_PX).heat for place in range(count)]
+    return np.bincount([int(np.argwhere(heat[: len(LABELS)] == 1.0)[0, 0]) for heat in heats], minlength=4).tolist()
+
+
+def test_only_the_scenes_that_are_known_by_then_are_shown():
+    for known in (1, 3, 4):
+        assert {place for place, times in enumerate(times_shown(SceneRange(0, known), 60)) if times} == {*range(known)}
+
+
+def test_a_round_of_harder_pictures_shows_its_own_scenes_more_often():
+    assert min(times_shown(SceneRange(3, 4), 200)) > 30
+    times = times_shown(SceneRange(3, 4, harder=True), 200)
+    assert min(times) > 10 and 95 < times[3] < 155
+
+
+def test_a_round_of_harder_pictures_is_cut_around_other_things_too():
+    def middle_in_view(which):
+        seen = [sample(four_scenes(), which, (1, 0, place), CUT_PX).heat[-1].max() == 1.0 for place in range(200)]
+        return sum(seen)
+
+    assert middle_in_view(SceneRange(0, 4, harder=True)) > middle_in_view(SceneRange(0, 4)) + 20
+
+
+def test_a_round_of_harder_pictures_has_more_clear_ones_and_more_bad_ones():
+    """Of black and white squares: clear ones are bright with sharp edges, bad ones neither."""
+    squares = (np.indices((HEIGHT_PX, WIDTH_PX)) // 40).sum(0) % 2 * 255
+    scenes = DrawnScenes(np.repeat(squares[None, ..., None], 3, 3).astype(np.uint8), ((),), ((),), ((),))
+
+    def kinds(which):
+        pictures = [sample(scenes, which, (1, 0, place), WHOLE_PX).image.astype(int) for place in range(150)]
+        sharp = [np.abs(np.diff(one.mean(0))).max() > 60 for one in pictures]
+        bright = [one.mean() > 100 for one in pictures]
+        both = list(zip(sharp, bright, strict=True))
+        return both.count((True, True)), both.count((False, False))
+
+    clear, bad = kinds(SceneRange(0, 1, harder=True))
+    clear_before, bad_before = kinds(SceneRange(0, 1))
+    assert clear > clear_before + 10 and bad > bad_before + 10
+
+
+def test_what_the_cut_leaves_too_little_of_is_neither_right_nor_wrong():
+    blanked = marked = 0
+    for place in range(60):
+        one = shown(one_scene(), 5, 0, place, CUT_PX)
+        has_middle = bool((one.heat == 1.0).any())
+        marked += has_middle
+        blanked += not has_middle and one.counts.min() == 0
+        assert has_middle == bool(one.sure.any())
+    assert marked > 20 and blanked > 0
+
+
+def test_what_is_unclear_in_a_scene_is_not_learned():
+    one = shown(one_scene((), [(40.0, 40.0, 80.0, 80.0)]), 5, 0, 1, WHOLE_PX)
+    assert not one.heat.any() and 90 < np.count_nonzero(one.counts == 0) < 150
+
+
+def test_what_nobody_asks_for_is_taught_on_a_map_of_its_own():
+    box = (40.0, 60.0, 90.0, 100.0)
+    alone, beside = (shown(one_scene(truths, (), [box]), 5, 0, 1, WHOLE_PX) for truths in ((), (BALL,)))
+    assert np.unique(np.argwhere(alone.heat > 0)[:, 0]).tolist() == [len(LABELS)] and (alone.heat[-1] == 1).sum() == 1
+    assert not alone.sure.any() and not alone.geometry.any(), "where its edges are is not learned"
+    assert any(np.allclose(beside.heat[-1], one) for one in (alone.heat[-1], alone.heat[-1][:, ::-1])), "or mirrored"
+    assert np.array_equal(beside.geometry, shown(one_scene(), 5, 0, 1, WHOLE_PX).geometry)
+
+
+def test_labels_have_maps_of_their_own():
+    for number, label in enumerate(LABELS):
+        one = shown(one_scene((LabelledBox(label, (40.0, 60.0, 90.0, 200.0), 1.0),)), 5, 0, 1, WHOLE_PX)
+        assert np.unique(np.argwhere(one.heat > 0)[:, 0]).tolist() == [number]
+
+
+def test_scenes_are_drawn_once(tmp_path):
+    told = []
+    first = drawn_scenes(tmp_path, 8, 1, told.append)
+    stamp = (tmp_path / "scenes.npy").stat().st_mtime_ns
+    again = drawn_scenes(tmp_path, 8, 1, told.append)
+    assert (tmp_path / "scenes.npy").stat().st_mtime_ns == stamp and told == [8, 8]
+    sent = pickle.loads(pickle.dumps(again))  # as to the processes that train
+    assert len(pickle.dumps(again)) < 20_000 and np.array_equal(sent.pictures, again.pictures)
+    assert first.truths == again.truths == sent.truths and first.others == sent.others and any(first.others)
+    assert first.pictures.shape == (8, HEIGHT_PX, WIDTH_PX, 3)
+    assert all(picture.std() > 1 for picture in first.pictures) and any(first.truths)
+
+
+def test_scenes_are_drawn_again_when_they_would_be_others_now_or_were_cut(tmp_path, monkeypatch):
+    first = drawn_scenes(tmp_path, 3, 1, lambda _: None)
+    (tmp_path / "scenes.json").unlink()  # as a run leaves it that is cut while it draws
+    again = drawn_scenes(tmp_path, 3, 1, lambda _: None)
+    assert np.array_equal(first.pictures, again.pictures) and first.digest() == again.digest()
+    notes = tmp_path / "scenes.json"
+    stamp = notes.stat().st_mtime_ns
+    pictures = np.lib.format.open_memmap(tmp_path / "scenes.npy", "r+")
+    pictures[1] += 1  # as if they were drawn by an older program
+    pictures.flush()
+    assert drawn_scenes(tmp_path, 3, 1, lambda _: None).truths == first.truths and notes.stat().st_mtime_ns > stamp
+    assert drawn_scenes(tmp_path, 2, 1, lambda _: None).digest() != first.digest()
+
+
+def test_no_scene_of_another_purpose_is_trained_on(tmp_path):
+    with pytest.raises(ConfigError, match="--scenes 800001"):
+        drawn_scenes(tmp_path, 800_001, 1, lambda _: None)
+
+
+def test_training_without_pytorch_says_what_to_install(monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(__import__("sys").modules, "torch", None)
+    assert cli.run(["train", "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "sightline[train]" in error and "torch" in error and "\n" not in error
+
+
+@pytest.mark.parametrize("arguments", [["--steps", "0"], ["--device", "tpu"], ["--scenes", "3"], ["--batch", "1"]])
+def test_a_bad_option_is_one_line(arguments, capsys):
+    assert cli.run(["train", *arguments]) == 2
+    error = capsys.readouterr().err.strip()
+    assert arguments[0] in error and "\n" not in error
+
+
+class TestGraph:
+    """The ONNX file, by weights that mean nothing."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def made(cls, tmp_path_factory):
+        pytest.importorskip("onnx")
+        from sightline.training.export import onnx_bytes
+
+        path = tmp_path_factory.mktemp("model") / "random.onnx"
+        path.write_bytes(onnx_bytes(weights(), {"min_score": "0.5"}))
+        return path
+
+    def outputs(self, path, image):
+        net = cv2.dnn.readNetFromONNX(str(path))
+        net.setInput(image, "image")
+        names = ["boxes", "scores", "labels"]
+        found = dict(zip(names, net.forward(names), strict=True))
+        return found["boxes"].reshape(-1, 4), found["scores"].reshape(-1), found["labels"].reshape(-1)
+
+    def picture(self, seed=3):
+        return np.random.default_rng(seed).integers(0, 256, (1, HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
+
+    def test_the_file_is_opset_17_and_says_what_it_finds(self, made):
+        import onnx
+
+        model = onnx.load(made)
+        assert [one.version for one in model.opset_import] == [17]
+        properties = {one.key: one.value for one in model.metadata_props}
+        assert json.loads(properties["labels"]) == list(LABELS) and properties["min_score"] == "0.5"
+        assert made.stat().st_size < 1_000_000
+
+    def test_boxes_lie_in_the_picture_and_no_two_cover_each_other(self, made):
+        from sightline.vision_side.detect.overlap import overlap
+
+        boxes, scores, labels = self.outputs(made, self.picture())
+        kept = boxes[scores > 0]
+        assert len(kept) > 3 and boxes.min() >= 0 and boxes[:, 2].max() <= WIDTH_PX and boxes[:, 3].max() <= HEIGHT_PX
+        assert set(labels.astype(int)) <= set(range(len(LABELS)))
+        pairs = [(i, j) for i in range(len(kept)) for j in range(i)]
+        assert max((overlap(tuple(kept[i]), tuple(kept[j])) for i, j in pairs), default=0.0) <= 0.5 + 1e-6
+
+    def test_both_engines_agree(self, made):
+        runtime = pytest.importorskip("onnxruntime")
+        session = runtime.InferenceSession(str(made), providers=["CPUExecutionProvider"])
+        image = self.picture(5)
+        theirs = dict(zip(("boxes", "scores", "labels"), session.run(["boxes", "scores", "labels"], {"image": image}),
+                          strict=True))
+        boxes, scores, labels = self.outputs(made, image)
+        assert scores == pytest.approx(theirs["scores"], abs=1e-4) and (labels == theirs["labels"]).all()
+        assert boxes == pytest.approx(theirs["boxes"], abs=0.05)
+
+    def test_brightness_changes_little(self, made):
+        image = (self.picture(6) // 2).astype(np.uint8)
+        _, bright, _ = self.outputs(made, image)
+        _, dim, _ = self.outputs(made, (image // 2).astype(np.uint8))
+        assert np.sort(dim) == pytest.approx(np.sort(bright), abs=0.2)  # boxes as good as each other change places
+
+    def test_a_black_and_a_white_picture_give_numbers(self, made):
+        for value in (0, 255):
+            boxes, scores, _ = self.outputs(made, np.full((1, HEIGHT_PX, WIDTH_PX, 3), value, np.uint8))
+            assert np.isfinite(boxes).all() and np.isfinite(scores).all()
+
+    def test_a_threshold_becomes_one_half(self, made, tmp_path):
+        from sightline.training.export import onnx_bytes, shifted
+
+        _, before, labels = self.outputs(made, self.picture())
+        thresholds = [0.2] * len(LABELS)
+        (tmp_path / "shifted.onnx").write_bytes(onnx_bytes(shifted(weights(), thresholds), {}))
+        _, after, _ = self.outputs(tmp_path / "shifted.onnx", self.picture())
+        odds = before / (1 - before) / (0.2 / 0.8)
+        seen = (before > 0.01) & (after > 0.01) & (labels >= 0)
+        assert seen.any() and after[seen] == pytest.approx((odds / (1 + odds))[seen], abs=1e-3)

@@ -1,0 +1,1 @@
+"""Modules of tests.vision_side.detect.color."""

@@ -1,0 +1,312 @@
+"""The detector `onnx`: what a file says of itself, what goes in, what comes out, and on what it ran."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.messages import FrameHeader
+from tests.contracts.detectors import assert_kept
+from tests.fixtures.vision.onnx import brightness_model, model, node, part, tensor, value, without_gpu, yolo_model
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
+from sightline.vision_side.decode import Decoder, Picture
+from sightline.vision_side.detect.onnx.self_test import difference, golden_picture, golden_text, read_golden
+from sightline.vision_side.detect.onnx.detector import OnnxDetector
+from sightline.vision_side.detect.onnx_engine import open_engine
+from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor, read_onnx_header
+from sightline.vision_side.detect.onnx.tensors import Letterbox, ModelFormat, fit_picture, model_format, read_outputs
+from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection
+
+BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 400.0, 300.0]]
+NEEDS_RUNTIME = pytest.mark.skipif(importlib.util.find_spec("onnxruntime") is None,
+                                   reason="onnxruntime is not installed: pip install 'sightline[onnx]'")
+PICTURE = Picture(np.full((240, 320, 3), 128, np.uint8), 1)
+
+
+@pytest.fixture(autouse=True)
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is said of a missing device is the same on a machine that has one."""
+    without_gpu(monkeypatch)
+
+
+def frame(bgr: np.ndarray, seq: int = 1) -> DetectFrame:
+    header = FrameHeader(session="0000abcd", seq=seq, t_us=seq * 33_333)
+    return DetectFrame("r1", header, jpeg_of(bgr), Decoder(bgr.shape[1], bgr.shape[0], 10**7))
+
+
+def detector(path: Path, **options: object) -> OnnxDetector:
+    return OnnxDetector(OnnxDetector.Config(address=str(path), **options))
+
+
+@pytest.fixture(params=["opencv", pytest.param("onnxruntime", marks=NEEDS_RUNTIME)])
+def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Both engines, whichever are installed; OpenCV takes over where the runtime cannot be imported."""
+    if request.param == "opencv":
+        monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
+    return request.param
+
+
+def test_a_file_says_what_it_takes_and_gives(tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], min_score="0.4")
+    header = read_onnx_header(path.read_bytes())
+    assert header.inputs == (Tensor("image", "uint8", (1, 240, 320, 3)),)
+    assert [one.name for one in header.outputs] == ["boxes", "scores", "labels"]
+    assert header.metadata == {"labels": '["ball", "legs"]', "min_score": "0.4"}
+
+
+def test_an_input_that_is_a_constant_is_none(tmp_path: Path) -> None:
+    path = model(tmp_path / "old.onnx", [node("Identity", ["x"], ["y"])], [tensor("w", np.ones(3, np.float32))],
+                 [value("w", "float32", (3,)), value("x", "float32", (1, 3, None, None))],
+                 [value("y", "float32", (1, 3, None, None))])
+    assert read_onnx_header(path.read_bytes()).inputs == (Tensor("x", "float32", (1, 3, None, None)),)
+
+
+@given(data=st.binary(max_size=200))
+def test_bytes_that_are_no_model_are_one_error(data: bytes) -> None:
+    try:
+        header = read_onnx_header(data)
+    except ValueError:
+        return
+    assert isinstance(header, OnnxHeader)
+
+
+@given(at=st.integers(0, 600), byte=st.integers(0, 255))
+def test_a_broken_model_is_one_error(tmp_path_factory: pytest.TempPathFactory, at: int, byte: int) -> None:
+    path = brightness_model(tmp_path_factory.mktemp("broken") / "m.onnx", BOXES, [0, 1])
+    data = bytearray(path.read_bytes())
+    data[at % len(data)] = byte
+    for broken in (bytes(data), bytes(data[:at])):
+        try:
+            model_format(read_onnx_header(broken), (), "auto")
+        except ValueError as error:
+            assert str(error)
+
+
+def test_boxes_scores_and_labels_become_detections(tmp_path: Path, engine: str) -> None:
+    path = brightness_model(tmp_path / "m.onnx", BOXES, [1, 0])
+    eye = detector(path, device="cpu", refine=())
+    result = eye.detect([frame(np.full((240, 320, 3), 128, np.uint8))], NO_DEADLINE)[0]
+    assert result is not None
+    first, second = result.detections
+    assert (first.x1_px, first.y1_px, first.x2_px, first.y2_px) == pytest.approx((10, 20, 60, 90), abs=0.01)
+    assert (second.x2_px, second.y2_px) == (320, 240), "clipped"
+    assert (first.label, second.label) == ("legs", "ball")
+    assert first.score == pytest.approx(0.5, abs=0.01)
+    assert (result.detector, result.device, len(result.model_hash)) == ("onnx:m.onnx", "cpu", 16)
+
+
+def test_what_is_less_sure_than_the_model_wants_does_not_count(tmp_path: Path, engine: str) -> None:
+    path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], min_score="0.6")
+    dark, light = frame(np.full((240, 320, 3), 120, np.uint8)), frame(np.full((240, 320, 3), 200, np.uint8))
+    counts = [len(one.detections) if one else None for one in detector(path).detect([dark, light], NO_DEADLINE)]
+    assert counts == [0, 2]
+    assert len(detector(path, min_score=0.1).detect([dark], NO_DEADLINE)[0].detections) == 2
+
+
+def test_half_scale_and_other_shapes_come_back_in_the_pictures_own_pixels(tmp_path: Path, engine: str) -> None:
+    eye = detector(brightness_model(tmp_path / "m.onnx", BOXES[:1], [0]), refine=())
+    for width, height, expected in ((640, 480, (20, 40, 120, 180)), (160, 120, (5, 10, 30, 45)),
+                                    (480, 480, (0, 40, 40, 180))):  # in the middle of a wider input
+        (result,) = eye.detect([frame(np.full((height, width, 3), 128, np.uint8))], NO_DEADLINE)
+        box = result.detections[0]
+        assert (box.x1_px, box.y1_px, box.x2_px, box.y2_px) == pytest.approx(expected, abs=0.6)
+
+
+def test_yolo_is_read_and_its_overlaps_are_removed(tmp_path: Path, engine: str) -> None:
+    columns = np.array([[32, 33, 10], [32, 32, 10], [20, 20, 8], [20, 20, 8], [0.9, 0.8, 0.7]])
+    eye = detector(yolo_model(tmp_path / "yolo.onnx", columns))
+    (result,) = eye.detect([frame(np.full((64, 64, 3), 90, np.uint8))], NO_DEADLINE)
+    assert [(one.label, round(one.score, 2)) for one in result.detections] == [("cup", 0.9), ("cup", 0.7)]
+    assert (result.detections[0].x1_px, result.detections[0].y2_px) == pytest.approx((22, 42), abs=0.01)
+
+
+def test_it_keeps_the_contract(tmp_path: Path, engine: str) -> None:
+    path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1])
+    assert_kept(lambda: detector(path))
+
+
+def test_the_time_is_over(tmp_path: Path) -> None:
+    eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))
+    assert eye.detect([frame(PICTURE.bgr)], 0) == [None]
+
+
+@pytest.mark.parametrize("kind", ["cuda", "tensorrt"])
+def test_a_device_that_is_not_there_is_refused_with_the_fix(tmp_path: Path, engine: str, kind: str) -> None:
+    path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1])
+    with pytest.raises(HardwareError, match=r"--device .*onnxruntime-gpu") as refused:
+        detector(path, device=kind)
+    assert refused.value.exit_code == 3
+    assert "\n" not in str(refused.value)
+
+
+def test_auto_says_once_that_it_runs_on_the_cpu(tmp_path: Path, engine: str) -> None:
+    eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))
+    assert len(told := eye.news()) == 1 and "cpu" in told[0]
+    eye.detect([frame(PICTURE.bgr)], NO_DEADLINE)
+    assert eye.news() == []
+    asked_for = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]), device="cpu").news()
+    assert bool(asked_for) is (engine == "opencv"), "who asked for the CPU is not told that it is the CPU"
+
+
+class _FakeRuntime:
+    """An onnxruntime built for CUDA on a machine whose GPU does not work: it lists CUDA and gives the CPU."""
+
+    __version__ = "0"
+
+    class SessionOptions:
+        pass
+
+    class InferenceSession:
+        def __init__(self, path: str, options: object, providers: list[str], enable_fallback: int) -> None:
+            self.asked = providers
+
+        def disable_fallback(self) -> None:
+            pass
+
+        def get_providers(self) -> list[str]:
+            return ["CPUExecutionProvider"]
+
+        def run(self, names: list[str], inputs: dict) -> list[np.ndarray]:
+            return [np.zeros((0, 4)), np.zeros(0), np.zeros(0)]
+
+    @staticmethod
+    def get_available_providers() -> list[str]:
+        return ["CUDAExecutionProvider", "CPUExecutionProvider"]
+
+
+class _FailingRuntime(_FakeRuntime):
+    """One whose GPU cannot even be asked; its own fallback prints that where JSON may be expected."""
+
+    class InferenceSession(_FakeRuntime.InferenceSession):
+        def __init__(self, path: str, options: object, providers: list[str], enable_fallback: int) -> None:
+            if providers != ["CPUExecutionProvider"] and enable_fallback:
+                print("EP Error")
+            elif providers != ["CPUExecutionProvider"]:
+                raise Exception("CUDA failure 100")  # as ONNX Runtime does
+
+
+@pytest.mark.parametrize("runtime", [_FakeRuntime, _FailingRuntime])
+def test_a_listed_gpu_that_the_model_did_not_get_is_not_believed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], runtime: type
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", runtime)
+    path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1])
+    header = read_onnx_header(path.read_bytes())
+    with pytest.raises(HardwareError, match="on cpu instead"):
+        open_engine(path, header, "cuda", 1)
+    auto = open_engine(path, header, "auto", 1)
+    assert auto.device == "cpu"
+    assert "did not get it" in auto.note and capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(None, "No such file"), (b"", "0 bytes"), (b"no model", "no ONNX model"), (part(7, part(2, "empty")), "0 inputs")],
+)
+def test_a_file_that_is_no_model_is_one_line(tmp_path: Path, content: bytes | None, words: str) -> None:
+    path = tmp_path / "bad.onnx"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError, match=words) as refused:
+        detector(path)
+    assert "\n" not in str(refused.value) and str(path) in str(refused.value)
+
+
+def test_a_model_of_another_kind_says_what_it_should_be() -> None:
+    image = Tensor("x", "float32", (1, 3, 64, 64))
+    with pytest.raises(ValueError, match=r"gives y \(1, 1000\)"):
+        model_format(OnnxHeader((image,), (Tensor("y", "float32", (1, 1000)),)), (), "auto")
+    with pytest.raises(ValueError, match="float32 \\(1, 128\\)"):
+        model_format(OnnxHeader((Tensor("x", "float32", (1, 128)),), (Tensor("y", "float32", (1, 6)),)), (), "auto")
+    with pytest.raises(ValueError, match="labels"):
+        model_format(OnnxHeader((image,), (Tensor("y", "float32", (None, 6)),), {"labels": "{"}), (), "auto")
+
+
+FORM = ModelFormat(False, False, (240, 320), "triple", ("ball",))
+STRAIGHT = Letterbox(1.0, 0, 0)
+
+
+def _found_beside_a_good_one(box: float, score: float, label: float) -> tuple[Detection, ...]:
+    outputs = {"boxes": np.array([[1, 1, 9, 9], [5, 5, box, 9]]), "scores": np.array([0.9, score]),
+               "labels": np.array([0.0, label])}
+    return read_outputs(outputs, FORM, STRAIGHT, PICTURE, 0.1)
+
+
+@pytest.mark.parametrize(("box", "score", "label"), [
+    (np.nan, 0.9, 0), (-np.inf, 0.9, 0), (9, np.nan, 0), (9, np.inf, 0), (9, 1.01, 0), (9, 7, 0), (9, 0.9, np.nan),
+])  # fmt: skip
+def test_numbers_that_are_none_are_no_answer(box: float, score: float, label: float) -> None:
+    """Who took them for "saw nothing" would begin to search."""
+    with pytest.raises(ValueError, match=r"nan or infinite|between 0 and 1"):
+        _found_beside_a_good_one(box, score, label)
+
+
+@pytest.mark.parametrize(("box", "score", "count"), [(np.nan, 0.05, 1), (9, -np.inf, 1), (1e300, 0.9, 2)])
+def test_what_does_not_count_may_hold_anything(box: float, score: float, count: int) -> None:
+    found = _found_beside_a_good_one(box, score, 0)
+    assert len(found) == count and all(0 <= one.x1_px < one.x2_px <= 320 for one in found)
+
+
+def test_a_million_boxes_and_other_shapes_are_refused() -> None:
+    many = {"boxes": np.zeros((200_000, 4)), "scores": np.ones(200_000), "labels": np.zeros(200_000)}
+    with pytest.raises(ValueError, match="boxes"):
+        read_outputs(many, FORM, STRAIGHT, PICTURE, 0.1)
+    short = {"boxes": np.zeros((2, 4)), "scores": np.ones(3), "labels": np.zeros(3)}
+    with pytest.raises(ValueError, match="scores"):
+        read_outputs(short, FORM, STRAIGHT, PICTURE, 0.1)
+
+
+def test_floats_are_planes_of_red_green_blue() -> None:
+    bgr = np.zeros((64, 64, 3), np.uint8)
+    bgr[:] = (0, 51, 255)
+    pixels, _ = fit_picture(Picture(bgr, 1), ModelFormat(True, True, (64, 64), "yolo", (), "float32"))
+    assert pixels.shape == (1, 3, 64, 64) and pixels.dtype == np.float32
+    assert pixels[0, :, 0, 0] == pytest.approx([1.0, 0.2, 0.0])
+
+
+def test_a_ball_is_refined_to_less_than_a_pixel(tmp_path: Path) -> None:
+    lens = camera(320, 240)
+    picture = scene(lens, 0.8, 0.1)
+    true = _true_centre(picture)
+    rough = [[true[0] - 27, true[1] - 24, true[0] + 22, true[1] + 26]]
+    eye = detector(brightness_model(tmp_path / "m.onnx", rough, [0]))
+    (result,) = eye.detect([frame(picture)], NO_DEADLINE)
+    circle = result.detections[0].circle
+    assert circle is not None
+    assert np.hypot(circle.cx_px - true[0], circle.cy_px - true[1]) < 0.5
+
+
+def _true_centre(picture: np.ndarray) -> tuple[float, float]:
+    """The middle of the yellow pixels; what the drawing itself does not say."""
+    rows, columns = np.nonzero(picture[..., 0] < 70)
+    return float(columns.mean()) + 0.5, float(rows.mean()) + 0.5
+
+
+def test_a_golden_output_that_differs_ends_it(tmp_path: Path) -> None:
+    good = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], size=(240, 320))
+    eye = detector(good, min_score=0.1, refine=())
+    (found,) = eye._seen([Picture(golden_picture(), 1)])
+    again = brightness_model(tmp_path / "g.onnx", BOXES, [0, 1], golden=golden_text(found))
+    assert detector(again, min_score=0.1).maker.device == "cpu"
+    other = golden_text([Detection(1, 1, 9, 9, 0.99, "ball")])
+    for least in (0.1, 0.95):  # what is asked of a picture has nothing to do with what the file should give
+        with pytest.raises(HardwareError, match="ball at \\(1, 1\\)"):
+            detector(brightness_model(tmp_path / "w.onnx", BOXES, [0, 1], golden=other), min_score=least)
+    with pytest.raises(ConfigError, match="golden"):
+        detector(brightness_model(tmp_path / "b.onnx", BOXES, [0, 1], golden="[1]"))
+
+
+def test_golden_text_comes_back_and_tells_apart() -> None:
+    found = [Detection(10, 20, 60, 90, 0.9, "ball"), Detection(100, 20, 160, 90, 0.3, "legs")]
+    back = read_golden(golden_text(found))
+    assert difference(found, back, 0.25) == ""
+    assert "missing" in difference(found, [], 0.25)
+    assert "should not be there" in difference([], found, 0.25)
+    assert difference(found, found[:1], 0.25) == "", "what is hardly sure enough may come and go"
+    assert json.loads(golden_text([])) == []
+    assert golden_picture().tobytes() == golden_picture().tobytes()

@@ -1,0 +1,99 @@
+"""The detector `onnx`: a device that fails in the middle, golden outputs under other options, things on things."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sightline.protocol.errors import HardwareError
+from tests.fixtures.vision.onnx import brightness_model, yolo_model
+from tests.vision_side.detect.onnx.test_detector import NEEDS_RUNTIME, detector, engine, frame
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.onnx import detector as onnx_detector
+from sightline.vision_side.detect.onnx.self_test import golden_picture, golden_text
+from sightline.vision_side.detect.port import NO_DEADLINE, Detection
+
+__all__ = ["engine"]
+BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 300.0, 200.0]]
+GREY = np.full((240, 320, 3), 128, np.uint8)
+
+
+class _Dying:
+    """An onnxruntime whose GPU is lost while it runs: with its fallback on, the CPU takes over without a word."""
+
+    __version__ = "0"
+
+    class SessionOptions:
+        pass
+
+    class InferenceSession:
+        def __init__(self, path, options, providers, enable_fallback):
+            self.falls_back, self.on, self.lost = bool(enable_fallback), providers, False
+
+        def disable_fallback(self):
+            self.falls_back = False
+
+        def get_providers(self):
+            return self.on
+
+        def run(self, names, inputs):
+            if self.lost and not self.falls_back:
+                raise RuntimeError("CUDA failure 719: unspecified launch failure")
+            return [np.array([[1.0, 1, 9, 9]]), np.array([0.9]), np.array([0])]
+
+    @staticmethod
+    def get_available_providers():
+        return ["CUDAExecutionProvider", "CPUExecutionProvider"]
+
+
+def test_a_gpu_that_is_lost_is_no_answer_and_not_the_cpu_under_its_name(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", _Dying)
+    eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]), device="cuda", refine=())
+    assert eye.detect([frame(GREY)], NO_DEADLINE)[0].device == "cuda" and eye.news() == []
+    eye._engine._session.lost = True
+    assert eye.detect([frame(GREY)], NO_DEADLINE) == [None]
+    assert "CUDA failure" in eye.news()[0]
+
+
+@NEEDS_RUNTIME
+def test_the_real_runtime_can_be_told_to_stay_where_it_is(tmp_path: Path) -> None:
+    eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))
+    assert eye._engine._session._enable_fallback is False
+
+
+def test_a_golden_output_is_of_the_models_own_labels_and_least_score(tmp_path: Path, engine: str) -> None:
+    plain = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], min_score="0.1"), refine=())
+    (found,) = plain._seen([Picture(golden_picture(), 1)])
+    assert 0.3 < found[0].score < 0.6
+    golden = golden_text(found)
+    named = detector(brightness_model(tmp_path / "g.onnx", BOXES, [0, 1], golden=golden), names=("a", "b"))
+    assert [one.label for one in named.detect([frame(GREY)], NO_DEADLINE)[0].detections] == ["a", "b"]
+    sure = brightness_model(tmp_path / "s.onnx", BOXES, [0, 1], min_score="0.9", golden="[]")
+    assert len(detector(sure, min_score=0.05).detect([frame(GREY)], NO_DEADLINE)[0].detections) == 2
+    wrong = golden_text([Detection(1, 1, 9, 9, 0.99, "ball")])
+    with pytest.raises(HardwareError, match="ball at"):
+        detector(brightness_model(tmp_path / "w.onnx", BOXES, [0, 1], golden=wrong), names=("a", "b"))
+
+
+@pytest.mark.skipif(not onnx_detector.SHIPPED.is_file(), reason="this copy comes without a model")
+@pytest.mark.parametrize("options", [{"names": ("a",)}, {"min_score": 0.05}, {"min_score": 0.9}])
+def test_the_model_that_comes_along_opens_with_any_names_and_least_score(options: dict) -> None:
+    config = onnx_detector.OnnxDetector.Config(device="cpu", **options)
+    assert onnx_detector.OnnxDetector(config).maker.device == "cpu"
+
+
+def test_labels_of_the_metadata_and_of_the_options_are_made_sayable(tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], words=("", "a\x1b[2J" + "x" * 99))
+    assert onnx_detector.read_onnx_model(onnx_detector.OnnxDetector.Config(address=str(path))).form.labels == (
+        "thing", ("a[2J" + "x" * 99)[:64])
+    named = onnx_detector.OnnxDetector.Config(address=str(path), names=("\n", "b"))
+    assert onnx_detector.read_onnx_model(named).form.labels == ("thing", "b")
+
+
+def test_a_cup_on_a_plate_is_there_beside_the_plate(tmp_path: Path, engine: str) -> None:
+    columns = np.array([[32, 33, 32, 10], [32, 32, 33, 10], [20, 20, 22, 8], [20, 20, 22, 8],
+                        [0.9, 0.8, 0.1, 0.7], [0.1, 0.2, 0.85, 0.1]])
+    eye = detector(yolo_model(tmp_path / "yolo.onnx", columns, names="{0: 'cup', 1: 'plate'}"))
+    (result,) = eye.detect([frame(np.full((64, 64, 3), 90, np.uint8))], NO_DEADLINE)
+    assert [(one.label, round(one.score, 2)) for one in result.detections] == [
+        ("cup", 0.9), ("plate", 0.85), ("cup", 0.7)]

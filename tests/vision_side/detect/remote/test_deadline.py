@@ -1,0 +1,268 @@
+"""Newest only, by the deadline, and what drives while the remote does not answer."""
+
+import math
+import threading
+import time
+
+import pytest
+
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError
+from tests.fixtures.links import until
+from tests.fixtures.vision.remote import GREY_JPEG, frame, within
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.own_decoders import MAX_DECODERS, DecoderPool
+from sightline.vision_side.detect.port import Detection, Maker, result_of
+from sightline.vision_side.detect.remote.deadline import FAILED, DeadlineDetector
+from sightline.vision_side.detect.remote.fallback import GOOD_ANSWERS, RESERVE_US, Fallback
+
+
+class Held:
+    """Answers when it is let go, and notes what it was asked."""
+
+    def __init__(self, name="remote"):
+        self.name, self.asked, self.deadlines = name, [], []
+        self.free = threading.Event()
+        self.free.set()
+        self.good, self.raises, self.closed = True, False, False
+
+    def detect(self, frames, deadline_us):
+        self.asked.append([one.header.seq for one in frames])
+        self.deadlines.append(deadline_us)
+        self.free.wait(10)
+        if self.raises:
+            raise RuntimeError("a plug-in's fault")
+        found = (Detection(1, 2, 3, 4, 0.9, "ball"),)
+        return [result_of(one, found, Maker(self.name)) if self.good else None for one in frames]
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def held():
+    one = Held()
+    yield one
+    one.free.set()
+
+
+@pytest.fixture
+def by_deadline(held):
+    one = DeadlineDetector(held)
+    yield one
+    held.free.set()
+    one.close()
+
+
+# --- by deadline -----------------------------------------------------------------------------------------------------
+
+
+def test_an_answer_in_time_is_given_in_the_frames_order(by_deadline, held):
+    results = by_deadline.detect([frame(1), frame(2, robot="r2")], within(2))
+    assert [(one.robot, one.seq) for one in results] == [("r1", 1), ("r2", 2)] and held.asked == [[1, 2]]
+
+
+def test_who_hangs_is_not_waited_for_longer_than_the_deadline(by_deadline, held):
+    held.free.clear()
+    for seq in (1, 2, 3):
+        began_s = time.monotonic()
+        assert by_deadline.detect([frame(seq)], within(0.05)) == [None]
+        assert time.monotonic() - began_s < 0.15
+    assert by_deadline.detect([frame(4), frame(5)], within(-1)) == [None, None]
+
+
+def test_what_is_over_before_its_turn_is_not_looked_at(by_deadline, held):
+    by_deadline.ask([frame(1)], within(-1))
+    time.sleep(0.05)
+    assert by_deadline.detect([frame(2)], within(2))[0].seq == 2 and held.asked == [[2]]
+
+
+def test_only_the_newest_waits_and_an_answer_that_is_late_is_nobodys(by_deadline, held):
+    held.free.clear()
+    for seq in range(1, 6):
+        by_deadline.detect([frame(seq)], within(0.02))
+    held.free.set()
+    assert by_deadline.detect([frame(6)], within(2))[0].seq == 6
+    assert held.asked == [[1], [6]], "2 to 5 waited in one place, and their time is over"
+    assert by_deadline.overtaken >= 3
+
+
+def test_what_raises_is_no_answer_and_the_next_is_one(by_deadline, held):
+    held.raises = True
+    assert by_deadline.detect([frame(1)], within(2)) == [None]
+    held.raises = False
+    assert by_deadline.detect([frame(2)], within(2))[0].seq == 2
+    assert by_deadline.refused == {FAILED: 1}
+    (line,) = by_deadline.news()
+    assert "RuntimeError: a plug-in's fault" in line
+
+
+def test_nonsense_is_no_answer_and_the_first_is_told():
+    class Strange:
+        def detect(self, frames, deadline_us):
+            beyond = (Detection(1, 2, math.nan, 4, 0.9, "ball"),)
+            return [result_of(one, beyond, Maker("strange")) for one in frames]
+
+    own = Held("own")
+    fallback = Fallback(Strange(), own)
+    assert [_who(fallback, seq) for seq in range(1, 20)] == [["own"]] * 19, "and none of it is a good answer"
+    assert [line for line in fallback.news() if "a number that is none" in line], "why is said"
+    assert fallback.news() == []
+    fallback.close()
+
+
+def test_pixels_of_a_frame_nobody_waits_for_any_more_do_not_get_into_the_next():
+    """The one who asks decodes its next frame while the other still looks at the last."""
+    looking, go_on, seen = threading.Event(), threading.Event(), []
+
+    class Slow:
+        def detect(self, frames, deadline_us):
+            picture = frames[0].picture().bgr
+            before = picture.copy()
+            looking.set()
+            go_on.wait(5)
+            seen.append((before == picture).all())
+            return [None]
+
+    one = DeadlineDetector(Slow())
+    first = frame(1)
+    assert one.detect([first], within(0.5)) == [None] and looking.is_set()
+    grey = type(first)("r1", frame(2).header, GREY_JPEG, first._decoder)
+    assert grey.picture().bgr.std() < 2
+    go_on.set()
+    one.close()
+    assert seen == [True]
+
+
+def test_ever_new_robots_leave_no_more_decoders_than_there_may_be():
+    decoders = DecoderPool(10**7)
+    for number in range(2 * MAX_DECODERS):
+        assert decoders.again(frame(1, robot=f"r{number}")).picture().bgr.shape == (240, 320, 3)
+    assert len(decoders._decoders) == MAX_DECODERS
+
+
+def test_what_fails_to_close_is_told_by_who_closes_it(held, monkeypatch):
+    monkeypatch.setattr(type(held), "close", lambda _self: 1 / 0)
+    with pytest.raises(ConfigError, match=r"close\(\) raises ZeroDivisionError"):
+        DeadlineDetector(held).close()
+
+
+def test_close_ends_the_thread_and_what_is_inside(held):
+    one = DeadlineDetector(held)
+    one.detect([frame(1)], within(2))
+    one.close()
+    assert held.closed and until(lambda: not [some for some in threading.enumerate() if some.name == "detector"])
+
+
+# --- fallback --------------------------------------------------------------------------------------------------------
+
+
+class Asked:
+    """What `FakeRemote` was asked."""
+
+    def __init__(self, results, over, begun=True):
+        self._results, self.over, self.begun = results, over, begun
+
+    def take(self, wait):
+        results, self._results = self._results, None
+        return results
+
+
+class FakeRemote(Held):
+    """Asked without waiting; `state` says how: good, none (no answer that counts), late, overtaken, or under way."""
+
+    state = "good"
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.besides = []
+
+    def detect(self, frames, deadline_us):
+        self.good = self.state == "good"
+        return super().detect(frames, deadline_us)
+
+    def ask(self, frames, deadline_us):
+        self.besides.append(deadline_us)
+        results = self.detect(frames, deadline_us) if self.state in ("good", "none") else None
+        return Asked(results, self.state in ("late", "overtaken"), self.state != "overtaken")
+
+
+def _who(fallback, seq, count=1, robot="r1"):
+    results = fallback.detect([frame(seq + one, robot=robot) for one in range(count)], within(2))
+    return [one and one.detector for one in results]
+
+
+def test_late_once_and_own_eyes_drive_on_in_that_very_frame():
+    remote, own = FakeRemote(), Held("own")
+    fallback = Fallback(remote, own)
+    assert _who(fallback, 1) == ["remote"] and own.asked == []
+    remote.state = "none"
+    deadline_us = within(2)
+    assert fallback.detect([frame(2)], deadline_us)[0].detector == "own"
+    assert remote.deadlines[-1] == deadline_us - RESERVE_US and own.deadlines == [deadline_us]
+    assert "own eyes drive on" in fallback.news()[0] and fallback.switched == 1
+
+
+def test_asked_beside_the_remote_has_no_more_time_than_when_it_drives():
+    """Or one that takes most of the deadline would be good beside, late when it drives, and change each second."""
+    remote = FakeRemote()
+    fallback = Fallback(remote, Held("own"))
+    remote.state = "none"
+    _who(fallback, 1)
+    deadline_us = within(2)
+    fallback.detect([frame(2)], deadline_us)
+    assert remote.besides == [deadline_us - RESERVE_US]
+
+
+def test_of_a_short_deadline_the_remote_has_half():
+    remote = FakeRemote()
+    began_us, deadline_us = monotonic_us(), within(0.01)
+    Fallback(remote, Held("own")).detect([frame()], deadline_us)
+    assert began_us < remote.deadlines[0] <= deadline_us - 4_000
+
+
+def test_it_drives_again_after_ten_good_answers_in_a_row_and_no_earlier():
+    remote, own = FakeRemote(), Held("own")
+    fallback = Fallback(remote, own)
+    remote.state = "none"
+    _who(fallback, 1)
+    for states in (["good"] * (GOOD_ANSWERS - 1) + ["none"], ["late"] * 3, ["good"] * 4 + ["late"]):
+        for seq, state in enumerate(states):
+            remote.state = state
+            assert _who(fallback, 10 + seq) == ["own"]
+    remote.state = "good"
+    assert [_who(fallback, 50 + seq)[0] for seq in range(GOOD_ANSWERS + 1)] == ["own"] * GOOD_ANSWERS + ["remote"]
+    assert "drives again" in fallback.news()[-1]
+
+
+def test_an_answer_under_way_is_waited_for_by_later_frames_not_by_this_one():
+    remote, own = FakeRemote(), Held("own")
+    fallback = Fallback(remote, own)
+    remote.state = "none"
+    _who(fallback, 1)
+    remote.state = "under way"
+    before = len(remote.asked)
+    assert all(_who(fallback, seq) == ["own"] for seq in range(2, 30)) and len(remote.asked) == before
+
+
+def test_of_a_batch_only_what_the_remote_left_out_is_looked_at_by_own_eyes():
+    class Half(FakeRemote):
+        def detect(self, frames, deadline_us):
+            results = super().detect(frames, deadline_us)
+            return [one if one.seq % 2 else None for one in results]
+
+    own = Held("own")
+    assert _who(Fallback(Half(), own), 1, 4) == ["remote", "own", "remote", "own"] and own.asked == [[2, 4]]
+
+
+def test_a_detector_that_can_only_be_waited_for_is_asked_on_its_own_thread(held):
+    fallback = Fallback(held, Hsv(Hsv.Config(hsv=HsvConfig())))
+    held.free.clear()
+    began_s = time.monotonic()
+    result = fallback.detect([frame(1)], within(0.1))[0]
+    assert result.detector == "hsv" and result.detections and time.monotonic() - began_s < 0.2
+    held.free.set()
+    assert until(lambda: fallback.detect([frame(2)], within(0.5))[0].detector == "remote")
+    fallback.close()
+    assert held.closed

@@ -1,0 +1,239 @@
+"""The Open Inference Protocol without a network: requests, answers, and whatever a hostile server may say."""
+
+import contextlib
+import json
+import random
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from tests.fixtures.vision.remote import ASKED, BALL_JPEG, COLUMNS, JPEG_INPUT, OUTPUTS, frame, grpc_answer
+from sightline.vision_side.detect.protobuf import fields, put, put_integers, varint
+from sightline.vision_side.detect.remote.oip import (
+    Inferred,
+    OipModel,
+    OutputOptions,
+    Slot,
+    Tensor,
+    detections_of,
+    model_of,
+    tensor_of,
+)
+from sightline.vision_side.detect.remote.oip_json import read_infer, read_metadata
+from sightline.vision_side.detect.remote.oip_messages import infer_request, metadata_request
+from sightline.vision_side.detect.remote.oip_messages import read_infer as read_grpc
+from sightline.vision_side.detect.remote.oip_messages import read_metadata as read_grpc_metadata
+from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+
+PIXELS = Slot("image", "UINT8", (-1, 240, 320, 3))
+SIZE = (320, 240)
+
+
+def _metadata(inputs, outputs, **more):
+    told = {"inputs": [asdict(one) for one in inputs], "outputs": [asdict(one) for one in outputs]}
+    return json.dumps({"name": "ball", "versions": ["1", "3"], "platform": "x", **told, **more}).encode()
+
+
+def _binary(boxes, scores, labels, **more):
+    """(body, length of its JSON) as Triton answers."""
+    columns = {"boxes": np.float32(boxes), "scores": np.float32(scores), "labels": np.int64(labels)}
+    kinds = {"boxes": "FP32", "scores": "FP32", "labels": "INT64"}
+    head = json.dumps({"id": ASKED, "model_version": "1", "outputs": [
+        {"name": name, "datatype": kinds[name], "shape": column.shape,
+         "parameters": {"binary_data_size": column.nbytes}} for name, column in columns.items()], **more}).encode()
+    return head + b"".join(column.tobytes() for column in columns.values()), str(len(head))
+
+
+def _found(answer, **looking):
+    return detections_of(answer, OutputOptions(**looking), (1.0, 1.0), SIZE)
+
+
+# --- models ----------------------------------------------------------------------------------------------------------
+
+
+def test_metadata_tells_what_to_send():
+    model = read_metadata(_metadata([JPEG_INPUT], OUTPUTS))
+    assert model == OipModel("ball", "3", JPEG_INPUT, ("boxes", "scores", "labels")) and model.takes_jpeg
+    assert not read_metadata(_metadata([PIXELS], OUTPUTS[:2])).takes_jpeg
+
+
+@pytest.mark.parametrize(("inputs", "outputs", "why"), [
+    ([], OUTPUTS, "takes 0 inputs"), ([JPEG_INPUT, PIXELS], OUTPUTS, "takes 2 inputs"),
+    ([Slot("image", "FP32", (1, 3, 240, 320))], OUTPUTS, "FP32; BYTES"), ([PIXELS], OUTPUTS[:1], "scores missing"),
+    ([PIXELS], [], "boxes and scores missing"), ([Slot("image", "UINT8", (240, 320))], OUTPUTS, "no picture"),
+    ([Slot("image", "UINT8", (1, 240, 320, 4))], OUTPUTS, "no picture"),
+    ([Slot("image", "BYTES", (1, 1, 1))], OUTPUTS, "not one JPEG"),
+])  # fmt: skip
+def test_a_model_that_does_not_fit_is_said_in_words(inputs, outputs, why):
+    with pytest.raises(NoAnswerError, match=why) as error:
+        read_metadata(_metadata(inputs, outputs))
+    assert error.value.reason is NoAnswerReason.UNFIT and "docs/remote-detectors.md" in error.value.detail
+
+
+def test_a_jpeg_is_sent_as_one_bytes_element():
+    tensor, stretch = tensor_of(model_of("m", "", [JPEG_INPUT], OUTPUTS), frame(), False)
+    assert tensor.data == len(BALL_JPEG).to_bytes(4, "little") + BALL_JPEG
+    assert (tensor.shape, stretch) == ((1, 1), (1.0, 1.0))
+
+
+@pytest.mark.parametrize(("shape", "sent", "stretch"), [
+    ((-1, 240, 320, 3), (1, 240, 320, 3), (1, 1)), ((240, 320, 3), (240, 320, 3), (1, 1)),
+    ((1, -1, -1, 3), (1, 240, 320, 3), (1, 1)), ((-1, 3, 120, 160), (1, 3, 120, 160), (2, 2)),
+    ((1, 480, 480, 3), (1, 480, 480, 3), (320 / 480, 0.5)),
+])
+def test_pixels_are_sent_at_the_size_that_the_model_takes(shape, sent, stretch):
+    one = frame()
+    tensor, factors = tensor_of(model_of("m", "", [Slot("image", "UINT8", shape)], OUTPUTS), one, False)
+    assert tensor.shape == sent and factors == pytest.approx(stretch) and len(tensor.data) == np.prod(sent)
+    if sent[1:] == (240, 320, 3):
+        assert tensor.data == one.picture().bgr.tobytes()
+
+
+def test_colours_go_in_the_configured_order():
+    model = model_of("m", "", [PIXELS], OUTPUTS)
+    bgr, rgb = (np.frombuffer(tensor_of(model, frame(), order)[0].data, np.uint8).reshape(240, 320, 3)
+                for order in (False, True))
+    assert np.array_equal(bgr[:, :, ::-1], rgb) and not np.array_equal(bgr, rgb)
+
+
+# --- answers ---------------------------------------------------------------------------------------------------------
+
+
+def test_binary_and_json_answers_are_the_same():
+    boxes, scores, labels = [[10, 20, 30, 40], [50, 60, 70, 80]], [0.5, 0.75], [0, 2]
+    body, length = _binary(boxes, scores, labels)
+    plain = json.dumps({"outputs": [
+        {"name": "boxes", "datatype": "FP32", "shape": [2, 4], "data": boxes},
+        {"name": "scores", "datatype": "FP32", "shape": [2], "data": scores},
+        {"name": "labels", "datatype": "INT64", "shape": [2], "data": labels}]}).encode()
+    names = ("ball", "box")
+    found = _found(read_infer(body, length, ASKED), labels=names)
+    assert found == _found(read_infer(plain, None, ASKED), labels=names)
+    assert read_infer(body, length, ASKED).version == "1" and not read_infer(plain, None, ASKED).version
+    assert [(one.label, one.score, one.x1_px) for one in found] == [("2", 0.75, 50), ("ball", 0.5, 10)]
+
+
+@pytest.mark.parametrize(("boxes", "scores", "labels"), [
+    (np.zeros((1, 3, 4)), np.zeros((1, 3)), np.zeros((1, 3))), (np.zeros((3, 4)), np.zeros(3), np.zeros((3, 1))),
+    (np.zeros((1, 1, 3, 4)), np.zeros((3, 1)), np.zeros(3)), (np.zeros((0, 4)), np.zeros(0), np.zeros(0)),
+    (np.zeros((1, 0, 4)), np.zeros((1, 0)), np.zeros((1, 0))),
+])
+def test_padded_rows_are_no_boxes_whatever_the_batch_dimension(boxes, scores, labels):
+    assert _found(read_infer(*_binary(boxes, scores, labels), ASKED)) == ()
+
+
+def test_boxes_in_the_models_pixels_become_those_of_the_picture():
+    outputs = {"boxes": np.array([[10.0, 10, 20, 20]]), "scores": np.array([0.9])}
+    one = detections_of(Inferred(outputs), OutputOptions(("ball",)), (2.0, 3.0), SIZE)[0]
+    assert (one.x1_px, one.y1_px, one.x2_px, one.y2_px, one.label) == (20, 30, 40, 60, "ball")
+
+
+BOXES = [[10, 20, 30, 40]]
+ANSWERS = {
+    "nan box": (_binary([[np.nan, 0, 1, 1]], [0.9], [0]), NoAnswerReason.NOT_FINITE),
+    "infinite score": (_binary(BOXES, [np.inf], [0]), NoAnswerReason.NOT_FINITE),
+    "boxes of five": (_binary([[1, 2, 3, 4, 5]], [0.9], [0]), NoAnswerReason.MALFORMED),
+    "flat boxes": (_binary([1, 2, 3, 4], [0.9], [0]), NoAnswerReason.MALFORMED),
+    "two batches": (_binary(np.zeros((2, 1, 4)), np.zeros((2, 1)), np.zeros((2, 1))), NoAnswerReason.MALFORMED),
+    "more scores": (_binary(BOXES, [0.9, 0.9], [0]), NoAnswerReason.MALFORMED),
+    "more labels": (_binary(BOXES, [0.9], [0, 1]), NoAnswerReason.MALFORMED),
+    "inside out": (_binary([[30, 20, 10, 40]], [0.9], [0]), NoAnswerReason.MALFORMED),
+    "score of two": (_binary(BOXES, [2.0], [0]), NoAnswerReason.MALFORMED),
+    "too many rows": (_binary(np.zeros((1025, 4)), np.zeros(1025), np.zeros(1025)), NoAnswerReason.TOO_MANY),
+    "other frame": (_binary(BOXES, [0.9], [0], id="0000abcd-2"), NoAnswerReason.OTHER_FRAME),
+    "no outputs": ((b'{"outputs":[]}', None), NoAnswerReason.MALFORMED),
+    "html": ((b"<html>", None), NoAnswerReason.MALFORMED),
+    "nested": ((b'{"outputs":' + b"[" * 50_000, None), NoAnswerReason.MALFORMED),
+    "length of text": ((_binary(BOXES, [0.9], [0])[0], "many"), NoAnswerReason.MALFORMED),
+    "length negative": ((_binary(BOXES, [0.9], [0])[0], "-1"), NoAnswerReason.MALFORMED),
+    "length too long": ((_binary(BOXES, [0.9], [0])[0], "99999"), NoAnswerReason.MALFORMED),
+    "binary cut": ((_binary(BOXES, [0.9], [0])[0][:-4], _binary(BOXES, [0.9], [0])[1]), NoAnswerReason.MALFORMED),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ANSWERS)
+def test_a_hostile_answer_is_refused_with_its_reason(name):
+    (body, length), reason = ANSWERS[name]
+    with pytest.raises(NoAnswerError) as error:
+        _found(read_infer(body, length, ASKED))
+    assert error.value.reason is reason and len(error.value.detail) <= 160
+
+
+@pytest.mark.parametrize("output", [
+    {"shape": [-1, 4]}, {"shape": [1 << 40, 4]}, {"shape": [1] * 9}, {"shape": [1024, 1024, 4]}, {"datatype": "FP128"},
+    {"data": [[1, 2, 3]]}, {"data": "text"}, {"data": [[1, 2, 3, "x"]]}, {"data": None}, {"data": [10**400, 1, 1, 1]},
+    {"data": {"a": 1}}, {"parameters": {"binary_data_size": -1}}, {"parameters": {"binary_data_size": 1 << 60}},
+])  # fmt: skip
+def test_a_misshapen_tensor_is_refused(output):
+    usual = {"name": "boxes", "datatype": "FP32", "shape": [1, 4], "data": [1, 2, 3, 4]} | output
+    body = json.dumps({"outputs": [usual, {"name": "scores", "datatype": "FP32", "shape": [1], "data": [1]}]}).encode()
+    with pytest.raises(NoAnswerError):
+        _found(read_infer(body, None, ASKED))
+
+
+# --- gRPC ------------------------------------------------------------------------------------------------------------
+
+
+def test_grpc_messages_say_what_json_says():
+    slots = [put(1, one.name) + put(2, one.datatype) + put_integers(3, one.shape) for one in (JPEG_INPUT, *OUTPUTS)]
+    said = put(1, "ball") + put(2, "1") + put(2, "3") + put(4, slots[0]) + b"".join(put(5, one) for one in slots[1:])
+    assert read_grpc_metadata(said) == read_metadata(_metadata([JPEG_INPUT], OUTPUTS))
+    assert read_grpc(grpc_answer(COLUMNS, version="7"), ASKED).version == "7"
+    assert _found(read_grpc(grpc_answer(COLUMNS), ASKED)) == _found(read_infer(*_binary(*COLUMNS.values()), ASKED))
+    assert dict(fields(metadata_request("ball", "3"))) == {1: b"ball", 2: b"3"}
+
+
+def test_a_grpc_request_names_frame_tensor_and_outputs():
+    model = model_of("ball", "", [JPEG_INPUT], OUTPUTS)
+    said = list(fields(infer_request(model, "", Tensor("image", "BYTES", (1, 1), b"data"), ASKED)))
+    assert (1, b"ball") in said and (3, ASKED.encode()) in said and (7, b"data") in said
+    assert [value for number, value in said if number == 6] == [put(1, name) for name in model.outputs]
+    (sent,) = (value for number, value in said if number == 5)
+    assert dict(fields(sent)) == {1: b"image", 2: b"BYTES", 3: b"\x01\x01"}
+
+
+@pytest.mark.parametrize("value", [0, 1, 127, 128, 300, 2**53, -1, -(2**63)])
+def test_integers_come_back_as_they_went(value):
+    from sightline.vision_side.detect.protobuf import integers
+
+    assert integers(varint(value)) == [value]
+
+
+@pytest.mark.parametrize("data", [
+    b"\xff", b"\xff" * 11, b"\x0a\x05abc", b"\x0b", b"\x0d\x00", put(6, b"x"), put(5, put(3, b"\xff")),
+    grpc_answer(COLUMNS) + put(6, b""), put_integers(5, [1]) + b"\x28\x01", b"\x28\x01" * 5000,
+    put(5, put(1, "boxes") + put(2, "FP32") + put_integers(3, [-1, 4])) + put(6, b""),
+])  # fmt: skip
+def test_what_is_no_answer_over_grpc_is_refused(data):
+    with pytest.raises(NoAnswerError):
+        _found(read_grpc(data, ASKED))
+
+
+def test_an_answer_to_something_else_over_grpc_is_refused():
+    with pytest.raises(NoAnswerError) as error:
+        read_grpc(grpc_answer(COLUMNS, "0000abcd-9"), ASKED)
+    assert error.value.reason is NoAnswerReason.OTHER_FRAME
+
+
+def _is_a_box(one):
+    inside = 0 <= one.x1_px < one.x2_px <= SIZE[0] and 0 <= one.y1_px < one.y2_px <= SIZE[1]
+    return inside and 0.25 <= one.score <= 1 and one.label.isprintable()
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+@pytest.mark.parametrize("kind", ["json", "grpc", "metadata"])
+def test_bytes_at_random_raise_nothing_else(kind, seed):
+    rng = random.Random(seed)
+    body, length = _binary(BOXES, [0.9], [0])
+    usual, read = {
+        "json": (body, lambda data: _found(read_infer(data, length, ASKED))),
+        "grpc": (grpc_answer(COLUMNS), lambda data: _found(read_grpc(data, ASKED))),
+        "metadata": (_metadata([PIXELS], OUTPUTS), lambda data: read_metadata(data) and ()),
+    }[kind]
+    for _ in range(600):
+        data = bytearray(usual)
+        for _ in range(rng.randint(1, 6)):
+            data[rng.randrange(len(data))] = rng.randrange(256)
+        with contextlib.suppress(NoAnswerError):
+            assert all(_is_a_box(one) for one in read(bytes(data[: rng.randint(0, len(data))] or data)))

@@ -1,0 +1,72 @@
+"""`sightline detector --serve` as people start it: a process that is found, answers, says what is wrong, and ends."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from sightline.benchmarks.detector_streams import DEADLINE_MS, measure_streams
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side.processes import Processes
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.vision.remote import within
+from tests.vision_side.detect.remote.test_zenoh_detector import Robot
+from sightline.vision_side.detect.remote.zenoh_detector import ZenohDetector
+
+
+@pytest.mark.parametrize(("arguments", "what"), [
+    (["--serve", "boxes"], "somebody else finds"), (["--serve", "zenoh"], "somebody else finds"),
+    (["--serve", "hvs"], "did you mean 'hsv'"), (["--serve", "http+jpeg://"], "http+jpeg://127.0.0.1:8080/detect"),
+    (["--serve", "oip+http://127.0.0.1"], "names no model"), (["--serve", "hsv", "--device", "gpu"], "device"),
+    (["--serve", "hsv", "--connect", "ws://127.0.0.1:9"], "Zenoh"), (["--serve", "hsv", "--deadline-ms", "0"], "5"),
+    (["--serve", "hsv", "--set", "detector.optoins.x=1"], "options"), (["--serve", "hsv", "check", "hsv"], "by itself"),
+])  # fmt: skip
+def test_what_cannot_be_served_is_one_line_and_exit_code_2(capsys, arguments, what):
+    assert cli.run(["detector", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert what in error and error.count("\n") == 1 and error.startswith("error: ")
+
+
+def test_nobody_at_the_endpoint_is_exit_code_4(capsys):
+    assert cli.run(["detector", "--serve", "hsv", "--connect", free_endpoint()]) == 4
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_process_that_serves_is_found_answers_and_ends_when_it_is_told_to(tmp_path, capsys):
+    endpoint = free_endpoint()
+    robot = Robot("r1", endpoint, listens=True)
+    with robot.link, Processes(tmp_path) as processes, open_zenoh("r1", connect=[endpoint]) as link:
+        detector = ZenohDetector(ZenohDetector.Config())
+        detector.attach(link)
+        processes.start("detector", ["detector", "--serve", "hsv", "--connect", endpoint])
+        processes.wait_line("detector", "hsv for robots *", 20)
+        assert until(lambda: (robot.here(), detector.detect([robot.frame()], within(0.1))[0])[1], 5)
+        assert cli.run(["robots", "--connect", endpoint]) == 0
+        assert "detector  of *" in (said := capsys.readouterr().out) and "hsv on cpu: 1 robots" in said
+        assert processes.end() == []
+        assert "detector: ended; hsv on cpu" in processes.log("detector").read_text()
+
+
+def test_it_ends_within_a_second_of_a_signal(tmp_path):
+    endpoint = free_endpoint()
+    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli.app", "detector", "--serve", "hsv", "--listen", endpoint]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert "for robots" in process.stdout.readline()
+        began_s = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(5) == 0 and time.monotonic() - began_s < 2.0
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+@pytest.mark.slow
+def test_more_streams_than_it_can_look_at_are_served_fairly_and_in_time(tmp_path):
+    load = measure_streams(free_endpoint(), tmp_path, streams=8, seconds=4)
+    assert len(load.answered) == 8 and load.overload > 1.5
+    assert load.p95_ms <= 2 * DEADLINE_MS and load.unfair_percent <= 25, "the bench judges; others load this"

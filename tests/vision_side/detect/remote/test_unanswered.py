@@ -1,0 +1,141 @@
+"""What is told of a remote that is not answered, and when a model server is asked anew what its model is like."""
+
+import json
+import time
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from tests.fixtures.vision.remote import COLUMNS, JPEG_INPUT, OUTPUTS, Server, frame, http_reply, within
+from sightline.vision_side.detect.remote.client import parse_address
+from sightline.vision_side.detect.remote.asking import ServerDetector
+from sightline.vision_side.detect.remote.oip import Inferred, OutputOptions, detections_of
+from sightline.vision_side.detect.remote.oip_http import HttpServer
+from sightline.vision_side.detect.remote.refusing import ErrorCounters, NoAnswerError, NoAnswerReason
+
+
+def _refuse(tally, count):
+    for _ in range(count):
+        tally.refuse(NoAnswerError(NoAnswerReason.LATE, "nothing by the deadline"))
+
+
+def _tally_after(answered, refused, good):
+    tally = ErrorCounters("far")
+    for _ in range(answered):
+        tally.good()
+    _refuse(tally, refused)
+    for _ in range(good):
+        tally.good()
+    return tally
+
+
+@pytest.mark.parametrize("between", [NoAnswerReason.REFUSED, None])
+def test_a_refusal_is_told_at_the_1st_10th_100th_of_its_kind(between):
+    tally, told = ErrorCounters("far"), []
+    for count in range(1, 1001):
+        tally.refuse(NoAnswerError(NoAnswerReason.LATE, "nothing by the deadline"))
+        if between and count < 10:
+            tally.refuse(NoAnswerError(between, "status 503"))
+        told += [(count, line) for line in tally.news.take() if "LATE" in line]
+    assert [count for count, _ in told] == [1, 10, 100, 1000]
+    assert "LATE: nothing by the deadline (1000 so far)" in told[-1][1]
+
+
+@pytest.mark.parametrize(("good", "bad"), [(10, 1), (3, 10), (500, 1)])
+def test_what_goes_bad_again_is_told_again(good, bad):
+    tally = _tally_after(1, 12, good)
+    tally.news.take()
+    _refuse(tally, bad - 1)
+    assert not [line for line in tally.news.take() if "LATE" in line]
+    _refuse(tally, 1)
+    assert "no answer: LATE" in tally.news.take()[0]
+
+
+def test_one_robot_of_two_that_is_not_answered_is_not_two_lines_for_each_frame():
+    tally, told = ErrorCounters("far"), []
+    for _ in range(1000):
+        _refuse(tally, 1)
+        tally.good()
+        told += tally.news.take()
+    assert [line for line in told if "1000 so far" in line] and len(told) == 8
+
+
+class ModelServer(Server):
+    """A server of one model, which it may change; with `closes`, it ends every connection after one answer."""
+
+    def __init__(self, closes):
+        self.headers = ["Connection: close"] if closes else []
+        self.slots, self.told, self.status, self.takes_s = OUTPUTS, 0, "200 OK", 0.0
+        super().__init__(self._answer)
+
+    def _answer(self, request):
+        head, body = request
+        time.sleep(self.takes_s)
+        if head.startswith("GET"):
+            self.told += 1
+            said = {"name": "ball", "versions": ["1"], "platform": "x", "inputs": [asdict(JPEG_INPUT)],
+                    "outputs": [asdict(one) for one in self.slots]}
+        else:
+            asked, _ = json.JSONDecoder().raw_decode(body.decode("latin-1"))
+            said = {"id": asked["id"], "outputs": [_column(one["name"]) for one in asked["outputs"]]}
+        return http_reply(json.dumps(said).encode(), self.status, self.headers)
+
+
+def _column(name):
+    column = COLUMNS[name]
+    kind = {one.name: one.datatype for one in OUTPUTS}[name]
+    return {"name": name, "datatype": kind, "shape": column.shape, "data": column.reshape(-1).tolist()}
+
+
+@pytest.mark.parametrize("closes", [False, True])
+def test_a_model_is_asked_for_once_and_again_after_an_error(closes):
+    with ModelServer(closes) as server:
+        address = f"oip+http://127.0.0.1:{server.port}/ball"
+        detector = ServerDetector(address, HttpServer(parse_address(address), OutputOptions(("ball", "box"))))
+
+        def label(seq):
+            result = detector.detect([frame(seq)], within(2))[0]
+            return result and result.detections[0].label
+
+        assert [label(seq) for seq in range(1, 6)] == ["box"] * 5 and server.told == 1
+        server.status = "500 Internal Server Error"
+        assert label(6) is None
+        server.status, server.slots = "200 OK", OUTPUTS[:2]
+        assert [label(7), label(8)] == ["ball"] * 2 and server.told == 2, "the model became another"
+        port = server.port
+        server.kill()
+        server.start(port)
+        server.slots = OUTPUTS
+        assert label(9) in ("ball", "box") and (closes or label(10) == "box"), "another server, unnoticed if it closes"
+        detector.close()
+
+
+def test_a_server_that_was_late_once_is_not_made_later_by_asking_for_its_model_again():
+    """60 ms for each request of 100: once the model is known that is enough, with its metadata asked for it is not."""
+    with ModelServer(closes=False) as server:
+        detector = ServerDetector("oip", HttpServer(parse_address(f"oip+http://127.0.0.1:{server.port}/ball"), OutputOptions(("b",))))
+        assert detector.detect([frame(1)], within(2)) != [None]
+        server.takes_s = 0.2
+        assert detector.detect([frame(2)], within(0.1)) == [None]
+        server.takes_s = 0.06
+        time.sleep(0.2)
+        seen = [detector.detect([frame(seq)], within(0.1))[0] for seq in range(3, 9)]
+        assert sum(one is not None for one in seen) >= 4 and server.told == 1
+        detector.close()
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.float16, np.int64])
+def test_numbers_of_labels_may_be_written_as_floats(kind):
+    outputs = {"boxes": np.float32([[10, 20, 30, 40], [50, 60, 70, 80]]), "scores": np.float32([0.9, 0.8]),
+               "labels": np.array([1, 7], kind)}
+    found = detections_of(Inferred(outputs), OutputOptions(("ball", "box")), (1.0, 1.0), (320, 240))
+    assert [one.label for one in found] == ["box", "7"]
+
+
+@pytest.mark.parametrize("bad", [0.5, float("nan"), float("inf"), -1e300])
+def test_what_is_no_whole_number_is_no_label(bad):
+    outputs = {"boxes": np.float32([[10, 20, 30, 40]]), "scores": np.float32([0.9]), "labels": np.float64([bad])}
+    with pytest.raises(NoAnswerError) as error:
+        detections_of(Inferred(outputs), OutputOptions(("ball",)), (1.0, 1.0), (320, 240))
+    assert error.value.reason is NoAnswerReason.MALFORMED

@@ -1,0 +1,351 @@
+"""The detector service and `--detector zenoh`, over real Zenoh sessions: frames to one, boxes to the other."""
+
+import threading
+import time
+from collections import Counter
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sightline.operator_side.client.discovery import as_object, lines
+from sightline.protocol.channels import DETECTIONS, FRAME, STATUS
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import (
+    DetectedBox,
+    Detections,
+    DetectionsHeader,
+    Echo,
+    FrameHeader,
+    Stamp,
+    State,
+    Status,
+)
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.transports.zenoh.discovery import peers_at
+from sightline.protocol.transports.zenoh_site import open_fleet
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.vision.remote import BALL_JPEG, GREY_JPEG, frame, within
+from tests.fixtures.vision.vision import jpeg_of
+from sightline.vision_side.config import DetectorConfig, HsvConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.port import DetectFrame
+from sightline.vision_side.detect.remote.zenoh_detector import ZenohDetector
+from sightline.vision_side.detector_service import ROLE, DetectorService, ServingOptions
+
+CORNERS = ("x1_px", "y1_px", "x2_px", "y2_px")
+DEADLINE_S = DetectorConfig().deadline_s
+HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
+
+
+class Robot:
+    """A robot that listens, says that it is there, and sends what it is told to."""
+
+    def __init__(self, name, endpoint, listens=False):
+        ends = {"listen": [endpoint]} if listens else {"connect": [endpoint]}
+        self.name, self.link, self.seq = name, open_zenoh(name, role="robot", **ends), 0
+        self.session = f"{sum(name.encode()):08x}"
+        self.said = self.link.latest(DETECTIONS)
+
+    def here(self):
+        stamp = Stamp(session=self.session, seq=1, t_us=1)
+        self.link.publish(STATUS, encode(stamp), encode(Status(state=State.HOLD, reason="test")))
+
+    def frame(self, jpeg=BALL_JPEG, header=None):
+        """Send one; the frame as a vision would ask about it."""
+        self.seq += 1
+        stamp = FrameHeader(session=self.session, seq=self.seq, t_us=self.seq * 33_333)
+        self.link.publish(FRAME, encode(stamp) if header is None else header, jpeg)
+        return DetectFrame(self.name, stamp, jpeg, Decoder(320, 240, 1920 * 1080))
+
+    def say(self, asked, *boxes, source=ROLE, by="00000009", width_px=320, **changes):
+        """Boxes as a service says them, or as a hostile one does."""
+        echo = Echo(channel="frame", session=asked.header.session, seq=asked.header.seq, t_us=asked.header.t_us)
+        header = DetectionsHeader(source=ROLE, session=by, seq=1, echo=echo.model_copy(update=changes))
+        said = Detections(width_px=width_px, height_px=240, boxes=boxes)
+        self.link.publish(DETECTIONS, encode(header), encode(said), source)
+
+
+@contextmanager
+def _served(service):
+    """Its thread, ended whatever happens: one that is left would keep the whole test run from its end."""
+    over = threading.Event()
+    thread = threading.Thread(target=service.serve, args=(over,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(5)
+
+
+class Bench:
+    """A detector service that is the router, and robots that connect to it."""
+
+    def __init__(self, ending, detector=HSV, **serving):
+        self.endpoint, self.words = free_endpoint(), []
+        site = ending.enter_context(open_fleet("*", listen=[self.endpoint], role=ROLE, about=self._about))
+        self.service = DetectorService(site, detector, ServingOptions("hsv", **serving), self.words.append)
+        ending.enter_context(_served(self.service))
+        self._ending = ending
+
+    def _about(self):
+        return self.service.about()
+
+    def robot(self, name):
+        robot = Robot(name, self.endpoint)
+        self._ending.callback(robot.link.close)
+        assert until(lambda: (robot.here(), f"detector: looks at the pictures of {name}" in self.words)[1])
+        return robot
+
+    def detector(self, *robots):
+        """As a vision has it: attached to a link of each robot."""
+        one = ZenohDetector(ZenohDetector.Config())
+        for name in robots:
+            one.attach(self._ending.enter_context(open_zenoh(name, connect=[self.endpoint])))
+        return one
+
+
+@pytest.fixture
+def bench():
+    with ExitStack() as ending:
+        yield Bench(ending)
+
+
+def _result(robot, detector, jpeg=BALL_JPEG, seconds=0.3):
+    return detector.detect([robot.frame(jpeg)], within(seconds))[0]
+
+
+def test_a_robots_frames_come_back_as_boxes_that_name_them(bench):
+    robot = bench.robot("r1")
+    detector = bench.detector("r1")
+    assert until(lambda: _result(robot, detector))
+    result = _result(robot, detector)
+    expected = HSV.detect([frame()], 0)[0].detections[0]
+    found = result.detections[0]
+    assert [getattr(found, name) for name in CORNERS] == [getattr(expected, name) for name in CORNERS]
+    assert found.circle.radius_px == pytest.approx(expected.circle.radius_px)
+    assert (result.robot, result.session, result.seq) == ("r1", robot.session, robot.seq)
+    assert (result.detector, result.device) == ("hsv", "cpu"), "who looked is said by who looked"
+    assert _result(robot, detector, GREY_JPEG).detections == (), "saw nothing is an answer"
+
+
+def test_one_detector_serves_every_robot_of_a_fleet(bench):
+    robots = [bench.robot(name) for name in ("r1", "r2", "r3")]
+    detector = bench.detector("r1", "r2", "r3")
+    assert until(lambda: all(_result(robot, detector) for robot in robots))
+    for robot in robots:
+        assert (result := _result(robot, detector)).robot == robot.name and result.session == robot.session
+
+
+def test_without_a_link_it_says_so():
+    alone = ZenohDetector(ZenohDetector.Config())
+    assert alone.detect([frame()], within(0.1)) == [None] and alone.refused == {"UNREACHABLE": 1}
+    assert "no link to robot r1" in alone.news()[0]
+
+
+def test_a_bad_picture_and_a_bad_header_get_no_answer_and_are_counted(bench):
+    robot = bench.robot("r1")
+    detector = bench.detector("r1")
+    assert until(lambda: _result(robot, detector))
+    before = bench.service.tallies()["r1"].refused
+    for jpeg in (b"", BALL_JPEG[:300], b"GIF89a"):
+        assert _result(robot, detector, jpeg, seconds=0.05) is None
+    robot.frame(header=b"{}")
+    assert until(lambda: bench.service.tallies()["r1"].refused == before + 4)
+    assert _result(robot, detector) is not None
+
+
+@pytest.mark.parametrize("size", [(1, 1), (15, 400), (8200, 16)])
+def test_a_picture_of_no_cameras_size_is_refused_before_any_detector_sees_it(bench, size):
+    robot, odd = bench.robot("r1"), bench.robot("r2")
+    detector = bench.detector("r1")
+    odd.frame(jpeg_of(np.full((size[1], size[0], 3), 128, np.uint8)))
+    assert until(lambda: "r2" in (of := bench.service.tallies()) and of["r2"].refused == 1)
+    assert until(lambda: _result(robot, detector)) and len(bench.words) == 2, bench.words
+
+
+class Faulty:
+    """Does what a plug-in should not, one thing for each frame; then it looks."""
+
+    def __init__(self):
+        self.asked = 0
+
+    def detect(self, frames, deadline_us):
+        self.asked += 1
+        if self.asked == 1:
+            raise RuntimeError("out of memory")
+        if self.asked == 2:
+            return []
+        seen = HSV.detect(frames, deadline_us)
+        return [replace(one, seq=one.seq + 1) for one in seen] if self.asked == 3 else seen
+
+
+def test_a_detector_that_fails_gives_no_answer_and_the_service_goes_on():
+    with ExitStack() as ending:
+        faulty = Faulty()
+        bench = Bench(ending, faulty)
+        robot = bench.robot("r1")
+        for asked in (1, 2, 3):
+            robot.frame()
+            assert until(lambda asked=asked: getattr(bench.service.tallies().get("r1"), "refused", 0) == asked)
+        detector = bench.detector("r1")
+        assert until(lambda: _result(robot, detector)), "and then it looks"
+        assert [line for line in bench.words if "out of memory" in line], bench.words
+        assert len(bench.words) == 4, "each reason once"
+
+
+def test_it_is_seen_by_who_asks_who_is_there_with_its_model_device_and_health(bench):
+    robot = bench.robot("r1")
+    detector = bench.detector("r1")
+    assert until(lambda: _result(robot, detector))
+    peers = peers_at([bench.endpoint], 2.0)
+    said = next(line for line in lines({}, peers) if line.startswith("detector"))
+    assert "of *" in said and "hsv on cpu: 1 robots" in said and "p95 age" in said
+    assert "hsv on cpu" in next(one["about"] for one in as_object({}, peers)["peers"] if one["role"] == "detector")
+
+
+def test_a_service_that_is_gone_is_no_answer_by_the_deadline_and_back_by_itself():
+    endpoint = free_endpoint()
+    with ExitStack() as ending:
+        robot = Robot("r1", endpoint, listens=True)
+        ending.callback(robot.link.close)
+        detector = ZenohDetector(ZenohDetector.Config())
+        detector.attach(ending.enter_context(open_zenoh("r1", connect=[endpoint])))
+        for _ in range(2):
+            assert not _result(robot, detector, seconds=0.05)
+            with (
+                open_fleet("*", connect=[endpoint], role=ROLE) as site,
+                _served(DetectorService(site, HSV, ServingOptions("hsv"), lambda line: None)),
+            ):
+                assert until(lambda: (robot.here(), _result(robot, detector, seconds=DEADLINE_S))[1], 3.0)
+        assert "LATE" in detector.refused and any("answers again" in line for line in detector.news())
+
+
+# --- hostile answers -------------------------------------------------------------------------------------------------
+
+BOX = DetectedBox(label="ball", score=0.9, x1_px=10.0, y1_px=10.0, x2_px=30.0, y2_px=30.0)
+
+
+@pytest.fixture
+def pair():
+    """A robot, and who waits for boxes over a link of its own."""
+    endpoint = free_endpoint()
+    with ExitStack() as ending:
+        robot = Robot("r1", endpoint, listens=True)
+        robot.link.ignore(DETECTIONS)  # or the service would take the robot for who waits
+        service = open_zenoh("r1", connect=[endpoint], role=ROLE)
+        link = open_zenoh("r1", connect=[endpoint])
+        for one in (robot.link, service, link):
+            ending.callback(one.close)
+        waiting = ZenohDetector(ZenohDetector.Config())
+        waiting.attach(link)
+        robot.link = service
+        assert until(lambda: service.has_listener(DETECTIONS))
+        yield robot, waiting
+
+
+@pytest.mark.parametrize(("changes", "reason"), [
+    ({"session": "0000ffff"}, "OTHER_FRAME"), ({"t_us": 1}, "OTHER_FRAME"), ({"seq": 0, "t_us": 10**9}, "OTHER_FRAME"),
+    ({"seq": 9, "t_us": 1}, "OTHER_FRAME"), ({"channel": "status"}, "OTHER_FRAME"), ({"width_px": 640}, "OTHER_SIZE"),
+])  # fmt: skip
+def test_boxes_of_another_frame_or_size_are_refused_and_counted(pair, changes, reason):
+    robot, waiting = pair
+    asked = frame(3)
+    robot.say(asked, BOX, **changes)
+    waited = Counter()
+
+    def is_refused():
+        """Every wait that ends without an answer is itself LATE."""
+        waited["LATE"] += 1
+        assert waiting.detect([asked], within(0.05)) == [None]
+        return waiting.refused - waited
+
+    assert until(is_refused) and waiting.refused - waited == {reason: 1}
+    robot.say(asked, BOX)
+    assert until(lambda: waiting.detect([asked], within(0.05))[0])
+
+
+@pytest.mark.parametrize("payload", [
+    b"", b"{", b"<html>", b"[" * 9_000, b'{"width_px":320,"height_px":240,"boxes":[{}]}', b"\xff" * 32_768,
+    b'{"width_px":320,"height_px":240,"boxes":[NaN]}',
+])  # fmt: skip
+def test_what_is_no_detections_message_is_refused_and_counted(pair, payload):
+    robot, waiting = pair
+    asked = frame(3)
+    echo = Echo(channel="frame", session=asked.header.session, seq=3, t_us=asked.header.t_us)
+    robot.link.publish(DETECTIONS, encode(DetectionsHeader(source=ROLE, session="00000009", seq=1, echo=echo)), payload)
+    assert until(lambda: waiting.detect([asked], within(0.05)) == [None] and waiting.refused["MALFORMED"])
+
+
+def test_boxes_of_an_older_frame_are_nobodys_and_no_news(pair):
+    """Vision asks about the newest frame and leaves others out; the service looks at all of them."""
+    robot, waiting = pair
+    for seq in range(4):
+        robot.say(frame(seq), BOX)
+        time.sleep(0.02)
+    assert waiting.detect([frame(9)], within(0.1)) == [None] and waiting.refused == {"LATE": 1}
+
+
+def test_of_two_services_one_is_kept_to_until_it_is_silent(pair):
+    """Two trackers' identities, or two models' boxes in turns, would steer by neither."""
+    robot, waiting = pair
+    other = DetectedBox(label="box", score=0.9, x1_px=50.0, y1_px=10.0, x2_px=90.0, y2_px=30.0)
+    robot.say(frame(2), BOX, by="00000001")
+    labels = {one.label for one in waiting.detect([frame(2)], within(1.0))[0].detections}
+    for seq in range(3, 9):
+        for box, by in sorted(((BOX, "00000001"), (other, "00000002")), key=lambda pair: pair[1], reverse=seq % 2):
+            robot.say(frame(seq), box, by=by)
+        labels |= {one.label for one in waiting.detect([frame(seq)], within(1.0))[0].detections}
+    assert labels == {"ball"} and not waiting.refused
+    assert sum("several services look at robot r1" in line for line in waiting.news()) == 1
+    time.sleep(0.6)
+    robot.say(frame(9), other, by="00000002")
+    assert waiting.detect([frame(9)], within(1.0))[0].detections[0].label == "box", "the first one is gone"
+
+
+def test_who_talks_nonsense_keeps_no_service_out(pair):
+    robot, waiting = pair
+    for seq in range(3, 6):
+        robot.say(frame(seq), BOX, by="00000002", session="0000ffff")
+        assert waiting.detect([frame(seq)], within(0.1)) == [None]
+        robot.say(frame(seq + 10), BOX, by="00000001")
+        assert waiting.detect([frame(seq + 10)], within(1.0))[0]
+
+
+def test_anothers_boxes_are_not_even_looked_at(pair):
+    robot, waiting = pair
+    asked = frame(3)
+    robot.say(asked, BOX, source="guest")
+    assert waiting.detect([asked], within(0.1)) == [None] and waiting.refused == {"LATE": 1}
+
+
+@pytest.mark.parametrize("ahead_us", [10**12, 900_000])
+def test_boxes_of_a_frame_that_never_was_do_not_stand_in_the_way_for_long(pair, ahead_us):
+    robot, waiting = pair
+    robot.say(frame(3), BOX, seq=10**9, t_us=frame(3).header.t_us + ahead_us)
+    assert until(lambda: waiting.detect([frame(3)], within(0.05)) == [None] and waiting.refused["OTHER_FRAME"])
+    seq = 3 + ahead_us // 33_333 + 1 if ahead_us < 10**6 else 4  # once the frames are past it, at once if it is far off
+    robot.say(frame(seq), BOX)
+    assert waiting.detect([frame(seq)], within(1.0))[0], "one message must not blind it for good"
+
+
+def test_who_lags_behind_gets_the_boxes_that_were_kept_for_it_though_newer_ones_came(pair):
+    robot, waiting = pair
+    for said, asked, is_answered in ((5, 4, False), (6, 5, True)):
+        robot.say(frame(said), BOX)
+        time.sleep(0.05)
+        answer = waiting.detect([frame(asked)], within(0.5))[0]
+        assert (answer is not None) is is_answered, (asked, waiting.refused)
+
+
+def test_boxes_of_a_newer_frame_end_the_waiting_and_are_kept_for_it(pair):
+    robot, waiting = pair
+    asked, newer = frame(3), frame(4)
+    robot.say(newer, BOX)
+    began_s = time.monotonic()
+    assert waiting.detect([asked], within(2.0)) == [None] and waiting.refused == {"OTHER_FRAME": 1}
+    assert time.monotonic() - began_s < 1.0
+    assert waiting.detect([newer], within(0.5))[0].detections[0].x2_px == BOX.x2_px

@@ -1,0 +1,172 @@
+"""The contract kit: our own detectors keep every promise, and each broken one is found out by the promise it breaks."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+
+from sightline.protocol.messages import MAX_DETECTED_BOXES
+from tests.contracts.detectors import assert_kept
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.registry import build_detector
+from sightline.vision_side.detect.colour_filter import ColorFilter
+from sightline.vision_side.detect.contract import check_detector
+from sightline.vision_side.detect.filters import LabelFilter
+from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Detection, DetectionResult
+from sightline.vision_side.detect.remote.fallback import Fallback
+from sightline.vision_side.detect.shadow import ShadowDetector
+from sightline.vision_side.detect.tracked import TrackIds
+
+CONFIG = VisionConfig()
+
+
+def hsv() -> Hsv:
+    return Hsv(Hsv.Config())
+
+
+@pytest.mark.parametrize("name", ["hsv", "adaptive"])
+def test_our_own_keep_every_promise(name: str) -> None:
+    assert_kept(lambda: build_detector(name, {}, CONFIG))
+
+
+@pytest.mark.parametrize(
+    "around",
+    [TrackIds, lambda one: ColorFilter(one, CONFIG.hsv.ranges), lambda one: LabelFilter(one, ("target",)),
+     lambda one: ShadowDetector(one, hsv(), "hsv", 10**7), lambda one: Fallback(one, hsv())],
+    ids=["tracked", "colour", "label", "shadow", "fallback"],
+)
+def test_what_is_around_a_detector_keeps_them_too(around) -> None:
+    assert_kept(lambda: around(hsv()), seed=11)
+
+
+class Broken:
+    """The colour detector with one fault."""
+
+    def __init__(self) -> None:
+        self.inner = hsv()
+        self.calls = 0
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        self.calls += 1
+        return self.inner.detect(frames, deadline_us)
+
+
+class Backwards(Broken):
+    def detect(self, frames, deadline_us):
+        return super().detect(frames, deadline_us)[::-1]
+
+
+class Short(Broken):
+    def detect(self, frames, deadline_us):
+        return super().detect(frames, deadline_us)[:1]
+
+
+class Tired(Broken):
+    def detect(self, frames, deadline_us):
+        found = super().detect(frames, deadline_us)
+        return [None] * len(found) if self.calls % 5 == 0 else found
+
+
+class Beyond(Broken):
+    def detect(self, frames, deadline_us):
+        wild = Detection(-5.0, 0.0, 5000.0, 10.0, 0.5, "target")
+        return [one and replace(one, detections=(wild,)) for one in super().detect(frames, deadline_us)]
+
+
+class Sure(Broken):
+    def detect(self, frames, deadline_us):
+        wild = Detection(1.0, 1.0, 9.0, 10.0, 1.5, "target")
+        return [one and replace(one, detections=(wild,)) for one in super().detect(frames, deadline_us)]
+
+
+class Flat(Broken):
+    def detect(self, frames, deadline_us):
+        flat = Detection(1.0, 1.0, 9.0, 10.0, 0.5, "target", Circle(5.0, 5.0, 0.0))
+        return [one and replace(one, detections=(flat,)) for one in super().detect(frames, deadline_us)]
+
+
+class Numbered(Broken):
+    def detect(self, frames, deadline_us):
+        odd = Detection(1.0, 1.0, 9.0, 10.0, 0.5, "target", track_id=-1)
+        return [one and replace(one, detections=(odd,)) for one in super().detect(frames, deadline_us)]
+
+
+class Crowded(Broken):
+    def detect(self, frames, deadline_us):
+        many = (Detection(1.0, 1.0, 9.0, 10.0, 0.5, "target"),) * (MAX_DETECTED_BOXES + 1)
+        return [one and replace(one, detections=many) for one in super().detect(frames, deadline_us)]
+
+
+class Raising(Broken):
+    def detect(self, frames, deadline_us):
+        for one in frames:
+            one.picture()
+        return super().detect(frames, deadline_us)
+
+
+class Inventing(Broken):
+    """Says "saw nothing" where it had nothing to look at."""
+
+    def detect(self, frames, deadline_us):
+        good = super().detect(frames, deadline_us)
+        return [one or self.empty(frame) for frame, one in zip(frames, good, strict=True)]
+
+    @staticmethod
+    def empty(frame):
+        return DetectionResult(frame.robot, frame.header.session, frame.header.seq, frame.header.t_us, frame.width_px,
+                               frame.height_px, (), "broken", "", "cpu")
+
+
+class Slow(Broken):
+    def detect(self, frames, deadline_us):
+        import time
+
+        if deadline_us != NO_DEADLINE:
+            time.sleep(0.3)
+        return super().detect(frames, deadline_us)
+
+
+class Moody(Broken):
+    counter = 0
+
+    def __init__(self) -> None:
+        super().__init__()
+        Moody.counter += 1
+        self.mood = Moody.counter % 2
+
+    def detect(self, frames, deadline_us):
+        box = Detection(10.0 * self.mood, 1.0, 10.0 * self.mood + 9.0, 10.0, 0.9, "target")
+        return [one and replace(one, detections=(box,)) for one in super().detect(frames, deadline_us)]
+
+
+class Mixing(Broken):
+    """Remembers what any robot saw."""
+
+    def detect(self, frames, deadline_us):
+        results = []
+        for one in super().detect(frames, deadline_us):
+            x = float(min(200, self.calls + 40 * len(results)))
+            results.append(one and replace(one, detections=(Detection(x, 1.0, x + 9.0, 10.0, 0.9, "target"),)))
+        return results
+
+
+class Nameless(Broken):
+    def detect(self, frames, deadline_us):
+        return [one and replace(one, device="") for one in super().detect(frames, deadline_us)]
+
+
+class Halved(Broken):
+    def detect(self, frames, deadline_us):
+        return [one and replace(one, compute_us=12.5) for one in super().detect(frames, deadline_us)]
+
+
+@pytest.mark.parametrize(
+    ("broken", "promise"),
+    [(Backwards, "order"), (Short, "order"), (Tired, "answering"), (Beyond, "bounds"), (Sure, "bounds"),
+     (Flat, "bounds"), (Numbered, "bounds"), (Crowded, "bounds"),
+     (Raising, "silence"), (Inventing, "silence"), (Slow, "deadline"), (Moody, "the_same"), (Mixing, "robots_apart"),
+     (Nameless, "its_name"), (Halved, "its_name")],
+)
+def test_a_broken_one_is_found_out_by_the_promise_that_it_breaks(broken: type[Broken], promise: str) -> None:
+    assert promise in {one.name for one in check_detector(broken, 3) if one.wrong}

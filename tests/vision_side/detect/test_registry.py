@@ -1,0 +1,182 @@
+"""Detectors by name: what is built in, addresses, options, what goes around them, and every mistake as one line."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.messages import FrameHeader
+from tests.fixtures.vision.onnx import brightness_model, without_gpu
+from sightline.vision_side import plugins as plugin_choice
+from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.registry import (
+    GROUP,
+    REGISTRY,
+    build_detector,
+    configured_detector,
+    is_plain,
+    split_kind,
+)
+from sightline.vision_side.detect.colour_filter import ColorFilter
+from sightline.vision_side.detect.filters import LabelFilter
+from sightline.vision_side.detect.color.detectors import Adaptive, Hsv
+from sightline.vision_side.detect.onnx.detector import OnnxDetector
+from sightline.vision_side.detect.port import DetectFrame, result_of
+from sightline.vision_side.detect.shadow import ShadowDetector
+from sightline.vision_side.detect.tracked import TrackIds
+
+
+@pytest.fixture(autouse=True)
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is said of a missing device is the same on a machine that has one."""
+    without_gpu(monkeypatch)
+
+
+class Mine:
+    """A plug-in in a test, as a person's own file would have it."""
+
+    class Config(Settings):
+        address: str = ""
+        robot: str = ""
+        deadline_s: float = 0.0
+        sure: bool = False
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+
+    def detect(self, frames, deadline_us):
+        return [result_of(one, (), None) for one in frames]
+
+
+class NoConfig:
+    """Looks like a detector."""
+
+
+MINE = f"{__name__}:Mine"
+
+
+def config(**detector: object) -> VisionConfig:
+    return VisionConfig(robot="r7", detector=DetectorConfig(**detector))
+
+
+def test_every_built_in_name_can_be_imported() -> None:
+    assert {"hsv", "adaptive", "onnx", "zenoh", "oip+http", "oip+grpc", "http+jpeg"} <= set(REGISTRY.names())
+    for name in REGISTRY.built_in:
+        assert hasattr(REGISTRY.load(name), "detect") and hasattr(REGISTRY.load(name), "Config")
+
+
+@pytest.mark.parametrize(
+    ("kind", "parts"),
+    [("hsv", ("hsv", "")), ("onnx:my/ball.onnx", ("onnx", "my/ball.onnx")),
+     ("onnx:C:/ball.onnx", ("onnx", "C:/ball.onnx")),
+     ("oip+http://box:8000/ball", ("oip+http", "oip+http://box:8000/ball")), ("my_eyes:Eyes", ("my_eyes:Eyes", "")),
+     ("zenoh:operator", ("zenoh", "operator"))],
+)
+def test_a_name_and_what_stands_after_it(kind: str, parts: tuple[str, str]) -> None:
+    assert split_kind(kind) == parts
+
+
+def test_the_plain_colour_detector_needs_nothing_around_it() -> None:
+    assert configured_detector(VisionConfig()) is None
+    assert is_plain(VisionConfig())
+    assert isinstance(configured_detector(config(options={"label": "ball"})), Hsv)
+    assert isinstance(configured_detector(config(kind="adaptive")), Adaptive)
+    assert configured_detector(config(kind="boxes")) is None
+
+
+def test_a_class_of_ones_own_gets_its_options_and_what_vision_knows() -> None:
+    made = build_detector(MINE, {"sure": True}, config(deadline_s=0.2))
+    assert isinstance(made, Mine)
+    assert made.config == Mine.Config(robot="r7", deadline_s=0.2, sure=True)
+    assert build_detector(MINE, {"robot": "other"}, config()).config.robot == "other"
+
+
+def test_hsv_takes_the_section_of_its_name_with_its_options_over_it() -> None:
+    settings = VisionConfig.model_validate({"hsv": {"min_radius_px": 9.0}})
+    made = build_detector("hsv", {"hsv": {"max_contours": 2}}, settings)
+    assert (made._eye._config.min_radius_px, made._eye._config.max_contours) == (9.0, 2)
+
+
+def test_what_is_around_it_is_built_from_the_inside_out() -> None:
+    made = configured_detector(config(labels=("ball",), only_colour=True, tracked=True, shadow="adaptive"))
+    assert isinstance(made, ShadowDetector)
+    made.close()
+    tracked = made._eyes[0]
+    assert isinstance(tracked, TrackIds) and isinstance(tracked.inner, ColorFilter)
+    assert isinstance(tracked.inner.inner, LabelFilter) and isinstance(tracked.inner.inner.inner, Hsv)
+
+
+def test_a_fallback_lets_pass_what_vision_lets_pass() -> None:
+    large = (2000, 1200)
+    jpeg = cv2.imencode(".jpg", np.full((large[1], large[0], 3), 120, np.uint8))[1].tobytes()
+    made = configured_detector(config(fallback="adaptive").model_copy(update={"max_pixels": 3_000_000}))
+    header = FrameHeader(session="0000abcd", seq=1, t_us=1)
+    (result,) = made.detect([DetectFrame("r1", header, jpeg, Decoder(*large, 3_000_000))], monotonic_us() + 2_000_000)
+    made.close()
+    assert result.detector == "hsv" and made.switched == 0
+
+
+@pytest.mark.parametrize(
+    ("detector", "words"),
+    [
+        ({"kind": "hsw"}, "no detector called 'hsw'; did you mean 'hsv'"),
+        ({"kind": "nowhere:Eyes"}, "'nowhere:Eyes' cannot be loaded"),
+        ({"kind": "onx:ball"}, "No module named 'onx'; did you mean 'onnx'?"),
+        ({"kind": "onx:models/ball.onnx"}, "no detector called 'onx:models/ball.onnx'; did you mean 'onnx'?"),
+        ({"kind": "http://box/detect"}, "no detector called 'http://box/detect'; did you mean 'oip+http'?; there are"),
+        ({"kind": f"{__name__}:Gone"}, "cannot be loaded"),
+        ({"kind": f"{__name__}:NoConfig"}, "no pydantic model called Config"),
+        ({"kind": "hsv:red"}, "takes nothing after its name, not 'red'"),
+        ({"kind": "hsv", "options": {"hue": 3}}, "unknown option 'hue'; it takes hsv, label"),
+        ({"kind": "onnx:/nowhere/ball.onnx"}, "No such file"),
+        ({"kind": "adaptive", "options": {"confirm": 0}}, "option 'confirm'"),
+        ({"kind": "hsv", "device": "cuda"}, "no device to choose"),
+        ({"kind": "boxes", "shadow": "hsv"}, "detector.shadow goes with a detector that runs here"),
+        ({"kind": "boxes", "device": "cuda"}, "detector.device goes with a detector that runs here"),
+        ({"kind": "boxes", "options": {"min_score": 0.5}}, "detector.options goes with a detector that runs here"),
+        ({"kind": "boxes", "shadow_options": {"a": 1}}, "detector.shadow_options goes with"),
+        ({"kind": "hsv", "shadow": "hsw"}, "did you mean 'hsv'"),
+    ],
+)
+def test_every_mistake_is_one_line(detector: dict, words: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(words)) as refused:
+        configured_detector(config(**detector))
+    assert "\n" not in str(refused.value) and len(str(refused.value)) < 300
+
+
+class Entry:
+    """An entry point as an installed package has it."""
+
+    def __init__(self, name: str, loaded: object) -> None:
+        self.name, self.loaded = name, loaded
+
+    def load(self) -> object:
+        if isinstance(self.loaded, Exception):
+            raise self.loaded
+        return self.loaded
+
+
+def test_an_installed_package_brings_its_detectors_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    installed = [Entry("lens", Mine), Entry("broken", ImportError("no module named lens"))]
+    monkeypatch.setattr(plugin_choice, "entry_points", lambda group: installed if group == GROUP else [])
+    made = build_detector("lens:/dev/lens0", {"sure": True}, config())
+    assert isinstance(made, Mine) and made.config == Mine.Config(address="/dev/lens0", robot="r7", deadline_s=0.1,
+                                                                 sure=True)
+    assert isinstance(configured_detector(config(kind="lens", tracked=True)).inner, Mine)
+    with pytest.raises(ConfigError, match="'broken' cannot be loaded: no module named lens"):
+        build_detector("broken", {}, config())
+    with pytest.raises(ConfigError, match="did you mean 'lens'"):
+        build_detector("lense", {}, config())
+
+
+def test_a_device_is_handed_to_who_can_have_one(tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0])
+    assert isinstance(configured_detector(config(kind=f"onnx:{path}", device="cpu")), OnnxDetector)
+    with pytest.raises(HardwareError, match="--device cuda"):
+        configured_detector(config(kind=f"onnx:{path}", device="cuda"))

@@ -1,0 +1,220 @@
+"""Missions: the contract over all that there are, how one is chosen, and the older laws with their own numbers."""
+
+import math
+import re
+import tomllib
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import STILL, CameraModel, FrameHeader
+from sightline.protocol.mission_messages import MissionRequest
+from tests.contracts.missions import CAMERA, check_mission
+from sightline.vision_side import plugins as plugin_choice
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.port import Circle, Detection
+from sightline.vision_side.missions import registry as choice
+from sightline.vision_side.missions.registry import BUILT_IN, configured_mission, mission_spec, requested_mission
+from sightline.vision_side.missions.port import Plan, View
+
+CONFIG = VisionConfig()
+ROOT = Path(__file__).parent.parent.parent.parent
+WAYPOINTS = {"waypoints": [[1.0, 0.5], [0.0, -1.0]]}
+
+
+def options_of(name: str) -> dict:
+    return WAYPOINTS if name.startswith("goto") else {}
+
+
+@pytest.mark.parametrize("seed", [7, 19])
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_every_mission_keeps_the_contract(name, seed):
+    check_mission(mission_spec(name, options_of(name), CONFIG), frames=120, seed=seed)
+
+
+class Raising:
+    """A mission that breaks the contract."""
+
+    Config = BUILT_IN and mission_spec("band", {}, CONFIG).plugin.Config
+
+    def __init__(self, config, camera):
+        self.count = 0
+
+    def step(self, view):
+        self.count += 1
+        return Plan(STILL, "fine" if self.count < 50 else "two\nlines")
+
+
+def test_the_contract_finds_what_is_broken():
+    with pytest.raises(AssertionError, match="one line"):
+        check_mission(mission_spec(f"{__name__}:Raising", {}, CONFIG))
+
+
+# --- choosing --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "options", "words"), [
+    ("folow", {}, "no mission called 'folow'; did you mean 'follow'?"),
+    ("os:nothing", {}, "cannot be loaded"),
+    ("no_such_package:Name", {}, "cannot be loaded: No module named"),
+    ("math:pi", {}, "no pydantic model called Config"),
+    ("band", {"centre_shere": 0.1}, "unknown option 'centre_shere'; it takes"),
+    ("band", {"centre_share": 3}, "option 'centre_share': Input should be less than or equal to 1"),
+    ("band", {"centre_share": float("nan")}, "centre_share"),
+    ("follow", {"target": {"radius_m": -1}}, "option 'target.radius_m'"),
+    ("follow", {"target": 3}, "option 'target'"),
+    ("goto", {}, "option 'waypoints' is missing"),
+])
+def test_what_cannot_be_chosen_is_one_line_that_says_why(kind, options, words):
+    with pytest.raises(ConfigError) as error:
+        mission_spec(kind, options, CONFIG)
+    assert words in str(error.value) and len(str(error.value).splitlines()) == 1
+
+
+def test_an_entry_point_gives_a_mission_its_name(monkeypatch):
+    shy = EntryPoint("shy", "examples.my_mission:Shy", choice.GROUP)
+    broken = EntryPoint("broken", "examples.nothing:There", choice.GROUP)
+    monkeypatch.setattr(plugin_choice, "entry_points", lambda group: [shy, broken] if group == choice.GROUP else [])
+    monkeypatch.chdir(ROOT)
+    assert requested_mission(MissionRequest(id=1, name="shy", options={"near_px": 12}), CONFIG).config.near_px == 12
+    with pytest.raises(ConfigError, match="'broken' cannot be loaded"):
+        mission_spec("broken", {}, CONFIG)
+    with pytest.raises(ConfigError, match="did you mean 'shy'"):
+        mission_spec("shi", {}, CONFIG)
+
+
+def test_a_mission_begins_with_the_sections_of_vision_and_its_options_lie_over_them():
+    config = VisionConfig.model_validate({"target": {"stand_off_m": 0.5, "radius_m": 0.07}, "mission": {
+        "options": {"target": {"stand_off_m": 1.5}, "steer": {"bearing_kp": 2}}}})
+    made = configured_mission(config).config
+    assert (made.target.stand_off_m, made.target.radius_m, made.steer.bearing_kp) == (1.5, 0.07, 2.0)
+    assert made.track == config.track
+
+
+def test_what_is_asked_for_lies_over_what_is_configured_for_the_same_mission():
+    config = VisionConfig.model_validate({"mission": {"kind": "band", "options": {"averaged": 3, "linear_mps": 0.3}}})
+    asked = requested_mission(MissionRequest(id=1, name="band", options={"linear_mps": 0.2}), config)
+    assert (asked.config.averaged, asked.config.linear_mps) == (3, 0.2)
+    assert requested_mission(MissionRequest(id=1, name="follow", options={"steer.bearing_kp": 3}), config
+                     ).config.steer.bearing_kp == 3
+    assert config.mission.options == {"averaged": 3, "linear_mps": 0.3}
+    others = config.model_copy(update={"missions": {"goto": {"sight_m": 2.0, "waypoints": [[9, 9]]}}})
+    goto = requested_mission(MissionRequest(id=1, name="goto", waypoints=((1.0, 2.0),)), others)
+    assert goto.config.waypoints == ((1.0, 2.0),) and goto.wants_scan and not goto.needs_camera
+    assert goto.config.sight_m == 2.0
+
+
+# --- the older laws --------------------------------------------------------------------------------------------------
+
+
+def ball(x_px: float, radius_px: float) -> Detection:
+    box = (x_px - radius_px, 120 - radius_px, x_px + radius_px, 120 + radius_px)
+    return Detection(*box, 1.0, "target", Circle(x_px, 120.0, radius_px))
+
+
+def view(*detections: Detection, t_us: int = 1_000_000, camera: CameraModel = CAMERA) -> View:
+    return View(FrameHeader(session="0000abcd", seq=1, t_us=t_us), 0.033, 0.06, camera, detections)
+
+
+def twist_of(mission, *seen: View) -> tuple[float, float]:
+    for one in seen:
+        plan = mission.step(one)
+    return plan.twist.linear_mps, plan.twist.angular_rad_s
+
+
+def mission(name: str, **options):
+    return mission_spec(name, options, CONFIG).build(CAMERA)
+
+
+@pytest.mark.parametrize(("x_px", "radius_px", "linear_angular"), [
+    (159, 15.9, (0.0, 0.0)),  # below 5 % of 320
+    (159, 16, (0.1, 0.0)),
+    (159, 106.6, (0.1, 0.0)),
+    (159, 106.7, (0.0, 0.0)),  # above a third
+    (255, 40, (0.1, 0.0)),  # 96 pixels: 30 % of the width, not of half of it
+    (256, 40, (0.1, -0.5)),  # the target is right: turn right
+    (62, 40, (0.1, 0.5)),
+    (63, 40, (0.1, 0.0)),
+])
+def test_band_steering_has_the_write_ups_bands(x_px, radius_px, linear_angular):
+    assert twist_of(mission("band"), view(ball(x_px, radius_px))) == linear_angular
+
+
+def test_band_steering_averages_five_positions_and_takes_the_largest_target():
+    law = mission("band")
+    for _ in range(4):
+        law.step(view(ball(60, 40)))
+    assert twist_of(law, view(ball(160, 40), ball(300, 20))) == (0.1, 0.0)  # mean 80: 79 left of the middle, forward
+    for _ in range(4):
+        law.step(view(ball(260, 40)))
+    assert twist_of(law, view(ball(300, 40))) == (0.1, -0.5)
+    assert twist_of(law, view()) == (0.0, 0.0)
+
+
+def test_pixel_pi_has_the_write_ups_numbers():
+    law = mission("pixel-pi")
+    radius = math.sqrt(400 / math.pi)
+    linear, angular = twist_of(law, view(ball(200, radius)))
+    assert (linear, angular) == (pytest.approx(0.5), pytest.approx(-0.2 * 1.007))
+    linear, angular = twist_of(law, view(ball(200, radius)))
+    assert angular == pytest.approx(-0.2 - 0.007 * 0.4), "the sum grows with each picture, whatever its time"
+    assert twist_of(law, view(ball(180, radius)))[1] == 0.0, "0.1 is within the dead band"
+    assert twist_of(law, view(ball(181, radius)))[1] == pytest.approx(-0.105 - 0.007 * 0.605)
+    assert twist_of(law, view(ball(200, math.sqrt(40 / math.pi) - 1e-9))) == (0.0, 0.0)
+    assert twist_of(law, view(ball(160, math.sqrt(41 / math.pi))))[0] == pytest.approx(200 / 41), "as fast as it asks"
+    assert twist_of(law, view()) == (0.0, 0.0)
+
+
+def test_pixel_pi_can_be_bounded():
+    law = mission("pixel-pi", max_linear_mps=0.4, stop_area_px=1800, max_integral_rad_s=1)
+    for _ in range(100):
+        linear, angular = twist_of(law, view(ball(300, 10)))
+    assert linear == 0.4 and angular == pytest.approx(-0.7 - 0.007)
+    assert twist_of(law, view(ball(300, 30)))[0] == 0.0
+
+
+@pytest.mark.parametrize(("x_px", "radius_px", "linear_angular"), [
+    (160, 10, (0.0, 0.0)),  # no larger than ten pixels: none
+    (160, 11, (0.5, 0.0)),
+    (141, 30, (0.5, 0.009 * 19)),
+    (140, 30, (0.2, 0.009 * 20)),
+    (250, 30, (0.2, -0.009 * 90)),
+    (140, 50, (0.2, 0.009 * 20)),
+    (140, 51, (0.0, 0.009 * 20)),
+])
+def test_pixel_p_has_the_write_ups_numbers(x_px, radius_px, linear_angular):
+    assert twist_of(mission("pixel-p"), view(ball(x_px, radius_px))) == pytest.approx(linear_angular)
+
+
+def test_pixel_p_decides_five_times_a_second():
+    law = mission("pixel-p")
+    turns = [twist_of(law, view(ball(160 + at, 30), t_us=10_000_000 + at * 33_333))[1] for at in range(12)]
+    assert [round(turn / -0.009) for turn in turns] == [0] * 7 + [7] * 5
+    assert twist_of(law, view(t_us=12_000_000)) == (0.0, 0.0)
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+PAGE = (ROOT / "docs" / "missions.md").read_text("utf-8")
+
+
+def test_the_page_names_every_mission_and_shows_its_example_as_it_is(monkeypatch):
+    table = PAGE.partition("## Choose one")[0]
+    assert set(re.findall(r"`([a-z-]+)`", table)) >= set(BUILT_IN)
+    shown = re.search(r"```python\n(class Shy:.*?)```", PAGE, re.DOTALL)[1]
+    assert shown.strip() in (ROOT / "examples" / "my_mission.py").read_text("utf-8") and shown.count("\n") <= 30
+    monkeypatch.chdir(ROOT)
+    check_mission(mission_spec("examples.my_mission:Shy", {"near_px": 30}, CONFIG))
+    law = mission_spec("examples.my_mission:Shy", {}, CONFIG).build(CAMERA)
+    assert twist_of(law, view(ball(200, 50)))[0] == -0.15 and twist_of(law, view(ball(100, 10)))[1] > 0
+
+
+def test_the_sane_numbers_of_the_page_are_options_of_their_missions():
+    laws = re.findall(r"```toml\n(.*?)```", PAGE.partition("## The older laws")[2], re.DOTALL)
+    blocks = [tomllib.loads(text)["mission"] for text in laws]
+    assert [one["kind"] for one in blocks] == ["band", "pixel-pi", "pixel-p"]
+    for one in blocks:
+        chosen = mission_spec(one["kind"], one["options"], CONFIG)
+        assert chosen.config != chosen.plugin.Config()

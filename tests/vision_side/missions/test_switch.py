@@ -1,0 +1,159 @@
+"""From one mission to the next: at rest in between, whatever a mission does, and over when it is over."""
+
+import pytest
+
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import STILL, FrameHeader, RequestId, Twist
+from tests.contracts.missions import CAMERA
+from tests.fixtures.vision.vision import jpeg_of, scene
+from sightline.vision_side.config import MissionConfig, VisionConfig
+from sightline.vision_side.missions.registry import mission_spec
+from sightline.vision_side.missions.switch import SETTLE_S, MissionSwitch
+from sightline.vision_side.missions.port import Plan, View
+from sightline.vision_side.pipeline import Frame, Pipeline
+
+CONFIG = VisionConfig()
+FRAME_US = 33_333
+ASKED = RequestId(session="0000feed", id=1)
+
+
+class Scripted:
+    """Says what its options tell it, and which frame it is in."""
+
+    Config = MissionConfig  # any model with free options
+
+    def __init__(self, config, camera):
+        self.options, self.seen = config.options, []
+
+    def step(self, view):
+        self.seen.append(view.dt_s)
+        number = len(self.seen)
+        if self.options.get("raises_at") == number:
+            raise RuntimeError("a bug\nof its own")
+        if self.options.get("nonsense_at") == number:
+            return None
+        speed = 1e9 if self.options.get("wild_at") == number else self.options.get("speed", 0.3)
+        over = self.options.get("done_at") == number
+        return Plan(Twist(linear_mps=speed, angular_rad_s=0.1), "driving", f"{number} after {view.dt_s:.2f}", over)
+
+
+class Unbuildable(Scripted):
+    def __init__(self, config, camera):
+        raise ValueError("cannot begin")
+
+
+def scripted(name="Scripted", **options):
+    return mission_spec(f"{__name__}:{name}", {"options": options}, CONFIG)
+
+
+def view(seq, moving=(0.0, 0.0), applied=(0.0, 0.0), dt_s=0.033):
+    header = FrameHeader(session="0000abcd", seq=seq, t_us=seq * FRAME_US, moving=moving, applied=applied)
+    return View(header, dt_s, 0.06, CAMERA, ())
+
+
+def test_a_switch_stands_still_until_the_wheels_do_and_the_new_one_begins_afresh():
+    duty = MissionSwitch(scripted(), CAMERA)
+    assert duty.step(view(1)).twist.linear_mps == 0.3
+    duty.switch(scripted(speed=-0.2))
+    assert duty.chosen.config.options == {"speed": -0.2}
+    for seq in range(2, 8):
+        plan = duty.step(view(seq, moving=(0.2, 0.0), applied=(0.1, 0.0)))
+        assert (plan.twist, plan.phase) == (STILL, "switching")
+    assert duty.step(view(8, moving=(0.0, 0.2))).twist == STILL, "it still turns"
+    assert duty.step(view(9, applied=(0.05, 0.0))).twist == STILL, "it is told to move"
+    plan = duty.step(view(10, moving=(0.005, 0.0)))
+    assert (plan.twist.linear_mps, plan.note) == (-0.2, "1 after 0.00")
+    assert duty.step(view(11)).note == "2 after 0.03"
+
+
+def test_a_robot_that_stands_is_waited_for_no_longer_than_a_command_takes():
+    """What was told before may still be on its way: standing in one picture is not yet standing."""
+    duty = MissionSwitch(scripted(), CAMERA)
+    duty.step(view(1))
+    duty.switch(scripted(speed=0.1))
+    assert [duty.step(view(seq)).twist.linear_mps for seq in range(2, 5)] == [0.0, 0.1, 0.1]
+
+
+def test_a_robot_that_will_not_stand_is_waited_for_a_second():
+    duty = MissionSwitch(scripted(), CAMERA)
+    duty.switch(scripted(speed=0.1))
+    waited = [duty.step(view(seq, moving=(0.3, 0.0), dt_s=0.125)).twist.linear_mps for seq in range(1, 11)]
+    frames = round(SETTLE_S / 0.125)
+    assert waited == [0.0] * (frames - 1) + [0.1] * (11 - frames)
+
+
+def test_a_mission_that_is_over_stays_over_and_still():
+    duty = MissionSwitch(scripted(done_at=2), CAMERA)
+    duty.step(view(1))
+    for seq in range(2, 6):
+        plan = duty.step(view(seq))
+        assert (plan.twist, plan.done, plan.note) == (STILL, True, "2 after 0.03")
+    duty.switch(scripted())
+    assert [duty.step(view(seq)).phase for seq in range(6, 9)] == ["switching", "driving", "driving"]
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"raises_at": 2}, "RuntimeError: a bug of its own"),
+    ({"nonsense_at": 2}, "AttributeError"),
+    ({"wild_at": 2}, "ValueError: asks for 1e+09 m/s"),
+    ({"speed": float("inf")}, "ValidationError"),
+])
+def test_a_mission_that_breaks_is_over_and_the_robot_stands(options, words):
+    duty = MissionSwitch(scripted(**options), CAMERA)
+    plans = [duty.step(view(seq)) for seq in range(1, 5)]
+    assert [plan.twist for plan in plans[1:]] == [STILL] * 3
+    assert plans[-1].done and plans[-1].phase == "failed"
+    assert words in plans[-1].note and "\n" not in plans[-1].note
+
+
+def test_a_mission_that_cannot_even_begin_is_over():
+    duty = MissionSwitch(scripted("Unbuildable"), CAMERA)
+    assert duty.step(view(1)).note == "ValueError: cannot begin"
+    duty.switch(scripted())
+    assert [duty.step(view(seq)).twist.linear_mps for seq in range(2, 5)][-1] == 0.3
+
+
+# --- in the pipeline -------------------------------------------------------------------------------------------------
+
+
+BALL = jpeg_of(scene(CAMERA, 1.0, 0.2))
+
+
+def frame(seq, session="0000abcd"):
+    return Frame(FrameHeader(session=session, seq=seq, t_us=seq * FRAME_US), BALL)
+
+
+def test_an_answer_names_the_mission_that_was_asked_for_and_a_new_session_ends_it():
+    pipeline = Pipeline(CONFIG, CAMERA)
+    assert pipeline.step(frame(1)).mission is None
+    pipeline.switch(scripted(), ASKED)
+    answers = [pipeline.step(frame(seq)) for seq in range(2, 8)]
+    assert {answer.mission for answer in answers} == {ASKED}
+    assert answers[-1].seen.phase == "driving" and pipeline.mission.plugin is Scripted
+    anew = pipeline.step(frame(8, session="0000beef"))
+    assert (anew.mission, pipeline.mission.name, anew.seen.phase) == (None, "follow", "tracking")
+
+
+def test_what_was_asked_for_goes_on_with_another_camera_and_without_one_needed_as_it_is():
+    pipeline = Pipeline(CONFIG, CAMERA)
+    pipeline.step(frame(1))
+    larger = CAMERA.model_copy(update={"width_px": 640, "height_px": 480})
+    assert pipeline.with_camera(larger).mission.name == "follow"
+    pipeline.switch(scripted(), ASKED)
+    for seq in range(2, 6):
+        pipeline.step(frame(seq))
+    after = pipeline.with_camera(CAMERA)
+    note = after.step(frame(6)).seen.note
+    assert (after.asked, note) == (ASKED, "1 after 0.00"), "it begins anew: it may have learned the camera by heart"
+    chosen = scripted()
+    object.__setattr__(chosen, "plugin", type("Blind", (Scripted,), {"needs_camera": False}))
+    after.switch(chosen, ASKED)
+    for seq in range(7, 12):
+        before = after.step(frame(seq)).seen.note
+    assert int(before.split()[0]) > 2
+    assert int(after.with_camera(CAMERA).step(frame(12)).seen.note.split()[0]) == int(before.split()[0]) + 1
+
+
+def test_a_pipeline_of_no_mission_is_refused_in_words():
+    with pytest.raises(ConfigError, match="did you mean 'goto'"):
+        Pipeline(VisionConfig(mission=MissionConfig(kind="gotto")), CAMERA)

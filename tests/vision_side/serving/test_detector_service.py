@@ -1,0 +1,157 @@
+"""The detector service over a link in memory: what it says, drops and counts, whatever the detector answers."""
+
+from dataclasses import replace
+
+import pytest
+
+from sightline.protocol.channels import DETECTIONS, FRAME
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import Detections, FrameHeader
+from sightline.protocol.transports.memory import MemoryNetwork
+from tests.fixtures.vision.remote import BALL_JPEG
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.detect.filters import LabelFilter
+from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.port import Circle, Detection, Maker, result_of
+from sightline.vision_side.detector_service import DetectorService, ServingOptions
+
+HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
+GOOD = Detection(10.0, 10.0, 50.0, 50.0, 0.9, "ball")
+LONGEST = Detection(10.123456789012345, 11.123456789012345, 312.1234567890123, 232.1234567890123, 0.12345678901234567,
+                    "\N{LARGE YELLOW CIRCLE}" * 64, Circle(-1.2345678901234567, 120.12345678901235, 1.2345678901234567),
+                    track_id=2**53 - 1)
+
+
+class Says:
+    """Answers what it is told to; an exception is raised, and `news` are told once."""
+
+    def __init__(self, *found, **changes):
+        self.found, self.changes, self.lines = found, changes, []
+
+    def detect(self, frames, deadline_us):
+        if self.found and isinstance(self.found[0], Exception):
+            raise self.found[0]
+        return [replace(result_of(one, self.found, Maker("says", device="cpu")), **self.changes) for one in frames]
+
+    def news(self):
+        lines, self.lines = self.lines, []
+        return lines
+
+
+class Bench:
+    """A robot, and the service that looks at its frames."""
+
+    def __init__(self, detector, **serving):
+        self.network, self.words, self.seq = MemoryNetwork(seed=31), [], 0
+        self.robot = self.network.link("r1")
+        self.heard = self.robot.latest(DETECTIONS)
+        self.service = DetectorService(self, detector, ServingOptions("says", **serving), self.words.append)
+
+    def robots(self):
+        return ["r1"]
+
+    def on_news(self, callback):
+        self.ring = callback
+
+    def link(self, robot):
+        return self.network.link(robot, role="detector")
+
+    def look(self, jpeg=BALL_JPEG):
+        """What the service says of one more frame; None if it says nothing."""
+        self.service.turn()
+        self.seq += 1
+        self.robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=self.seq, t_us=self.seq)), jpeg)
+        self.network.advance(self.network.now_us + 1)
+        self.service.turn()
+        self.network.advance(self.network.now_us + 1)
+        message = self.heard.take()
+        return message and decode(Detections, message.payload, DETECTIONS.max_payload_bytes)
+
+    def tally(self):
+        return self.service.tallies()["r1"]
+
+
+def test_what_is_refused_is_no_load_and_each_reason_is_told_once():
+    says = Says(GOOD)
+    bench = Bench(says)
+    assert bench.look() is not None
+    says.found = (ValueError("out of memory"),)
+    for _ in range(30):
+        assert bench.look() is None
+    says.found, says.changes = (GOOD,), {"device": "d" * 100}
+    for _ in range(30):
+        assert bench.look() is None
+    told = [line for line in bench.words if "looks at" not in line]
+    assert len(told) == 2 and "out of memory" in told[0] and "cannot be sent" in told[1]
+    bench.service._look_at_load(1e9)
+    assert bench.tally().refused == 60 and "overloaded" not in bench.service.about() and len(bench.words) == 3
+
+
+def test_other_reasons_each_time_end_somewhere():
+    says = Says()
+    bench = Bench(says)
+    for number in range(100):
+        says.found = (ValueError(f"failure {number}"),)
+        bench.look()
+    assert 4 < len(bench.words) < 20
+
+
+def test_an_answer_that_is_too_long_for_the_wire_loses_its_last_boxes_and_ends_nothing():
+    bench = Bench(Says(*[LONGEST] * 64))
+    said = bench.look()
+    assert said is not None and 50 < len(said.boxes) < 64 and said.boxes[0].label == LONGEST.label
+    assert bench.look() is not None and bench.tally().served == 2
+
+
+@pytest.mark.parametrize(("detector", "why"), [
+    (Says(replace(GOOD, label="")), "label"), (Says(replace(GOOD, label="a\x1b[2J")), "label"),
+    (Says(replace(GOOD, label="\ud800")), "label"), (Says(replace(GOOD, circle=Circle(1.0, 1.0, 0.0))), "radius"),
+    (Says(replace(GOOD, track_id=-1)), "track"), (Says(GOOD, detector="d" * 65), "detector"),
+    (Says(GOOD, device="d" * 33), "device"), (Says(GOOD, model_hash="h" * 65), "model"),
+    (Says(*[GOOD] * 65), "65 boxes"), (Says(RuntimeError("out of memory")), "out of memory"),
+])
+def test_what_the_wire_cannot_say_is_counted_and_said_once_with_what_is_wrong(detector, why):
+    bench = Bench(detector)
+    assert bench.look() is None and bench.look() is None
+    assert (bench.tally().refused, bench.tally().served) == (2, 0)
+    (line,) = [one for one in bench.words if "looks at" not in one]
+    assert why in line and line.startswith("detector: ") and "\n" not in line
+
+
+def test_news_of_the_detector_are_told_at_the_start_and_whenever_there_are_any():
+    detector = Says(GOOD)
+    detector.lines = ["m.onnx runs on cpu: no GPU runtime is installed"]
+    bench = Bench(LabelFilter(detector, ("ball",)))
+    bench.service.turn()
+    assert bench.words[0] == "detector: m.onnx runs on cpu: no GPU runtime is installed"
+    detector.lines = ["no answer: LATE"]
+    bench.look()
+    assert "detector: no answer: LATE" in bench.words
+
+
+def test_model_and_device_are_known_before_the_first_frame():
+    known = Says()
+    known.maker = Maker("says", "0123456789abcdef", "cuda")
+    assert Bench(LabelFilter(known, ("ball",))).service.about().startswith("says 01234567 on cuda: ")
+    assert Bench(Says()).service.about().startswith("says: ")
+    assert Bench(HSV).service.about().startswith("says on cpu: ")
+
+
+class Late:
+    """Gives no answer, or one, after the deadline."""
+
+    def __init__(self, answers):
+        self.answers = answers
+
+    def detect(self, frames, deadline_us):
+        while monotonic_us() <= deadline_us:
+            pass
+        return [result_of(one, (), Maker("late")) if self.answers else None for one in frames]
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_what_comes_after_the_deadline_is_late_and_not_refused(answers):
+    bench = Bench(Late(answers), deadline_us=5_000)
+    assert bench.look() is None
+    assert (bench.tally().late, bench.tally().refused) == (1, 0)

@@ -1,0 +1,138 @@
+"""One vision for several robots: a pipeline each, fair turns, newest frames only; over real Zenoh sessions."""
+
+import threading
+import time
+from contextlib import ExitStack
+
+import pytest
+
+from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import AnswerHeader, FrameHeader, Stamp, State, Status
+from sightline.protocol.transports.link import LatestSlot
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.transports.zenoh_site import open_fleet
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.robot_process import JPEG
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.serving.fleet import Fleet
+
+
+class Robot:
+    """Says who it is, sends frames as fast as it is told to, and notes which were answered."""
+
+    def __init__(self, name, endpoint):
+        self.link = open_zenoh(name, connect=[endpoint], role="robot")
+        self.answered = []
+        self.sent = 0
+        self._session = f"{abs(hash(name)) % 2**32:08x}"
+        for channel in (TWIST, ACK):
+            self.link.subscribe(channel, self._answer)
+
+    def _answer(self, message):
+        self.answered.append(decode(AnswerHeader, message.header).echo.seq)
+
+    def say(self):
+        stamp = Stamp(session=self._session, seq=self.sent, t_us=1000 + self.sent)
+        self.link.publish(STATUS, encode(stamp), encode(Status(state=State.HOLD, reason="test")))
+
+    def frame(self):
+        header = FrameHeader(session=self._session, seq=self.sent, t_us=1000 + self.sent)
+        self.link.publish(FRAME, encode(header), JPEG)
+        self.sent += 1
+
+
+@pytest.fixture
+def fleet():
+    """A vision for `r*` that listens, its endpoint, and all it said."""
+    endpoint, said, ending = free_endpoint(), [], threading.Event()
+    config = VisionConfig(robot="r*", listen=(endpoint,), connect=())
+    with open_fleet("r*", listen=[endpoint], role="vision") as site:
+        running = Fleet(config, site, said.append)
+        thread = threading.Thread(target=running.serve, args=(ending,), daemon=True)
+        thread.start()
+        yield running, endpoint, said
+        ending.set()
+        thread.join(5)
+        assert not thread.is_alive()
+
+
+def test_every_robot_that_fits_is_answered_and_no_other(fleet):
+    _, endpoint, said = fleet
+    with ExitStack() as ending:
+        robots = {name: Robot(name, endpoint) for name in ("r1", "r2", "rex", "x1")}
+        for robot in robots.values():
+            ending.enter_context(robot.link)
+
+        def all_answered():
+            for robot in robots.values():
+                robot.say()
+                robot.frame()
+            time.sleep(0.03)
+            return all(len(robots[name].answered) >= 5 for name in ("r1", "r2", "rex"))
+
+        assert until(all_answered, 10)
+        assert robots["x1"].answered == []
+        for robot in robots.values():
+            assert robot.answered == sorted(set(robot.answered)), "newest only, each once"
+    assert any(line.startswith("vision: rex: frames from robot rex") for line in said)
+
+
+def test_a_robot_that_floods_takes_no_turn_from_another(fleet):
+    running, endpoint, _ = fleet
+    with Robot("r1", endpoint).link, ExitStack() as ending:
+        loud, quiet = Robot("rloud", endpoint), Robot("rquiet", endpoint)
+        for robot in (loud, quiet):
+            ending.enter_context(robot.link)
+        assert until(lambda: [loud.say(), quiet.say(), time.sleep(0.02)] and len(running.services) >= 2, 10)
+        assert until(lambda: quiet.link.has_listener(FRAME) and loud.link.has_listener(FRAME), 5)
+        for _ in range(60):
+            for _ in range(20):
+                loud.frame()
+            quiet.frame()
+            time.sleep(0.02)
+        assert until(lambda: len(quiet.answered) >= 0.9 * quiet.sent, 3), (len(quiet.answered), quiet.sent)
+        assert len(loud.answered) < loud.sent
+
+
+class _NoRobots:
+    """A site where nobody is, until `arrive`."""
+
+    def __init__(self):
+        self._names, self._news = [], lambda: None
+
+    def robots(self):
+        return self._names
+
+    def on_news(self, callback):
+        self._news = callback
+
+    def link(self, robot):
+        return _Silent(robot)
+
+
+class _Silent:
+    def __init__(self, robot):
+        self.robot = robot
+
+    def subscribe(self, channel, callback):
+        pass
+
+    def latest(self, channel):
+        return LatestSlot()
+
+
+def test_a_robot_may_come_later():
+    site = _NoRobots()
+    fleet = Fleet(VisionConfig(robot="r*"), site, lambda line: None)
+    fleet.turn()
+    assert fleet.services == {}
+    site.robots().append("r7")
+    fleet.turn()
+    assert list(fleet.services) == ["r7"]
+
+
+def test_several_robots_need_zenoh():
+    with pytest.raises(ConfigError, match="need Zenoh"):
+        open_fleet("r*", connect=["ws://127.0.0.1:9090"])

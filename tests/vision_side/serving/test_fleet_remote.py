@@ -1,0 +1,181 @@
+"""Several robots behind one vision whose eyes are elsewhere: none waits for the answer that another is waiting for."""
+
+import threading
+import time
+from contextlib import ExitStack
+
+import pytest
+
+from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST
+from sightline.protocol.codec import encode
+from sightline.protocol.config import Config
+from sightline.protocol.messages import FrameHeader, Stamp, State, Status
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.transports.zenoh_site import open_fleet
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.vision.remote import BALL_JPEG, MODEL, Server, box, http_reply, said
+from sightline.vision_side.config import DetectorConfig, HsvConfig, VisionConfig
+from sightline.vision_side.detect.around import close_detector
+from sightline.vision_side.detect.registry import configured_detector
+from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detector_service import DetectorService, ServingOptions
+from sightline.vision_side.serving.fleet import Fleet
+from sightline.vision_side.service import Service
+
+DEADLINE_S = 0.5
+ROBOTS = {"ra1": "00000001", "rb": "00000002", "ra2": "00000003", "ra3": "00000004"}
+"""Each one's session."""
+MUTE = "rb"
+"""Nobody answers about its frames."""
+
+
+class Robot:
+    """Sends a ball's picture, and counts the twists and the acknowledgements that it gets."""
+
+    def __init__(self, name, endpoint):
+        self.session, self.link = ROBOTS[name], open_zenoh(name, connect=[endpoint], role="robot")
+        self.sent, self.heard = 0, {TWIST: 0, ACK: 0}
+        for channel in (TWIST, ACK):
+            self.link.subscribe(channel, lambda _, channel=channel: self._count(channel))
+
+    def _count(self, channel):
+        self.heard[channel] += 1
+
+    def show(self):
+        self.sent += 1
+        stamp = {"session": self.session, "seq": self.sent, "t_us": self.sent * 40_000}
+        self.link.publish(STATUS, encode(Stamp(**stamp)), encode(Status(state=State.HOLD, reason="test")))
+        self.link.publish(FRAME, encode(FrameHeader(**stamp)), BALL_JPEG)
+
+
+def _all_show(robots, seconds=0.0):
+    """Once, or for so long; the share of each robot's frames that it was sent a twist for."""
+    before = {name: (robot.sent, robot.heard[TWIST]) for name, robot in robots.items()}
+    for _ in range(max(1, round(seconds / 0.04))):
+        for robot in robots.values():
+            robot.show()
+        time.sleep(0.04)
+    return {name: (robots[name].heard[TWIST] - steered) / (robots[name].sent - sent)
+            for name, (sent, steered) in before.items()}
+
+
+def _by_http(ending, endpoint):
+    """A server; what vision is told of it."""
+    over = threading.Event()
+    ending.callback(over.set)
+
+    def answer(request):
+        if f"x-sightline-session: {ROBOTS[MUTE]}" not in request[0].lower():
+            return http_reply(said(box()))
+        over.wait(10)
+        return None
+
+    server = ending.enter_context(Server(answer))
+    return f"http+jpeg://127.0.0.1:{server.port}/"
+
+
+def _by_zenoh(ending, endpoint):
+    """A detector service for the others."""
+    site = ending.enter_context(open_fleet("ra*", connect=[endpoint], role="detector"))
+    service = DetectorService(site, Hsv(Hsv.Config(hsv=HsvConfig())), ServingOptions("hsv"), lambda line: None)
+    _served(ending, service)
+    return "zenoh"
+
+
+def _served(ending, service):
+    """Until the end."""
+    over = threading.Event()
+    thread = threading.Thread(target=service.serve, args=(over,), daemon=True)
+    thread.start()
+    ending.callback(thread.join, 5)
+    ending.callback(over.set)
+
+
+@pytest.fixture
+def shown():
+    """The robots, shown for 3 s to a vision with those eyes, and each one's share of twists."""
+    with ExitStack() as ending:
+
+        def show(eyes, fallback):
+            endpoint = free_endpoint()
+            site = ending.enter_context(open_fleet("r*", listen=[endpoint], role="vision"))
+            detector = DetectorConfig(kind=eyes(ending, endpoint), fallback=fallback, deadline_s=DEADLINE_S)
+            config = VisionConfig(robot="r*", camera=MODEL, detector=detector)
+            first = configured_detector(config)
+            ending.callback(close_detector, first)
+            _served(ending, Fleet(config, site, lambda line: None, first))
+            robots = {name: Robot(name, endpoint) for name in ROBOTS}
+            for robot in robots.values():
+                ending.enter_context(robot.link)
+            assert until(lambda: _all_show(robots) and all(sum(one.heard.values()) for one in robots.values()), 10)
+            return robots, _all_show(robots, 3.0)
+
+        yield show
+
+
+@pytest.mark.parametrize("eyes", [_by_http, _by_zenoh])
+def test_who_is_not_answered_keeps_no_other_robot_waiting(shown, eyes):
+    robots, shares = shown(eyes, "")
+    mute = robots[MUTE].heard
+    assert mute[TWIST] == 0 and mute[ACK] >= 3, "no answer is no twist, and is acknowledged"
+    assert shares.pop(MUTE) == 0 and min(shares.values()) > 0.7, shares
+
+
+@pytest.mark.parametrize("eyes", [_by_http, _by_zenoh])
+def test_with_a_fallback_every_robot_is_steered(shown, eyes):
+    _, shares = shown(eyes, "hsv")
+    assert min(shares.values()) > 0.7, shares
+
+
+class Quiet:
+    """A site with robots that say nothing."""
+
+    def __init__(self, count):
+        self._robots = [f"r{number}" for number in range(count)]
+
+    def robots(self):
+        return self._robots
+
+    def on_news(self, callback):
+        pass
+
+    def link(self, robot):
+        return MemoryNetwork().link(robot, role="vision")
+
+
+def test_what_ends_one_robots_thread_ends_the_vision(monkeypatch):
+    def fail(service, wait_s):
+        raise RuntimeError("out of threads")
+
+    monkeypatch.setattr(Service, "turn", fail)
+    fleet = Fleet(VisionConfig(robot="r*", detector=DetectorConfig(kind="zenoh")), Quiet(1), lambda line: None)
+    with pytest.raises(RuntimeError, match="out of threads"):
+        fleet.serve(threading.Event())
+
+
+class Hanging:
+    """Eyes elsewhere that take their time to end."""
+
+    Config = Config
+    waits = True
+
+    def __init__(self, config):
+        pass
+
+    def detect(self, frames, deadline_us):
+        return [None for _ in frames]
+
+    def close(self):
+        time.sleep(1.0)
+
+
+def test_eyes_that_hang_at_the_end_hang_beside_one_another():
+    kind, over = f"{__name__}:Hanging", threading.Event()
+    fleet = Fleet(VisionConfig(robot="r*", detector=DetectorConfig(kind=kind)), Quiet(8), lambda line: None)
+    thread = threading.Thread(target=fleet.serve, args=(over,), daemon=True)
+    thread.start()
+    assert until(lambda: len(fleet.services) == 8)
+    over.set()
+    thread.join(3)
+    assert not thread.is_alive(), "seven of them, one after the other, take 7 s"

@@ -1,0 +1,215 @@
+"""What a vision takes for a mission and from whom, what it reports, and the scans that a mission goes by."""
+
+import array
+import struct
+
+import pytest
+
+from sightline.protocol.channels import CAMERA, FRAME, MISSION, REPORT, SCAN, TWIST
+from sightline.protocol.codec import decode, encode, encode_ranges
+from sightline.protocol.messages import (
+    AnswerHeader,
+    DetectionsHeader,
+    Echo,
+    FrameHeader,
+    RequestHeader,
+    RequestId,
+    ScanHeader,
+    Stamp,
+)
+from sightline.protocol.mission_messages import MissionReport, MissionRequest
+from sightline.protocol.transports.memory import MemoryNetwork
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
+from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.serving.dry_run import AckingService
+from sightline.vision_side.pipeline import Observation
+from sightline.vision_side.reporting import LEAST_GAP_S, PERIOD_S, Reporter
+from sightline.vision_side.service import Service
+
+MODEL = camera()
+BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
+FRAME_US = 33_333
+SESSION, ASKER = "0000abcd", "0000feed"
+
+
+class Bench:
+    """A robot, a person and the service; `reports` are all that were heard."""
+
+    def __init__(self, service=Service, config=None):
+        self.network = MemoryNetwork(seed=3)
+        self.robot, self.person = self.network.link("r1"), self.network.link("r1", role="operator")
+        self.twists, self.reports, self.said, self.seq = self.robot.latest(TWIST), [], [], 0
+        self.person.subscribe(REPORT, self.reports.append)
+        self.service = service(config or VisionConfig(), self.network.link("r1", role="vision"), self.said.append)
+        self.robot.publish(CAMERA, encode(Stamp(session=SESSION, seq=1, t_us=0)), encode(MODEL))
+        self.turn()
+
+    def turn(self):
+        self.network.advance(self.network.now_us + FRAME_US)
+        self.service.turn(0.0)
+        self.network.advance(self.network.now_us + 1)
+
+    def frames(self, count=1, session=SESSION):
+        for _ in range(count):
+            self.seq += 1
+            header = FrameHeader(session=session, seq=self.seq, t_us=self.seq * FRAME_US)
+            self.robot.publish(FRAME, encode(header), BALL)
+            self.turn()
+        return self
+
+    def answer(self) -> AnswerHeader:
+        """The newest answer's header, after one more frame."""
+        self.frames()
+        return decode(AnswerHeader, self.twists.take().header)
+
+    def ask(self, name="band", number=1, source="operator", key_source="", age_us=0, session=SESSION, echo=True,
+            **what):
+        cited = Echo(channel="status", session=session, seq=4, t_us=self.seq * FRAME_US - age_us) if echo else None
+        header = RequestHeader(source=source, session=ASKER, seq=number, echo=cited)
+        self.person.publish(MISSION, encode(header), encode(MissionRequest(id=number, name=name, **what)),
+                            key_source or source)
+        return self
+
+    def report(self) -> MissionReport:
+        """The newest, once it had its time."""
+        self.service._dispatch._reporter._said_s = -1e9
+        self.frames()
+        return decode(MissionReport, self.reports[-1].payload, REPORT.max_payload_bytes)
+
+
+def test_a_mission_that_is_asked_for_is_taken_up_cited_and_reported():
+    bench = Bench().frames(5)
+    assert bench.answer().mission is None
+    bench.ask("band", 7, options={"linear_mps": 0.2})
+    assert bench.frames(6).answer().mission == RequestId(session=ASKER, id=7)
+    report = bench.report()
+    assert (report.mission, report.phase, report.refused, report.done) == ("band", "forward", "", False)
+    assert (report.asked, report.detector, report.device) == (RequestId(session=ASKER, id=7), "hsv", "cpu")
+    header = decode(DetectionsHeader, bench.reports[-1].header)
+    assert (header.source, header.echo.channel, header.echo.seq) == ("vision", "frame", bench.seq)
+    assert any("mission band, asked for by operator" in line for line in bench.said)
+
+
+def test_what_is_said_again_is_taken_up_once():
+    bench = Bench().frames(5).ask("band", 1).frames(6)
+    for _ in range(4):
+        bench.ask("band", 1).frames()
+        assert decode(MissionReport, bench.reports[-1].payload).phase != "switching"
+    bench.ask("band", 2).frames()
+    assert bench.service._pipeline.asked == RequestId(session=ASKER, id=2)
+
+
+@pytest.mark.parametrize(("how", "words"), [
+    ({"name": "bnad"}, "no mission called 'bnad'; did you mean 'band'?"),
+    ({"name": "goto"}, "option 'waypoints' is missing"),
+    ({"options": {"speed": 1.0}}, "unknown option 'speed'"),
+    ({"options": {"averaged": "many"}}, "option 'averaged'"),
+    ({"source": "guest"}, "UNKNOWN_SOURCE: guest chooses no mission; operator and teleop do"),
+    ({"source": "vision"}, "UNKNOWN_SOURCE"),
+    ({"source": "operator", "key_source": "teleop"}, "UNKNOWN_SOURCE: key and header disagree"),
+    ({"echo": False}, "NOT_ALLOWED: a mission cites the newest status"),
+    ({"session": "0000beef"}, "OTHER_SESSION"),
+    ({"age_us": 2_100_000}, "STALE: it was asked 2.1 s ago: say it again"),
+])
+def test_what_is_not_taken_up_is_said_why_and_changes_nothing(how, words):
+    bench = Bench().frames(80).ask(**{"name": "band", **how}).frames(3)
+    assert bench.answer().mission is None and bench.service._pipeline.mission.name == "follow"
+    report = bench.report()
+    assert report.mission == "follow" and words in report.refused and report.asked.id == 1
+    bench.ask("band", 2).frames(5)
+    assert (bench.report().refused, bench.answer().mission.id) == ("", 2)
+
+
+@pytest.mark.parametrize("payload", [b"", b"{", b"[]", b'{"id":1}', b'{"id":1,"name":"os:system"}', b"\xff" * 40])
+def test_a_broken_mission_is_counted_and_ends_nothing(payload):
+    bench = Bench().frames(5)
+    header = RequestHeader(source="operator", session=ASKER, seq=1)
+    bench.person.publish(MISSION, encode(header), payload)
+    bench.frames()
+    assert bench.service.skipped["MALFORMED"] == 1 and bench.twists.take() is not None
+    assert "MALFORMED" in bench.report().refused
+
+
+def test_a_new_session_of_the_robot_ends_what_was_asked_for_and_says_so():
+    bench = Bench().frames(5).ask("band", 3).frames(6)
+    bench.frames(2, session="0000beef")
+    bench.service._dispatch._reporter._said_s = -1e9
+    bench.frames(1, session="0000beef")
+    report = decode(MissionReport, bench.reports[-1].payload)
+    assert (report.mission, report.asked.id) == ("follow", 3) and "started anew" in report.refused
+
+
+def test_only_who_drives_takes_missions():
+    bench = Bench(AckingService).frames(5).ask("band").frames(5)
+    assert bench.reports == [] and bench.service._pipeline.mission.name == "follow"
+
+
+# --- reports ---------------------------------------------------------------------------------------------------------
+
+
+def test_reports_come_twice_a_second_and_at_once_on_a_change_but_not_with_every_frame():
+    reporter, told = Reporter(DetectorConfig()), []
+    for at in range(300):
+        now_s = at / 100
+        seen = Observation("tracking" if at < 200 or at % 4 < 2 else "coasting", note=f"{at}")
+        if reporter.due(now_s, "follow", seen, None, "") is not None:
+            told.append(now_s)
+    assert [one for one in told if one < 2] == [0.0, PERIOD_S, 2 * PERIOD_S, 3 * PERIOD_S]
+    late = [one for one in told if one >= 2]
+    assert 8 <= len(late) <= 1 / LEAST_GAP_S + 1
+
+
+def test_a_report_says_what_a_mission_says_on_one_line_and_within_bounds():
+    report = Reporter(DetectorConfig()).due(0.0, "m" * 90, Observation("two\nlines" + "x" * 90, note="a\n" * 300), None, "")
+    assert "\n" not in report.phase + report.note and decode(MissionReport, encode(report), 2048) == report
+
+
+# --- scans -----------------------------------------------------------------------------------------------------------
+
+
+GOTO = VisionConfig.model_validate({"mission": {"kind": "goto", "options": {"waypoints": [[2.0, 0.0]]}}})
+
+
+def scan(seq, payload=None, session=SESSION, t_us=None):
+    header = ScanHeader(session=session, seq=seq, t_us=seq * 100_000 if t_us is None else t_us, angle_min_rad=-0.5,
+                        angle_increment_rad=0.1, range_min_m=0.02, range_max_m=0.2)
+    return encode(header), encode_ranges(array.array("f", [0.1] * 11)) if payload is None else payload
+
+
+def test_a_mission_that_goes_by_scans_is_given_the_newest_and_cites_it():
+    bench = Bench(config=GOTO)
+    assert bench.answer().scan is None
+    for seq in (3, 4, 5):
+        bench.robot.publish(SCAN, *scan(seq))
+    assert [bench.answer().scan for _ in range(2)] == [5, 5]
+    bench.robot.publish(SCAN, *scan(9, session="0000beef"))
+    assert [bench.answer().scan for _ in range(2)] == [None, None], "another robot's, as far as anybody knows"
+    bench.robot.publish(SCAN, *scan(10))
+    assert bench.answer().scan == 10
+
+
+def test_nobody_else_subscribes_to_scans_until_a_mission_asks_for_them():
+    bench = Bench().frames(5)
+    assert not bench.robot.has_listener(SCAN)
+    bench.ask("goto", waypoints=((1.0, 1.0),)).frames(6)
+    assert bench.robot.has_listener(SCAN)
+    bench.robot.publish(SCAN, *scan(7))
+    assert bench.answer().scan == 7
+
+
+@pytest.mark.parametrize(("payload", "reason"), [
+    (struct.pack("<2f", 1.0, float("nan")), "NOT_FINITE"),
+    (struct.pack("<f", -0.5), "NOT_FINITE"),
+    (bytes(6), "MALFORMED"),
+])
+def test_a_scan_that_is_none_is_refused_counted_and_said_once(payload, reason):
+    bench = Bench(config=GOTO).frames(2)
+    bench.robot.publish(SCAN, *scan(1))
+    bench.frames()
+    for seq in range(2, 6):
+        bench.robot.publish(SCAN, *scan(seq, payload))
+        assert bench.answer().scan == 1
+    assert bench.service.skipped == {reason: 4}
+    assert sum("scans are refused" in line for line in bench.said) == 1
+    bench.robot.publish(SCAN, *scan(7, struct.pack("<f", float("inf"))))
+    assert bench.answer().scan == 7

@@ -1,0 +1,218 @@
+"""The service over a link in memory: every frame answered, bad ones counted, one line per change of state."""
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from sightline.protocol.channels import ACK, CAMERA, FRAME, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import AnswerHeader, CameraModel, FrameHeader, Stamp
+from sightline.protocol.transports.link import LatestSlot, Message
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.text import parse_twist
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.service import Service
+from sightline.vision_side.serving.process import serve
+
+MODEL = camera()
+BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
+EMPTY = jpeg_of(np.full((240, 320, 3), 140, np.uint8))
+
+
+class Bench:
+    """A robot's end of the link, and the service on the other."""
+
+    def __init__(self) -> None:
+        self.network = MemoryNetwork(seed=1)
+        self.robot = self.network.link("r1")
+        self.twists: LatestSlot[Message] = self.robot.latest(TWIST)
+        self.acks: LatestSlot[Message] = self.robot.latest(ACK)
+        self.said: list[str] = []
+        self.service = Service(VisionConfig(), self.network.link("r1", role="vision"), self.said.append)
+        self.now_us = 0
+
+    def camera(self, model: CameraModel = MODEL) -> None:
+        self.robot.publish(CAMERA, encode(Stamp(session="0000abcd", seq=1, t_us=self.now_us)), encode(model))
+        self.turn()
+
+    def frame(self, jpeg: bytes, seq: int, session: str = "0000abcd") -> None:
+        header = FrameHeader(session=session, seq=seq, t_us=seq * 33_333)
+        self.raw(encode(header), jpeg)
+
+    def raw(self, header: bytes, jpeg: bytes) -> None:
+        self.robot.publish(FRAME, header, jpeg)
+        self.turn()
+
+    def turn(self) -> None:
+        self.now_us += 33_333
+        self.network.advance(self.now_us)
+        self.service.turn(0.0)
+        self.network.advance(self.now_us)
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_a_frame_is_answered_by_a_twist_that_names_it(bench: Bench) -> None:
+    bench.camera()
+    for seq in range(1, 6):
+        bench.frame(BALL, seq)
+        message = bench.twists.take()
+        assert message is not None and message.source == "vision"
+        header = decode(AnswerHeader, message.header)
+        assert (header.echo.session, header.echo.seq, header.echo.t_us) == ("0000abcd", seq, seq * 33_333)
+        assert (header.seq, header.compute_us > 0) == (seq, True)
+        assert parse_twist(message.payload).angular_rad_s > 0
+
+
+def test_a_picture_that_does_not_decode_is_acknowledged_and_counted(bench: Bench) -> None:
+    bench.camera()
+    bench.frame(b"junk", 1)
+    message = bench.acks.take()
+    assert message is not None and message.payload == b"" and bench.twists.take() is None
+    assert decode(AnswerHeader, message.header).echo.seq == 1
+    assert bench.service.skipped == {"MALFORMED": 1}
+
+
+def test_before_the_camera_model_frames_are_only_acknowledged(bench: Bench) -> None:
+    bench.frame(BALL, 1)
+    assert bench.twists.take() is None
+    assert decode(AnswerHeader, bench.acks.take().header).echo.seq == 1
+
+
+@pytest.mark.parametrize("header", [b"", b"{", b"{}", b"[1]", b'{"v":1,"session":"x","seq":1,"t_us":1}', b"\xff" * 40])
+def test_broken_headers_are_counted_and_end_nothing(bench: Bench, header: bytes) -> None:
+    bench.camera()
+    bench.raw(header, BALL)
+    assert bench.service.skipped["MALFORMED"] == 1
+    bench.frame(BALL, 2)
+    assert bench.twists.take() is not None
+
+
+def test_a_robot_of_another_version_is_told_once(bench: Bench) -> None:
+    bench.camera()
+    for _ in range(5):
+        bench.raw(b'{"v":2,"session":"0000abcd","seq":1,"t_us":1}', BALL)
+    assert len([line for line in bench.said if "version 2" in line]) == 1
+    assert bench.service.skipped["UNSUPPORTED_VERSION"] == 5
+
+
+def test_another_camera_is_taken_over(bench: Bench) -> None:
+    bench.camera()
+    bench.frame(BALL, 1)
+    large = camera(640, 480)
+    bench.camera(large)
+    bench.frame(jpeg_of(scene(large, 1.0, 0.2)), 2)
+    bench.twists.take()
+    bench.frame(jpeg_of(scene(large, 1.0, 0.2)), 3)
+    assert bench.twists.take() is not None
+    assert any("640x480" in line for line in bench.said)
+
+
+def test_lines_are_said_per_change_and_never_per_frame(bench: Bench) -> None:
+    bench.camera()
+    for seq in range(1, 50):
+        bench.frame(BALL, seq)
+    for seq in range(50, 130):
+        bench.frame(EMPTY, seq)
+    for seq in range(130, 230):
+        bench.frame(b"junk", seq)
+    assert [line.split(": ", 1)[1].split(" at ")[0] for line in bench.said] == [
+        "camera is 320x240, fx 190.7 px, calibrated", "frames from robot r1, session 0000abcd", "target seen",
+        "target lost", "target not in sight, searching",
+        *(f"pictures skipped so far: {count}; this one: picture: does not start with SOI; is it a JPEG?"
+          for count in (1, 10, 100)),
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_the_process_ends_within_a_second_of_a_signal(number: signal.Signals) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    code = (f"from sightline.vision_side.config import VisionConfig; from sightline.vision_side.serving.process import run; "
+            f"raise SystemExit(run(VisionConfig(connect=(), listen=('{endpoint}',))))")
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert "looking for robot r1" in process.stdout.readline()
+        started = time.monotonic()
+        process.send_signal(number)
+        assert process.wait(5) == 0
+        assert time.monotonic() - started < 1.0
+
+
+def test_serve_ends_when_asked(bench: Bench) -> None:
+    ending, said = threading.Event(), list[str]()
+    link = bench.network.link("r1", role="vision")
+    running = threading.Thread(target=serve, args=(VisionConfig(), link, ending, said.append), daemon=True)
+    running.start()
+    ending.set()
+    running.join(1.0)
+    assert not running.is_alive()
+    assert said[-1].startswith("vision: ended after 0 frames")
+
+
+def test_frames_that_come_again_after_a_silence_are_told_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.camera()
+    bench.frame(BALL, 1)
+    monkeypatch.setattr("sightline.vision_side.service._SILENCE_S", -1.0)
+    bench.turn()
+    bench.frame(BALL, 2)
+    bench.frame(BALL, 3)
+    assert len([line for line in bench.said if "no frames from robot r1" in line]) == 1
+    assert len([line for line in bench.said if "frames from robot r1, session 0000abcd" in line]) == 2
+
+
+def test_what_was_skipped_is_counted_over_every_camera(bench: Bench) -> None:
+    bench.camera()
+    for seq in range(1, 4):
+        bench.frame(b"junk", seq)
+    bench.camera(camera(640, 480))
+    bench.frame(b"junk", 4)
+    bench.frame(BALL, 5)  # the last camera's size
+    assert bench.service.skipped == {"MALFORMED": 5}
+
+
+def test_frames_of_a_session_that_is_over_are_left_out_and_said_once(bench):
+    """A late frame of before a restart, or two robots of one id: it steers for the newer one alone."""
+    bench.camera()
+    for seq in range(1, 4):
+        bench.frame(BALL, seq)
+    bench.frame(BALL, 1, session="0000beef")
+    answered = bench.service.answered
+    for seq in range(4, 8):
+        bench.frame(BALL, seq)
+    assert bench.service.answered == answered == 4
+    assert bench.service.skipped["OTHER_SESSION"] == 4
+    refused = "frames of session 0000abcd are refused: robot r1 is steered in session 0000beef"
+    assert sum(refused in line for line in bench.said) == 1
+    bench.frame(BALL, 2, session="0000beef")
+    assert bench.service.answered == 5
+
+
+def test_of_two_robots_with_one_id_the_second_is_refused_and_that_is_said(bench, monkeypatch):
+    """Where they cannot meet, nobody but vision can see that they are two."""
+    monkeypatch.setattr("sightline.vision_side.service.monotonic_us", lambda: bench.now_us)
+    bench.camera()
+    answers = {"0000abcd": 0, "0000beef": 0}
+    for seq in range(1, 10):
+        bench.frame(BALL, seq)
+    for seq in range(10, 100):
+        for session in answers:
+            before = bench.service.answered
+            bench.frame(BALL, seq, session=session)
+            answers[session] += bench.service.answered - before
+    assert answers["0000abcd"] > 75 and answers["0000beef"] < 12
+    refused = [line for line in bench.said if "are refused" in line]
+    assert len(refused) == 2, refused  # first the old one, for a moment, then the second robot
+    assert "frames of session 0000beef are refused: robot r1 is steered in session 0000abcd" in refused[-1]

@@ -1,0 +1,148 @@
+"""The pipeline: deterministic, never raising, and quiet when there is no picture."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import sightline.vision_side
+from sightline.protocol.channels import MAX_HEADER_BYTES
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import STILL, AnswerHeader, FrameHeader, RequestId
+from sightline.protocol.text import format_twist
+from tests.fixtures.vision.vision import Rig, camera, eight, jpeg_of, scene
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header, encode_answer
+
+MODEL = camera()
+BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
+EMPTY = jpeg_of(np.full((240, 320, 3), 140, np.uint8))
+FRAME_US = 33_333
+
+
+def header(seq: int, session: str = "0000abcd", t_us: int | None = None) -> FrameHeader:
+    return FrameHeader(session=session, seq=seq, t_us=seq * FRAME_US if t_us is None else t_us)
+
+
+def pipeline() -> Pipeline:
+    return Pipeline(VisionConfig(), MODEL)
+
+
+def phases(pictures: list[bytes]) -> list[PipelineAnswer]:
+    one = pipeline()
+    return [one.step(Frame(header(seq), jpeg)) for seq, jpeg in enumerate(pictures, 1)]
+
+
+def test_seen_coasted_searched_and_found() -> None:
+    answers = phases([BALL] * 10 + [EMPTY] * 60 + [BALL] * 3)
+    names = [answer.seen.phase for answer in answers]
+    assert names[:10] == ["tracking"] * 10
+    assert names[10] == "coasting"
+    assert names[69] == "searching"
+    assert names[70:] == ["tracking"] * 3
+    turning = answers[69].twist
+    assert turning is not None and 0 < turning.angular_rad_s <= 1.2  # the ball was last seen on the left
+    assert answers[9].seen.distance_m is not None and answers[9].seen.target in answers[9].seen.detections
+
+
+def test_no_picture_is_acknowledged_and_starts_no_search() -> None:
+    answers = phases([BALL] * 5 + [b"not a picture"] * 90)
+    assert all(answer.twist is None and answer.seen.phase == "no picture" for answer in answers[5:])
+
+
+def test_an_empty_room_from_the_start_waits_then_searches() -> None:
+    answers = phases([EMPTY] * 20)
+    assert answers[0].twist == STILL
+    assert answers[-1].seen.phase == "searching"
+
+
+def test_old_and_repeated_frames_are_counted_and_not_steered_by() -> None:
+    one = pipeline()
+    one.step(Frame(header(5), BALL))
+    assert one.step(Frame(header(5), BALL)).twist is None
+    assert one.step(Frame(header(4), BALL)).twist is None
+    assert one.skipped == {"OUT_OF_ORDER": 2}
+
+
+def test_a_new_robot_session_starts_from_nothing() -> None:
+    one = pipeline()
+    for seq in range(1, 20):
+        one.step(Frame(header(seq), BALL))
+    again = one.step(Frame(header(1, "0000beef"), BALL))
+    assert again == pipeline().step(Frame(header(1, "0000beef"), BALL))
+
+
+@settings(max_examples=60, deadline=None)
+@given(pictures=st.lists(st.one_of(st.binary(max_size=300), st.sampled_from([BALL, EMPTY, BALL[:500]])), max_size=12),
+       times=st.lists(st.integers(0, 2**53 - 1), min_size=12, max_size=12))
+def test_any_bytes_and_any_times_are_answered(pictures: list[bytes], times: list[int]) -> None:
+    one = pipeline()
+    answers = [one.step(Frame(header(seq, t_us=t_us), jpeg))
+               for seq, (jpeg, t_us) in enumerate(zip(pictures, times, strict=False))]
+    for answer in answers:
+        assert answer.twist is None or format_twist(answer.twist)
+    assert sum(one.skipped.values()) == sum(answer.twist is None for answer in answers)
+
+
+def test_the_same_frames_give_the_same_twists_byte_for_byte() -> None:
+    frames: list[Frame] = []
+    twists: list[bytes] = []
+
+    class Recorded(Rig):
+        def _set_up(self) -> None:
+            super()._set_up()
+            step = self.pipeline.step
+
+            def recorded(frame: Frame) -> PipelineAnswer:
+                answer = step(frame)
+                frames.append(frame)
+                twists.append(format_twist(answer.twist) if answer.twist else b"")
+                return answer
+
+            self.pipeline.step = recorded
+
+    Recorded(eight(), drawn=True, seed=3).run(1.5)
+    replay = pipeline()
+    again = [replay.step(Frame(decode(FrameHeader, encode(one.header)), one.jpeg)).twist for one in frames]
+    assert len(twists) > 30
+    assert [format_twist(twist) if twist else b"" for twist in again] == twists
+
+
+def test_the_answer_names_the_frame_field_for_field() -> None:
+    frame = header(7)
+    answer = decode(AnswerHeader, encode(answer_header(frame, "12345678", 3, 412)))
+    assert (answer.source, answer.session, answer.seq, answer.compute_us) == ("vision", "12345678", 3, 412)
+    assert (answer.echo.channel, answer.echo.session, answer.echo.seq, answer.echo.t_us) == (
+        "frame", frame.session, frame.seq, frame.t_us)
+
+
+ALWAYS_PURE = ("pipeline.py", "decode.py", "port.py", "hsv.py", "checking.py", "track.py", "steer.py", "follow.py")
+"""From a frame to its twist: nothing there may become a shell."""
+
+
+def test_only_the_shells_know_of_clocks_and_links() -> None:
+    forbidden = {"time", "threading", "socket", "asyncio", "logging", "zenoh", "random"}
+    for path in Path(sightline.vision_side.__file__).parent.rglob("*.py"):
+        tree = ast.parse(path.read_text())
+        names = {alias.name.split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import)
+                 for alias in node.names}
+        names |= {(node.module or "").split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+        is_shell = "Shell" in (ast.get_docstring(tree) or "").split("\n\n")[0]
+        assert not names & forbidden or (is_shell and path.name not in ALWAYS_PURE), path.name
+
+
+COUNTS = st.integers(0, 2**53 - 1)
+SESSIONS = st.from_regex(r"[0-9a-f]{8}", fullmatch=True)
+
+
+ANSWERS = st.none() | st.builds(PipelineAnswer, twist=st.none(), seen=st.just(Observation("tracking")), scan=st.none() | COUNTS,
+                                mission=st.none() | st.builds(RequestId, session=SESSIONS, id=COUNTS))
+
+
+@given(SESSIONS, SESSIONS, st.tuples(COUNTS, COUNTS, COUNTS, COUNTS), ANSWERS)
+def test_the_quick_answer_header_is_that_of_the_model(robot, vision, counts, answer) -> None:
+    frame = FrameHeader(session=robot, seq=counts[0], t_us=counts[1])
+    quick = encode_answer(frame, vision, *counts[2:], answer)
+    assert quick == encode(answer_header(frame, vision, *counts[2:], answer)) and len(quick) <= MAX_HEADER_BYTES

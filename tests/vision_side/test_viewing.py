@@ -1,0 +1,193 @@
+"""Overlay and preview over real sessions: only while watched, of the frame they name, after its twist, never queued."""
+
+import time
+from contextlib import ExitStack
+
+import cv2
+import numpy as np
+import pytest
+
+from sightline.operator_side.setup import keys
+from sightline.protocol.channels import CAMERA, DETECTIONS, FRAME, OVERLAY, PREVIEW, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader, Stamp
+from sightline.protocol.transports.open import open_link
+from sightline.protocol.transports.zenoh_session import open_session
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
+from sightline.vision_side import viewing
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.service import open_service
+
+MODEL = camera()
+BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
+BAD = b"\xff\xd8 no picture"
+
+
+class Site:
+    """A robot, its vision and a viewer, each with a link of its own."""
+
+    def __init__(self, ending: ExitStack, end: str, secure: str = "", **config: object) -> None:
+        self.robot = ending.enter_context(open_link("r1", listen=[end], role="robot", secure=secure))
+        self.link = ending.enter_context(open_link("r1", connect=[end], role="vision", secure=secure))
+        self.viewer = ending.enter_context(open_link("r1", connect=[end], role="viewer", secure=secure))
+        self.twists = self.robot.latest(TWIST)
+        self.said: list[str] = []
+        self.service = open_service(VisionConfig.model_validate(config), self.link, self.said.append)
+        self.seq = 0
+        assert until(lambda: self.robot.has_listener(FRAME) and self.robot.has_listener(CAMERA))
+        self.robot.publish(CAMERA, encode(Stamp(session="0000abcd", seq=1, t_us=0)), encode(MODEL))
+        assert until(lambda: self.service.turn(0.01) or self.said)
+
+    def frame(self, jpeg: bytes = BALL) -> FrameHeader:
+        """Send a frame and let vision answer it."""
+        self.seq += 1
+        header = FrameHeader(session="0000abcd", seq=self.seq, t_us=self.seq * 33_333, latency_us=21_000)
+        answered = self.service.answered
+        self.robot.publish(FRAME, encode(header), jpeg)
+        assert until(lambda: self.service.turn(0.05) or self.service.answered > answered)
+        return header
+
+
+@pytest.fixture(params=["tcp", "ws"])
+def site(request):
+    end = free_endpoint().replace("tcp/", "ws://") if request.param == "ws" else free_endpoint()
+    with ExitStack() as ending:
+        yield Site(ending, end)
+
+
+def pixels(message):
+    return cv2.imdecode(np.frombuffer(message.payload, np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_nobody_watches_so_nothing_is_drawn(site):
+    for _ in range(5):
+        site.frame()
+    assert not site.link.has_listener(OVERLAY) and not site.link.has_listener(PREVIEW)
+    assert site.service._viewing._thread is None
+
+
+def test_who_watches_sees_the_answered_frame_with_what_was_seen(site):
+    overlays = site.viewer.latest(OVERLAY)
+    assert until(lambda: site.link.has_listener(OVERLAY))
+    header = site.frame()
+    message = overlays.take(5.0)
+    assert message is not None and message.source == "vision"
+    said = decode(DetectionsHeader, message.header)
+    assert said.echo == Echo(channel="frame", session=header.session, seq=header.seq, t_us=header.t_us)
+    assert said.compute_us > 0 and said.source == "vision"
+    shown = pixels(message)
+    assert shown.shape == (480, 640, 3)
+    plain = cv2.resize(cv2.imdecode(np.frombuffer(BALL, np.uint8), 1), (640, 480))
+    differs = np.abs(shown.astype(int) - plain).mean(axis=(1, 2))
+    assert differs[60:420].mean() < 8 and differs[:20].mean() > 40  # the picture, and the strip with words
+    assert not site.link.has_listener(PREVIEW)
+
+
+def test_it_ends_when_nobody_watches_any_more(site, monkeypatch):
+    monkeypatch.setattr(viewing, "IDLE_S", 0.1)
+    overlays, previews = site.viewer.latest(OVERLAY), site.viewer.latest(PREVIEW)
+    assert until(lambda: site.link.has_listener(OVERLAY) and site.link.has_listener(PREVIEW))
+    site.frame()
+    assert overlays.take(5.0) and pixels(previews.take(5.0)).shape == (240, 320, 3)
+    site.viewer.ignore(OVERLAY)
+    assert until(lambda: not site.link.has_listener(OVERLAY)) and site.link.has_listener(PREVIEW)
+    site.viewer.close()
+    assert until(lambda: not site.link.has_listener(PREVIEW))
+    site.frame()
+    assert until(lambda: site.service._viewing._thread is None, 3.0)
+    assert overlays.take(0.2) is None
+
+
+def test_the_twist_is_out_before_its_picture_and_pictures_keep_their_pace(site):
+    arrivals = []
+    site.robot.subscribe(TWIST, lambda message: arrivals.append("twist"))
+    site.viewer.subscribe(OVERLAY, lambda message: arrivals.append("overlay"))
+    assert until(lambda: site.link.has_listener(OVERLAY))
+    started_s = time.monotonic()
+    while time.monotonic() - started_s < 1.0:
+        site.frame()
+    assert until(lambda: arrivals.count("overlay") >= 10)
+    lasted_s = time.monotonic() - started_s
+    assert arrivals[0] == "twist" and arrivals.count("twist") >= 30
+    assert arrivals.count("overlay") <= 15.0 * lasted_s + 2
+
+
+def test_a_picture_that_vision_refuses_is_not_shown(site):
+    overlays = site.viewer.latest(OVERLAY)
+    assert until(lambda: site.link.has_listener(OVERLAY))
+    site.frame(BAD)
+    assert overlays.take(0.3) is None
+    site.frame()
+    assert overlays.take(5.0) is not None
+
+
+def test_what_cannot_be_drawn_is_said_once_and_the_robot_is_driven_on(site, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("no paint")
+
+    monkeypatch.setattr(viewing, "draw_overlay", fail)
+    overlays = site.viewer.latest(OVERLAY)
+    assert until(lambda: site.link.has_listener(OVERLAY))
+    for _ in range(3):
+        site.frame()
+        assert site.twists.take(2.0) is not None
+        time.sleep(0.08)  # so that it is time for another overlay
+    assert until(lambda: site.said.count("vision: a picture cannot be shown: RuntimeError: no paint") == 1)
+    monkeypatch.undo()
+    assert until(lambda: site.frame() and overlays.take(0.1), 5.0)
+
+
+def test_any_zenoh_tool_sees_the_overlay_as_a_jpeg():
+    end = free_endpoint()
+    with ExitStack() as ending:
+        site = Site(ending, end)
+        stranger = open_session((), [end], 5.0)
+        ending.callback(stranger.close)
+        seen = []
+        stranger.declare_subscriber("sightline/r1/overlay/vision", seen.append)
+        assert until(lambda: site.link.has_listener(OVERLAY))
+        site.frame()
+        assert until(lambda: seen)
+        assert str(seen[0].encoding) == "image/jpeg"
+        assert cv2.imdecode(np.frombuffer(seen[0].payload.to_bytes(), np.uint8), 1).shape == (480, 640, 3)
+
+
+def test_with_keys_a_viewer_sees_it_and_only_vision_may_say_it(tmp_path):
+    keys.make(tmp_path / "k", ["robot.local"])
+    end, folder = free_endpoint().replace("tcp/", "tls/"), str(tmp_path / "k")
+    with ExitStack() as ending:
+        site = Site(ending, end, folder)
+        operator = ending.enter_context(open_link("r1", connect=[end], role="operator", secure=folder))
+        overlays = site.viewer.latest(OVERLAY)
+        assert until(lambda: site.link.has_listener(OVERLAY))
+        header = site.frame()
+        assert decode(DetectionsHeader, overlays.take(5.0).header).echo.seq == header.seq
+        for source in ("vision", "operator"):
+            operator.publish(OVERLAY, b"{}", b"forged", source)
+        assert overlays.take(0.5) is None
+
+
+@pytest.mark.parametrize("transport", ["tcp", "ws"])
+def test_somebody_elses_boxes_are_drawn_over_the_frame_that_they_name(transport):
+    end = free_endpoint().replace("tcp/", "ws://") if transport == "ws" else free_endpoint()
+    with ExitStack() as ending:
+        site = Site(ending, end, detector={"kind": "boxes"})
+        guest = ending.enter_context(open_link("r1", connect=[end], role="guest"))
+        site.robot.latest(DETECTIONS)  # as a robot does, to pass them on
+        overlays = site.viewer.latest(OVERLAY)
+        assert until(lambda: site.link.has_listener(OVERLAY) and guest.has_listener(DETECTIONS))
+        header = site.frame()
+        echo = Echo(channel="frame", session=header.session, seq=header.seq, t_us=header.t_us)
+        about = DetectionsHeader(source="guest", session="0000beef", seq=1, echo=echo)
+        box = DetectedBox(label="ball", score=0.9, x1_px=40.0, y1_px=100.0, x2_px=80.0, y2_px=140.0)
+        guest.publish(DETECTIONS, encode(about), encode(Detections(width_px=320, height_px=240, boxes=(box,))), "guest")
+        got = []
+        assert until(lambda: site.service.turn(0.05) or got.append(overlays.take()) or got[-1])
+        assert decode(DetectionsHeader, got[-1].header).echo == echo
+
+
+def test_too_large_for_the_channel_is_sent_coarser_or_not_at_all():
+    noise = np.random.default_rng(5).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    sizes = [len(viewing._encoded(noise, 80, bound) or b"") for bound in (10**9, 200_000, 120_000, 1_000)]
+    assert sizes[0] > 200_000 and 0 < sizes[1] <= 200_000 and sizes[3] == 0 and sizes[0] > sizes[1]
