@@ -12,7 +12,6 @@ from tests.fixtures.vision.vision import YELLOW_BGR, jpeg_of
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.colour_filter import ColorFilter
-from sightline.vision_side.detect.formats import foxglove_annotations, supervision_fields, vision_msgs_fields
 from sightline.vision_side.detect.filters import LabelFilter
 from sightline.vision_side.detect.overlap import corners, overlap
 from sightline.vision_side.detect.port import (
@@ -120,39 +119,3 @@ def test_overlap_is_a_share_and_the_same_both_ways(x: float, y: float, size: flo
 def test_boxes_are_clipped_to_the_picture(corners: tuple, expected: tuple | None) -> None:
     part = clipped(Detection(*corners, 0.5, "ball"), 320, 240)
     assert (None if part is None else (part.x1_px, part.y1_px, part.x2_px, part.y2_px)) == expected
-
-
-# --- what other tools take -------------------------------------------------------------------------------------------
-
-RESULT = DetectionResult(
-    "r1", "0000abcd", 7, 2_500_001, 320, 240,
-    (Detection(10, 20, 50, 60, 0.9, "ball", Circle(30, 40, 20), track_id=4),
-     Detection(1, 2, 3, 6, 0.5, "legs", track_id=9)),
-    "told",
-)
-
-
-def test_supervision_takes_it() -> None:
-    fields = supervision_fields(RESULT, ("legs", "ball"))
-    assert fields["xyxy"].tolist() == [[10, 20, 50, 60], [1, 2, 3, 6]]
-    assert fields["class_id"].tolist() == [1, 0]
-    assert fields["tracker_id"].tolist() == [4, 9]
-    assert fields["data"]["class_name"].tolist() == ["ball", "legs"]
-    empty = supervision_fields(DetectionResult("r1", "0000abcd", 7, 1, 320, 240, (), "told"))
-    assert empty["xyxy"].shape == (0, 4) and "tracker_id" not in empty
-
-
-def test_ros_takes_it() -> None:
-    fields = vision_msgs_fields(RESULT, "lens")
-    assert fields["header"] == {"stamp": {"sec": 2, "nanosec": 500_001_000}, "frame_id": "lens"}
-    first = fields["detections"][0]
-    assert first["bbox"] == {"center": {"position": {"x": 30, "y": 40}, "theta": 0.0}, "size_x": 40, "size_y": 40}
-    assert first["results"] == [{"hypothesis": {"class_id": "ball", "score": 0.9}}]
-    assert first["id"] == "4"
-
-
-def test_foxglove_takes_it() -> None:
-    fields = foxglove_annotations(RESULT)
-    assert [one["diameter"] for one in fields["circles"]] == [40]
-    assert fields["points"][0]["points"][2] == {"x": 50, "y": 60}
-    assert [one["text"] for one in fields["texts"]] == ["ball 0.90", "legs 0.50"]
