@@ -20,10 +20,10 @@ from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import Holder
-from sightline.robot_side.hardware.v4l2_camera import V4l2Camera
-from sightline.robot_side.hardware.v4l2_device import V4l2CameraConfig
+from sightline.robot_side.hardware.cameras.v4l2 import V4l2Camera
+from sightline.robot_side.hardware.cameras.v4l2 import V4l2CameraConfig
 from sightline.robot_side.pipe import CommandAck
-from sightline.robot_side.sending import NetworkCore
+from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.network.stream import StreamConfig
 
 BOUND_MS: Final = 0.1

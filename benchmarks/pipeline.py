@@ -14,9 +14,9 @@ import numpy as np
 from sightline.protocol.messages import CameraModel, FrameHeader
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.onnx.detector import OnnxDetector, read_onnx_model
-from sightline.vision_side.detect.onnx_engine import open_engine
+from sightline.vision_side.detect.onnx.engine import open_engine
 from sightline.vision_side.detect.onnx.tensors import fit_picture
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame
 from sightline.vision_side.pipeline import Frame, Pipeline

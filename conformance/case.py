@@ -14,13 +14,21 @@ raises `NotApplicableError` (through `bench.need`) when what it builds on is mis
 a choice.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import heapq
+import itertools
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from sightline.protocol.channels import Channel
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import WireModel
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
+from typing import Final, TYPE_CHECKING, TypeVar
 
-if TYPE_CHECKING:
-    from sightline.protocol.conformance.bench import Bench
 
 GROUPS: Final = {
     "FRAM": "framing",
@@ -112,3 +120,204 @@ class Suite:
 
 
 Run = Callable[["Bench"], None]
+
+
+# What a case sees of the world: messages, time, and words for what it expects. Pure; two files bring it to life.
+# `virtual.py` runs a peer in virtual time without sleeping, `live.py` a real one over the network. A case is written
+# in blocking style; only `wait` and `rest` let time pass, and callbacks (`on`, `after`) run inside them, never beside.
+
+
+KEPT_MESSAGES: Final = 600
+"""Per channel; 20 s of frames at 30 fps, longer than any case lasts."""
+
+Model = TypeVar("Model", bound=WireModel)
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """What the kit shows, or asks for: a token for each role, and a folder of keys. Both are empty at an open peer."""
+
+    tokens: Mapping[str, str] = field(default_factory=dict)
+    folder: str = ""
+
+    @property
+    def is_guarded(self) -> bool:
+        """Whether roles are kept apart by tokens or certificates."""
+        return bool(self.tokens or self.folder)
+
+    @property
+    def watcher(self) -> str:
+        """A role that may ask and may not drive: where keys are asked for, a viewer may say nothing at all."""
+        return "operator" if self.is_guarded else "viewer"
+
+    def may_ask(self, source: str) -> bool:
+        """Whether requests of `source` get through."""
+        return not self.is_guarded or source in SOURCES_OF_ROLE["operator"]
+
+    def token_of(self, source: str) -> str:
+        """What `source` shows; "" where nothing is asked for."""
+        return self.tokens.get(certificate_role(source), "")
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A message from the peer: when it arrived on the kit's clock, and its number among all that were heard."""
+
+    number: int
+    at_us: int
+    message: Message
+
+    def header(self, model: type[Model]) -> Model | None:
+        """The header as `model`; None for what is none (a case of its own says so)."""
+        return _read(model, self.message.header, len(self.message.header))
+
+    def payload(self, model: type[Model]) -> Model | None:
+        """The payload as `model`; None for what is none."""
+        return _read(model, self.message.payload, len(self.message.payload))
+
+
+def _read(model: type[Model], data: bytes, max_bytes: int) -> Model | None:
+    try:
+        return decode(model, data, max_bytes)
+    except WireError:
+        return None
+
+
+class Bench(ABC):
+    """One peer under test. `robot` is the robot's id: the peer's own, or the one that the kit plays."""
+
+    def __init__(self, robot: str, endpoint: str = "", older: str = "", access: Access | None = None) -> None:
+        """`endpoint` is where the peer is, `older` where it speaks the older dialect, `access` what opens its doors.
+
+        These three are for cases with sockets of their own.
+        """
+        self.robot, self.endpoint, self.older, self.access = robot, endpoint, older, access or Access()
+        self._log: dict[str, deque[Heard]] = {}
+        self._reactions: list[tuple[Channel, Callable[[Heard], None]]] = []
+        self._timers: list[tuple[int, int, Callable[[], None]]] = []
+        self._numbers = itertools.count(1)
+        self._newest_number = 0
+
+    # --- to be brought to life -----------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def now_us(self) -> int:
+        """The kit's clock, monotonic. Never compare it with a robot's `t_us`."""
+
+    @property
+    @abstractmethod
+    def dropped_here(self) -> Counter[str]:
+        """Messages of the peer that the kit's link turned away, by reason: OVERSIZE, INEXACT_KEY ..."""
+
+    @abstractmethod
+    def send(self, channel: Channel, header: bytes, payload: bytes, source: str) -> None:
+        """Publish bytes within the channel's bounds."""
+
+    @abstractmethod
+    def put(self, key: str, header: bytes, payload: bytes) -> None:
+        """Publish anything under any key, as a stranger could. Raises NotApplicableError where that cannot be."""
+
+    @abstractmethod
+    def leave(self) -> None:
+        """Close the kit's connection; nothing is heard and nothing can be sent until `join`."""
+
+    @abstractmethod
+    def join(self) -> None:
+        """Connect again, as a new connection."""
+
+    @abstractmethod
+    def _pass_time(self, until_us: int) -> None:
+        """Let some time pass, at most until `until_us`, and hand what arrived meanwhile to `_hear`."""
+
+    # --- messages ------------------------------------------------------------------------------------------------
+
+    def publish(self, channel: Channel, header: WireModel | bytes, payload: WireModel | bytes = b"", source: str = "") -> None:
+        """Send a message; `source` is the role in the key, for channels towards the robot."""
+        self.send(channel, _bytes(header), _bytes(payload), source)
+
+    def mark(self) -> int:
+        """A point in what was heard, for `heard`."""
+        return self._newest_number
+
+    def number(self) -> int:
+        """A number that this bench gives only once."""
+        return next(self._numbers)
+
+    def heard(self, channel: Channel, since: int = 0) -> list[Heard]:
+        """What came on `channel` after the mark `since`, oldest first."""
+        newer: list[Heard] = []
+        for one in reversed(self._log.get(channel.name, ())):
+            if one.number <= since:
+                break
+            newer.append(one)
+        return newer[::-1]
+
+    def newest(self, channel: Channel) -> Heard | None:
+        """The newest message of `channel`."""
+        log = self._log.get(channel.name)
+        return log[-1] if log else None
+
+    def on(self, channel: Channel, react: Callable[[Heard], None]) -> None:
+        """From now on call `react` for every message of `channel`, inside `wait` and `rest`."""
+        self._reactions.append((channel, react))
+
+    def forget(self) -> None:
+        """Drop the log, the reactions and the timers: between two cases."""
+        self._log.clear()
+        self._reactions.clear()
+        self._timers.clear()
+
+    def _hear(self, message: Message) -> None:
+        self._newest_number = next(self._numbers)
+        one = Heard(self._newest_number, self.now_us, message)
+        self._log.setdefault(message.channel.name, deque(maxlen=KEPT_MESSAGES)).append(one)
+        for channel, react in tuple(self._reactions):
+            if channel is message.channel:
+                react(one)
+
+    # --- time ----------------------------------------------------------------------------------------------------
+
+    def after(self, delay_us: int, call: Callable[[], None]) -> None:
+        """Call once, `delay_us` from now, inside `wait` and `rest`."""
+        heapq.heappush(self._timers, (self.now_us + delay_us, next(self._numbers), call))
+
+    def wait(self, until: Callable[[], object], within_us: int) -> bool:
+        """Let time pass until `until()` is true, at most `within_us`. Whether it became true."""
+        deadline_us = self.now_us + within_us
+        while not until():
+            if self.now_us >= deadline_us:
+                return False
+            next_us = min(deadline_us, self._timers[0][0]) if self._timers else deadline_us
+            self._pass_time(max(next_us, self.now_us))
+            self._ring()
+        return True
+
+    def rest(self, for_us: int) -> None:
+        """Let `for_us` pass."""
+        self.wait(lambda: False, for_us)
+
+    def _ring(self) -> None:
+        now_us = self.now_us
+        while self._timers and self._timers[0][0] <= now_us:
+            heapq.heappop(self._timers)[2]()
+
+    # --- verdicts ------------------------------------------------------------------------------------------------
+
+    def expect(self, condition: object, reason: str) -> None:
+        """Fail the case with `reason` unless `condition` is true."""
+        if not condition:
+            raise ConformanceError(reason)
+
+    def expect_within(self, until: Callable[[], object], within_us: int, reason: str) -> None:
+        """Fail the case unless `until()` becomes true in time."""
+        self.expect(self.wait(until, within_us), f"{reason} (waited {within_us / 1e6:g} s)")
+
+    def need(self, condition: object, reason: str) -> None:
+        """Leave the case as not applicable unless `condition` is true."""
+        if not condition:
+            raise NotApplicableError(reason)
+
+
+def _bytes(part: WireModel | bytes) -> bytes:
+    return part if isinstance(part, bytes) else encode(part)

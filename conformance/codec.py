@@ -9,10 +9,24 @@ The order of answers is free; each question gets exactly one.
 """
 
 import base64
+import contextlib
 import json
-from collections.abc import Iterable, Mapping
+import os
+import select
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from pathlib import Path
+from sightline.conformance.case import Bench, Case, Level, NotApplicableError, Suite
+from sightline.conformance.runner import Outcome, Result
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.spec.golden import outcome
+from types import TracebackType
+from typing import Any, Final, IO, Self
+
 
 MAX_ANSWER_BYTES: Final = 1_048_576
 """Security limit: a longer line is no answer."""
@@ -90,3 +104,280 @@ def _differ(expected: Any, got: Any, where: str) -> str:
 def _short(value: Any) -> str:
     text = ascii(value)
     return text if len(text) <= _PRINTED else text[:_PRINTED] + "..."
+
+
+# A codec of somebody else's as a process: questions to its stdin, answers from its stdout, in time. Shell.
+
+
+START_S: Final = 10.0
+"""Until the first answer: an interpreter may have to start and compile."""
+ANSWER_S: Final = 2.0
+"""From then on until the next answer, whichever it is."""
+END_S: Final = 2.0
+_READ_BYTES: Final = 65_536
+_LAST_WORDS: Final = 200
+
+
+class CodecProgram:
+    """Use it in a `with`; whatever happens, the program and what it started have ended afterwards."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        """Raises ConfigError if `command` cannot be started."""
+        try:
+            self._process = subprocess.Popen(
+                list(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise ConfigError(f"codec: cannot start {command[0]!r}: {error.strerror}; is it installed?") from None
+        self._number = 0
+        self._buffer = b""
+        self._last_words = b""
+        self._answered = False
+        assert self._process.stderr is not None
+        threading.Thread(target=self._listen, args=(self._process.stderr,), daemon=True).start()
+
+    def ask(self, questions: Iterator[Question]) -> Iterator[tuple[Question, dict[str, Any]]]:
+        """Ask all of them, and give each with its answer as it comes. Raises ProgramError."""
+        lines: list[bytes] = []
+        waiting: dict[int, Question] = {}
+        for question in questions:
+            self._number += 1
+            waiting[self._number] = question
+            lines.append(question.line(self._number))
+        threading.Thread(target=self._write, args=(b"".join(lines),), daemon=True).start()
+        while waiting:
+            number, answer = read_answer(self._line())
+            if number not in waiting:
+                raise ProgramError(f"an answer has the id {number}, which waits for none")
+            yield waiting.pop(number), answer
+
+    def finish(self) -> None:
+        """End its input, and wait for it to end. Raises ProgramError if it does not, or not well."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            code = self._process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            raise ProgramError(f"it does not end within {END_S:g} s of its input") from None
+        if code != 0:
+            raise ProgramError(f"it {_ended(code)}{self._said()}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+    # --- pipes -------------------------------------------------------------------------------------------------------
+
+    def _write(self, data: bytes) -> None:
+        """On a thread: a program may answer before it has read all. One that is gone is noticed by who reads."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(data)
+            self._process.stdin.flush()
+        except (OSError, ValueError):
+            return
+
+    def _listen(self, stderr: IO[bytes]) -> None:
+        """On a thread: read what it complains of, and keep the end."""
+        while data := os.read(stderr.fileno(), _READ_BYTES):
+            self._last_words = (self._last_words + data)[-_LAST_WORDS:]
+
+    def _line(self) -> bytes:
+        """The next line, without its end. Raises ProgramError if none comes in time, or ever."""
+        deadline_s = time.monotonic() + (ANSWER_S if self._answered else START_S)
+        while b"\n" not in self._buffer:
+            if len(self._buffer) > MAX_ANSWER_BYTES:
+                raise ProgramError(f"an answer is longer than {MAX_ANSWER_BYTES} bytes: {shown(self._buffer)}")
+            self._read(deadline_s)
+        line, _, self._buffer = self._buffer.partition(b"\n")
+        self._answered = True
+        return line
+
+    def _read(self, deadline_s: float) -> None:
+        assert self._process.stdout is not None
+        ready, _, _ = select.select([self._process.stdout], [], [], max(0.0, deadline_s - time.monotonic()))
+        if not ready:
+            raise ProgramError(f"no answer within {ANSWER_S if self._answered else START_S:g} s{self._said()}")
+        data = os.read(self._process.stdout.fileno(), _READ_BYTES)
+        if not data:
+            raise ProgramError(f"it {self._ending()} before it had answered{self._said()}")
+        self._buffer += data
+
+    def _ending(self) -> str:
+        try:
+            return _ended(self._process.wait(END_S))
+        except subprocess.TimeoutExpired:
+            return "closed its output"
+
+    def _said(self) -> str:
+        """Its last words on stderr, as one line."""
+        words = self._last_words.strip().splitlines()
+        return f"; it said {shown(words[-1])}" if words else ""
+
+
+def _ended(code: int) -> str:
+    return f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
+
+
+# What a codec is asked: every golden vector, every accepted one cut short, and twists to write. Pure.  A vector's
+# outcome is what its file says; what a cut message must come to is what our own decoders say of it. The files alone
+# decide what is asked: a new vector is a new case.
+
+
+VECTORS: Final = Path(__file__).parent.parent / "protocol" / "vectors"
+_HEX: Final = "_hex"
+_CUT_EVERY: Final = 8
+"""Of all but a channel's usual message: each is much like that one, and a kit should not take minutes."""
+_VECTORS_FROM, _CUTS_FROM, _WRITES_FROM = 1001, 2001, 3001
+
+_WRITTEN: Final = {
+    "usual": ("four decimals", 0.2, -0.35, "0.2000|-0.3500"),
+    "zero": ("four decimals though it is zero", 0, 0, "0.0000|0.0000"),
+    "minus_zero": ("no sign where it is zero", -0.0, -0.0, "0.0000|0.0000"),
+    "rounds_to_minus_zero": ("no sign where it rounds to zero", -1e-5, -4.9e-5, "0.0000|0.0000"),
+    "rounds_away": ("the last decimal rounded", 0.00006, -0.00006, "0.0001|-0.0001"),
+    "integers": ("four decimals though they are integers", 1, -2, "1.0000|-2.0000"),
+    "small": ("no exponent though it is small", 1e-7, 1e-300, "0.0000|0.0000"),
+    "large": ("no exponent and no groups though it is large", 123456.75, -9876543.5, "123456.7500|-9876543.5000"),
+    "tenths": ("the nearest decimals", 0.1, 0.30000000000000004, "0.1000|0.3000"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class CodecCase:
+    """One line of the report: all of its questions must be answered rightly; `family` is vector, cut or write."""
+
+    number: int
+    family: str
+    purpose: str
+    must: bool
+    clause: str
+    questions: Callable[[], Iterator[Question]]
+    """Made anew each time: there are tens of thousands."""
+
+
+def codec_cases(vectors: Path = VECTORS) -> list[CodecCase]:
+    """Every case: one per vector, one per vector that is accepted and can be cut, one per twist to write."""
+    read = [(path.relative_to(vectors).with_suffix("").as_posix(), json.loads(path.read_text("utf-8")))
+            for path in sorted(vectors.rglob("*.json"))]
+    able = [(name, vector) for name, vector in read if "accept" in vector and "key" in vector]
+    return [
+        *(_vector_case(_VECTORS_FROM + count, *one) for count, one in enumerate(read)),
+        *(_cut_case(_CUTS_FROM + count, *one) for count, one in enumerate(able)),
+        *(_write_case(_WRITES_FROM + count, *one) for count, one in enumerate(_WRITTEN.items())),
+    ]
+
+
+def _vector_case(number: int, name: str, vector: dict[str, Any]) -> CodecCase:
+    expected = {"ok": vector["accept"]} if "accept" in vector else {"refusal": vector["refuse"]}
+    asked = {field: value for field, value in vector.items() if field not in ("purpose", "accept", "refuse")}
+    kind = name.partition("/")[0]
+    if "key" in vector:
+        kind = "message"
+        asked = {field.removesuffix(_HEX): bytes.fromhex(value) if field.endswith(_HEX) else value
+                 for field, value in asked.items()}
+    purpose = f"`vectors/{name}.json`: {vector['purpose']}."
+    clause = "17.1 Golden vectors"
+    return CodecCase(number, "vector", purpose, True, clause, lambda: iter((Question(kind, asked, expected),)))
+
+
+def _cut_case(number: int, name: str, vector: dict[str, Any]) -> CodecCase:
+    key, header, payload = vector["key"], bytes.fromhex(vector["header_hex"]), bytes.fromhex(vector["payload_hex"])
+
+    step = 1 if name.endswith("/usual") else _CUT_EVERY
+
+    def questions() -> Iterator[Question]:
+        for size in range(0, min(len(header), len(header.rstrip()) + 1), step):
+            yield _message(key, header[:size], payload)
+        for size in range(0, len(payload), step):
+            yield _message(key, header, payload[:size])
+
+    where = "every byte" if step == 1 else f"every {step}th byte"
+    purpose = f"`vectors/{name}.json`, header or payload cut short at {where}."
+    return CodecCase(number, "cut", purpose, True, "17.2 Golden vectors", questions)
+
+
+def _message(key: str, header: bytes, payload: bytes) -> Question:
+    came_to = json.loads(json.dumps(outcome(key, header, payload)))
+    expected = {"ok": came_to["accept"]} if "accept" in came_to else {"refusal": came_to["refuse"]}
+    return Question("message", {"key": key, "header": header, "payload": payload}, expected)
+
+
+def _write_case(number: int, name: str, twist: tuple[str, float, float, str]) -> CodecCase:
+    purpose, linear, angular, text = twist
+    asked = Question("write_twist", {"linear_mps": linear, "angular_rad_s": angular}, {"ok": text})
+    return CodecCase(number, "write", f"A twist is written with {purpose} ({name}).", False, "4.2 Writing",
+                     lambda: iter((asked,)))
+
+
+# Every case for a codec, and running them against a program on a pipe. Shell.
+#
+# results = run_codec(["node", "codec_adapter.mjs"], CASES)
+
+
+END: Final = "C-CODEC-9001"
+
+
+def _on_a_pipe(_bench: Bench) -> None:
+    raise NotApplicableError("a codec is asked on a pipe, not over a network")
+
+
+def _cases(asked: Sequence[CodecCase]) -> tuple[Case, ...]:
+    suite = Suite("C")
+    for one in asked:
+        level = Level.MUST if one.must else Level.SHOULD
+        suite.add(Case(f"C-CODEC-{one.number}", level, one.clause, one.purpose, _on_a_pipe))
+    title = "The program ends, with 0, when its input ends."
+    suite.add(Case(END, Level.SHOULD, "17.3 A codec on a pipe", title, _on_a_pipe))
+    return tuple(suite.cases)
+
+
+_SENT: Final = {f"C-CODEC-{one.number}": one for one in codec_cases()}
+CASES: Final[tuple[Case, ...]] = _cases(tuple(_SENT.values()))
+
+
+def run_codec(
+    command: Sequence[str], cases: Sequence[Case] = CASES, on_result: Callable[[Result], None] = lambda _result: None
+) -> list[Result]:
+    """Ask the program of `command` about each of `cases`.
+
+    One that dies, hangs or answers what is no answer fails the case it was in; what it cannot be asked any more is not
+    applicable. Raises ConfigError if it cannot be started.
+    """
+    results: list[Result] = []
+    gone = ""
+    with CodecProgram(command) as program:
+        for case in cases:
+            began_s = time.monotonic()
+            outcome, reason = (Outcome.SKIPPED, "the program is gone") if gone else (Outcome.PASSED, "")
+            try:
+                if not gone:
+                    outcome, reason = _result(program, case)
+            except ProgramError as fault:
+                gone = reason = str(fault)
+                outcome = Outcome.FAILED
+            results.append(Result(case, outcome, reason, round((time.monotonic() - began_s) * 1e6)))
+            on_result(results[-1])
+    return results
+
+
+def _result(program: CodecProgram, case: Case) -> tuple[Outcome, str]:
+    """Ask one case's questions. Raises ProgramError."""
+    if case.id == END:
+        program.finish()
+        return Outcome.PASSED, ""
+    wrong, unsupported = "", ""
+    for question, answer in program.ask(_SENT[case.id].questions()):
+        if "unsupported" in answer:
+            unsupported = f"the program does not know questions of kind {question.kind}"
+        wrong = wrong or ("" if unsupported else same(dict(question.expected), answer))
+    if wrong:
+        return Outcome.FAILED, wrong
+    return (Outcome.SKIPPED, unsupported) if unsupported else (Outcome.PASSED, "")

@@ -21,14 +21,14 @@ from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.core import DriverCore
 from sightline.robot_side.safety.limits import TICK_US
 from sightline.robot_side.ports import Picture
-from sightline.robot_side.sending import NetworkCore
+from sightline.robot_side.network.core import NetworkCore
 from sightline.sim.process import PeriodicTimer
 from sightline.sim.robot import RobotModel
 from sightline.sim.scenario import Scenario
 from sightline.sim.truth import Truth
 from sightline.sim.world.world import World
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.around import close_detector, notices_of
+from sightline.vision_side.detect.plugin_calls import close_detector, notices_of
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
 from sightline.vision_side.missions.ranges import decode_scan

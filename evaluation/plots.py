@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from sightline.operator_side.preflight import needs
 from sightline.sim.scenario import Scenario, Wall
-from sightline.sim.things import Static
+from sightline.sim.scenario import Static
 from sightline.sim.truth import Truth
 
 if TYPE_CHECKING:

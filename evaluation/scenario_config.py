@@ -12,9 +12,9 @@ from pydantic import BaseModel, ValidationError
 
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.dead_zone import BlindZoneError, check_blind_zone
+from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
 from sightline.robot_side.ports import Ranges
-from sightline.sim.body import outline
+from sightline.sim.robot import outline
 from sightline.sim.robot import RobotModel, load_robot
 from sightline.sim.scenario import Scenario
 from sightline.sim.world.start import goals_seen

@@ -22,7 +22,7 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import SightlineError, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.open import open_link
 

@@ -1,10 +1,12 @@
 """A package that is not installed, said as the command that installs it. Pure."""
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-
+from pathlib import Path
 from sightline.protocol.errors import ConfigError
+
 
 _OURS = ("protocol", "robot_side", "vision_side", "sim", "operator_side", "benchmarks")
 _PYBULLET_UP_TO = (3, 11)
@@ -29,3 +31,20 @@ def _advice(package: str, extra: str, version: tuple[int, int]) -> str:
             "`docker compose up`, or let pip compile it (minutes): pip install 'sightline[sim]'"
         )
     return f"{package} is not installed: pip install 'sightline[{extra}]'"
+
+
+# Whether a result can be written where it is to go, looked at before the work that makes it. Shell.
+
+
+def check_out_file(path: Path) -> None:
+    """Raise ConfigError where no file of that name can be made or changed."""
+    try:
+        if not path.parent.is_dir():
+            raise ConfigError(f"{path}: there is no folder {path.parent}; name a file in one that exists")
+        if path.is_dir():
+            raise ConfigError(f"{path}: is a folder; name a file in it")
+        may = os.access(path if path.exists() else path.parent, os.W_OK)
+    except OSError:  # a folder on the way is somebody else's
+        may = False
+    if not may:
+        raise ConfigError(f"{path}: cannot be written; name a file in a folder of yours")

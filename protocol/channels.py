@@ -25,7 +25,7 @@ from sightline.protocol.messages import (
     Status,
     WireModel,
 )
-from sightline.protocol.mission_messages import MissionReport, MissionRequest
+from sightline.protocol.messages import MissionReport, MissionRequest
 from sightline.protocol.text import MAX_TWIST_BYTES
 
 MAX_HEADER_BYTES = 512

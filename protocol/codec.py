@@ -13,7 +13,7 @@ from sightline.protocol import VERSION
 from sightline.protocol.channels import MAX_HEADER_BYTES, SCAN, Channel
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import WireModel
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 
 Model = TypeVar("Model", bound=WireModel)
 

@@ -5,11 +5,10 @@ names; signs as in REP 103: x forward, y left, counter-clockwise positive. Times
 """
 
 from enum import StrEnum
-from typing import Annotated, Literal, Self
-
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-
 from sightline.protocol import VERSION
+from typing import Annotated, Final, Literal, Self
+
 
 MAX_INTEGER = 2**53 - 1  # the largest integer that every JSON reader holds exactly
 MAX_CHANNELS_SHOWN = 16
@@ -298,3 +297,49 @@ class CameraModel(WireModel):
     z_m: Number = 0.0
     pitch_rad: Number = 0.0
     calibrated: bool = False
+
+
+# What is said about missions: what vision is to do, and what it does. Frozen, strict, bounded models. Pure.
+
+
+MAX_WAYPOINTS: Final = 64
+"""Of one mission; a longer way is several."""
+MAX_WAYPOINT_M: Final = 100.0
+"""Each way from where odometry began: further off, wheels no longer know where they are."""
+MAX_OPTIONS: Final = 16
+
+MissionName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,31}$")]
+"""As vision's own machine knows it; never a path to code."""
+OptionName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.]{0,63}$")]
+OptionValue = bool | Number | Annotated[str, Field(max_length=64)]
+Metres = Annotated[float, Field(ge=-MAX_WAYPOINT_M, le=MAX_WAYPOINT_M)]
+
+
+class MissionRequest(WireModel):
+    """What vision is to do from now on; `id` is the asker's own and comes back in the report."""
+
+    id: Counter
+    name: MissionName
+    waypoints: Annotated[tuple[tuple[Metres, Metres], ...], Field(max_length=MAX_WAYPOINTS)] = ()
+    """(x_m, y_m) in the odometry frame."""
+    options: Annotated[dict[OptionName, OptionValue], Field(max_length=MAX_OPTIONS)] = {}  # noqa: RUF012
+    """For the mission's own configuration; a dot reaches into its tables."""
+
+
+class MissionReport(WireModel):
+    """What vision does at the moment.
+
+    `phase` is one or two words for a person, `note` the rest of the line. `asked` names the newest mission that was
+    asked for, `refused` says why it was not taken up.
+    """
+
+    mission: Annotated[str, Field(max_length=64)]
+    phase: Annotated[str, Field(max_length=32)]
+    note: Annotated[str, Field(max_length=200)] = ""
+    done: bool = False
+    asked: RequestId | None = None
+    refused: Annotated[str, Field(max_length=200)] = ""
+    detector: Annotated[str, Field(max_length=64)] = ""
+    device: Annotated[str, Field(max_length=32)] = ""
+    model: Annotated[str, Field(max_length=64)] = ""
+    inference_us: Microseconds | None = None

@@ -8,7 +8,7 @@ from pydantic import Field, field_validator
 
 from sightline.protocol.config import Config
 from sightline.protocol.messages import RobotId
-from sightline.protocol.transports.websocket_endpoints import with_allowed
+from sightline.protocol.transports.endpoints import with_allowed
 from sightline.robot_side.safety.guard import GuardConfig
 from sightline.robot_side.kinematics import DiffDriveConfig
 from sightline.robot_side.safety.limits import SafetyConfig

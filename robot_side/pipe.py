@@ -15,14 +15,25 @@ before it judges a RAW: it was sent before the frame, so it is there before any 
 """
 
 import json
+import socket
 import struct
-from collections.abc import Mapping
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from enum import IntEnum
-
-from sightline.protocol.channels import CHANNELS
-from sightline.protocol.messages import Holder, Planar, Pose
+from sightline.protocol.channels import CHANNELS, REQUEST
+from sightline.protocol.codec import decode
+from sightline.protocol.config import Config
+from sightline.protocol.errors import WireError
+from sightline.protocol.messages import Holder, Planar, Pose, Request, SessionId, Verb
 from sightline.protocol.transports.link import Message
+from sightline.robot_side.config import RobotConfig
+from typing import Final
+
 
 MAX_PACKET_BYTES = 65_536
 _ISSUED = struct.Struct("<BQQI")
@@ -142,3 +153,282 @@ def unpack_message(packet: bytes) -> Message:
     channel = CHANNELS[name.rstrip(b"\0").decode()]
     body = start + header_bytes
     return Message(channel, source.rstrip(b"\0").decode(), packet[start:body], packet[body:])
+
+
+# Requests that the driver's socket had no room for: kept until it has, STOP ahead of all. Pure.
+#
+# A twist that finds no room is dropped, for a newer one follows. A request comes once or is a person's STOP: it waits.
+
+
+MAX_PENDING: Final = 32
+
+
+class PendingRequests:
+    """The newest request per (source, verb), at most 32; a STOP always finds a place."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[tuple[str, Verb], Message] = {}
+
+    def __len__(self) -> int:
+        """How many wait."""
+        return len(self._waiting)
+
+    def hold(self, message: Message) -> bool:
+        """Keep a request; False for what is none, and when there is no room."""
+        try:
+            verb = decode(Request, message.payload).verb
+        except WireError:
+            return False
+        name = (message.source, verb)
+        if len(self._waiting) >= MAX_PENDING and name not in self._waiting and not self._gives_way(verb):
+            return False
+        self._waiting[name] = message
+        return True
+
+    def _gives_way(self, verb: Verb) -> bool:
+        """Make room for a STOP: it may cost anything but itself."""
+        if verb is not Verb.STOP:
+            return False
+        others = [name for name in self._waiting if name[1] is not Verb.STOP]
+        del self._waiting[others[0] if others else next(iter(self._waiting))]  # STOP is a level: one of 32 is as good
+        return True
+
+    def flush(self, send: Callable[[Message], bool]) -> bool:
+        """Send what waits, STOP first, until there is no room; whether nothing waits any more."""
+        for name in sorted(self._waiting, key=lambda name: name[1] is not Verb.STOP):
+            if not send(self._waiting[name]):
+                return False
+            del self._waiting[name]
+        return True
+
+
+# The network process's hold on its driver: both sockets, and the requests that found no room. Shell.
+
+
+class NetworkEnd:
+    """The driver as its network process sees it. Only `receive` waits; any thread may call."""
+
+    def __init__(self, waited: socket.socket, aside: socket.socket) -> None:
+        self._waited, self._aside = waited, aside
+        self._held = PendingRequests()
+        self._order = threading.Lock()
+        self.dropped_commands = 0
+
+    def receive(self) -> bytes:
+        """The next packet, however long it takes; empty when the driver has closed its end."""
+        try:
+            return self._waited.recv(MAX_PACKET_BYTES)
+        except OSError:
+            return b""
+
+    def motion(self, last: Motion) -> Motion:
+        """The newest that the driver said of the robot; `last` if it said nothing since."""
+        with suppress(OSError):
+            while packet := self._aside.recv(MAX_PACKET_BYTES, socket.MSG_DONTWAIT):
+                last = unpack_motion(packet)
+        return last
+
+    def tell(self, packet: bytes) -> bool:
+        """Hand over a packet that the driver waits for; False if there is no room."""
+        return _send_if_room(self._waited, packet)
+
+    def tell_aside(self, packet: bytes) -> bool:
+        """Hand over what the driver reads when it needs it; False if there is no room."""
+        return _send_if_room(self._aside, packet)
+
+    def forward(self, message: Message) -> None:
+        """A command goes on at once, undecoded. Without room a request waits; a twist is dropped and counted."""
+        with self._order:
+            if self._held.flush(self._pass) and self._pass(message):
+                return
+            if message.channel is not REQUEST or not self._held.hold(message):
+                self.dropped_commands += 1
+
+    def retry(self) -> None:
+        """Hand over the requests that wait, as far as there is room now."""
+        if len(self._held):
+            with self._order:
+                self._held.flush(self._pass)
+
+    def _pass(self, message: Message) -> bool:
+        return self.tell(pack_message(PacketKind.RAW, message))
+
+
+def _send_if_room(end: socket.socket, packet: bytes) -> bool:
+    try:
+        end.send(packet, socket.MSG_DONTWAIT)
+    except OSError:
+        return False
+    return True
+
+
+# The driver's hold on its network process: start it, talk to it without ever waiting for it, start it again. Shell.
+
+
+_PACKETS_PER_WAKE = 64  # a flood is drained in portions, so that no tick waits for its end
+_PACKETS_ASIDE = 1024  # more than that socket holds: all of it, but not for ever
+_DRAIN_US = 500_000  # to read what a dead process sent; a descendant may hold its end open
+_FIRST_BACKOFF_US = 700_000  # the wheels are at zero before anybody can drive them again
+_LONGEST_BACKOFF_US = 2_000_000
+_WEDGED_US = 2_000_000
+_STARTS_WITHIN_US = 30_000_000  # a first start reads its packages from a slow card
+_END_S = 1.0
+_CHILD: Final = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from sightline.robot_side.network.process import main; main()"
+)
+"""It looks for modules where the driver does: neither first in the folder that it starts in, where a file of the user's
+may be called as one of Python's, nor in another copy of this package than the driver's."""
+
+
+class NetworkSetup(Config):
+    """What the network process is told at its start, as its first packet."""
+
+    config: RobotConfig
+    session: SessionId
+    first_seq: int
+
+
+class DriverEnd:
+    """The network process as the driver sees it. No method waits for it, except `close`."""
+
+    def __init__(self, config: RobotConfig, session: str, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._heard = False
+        self._heard_us = 0
+        self._config = config
+        self._session = session
+        self._process: subprocess.Popen[bytes] | None = None
+        self.socket: socket.socket | None = None
+        """To wait on: commands from it, verdicts and messages to it."""
+        self._aside: socket.socket | None = None
+        """Nobody waits on it: frames issued, and the robot's motion. It wakes neither end."""
+        self._gone_us = 0
+        self._start_at_us = 0
+        self._backoff_us = _FIRST_BACKOFF_US
+        self._was_ready = False
+        self.restarts = -1
+        self.exit_code = 0
+        self.failed_at_start = False
+
+    def keep_alive(self, now_us: int, first_seq: int) -> None:
+        """Start it if it is not there and its time has come."""
+        if self._process is not None and self._process.poll() is not None and self._is_read(now_us):
+            self._on_exit(self._process.returncode, now_us)
+        if self._heard:
+            self._heard, self._heard_us = False, now_us
+        if self._process is not None and self._was_ready and now_us - self._heard_us > _WEDGED_US:
+            self._process.kill()  # stopped or wedged: it reports five times a second while it is well
+        if self._process is None and now_us >= self._start_at_us and not self.failed_at_start:
+            self._heard_us = now_us + _STARTS_WITHIN_US
+            try:
+                self._start(first_seq)
+            except OSError as error:
+                self._say(f"network process does not start: {error.strerror}; trying again")
+                self._start_at_us = now_us + _LONGEST_BACKOFF_US
+
+    def _start(self, first_seq: int) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        aside, their_aside = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with ExitStack() as undo, theirs, their_aside:
+            for end in (ours, aside):
+                undo.callback(end.close)
+                end.setblocking(False)
+            setup = NetworkSetup(config=self._config, session=self._session, first_seq=first_seq)
+            ours.send(setup.model_dump_json().encode())
+            ends = (theirs.fileno(), their_aside.fileno())
+            self._process = subprocess.Popen(_command(ends), pass_fds=ends, stdin=subprocess.DEVNULL)
+            undo.pop_all()
+        self.socket, self._aside = ours, aside
+        self.restarts += 1
+
+    def _is_read(self, now_us: int) -> bool:
+        """Whether all is read that the dead process sent: its last packet may be a STOP."""
+        self._gone_us = self._gone_us or now_us
+        return self.socket is None or now_us - self._gone_us >= _DRAIN_US
+
+    def _on_exit(self, code: int, now_us: int) -> None:
+        self._process, self._gone_us = None, 0
+        self._hang_up()
+        if not self._was_ready:  # it said why itself
+            self.failed_at_start, self.exit_code = True, code if code > 0 else 1
+            return
+        self._say(f"network process ended ({code}); starting it again")
+        self._start_at_us = now_us + self._backoff_us
+        self._backoff_us = min(2 * self._backoff_us, _LONGEST_BACKOFF_US)
+
+    def on_ready(self) -> None:
+        """Its endpoint is open: from here on it is restarted whatever happens."""
+        self._was_ready = True
+        self._backoff_us = _FIRST_BACKOFF_US
+
+    def send(self, packet: bytes) -> None:
+        """Hand over a packet or drop it: a child that does not read must not slow the driver."""
+        _send_or_drop(self.socket, packet)
+
+    def send_aside(self, packet: bytes) -> None:
+        """As `send`, without waking it: it looks when it needs to know."""
+        _send_or_drop(self._aside, packet)
+
+    def packets(self) -> Iterator[bytes]:
+        """What it has sent, a bounded portion: first all that it sent aside before."""
+        arrived = list(self._arrived())
+        for _ in range(_PACKETS_ASIDE):
+            packet = _receive(self._aside) if self._aside else None
+            if not packet:
+                break
+            yield packet
+        self._heard = self._heard or bool(arrived)
+        yield from arrived
+
+    def _arrived(self) -> Iterator[bytes]:
+        for _ in range(_PACKETS_PER_WAKE):
+            packet = _receive(self.socket) if self.socket else None
+            if packet:
+                yield packet
+            elif packet is None:
+                return
+            elif self.socket:  # it is gone, and all that it sent is read
+                self.socket.close()
+                self.socket = None
+
+    def _hang_up(self) -> None:
+        for end in (self.socket, self._aside):
+            if end:
+                end.close()
+        self.socket = self._aside = None
+
+    def close(self) -> None:
+        """End it: it leaves when its socket closes, and is killed if it does not within a second."""
+        self._hang_up()
+        if self._process is None:
+            return
+        deadline_s = time.monotonic() + _END_S
+        while self._process.poll() is None and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+        self._process.kill()
+        self._process.wait()
+
+
+def _command(ends: Sequence[int]) -> list[str]:
+    folders = [one for one in sys.path if isinstance(one, str)]  # Python ignores all else that a plug-in puts there
+    return [sys.executable, "-P", "-c", _CHILD, *map(str, ends), json.dumps(folders)]
+
+
+def _send_or_drop(end: socket.socket | None, packet: bytes) -> None:
+    if end:
+        try:
+            end.send(packet)
+        except OSError:
+            return
+
+
+def _receive(end: socket.socket) -> bytes | None:
+    """The next packet; None while there is none; empty when the other end is gone and all it sent has been read."""
+    for _ in range(2):
+        try:
+            return end.recv(MAX_PACKET_BYTES)
+        except BlockingIOError:
+            return None
+        except OSError:  # that it left packets of ours unread is told first, once; what it sent still waits
+            continue
+    return b""

@@ -1,5 +1,45 @@
 """Says when something periodic is due. Pure."""
 
+from __future__ import annotations
+
+import errno
+import fcntl
+import math
+import os
+import selectors
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from pydantic import Field
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.sim.bus import (
+    CAMERA,
+    MOTION,
+    MOTION_ANGLES,
+    MOTION_SET,
+    PICTURE_HEAD,
+    PICTURE_REQUEST,
+    RANGE,
+    RANGE_HEAD,
+    SimSocketConfig,
+    SimulationInfo,
+    TRUTH,
+    to_json,
+)
+from sightline.sim.robot import load_robot
+from sightline.sim.scenario import load_scenario
+from types import FrameType
+from typing import Annotated, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sightline.sim.world.world import World
+
 
 class PeriodicTimer:
     """On average exactly at its rate, whatever the steps in which it is asked."""
@@ -13,3 +53,352 @@ class PeriodicTimer:
         count = int(now_us / self._period_us)
         is_due, self._count = count > self._count, count
         return is_due
+
+
+# Where motor commands arrive: stamped, logged, latched. Shell (clock, file); called from the receiving thread.  The
+# log is what stopping is judged by, so a line is with the kernel before its command is obeyed, and survives kill -9.
+
+
+LOG_HEADER = b"t_us,left_rad_s,right_rad_s,left_rad,right_rad\n"
+
+
+class MotorPort:
+    """Holds the last speeds given; nobody's leaving changes them, as with real PWM."""
+
+    def __init__(self, log_path: str | None) -> None:
+        self.speeds_rad_s = (0.0, 0.0)
+        self.angles_rad = (0.0, 0.0)
+        """How far each wheel has turned, as the physics last said."""
+        self.refused = 0
+        try:
+            self._log = Path(log_path).open("wb", buffering=0) if log_path else None  # noqa: SIM115  closed by close()
+        except OSError as error:
+            raise ConfigError(f"motor_log {log_path}: {error.strerror}; name a file in a folder that exists") from None
+        if self._log:
+            self._log.write(LOG_HEADER)
+
+    def take(self, data: bytes) -> None:
+        """One packet from a drive; what is no pair of finite speeds is counted and changes nothing."""
+        t_us = monotonic_us()
+        speeds = MOTION_SET.unpack(data) if len(data) == MOTION_SET.size else (math.nan, math.nan)
+        if not all(map(math.isfinite, speeds)):
+            self.refused += 1
+            return
+        if self._log:
+            left_rad, right_rad = self.angles_rad
+            self._log.write(b"%d,%.5f,%.5f,%.5f,%.5f\n" % (t_us, *speeds, left_rad, right_rad))
+        self.speeds_rad_s = (speeds[0], speeds[1])
+
+    def close(self) -> None:
+        """Close the log."""
+        if self._log:
+            self._log.close()
+
+
+# The simulation's side of the bus: who is connected, and what they say. Shell (sockets, one thread).  The thread
+# accepts and receives; the physics loop only sends, and never waits: what a client does not take is dropped.
+
+
+SEND_BYTES = {MOTION: 4096, RANGE: 16_384, CAMERA: 1 << 20, TRUTH: 1 << 17}
+"""How much may wait for a client that does not read; little where only the newest is worth anything."""
+STOP_POLL_S = 0.2
+
+
+class SocketFolder:
+    """The folder of sockets, held by one simulation at a time through a lock that dies with its process."""
+
+    def __init__(self, path: str) -> None:
+        self.path = Path(path)
+        try:
+            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._lock = os.open(self.path / "sim.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise ConfigError(f"socket_dir {path}: {error.strerror}; choose another with --set socket_dir=") from None
+        self._hold()
+
+    def _hold(self) -> None:
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.read(self._lock, 32).decode("ascii", "replace").strip() or "?"
+            os.close(self._lock)
+            raise ConfigError(
+                f"socket_dir {self.path} is held by another simulation, process {holder}; "
+                "end it or choose another with --set socket_dir="
+            ) from None
+        os.ftruncate(self._lock, 0)
+        os.write(self._lock, f"{os.getpid()}\n".encode())
+
+    def listen(self, name: str) -> socket.socket:
+        """A listening socket in place of whatever a dead simulation left."""
+        place = self.path / name
+        place.unlink(missing_ok=True)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        listener.setblocking(False)
+        listener.bind(str(place))
+        listener.listen(8)
+        return listener
+
+    def close(self) -> None:
+        """Remove the sockets, then let go; idempotent."""
+        if self._lock >= 0:
+            for name in SEND_BYTES:
+                (self.path / name).unlink(missing_ok=True)
+            os.close(self._lock)
+            self._lock = -1
+
+
+class BusClients:
+    """Everybody connected to the four sockets of a folder."""
+
+    def __init__(self, folder: SocketFolder, hellos: dict[str, bytes], on_motion: Callable[[bytes], None]) -> None:
+        self._hellos, self._on_motion = hellos, on_motion
+        self._lock = threading.Lock()
+        self._clients: dict[str, set[socket.socket]] = {name: set() for name in SEND_BYTES}
+        self._wanting: dict[socket.socket, tuple[int, int]] = {}
+        self._selector = selectors.DefaultSelector()
+        self._listeners = {name: folder.listen(name) for name in SEND_BYTES}
+        for name, listener in self._listeners.items():
+            self._selector.register(listener, selectors.EVENT_READ, name)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="sim-sockets", daemon=True)
+        self._thread.start()
+
+    def has(self, name: str) -> bool:
+        """Whether anybody is connected there."""
+        return bool(self._clients[name])
+
+    def send(self, name: str, data: bytes) -> None:
+        """Send to everybody there who has room."""
+        with self._lock:
+            for client in self._clients[name]:
+                _send(client, data)
+
+    def wanted_pictures(self) -> set[tuple[int, int]]:
+        """The (quality_percent, scale_percent) that cameras asked the next capture in."""
+        with self._lock:
+            return set(self._wanting.values())
+
+    def send_picture(self, wanted: tuple[int, int], data: bytes) -> None:
+        """Send to the cameras that asked for it so, which settles their requests."""
+        with self._lock:
+            for client in [one for one, asked in self._wanting.items() if asked == wanted]:
+                _send(client, data)
+                del self._wanting[client]
+
+    def _serve(self) -> None:
+        while not self._stopping.is_set():
+            for key, _ in self._selector.select(STOP_POLL_S):
+                connection, name = key.fileobj, key.data
+                assert isinstance(connection, socket.socket)
+                if connection is self._listeners[name]:
+                    self._accept(connection, name)
+                else:
+                    self._receive(connection, name)
+
+    def _accept(self, listener: socket.socket, name: str) -> None:
+        try:
+            client, _ = listener.accept()
+        except OSError:
+            return  # it went away again
+        client.setblocking(False)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES[name])
+        if name in self._hellos:
+            _send(client, self._hellos[name])
+        self._selector.register(client, selectors.EVENT_READ, name)
+        with self._lock:
+            self._clients[name].add(client)
+
+    def _receive(self, client: socket.socket, name: str) -> None:
+        try:
+            data = client.recv(64)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(client, name)
+        elif name == MOTION:
+            self._on_motion(data)
+        elif name == CAMERA:
+            with self._lock:
+                self._wanting[client] = _wanted(data)
+
+    def _drop(self, client: socket.socket, name: str) -> None:
+        self._selector.unregister(client)
+        with self._lock:
+            self._clients[name].discard(client)
+            self._wanting.pop(client, None)
+            client.close()
+
+    def close(self) -> None:
+        """End the thread and every connection."""
+        self._stopping.set()
+        self._thread.join(timeout=5 * STOP_POLL_S)
+        with self._lock:
+            for connection in (*self._listeners.values(), *(c for held in self._clients.values() for c in held)):
+                connection.close()
+        self._selector.close()
+
+
+def _send(client: socket.socket, data: bytes) -> None:
+    """Send or drop: a full buffer and a client that just left are no concern of the physics."""
+    try:
+        client.send(data)
+    except OSError as error:
+        if error.errno == errno.EMSGSIZE:
+            raise HardwareError(
+                f"a picture of {len(data)} bytes does not fit a local socket; lower jpeg_quality or the camera's size"
+            ) from None
+
+
+def _wanted(data: bytes) -> tuple[int, int]:
+    """How a picture was asked for; what is no such request asks for it as it is."""
+    if len(data) != PICTURE_REQUEST.size:
+        return 100, 100
+    quality_percent, scale_percent = PICTURE_REQUEST.unpack(data)
+    return max(1, min(100, quality_percent)), max(1, min(100, scale_percent))
+
+
+# The simulation in real time, as a process that stands in for the hardware. Shell.  The main thread steps and draws
+# against absolute deadlines; another receives (`sockets.py`), so that a motor command is stamped and logged while a
+# picture is being drawn. World time and the robot's monotonic clock differ by a constant.
+
+
+ENCODERS_US, TRUTH_US = 10_000, 20_000
+LAG_TOLD_US = 100_000
+LAG_GIVEN_UP_US = 1_000_000  # after a suspended machine, time is skipped rather than replayed
+
+
+class SimConfig(SimSocketConfig):
+    """One simulated robot."""
+
+    scenario: Annotated[str, Field(min_length=1)] = "circle"
+    """A name (`sim/scenarios/`) or the path of a `.toml` file."""
+    robot: str = ""
+    """A name (`sim/robots/`) or the path of a `.toml` file; empty for the one that the scenario names."""
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    motor_log: str | None = None
+    """CSV of every motor command, stamped on receipt."""
+    seconds: Annotated[float, Field(gt=0)] | None = None
+    """End by itself after this long."""
+
+
+class Simulation:
+    """A world, its clients and the clock that drives it."""
+
+    def __init__(self, config: SimConfig, world: World, folder: SocketFolder) -> None:
+        self._config, self._world = config, world
+        self._motors = MotorPort(config.motor_log)
+        self._clients = BusClients(folder, self._hellos(), self._motors.take)
+        self._encoders, self._truth = PeriodicTimer(ENCODERS_US), PeriodicTimer(TRUTH_US)
+        self._frames = PeriodicTimer(1e6 / world.robot.camera.fps)
+        self._scans = PeriodicTimer(1e6 / world.robot.lidar.rate_hz)
+        self._offset_us = monotonic_us()
+        self._lag_us = 0
+        self._told_lag = False
+        self.stopping = False
+
+    def _hellos(self) -> dict[str, bytes]:
+        config = self._config
+        robot = config.robot or self._world.scenario.robot
+        about = SimulationInfo(scenario=config.scenario, robot=robot, seed=config.seed, pid=os.getpid())
+        return {CAMERA: encode(self._world.camera_model), TRUTH: about.model_dump_json().encode()}
+
+    def run(self) -> None:
+        """Step until told to stop or the time is over."""
+        end_us = self._config.seconds * 1e6 if self._config.seconds else float("inf")
+        self._offset_us = monotonic_us()
+        while not self.stopping and self._world.now_us < end_us:
+            self._wait()
+            self._world.set_wheels(*self._motors.speeds_rad_s)
+            self._world.step()
+            self._motors.angles_rad = self._world.wheels_turned()
+            self._publish(self._world.now_us)
+
+    def _wait(self) -> None:
+        """Sleep to the next step's deadline, and mind how late it is."""
+        from sightline.sim.world.world import STEP_US
+
+        late_us = monotonic_us() - (self._offset_us + self._world.now_us + STEP_US)
+        if late_us < 0:
+            time.sleep(-late_us / 1e6)
+        self._lag_us = max(0, late_us)
+        if self._lag_us > LAG_TOLD_US and not self._told_lag:
+            print(f"simulation is {self._lag_us // 1000} ms behind the clock; is the machine busy?", flush=True)
+        self._told_lag = self._lag_us > (LAG_TOLD_US // 5 if self._told_lag else LAG_TOLD_US)
+        if self._lag_us > LAG_GIVEN_UP_US:
+            self._offset_us += self._lag_us
+
+    def _publish(self, now_us: int) -> None:
+        """Send what is due and wanted."""
+        t_us = now_us + self._offset_us
+        if self._encoders.due(now_us):
+            angles = self._world.wheel_angles()
+            self._clients.send(MOTION, MOTION_ANGLES.pack(angles.left_rad, angles.right_rad, t_us))
+        if self._frames.due(now_us):
+            self._draw(t_us)
+        if self._scans.due(now_us) and self._clients.has(RANGE):
+            self._clients.send(RANGE, self._scan(t_us))
+        if self._truth.due(now_us) and self._clients.has(TRUTH):
+            truth = replace(self._world.truth(), t_us=t_us, lag_us=self._lag_us)
+            self._clients.send(TRUTH, truth.to_json())
+
+    def _draw(self, t_us: int) -> None:
+        """A picture for each way in which one is wanted: one, unless cameras differ in what they ask."""
+        asked = self._clients.wanted_pictures()
+        if asked and self._world.scenario.labels and self._clients.has(TRUTH):
+            self._clients.send(TRUTH, to_json(self._world.labels(), t_us, self._world.camera_model.width_px))
+        for wanted in asked:
+            self._clients.send_picture(wanted, PICTURE_HEAD.pack(t_us, wanted[1]) + self._world.render(*wanted))
+
+    def _scan(self, t_us: int) -> bytes:
+        scan = self._world.scan()
+        limits = (scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, scan.range_max_m)
+        return RANGE_HEAD.pack(t_us, *limits) + scan.ranges_m.tobytes()
+
+    def close(self) -> None:
+        """End every connection and the log."""
+        self._clients.close()
+        self._motors.close()
+
+
+def run(config: SimConfig) -> int:
+    """Simulate until SIGTERM, SIGINT or `seconds`; call it from the main thread.
+
+    Prints one line that begins with `simulation ready` once everything accepts. Raises ConfigError for an unknown
+    scenario or robot, a `socket_dir` in use, a missing extra.
+    """
+    scenario = load_scenario(config.scenario)
+    robot = load_robot(config.robot or scenario.robot)
+    folder = SocketFolder(config.socket_dir)
+    try:
+        with _world_class()(scenario, robot, config.seed) as world:
+            _simulate(Simulation(config, world, folder), config, robot.name)
+    finally:
+        folder.close()
+    return 0
+
+
+def _simulate(simulation: Simulation, config: SimConfig, robot: str) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  the signature is Python's
+        simulation.stopping = True
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        print(f"simulation ready: {config.scenario}, {robot}, seed {config.seed}, in {config.socket_dir}",
+              flush=True)
+        simulation.run()
+    finally:
+        simulation.close()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _world_class() -> type[World]:
+    """Imported late: whoever only reads `SimConfig` needs neither PyBullet nor NumPy."""
+    try:
+        from sightline.sim.world.world import World
+    except ImportError as error:
+        raise ConfigError(f"the simulation needs {error.name}; install it with: pip install 'sightline[sim]'") from None
+    return World

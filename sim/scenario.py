@@ -1,18 +1,347 @@
-"""What happens in a simulated run: the models behind `scenarios/*.toml`. Pure."""
+"""A closed path of straights and arcs, by arc length: where a moving target is. Pure."""
 
+import difflib
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
-
-from pydantic import Field, model_validator
-
+from pydantic import AfterValidator, Field, model_validator
 from sightline.protocol.config import Config
-from sightline.sim.light import Light
-from sightline.sim.look import Look, look_named
-from sightline.sim.things import Amounts, Color, Forced, Moving, OnPath, Point, Pushed, Span, Standing, Static
+from sightline.protocol.errors import ConfigError
 from sightline.sim.toml_file import check, find, names_in, read_table
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 __all__ = ["Forced", "OnPath", "Pushed", "Scenario", "Start", "Static", "Wall", "load_scenario", "scenario_names"]
+
+
+class Leg(Config):
+    """One piece of a path: its length along the path and how far it turns, left positive."""
+
+    length_m: Annotated[float, Field(gt=0, le=1000)]
+    turn_deg: Annotated[float, Field(ge=-3600, le=3600)] = 0.0
+
+
+class Place(NamedTuple):
+    """A point and the heading of whoever moves through it."""
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+class ClosedPath:
+    """Legs walked for ever, starting at `start`. Raises ValueError when the end does not meet the start."""
+
+    def __init__(self, start: Place, legs: tuple[Leg, ...]) -> None:
+        self._legs = legs
+        self._starts = [start]
+        for leg in legs:
+            self._starts.append(_along(self._starts[-1], leg, leg.length_m))
+        self.length_m = math.fsum(leg.length_m for leg in legs)
+        end = self._starts[-1]
+        gap_m = math.hypot(end.x_m - start.x_m, end.y_m - start.y_m)
+        bend_rad = abs(math.remainder(end.heading_rad - start.heading_rad, math.tau))
+        if gap_m > 0.01 or bend_rad > 0.02:
+            off = f"{gap_m:.3f} m and {math.degrees(bend_rad):.1f} degrees"
+            raise ValueError(f"the path does not close: it ends {off} from its start")
+
+    def at(self, distance_m: float) -> Place:
+        """The place `distance_m` along the path; laps repeat."""
+        left_m = distance_m % self.length_m
+        for leg, start in zip(self._legs, self._starts, strict=False):
+            if left_m <= leg.length_m:
+                return _along(start, leg, left_m)
+            left_m -= leg.length_m
+        return self._starts[0]
+
+
+def _along(start: Place, leg: Leg, distance_m: float) -> Place:
+    """The place `distance_m` into `leg`: the chord of an arc, which a straight is the limit of."""
+    half_rad = math.radians(leg.turn_deg) * distance_m / leg.length_m / 2
+    chord_m = distance_m * (math.sin(half_rad) / half_rad if abs(half_rad) > 1e-9 else 1.0)
+    heading_rad = start.heading_rad + half_rad
+    return Place(
+        start.x_m + chord_m * math.cos(heading_rad),
+        start.y_m + chord_m * math.sin(heading_rad),
+        start.heading_rad + 2 * half_rad,
+    )
+
+
+# What stands, rolls and walks in a scenario: shapes, and how each moves. Pure.
+#
+# The target is one of them, and so is whatever else is there: blocks of a lane, a cylinder in the way, other people.
+
+
+Metres = Annotated[float, Field(ge=-100, le=100)]
+Degrees = Annotated[float, Field(ge=-360, le=360)]
+Unit = Annotated[float, Field(ge=0, le=1)]
+Side = Annotated[float, Field(gt=0, le=10)]
+Color = tuple[Unit, Unit, Unit]
+"""Red, green, blue."""
+Point = tuple[Metres, Metres]
+
+
+def _ordered(span: tuple[float, float]) -> tuple[float, float]:
+    if span[0] > span[1]:
+        raise ValueError(f"lowest first: [{span[1]}, {span[0]}]")
+    return span
+
+
+Span = Annotated[tuple[Degrees, Degrees], AfterValidator(_ordered)]
+"""(lowest, highest); the seed draws between them."""
+Amount = Annotated[float, Field(ge=0, le=100)]
+Amounts = Annotated[tuple[Amount, Amount], AfterValidator(_ordered)]
+"""A span of what cannot be negative."""
+
+
+class Legs(Config):
+    """A person from the knees down: two upright cylinders that walk. A foot stands, or swings twice as fast."""
+
+    apart_m: Side = 0.20
+    """Between the legs' middles."""
+    stride_m: Side = 0.9
+    """Way of one whole step of both legs."""
+
+    def ahead_m(self, way_m: float, is_left: bool) -> float:
+        """How far a leg is ahead of the person, who has walked `way_m`: a triangle wave of a quarter stride."""
+        turn = (way_m / self.stride_m + (0.0 if is_left else 0.5)) % 1.0
+        return self.stride_m * (abs(2.0 * turn - 1.0) - 0.5) / 2.0
+
+
+class Thing(Config):
+    """What every one of them has: a shape on the floor."""
+
+    shape: Literal["ball", "box", "cylinder", "legs", "place"] = "ball"
+    """`place` is a point of the floor: nothing to see and nothing to touch."""
+    radius_m: Annotated[float, Field(gt=0, le=1)] = 0.10
+    """Of a ball, a cylinder, a leg."""
+    size_m: tuple[Side, Side, Side] = (0.266, 0.317, 0.281)
+    """Of a box: along, across, up."""
+    height_m: Side = 0.4
+    """Of a cylinder or a leg."""
+    legs: Legs = Legs()
+    colour: Color = (0.95, 0.78, 0.05)
+
+    @property
+    def middle_m(self) -> float:
+        """How high its middle is."""
+        heights = {"ball": 2 * self.radius_m, "box": self.size_m[2], "place": 0.0}
+        return heights.get(self.shape, self.height_m) / 2
+
+    @property
+    def reach_m(self) -> float:
+        """Radius of the circle around it, seen from above."""
+        if self.shape == "box":
+            return math.hypot(self.size_m[0], self.size_m[1]) / 2
+        return self.radius_m + (self.legs.apart_m / 2 if self.shape == "legs" else 0.0)
+
+
+class Static(Thing):
+    """Does not move; nothing can move it."""
+
+    kind: Literal["static"] = "static"
+    at_m: Point = (0.0, 0.0)
+    heading_deg: Degrees = 0.0
+    jitter_m: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """The seed moves it by up to this much along each axis."""
+
+
+class OnPath(Thing):
+    """Moves along a closed path at constant speed; nothing can stop it."""
+
+    kind: Literal["path"]
+    start_m: Point = (0.0, 0.0)
+    heading_deg: Degrees = 0.0
+    path: Annotated[tuple[Leg, ...], Field(min_length=1, max_length=64)]
+    speed_mps: Annotated[float, Field(ge=0, le=5)]
+    phase: Amounts = (0.0, 1.0)
+    """Where on the path it begins, as a fraction of a lap."""
+    waits_s: Annotated[float, Field(ge=0, le=600)] = 0.0
+    """How long it stands there first."""
+
+    @model_validator(mode="after")
+    def _closes(self) -> Self:
+        self.closed_path()
+        return self
+
+    def closed_path(self) -> ClosedPath:
+        """The path itself."""
+        return ClosedPath(Place(*self.start_m, math.radians(self.heading_deg)), self.path)
+
+
+class Rolling(Thing):
+    """A real ball, which can be bumped."""
+
+    at_m: Point = (0.0, 0.0)
+    mass_kg: Annotated[float, Field(gt=0, le=100)] = 0.3
+    drag: Annotated[float, Field(ge=0, le=1)] = 0.3
+    """Fraction of its speed that rolling loses each second."""
+
+    @model_validator(mode="after")
+    def _is_round(self) -> Self:
+        if self.shape != "ball":
+            raise ValueError(f"only a ball rolls; a {self.shape} is static or on a path")
+        return self
+
+
+class Pushed(Rolling):
+    """Rolls where seeded pushes send it."""
+
+    kind: Literal["pushed"]
+    push_every_s: Amounts = (2.0, 4.0)
+    push_mps: Amounts = (0.15, 0.3)
+    """Speed that a push gives a resting ball."""
+    arena_m: Annotated[float, Field(gt=0, le=100)] = 1.5
+    """Pushes aim at random points within this radius of `at_m`, so that it stays about."""
+
+
+class Forced(Rolling):
+    """Rolls under one constant force, for ever; drag gives it a top speed."""
+
+    kind: Literal["forced"]
+    heading_deg: Degrees = 0.0
+    force_n: Annotated[float, Field(ge=0, le=100)]
+    from_s: Amount = 1.0
+    """When the force begins."""
+
+
+Moving = Annotated[Static | OnPath | Pushed | Forced, Field(discriminator="kind")]
+Standing = Annotated[Static | OnPath, Field(discriminator="kind")]
+"""What else there is but the target: nothing that the robot could push about."""
+
+
+# A traffic light: what it looks like and when it is which colour. Pure.
+#
+# Three lamps in a housing on a pole, or one box that changes its colour as a whole. It faces whoever drives along the
+# lane; the stop line crosses the lane `line_m` before it.
+
+
+State = Literal["red", "yellow", "green"]
+
+LIT: dict[str, Color] = {"red": (0.95, 0.10, 0.08), "yellow": (0.98, 0.80, 0.06), "green": (0.06, 0.80, 0.22)}
+UNLIT = 0.22  # of its lit colour: glass that nothing shines behind
+
+
+class Phase(Config):
+    """One colour for a time."""
+
+    state: State
+    seconds: Annotated[float, Field(gt=0, le=600)]
+
+
+class Part(NamedTuple):
+    """One body of the light: sizes as its shape needs them; `state` is the colour it shows, "" for what never lights.
+    """
+
+    shape: Literal["box", "ball"]
+    at_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]
+    state: State | Literal["", "all"]
+
+
+class Light(Config):
+    """One light. The older write-up's schedule is the default: red 5 s, green 5 s, yellow 2 s."""
+
+    kind: Literal["lamps", "box"] = "lamps"
+    at_m: Point
+    faces_deg: Degrees = 180.0
+    """Where it looks: towards those who come."""
+    height_m: Side = 0.34
+    """Of the housing's middle, which must be in the robots' view."""
+    housing_m: tuple[Side, Side, Side] = (0.06, 0.10, 0.26)
+    """Deep, wide, high."""
+    lamp_radius_m: Side = 0.033
+    box_m: tuple[Side, Side, Side] = (0.266, 0.317, 0.281)
+    line_m: Side = 0.6
+    """The stop line is this far before it."""
+    schedule: Annotated[tuple[Phase, ...], Field(min_length=1, max_length=16)] = (
+        Phase(state="red", seconds=5.0), Phase(state="green", seconds=5.0), Phase(state="yellow", seconds=2.0),
+    )
+    begin: Amounts = (0.0, 1.0)
+    """Where in its cycle it begins, as a fraction; the seed draws."""
+
+    def state_at(self, begin: float, now_us: int) -> State:
+        """Which colour is lit at `now_us` of a run that began at `begin` of the cycle."""
+        cycle_s = math.fsum(phase.seconds for phase in self.schedule)
+        left_s = (begin * cycle_s + now_us / 1e6) % cycle_s
+        for phase in self.schedule:
+            if left_s < phase.seconds:
+                return phase.state
+            left_s -= phase.seconds
+        return self.schedule[-1].state
+
+    def parts(self) -> list[Part]:
+        """Its bodies, where they are in the world."""
+        if self.kind == "box":
+            return [Part("box", (*self.at_m, self.box_m[2] / 2), self.box_m, "all")]
+        deep, _, high = self.housing_m
+        pole_m = self.height_m - high / 2
+        parts = [Part("box", (*self.at_m, pole_m / 2), (0.03, 0.03, pole_m), ""),
+                 Part("box", (*self.at_m, self.height_m), self.housing_m, "")]
+        states: tuple[State, ...] = ("red", "yellow", "green")
+        for state, up_m in zip(states, (high / 3, 0.0, -high / 3), strict=True):
+            x_m, y_m = self.ahead(deep / 2)
+            size_m = (self.lamp_radius_m,) * 3
+            parts.append(Part("ball", (x_m, y_m, self.height_m + up_m), size_m, state))
+        return parts
+
+    def ahead(self, way_m: float) -> Point:
+        """The point `way_m` before the light."""
+        faces_rad = math.radians(self.faces_deg)
+        return self.at_m[0] + way_m * math.cos(faces_rad), self.at_m[1] + way_m * math.sin(faces_rad)
+
+    def past_line_m(self, x_m: float, y_m: float) -> float:
+        """How far a point is beyond the stop line, negative before it."""
+        faces_rad = math.radians(self.faces_deg)
+        line_x_m, line_y_m = self.ahead(self.line_m)
+        return (line_x_m - x_m) * math.cos(faces_rad) + (line_y_m - y_m) * math.sin(faces_rad)
+
+
+def color_of(part: Part, state: State) -> Color:
+    """What a part looks like while `state` is lit."""
+    if part.state == "":
+        return 0.07, 0.07, 0.08
+    if part.state == "all":
+        return LIT[state]
+    red, green, blue = LIT[part.state]
+    share = 1.0 if part.state == state else UNLIT
+    return red * share, green * share, blue * share
+
+
+# How pictures look: light and camera defects as data (`looks.toml`). Pure.
+
+
+LOOKS = Path(__file__).parent / "looks.toml"
+
+Gain = Annotated[float, Field(gt=0, le=4)]
+
+
+class Look(Config):
+    """What happens to a picture between the scene and the JPEG, in this order."""
+
+    exposure: Gain = 1.0
+    """Brightness factor; above 1 the bright parts burn out."""
+    saturation: Annotated[float, Field(ge=0, le=2)] = 1.0
+    """Colourfulness: 0 is a grey picture."""
+    white_balance: tuple[Gain, Gain, Gain] = (1.0, 1.0, 1.0)
+    """Factors on red, green, blue."""
+    blur_px: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Standard deviation of the lens's blur."""
+    noise: Annotated[float, Field(ge=0, le=64)] = 2.0
+    """Standard deviation, in steps of 0..255."""
+    jpeg_quality: Annotated[int, Field(ge=5, le=100)] = 80
+
+
+def look_named(name: str) -> Look:
+    """A look of `looks.toml`. Raises ConfigError with the nearest name."""
+    table = read_table(LOOKS)
+    if name not in table:
+        near = difflib.get_close_matches(name, table, n=1)
+        hint = f", did you mean {near[0]!r}?" if near else ""
+        raise ConfigError(f"no look called {name!r}{hint}; there are {', '.join(sorted(table))}")
+    return check(Look, table[name], LOOKS)
+
+
+# What happens in a simulated run: the models behind `scenarios/*.toml`. Pure.
+
 
 SCENARIOS = Path(__file__).parent / "scenarios"
 

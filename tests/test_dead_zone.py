@@ -10,7 +10,7 @@ import pytest
 from sightline.evaluation.scenario_config import robot_config
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
-from sightline.robot_side.dead_zone import BlindZoneError, check_blind_zone
+from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
 from sightline.robot_side.safety.guard import GuardConfig
 from sightline.robot_side.ports import Ranges
 from sightline.sim.robot import load_robot

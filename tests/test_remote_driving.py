@@ -10,14 +10,14 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from sightline.operator_side.processes import Processes
+from sightline.evaluation.processes import Processes
 from tests.fixtures.links import until
 from tests.fixtures.vision.remote import Server, box, grpc_answer, grpc_started, http_reply, said
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.protobuf import fields
 
 pytestmark = pytest.mark.slow

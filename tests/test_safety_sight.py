@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import STILL, State, Twist, Verb
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.guard import GuardConfig, RangeGuard
 from sightline.robot_side.ports import Ranges
 from tests.fixtures.safety import MS, Rig

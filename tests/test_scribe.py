@@ -10,7 +10,7 @@ import pytest
 
 from sightline.protocol.log import JsonLineStream
 from sightline.robot_side.driver.persistence import StopLatch
-from sightline.robot_side.scribe import BackgroundWriter
+from sightline.robot_side.driver.persistence import BackgroundWriter
 from tests.fixtures.links import until
 
 

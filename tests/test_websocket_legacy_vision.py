@@ -12,11 +12,11 @@ from websockets.sync.server import serve
 from sightline.protocol.channels import ACK, CAMERA, FRAME, TWIST
 from sightline.protocol.codec import decode
 from sightline.protocol.messages import FrameHeader
-from sightline.protocol.refusals import RejectReason
-from sightline.protocol.transports.link_rules import OVERSIZE
+from sightline.protocol.errors import RejectReason
+from sightline.protocol.transports.link import OVERSIZE
 from sightline.protocol.transports.websocket.link import open_websocket
-from sightline.protocol.transports.websocket_dialects import BAD_FRAMING
-from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint
+from sightline.protocol.transports.websocket.framing import BAD_FRAMING
+from sightline.protocol.transports.endpoints import parse_websocket_endpoint
 from tests.fixtures.links import until
 from tests.protocol.transports.websocket.test_legacy import JPEG, TEXT, free_legacy
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 from websockets.protocol import CLIENT, SERVER, Protocol
 
-from sightline.protocol.transports.websocket_messages import MAX_FRAGMENTS, MessageReader, unmasked_head
+from sightline.protocol.transports.websocket.connection import MAX_FRAGMENTS, MessageReader, unmasked_head
 
 BOUND = 70_000
 SIZES = (0, 1, 125, 126, 127, 65_535, 65_536, BOUND - 1, BOUND, BOUND + 1)

@@ -1,26 +1,42 @@
 """The network's table as a PyTorch module, and its weights as arrays with the normalisation folded in. Pure (PyTorch).
 """
 
-from functools import partial
-from typing import Any
-
+import hashlib
+import json
 import numpy as np
+import os
+import signal
+import sys
 import torch
-from torch import nn
-
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from datetime import timedelta
+from functools import partial
+from pathlib import Path
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.sim.scenes.model import LABELS
+from sightline.training.export import shifted
 from sightline.training.network import (
     AGAINST,
     BRIGHTNESS,
     COLOURS,
     DARKEST,
     LOOKED_AT,
+    Layer,
     OUTPUTS,
     TAUGHT,
-    Layer,
     Weights,
     network,
 )
-from sightline.sim.scenes.model import LABELS
+from sightline.training.scenes import CUT_PX, DrawnScenes, Sample, WHOLE_PX, drawn_scenes, sample
+from sightline.training.schedule import Training
+from sightline.training.shipping import Card, Progress, card_text, chosen_thresholds, final_report, written
+from torch import nn
+from typing import Any, Final
+
 
 _RARE = -4.6  # bias of the heat maps at the beginning: a hundredth of the cells
 
@@ -127,3 +143,270 @@ def folded(state: dict[str, Any]) -> Weights:
             weights[f"{layer.name}.weight"] = (values[f"{key}.0.weight"] * gain[:, None, None, None]).astype(np.float32)
             weights[f"{layer.name}.bias"] = bias.astype(np.float32)
     return weights
+
+
+# The training itself: batches prepared beside it, checkpoints, an average of the weights. Shell (threads, files).
+
+
+_PREPARED: Final = 3  # batches that wait
+_AVERAGED: Final = 0.998
+_GEOMETRY_WEIGHT: Final = 1.0
+_TAUGHT_WEIGHT: Final = 0.5
+_MEETING: Final = "meeting"
+_MET_WITHIN: Final = timedelta(minutes=3)
+"""All processes there, and each step's gradients: a machine that swaps needs a while."""
+CHECKPOINT: Final = "checkpoint.pt"
+_CHECKPOINT_EVERY: Final = 100
+_SAY_EVERY: Final = 50
+
+
+def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
+          say: Callable[[str], None]) -> Weights:
+    """Train, or go on from the checkpoint in `folder`; the averaged weights, normalisation folded in. More than one
+    process only on the CPU."""
+    if training.jobs == 1:
+        return _trained(scenes, training, device, folder, say)
+    _checkpoint(folder / CHECKPOINT, _made_by(scenes, training), device)  # what it cannot go on from is said once
+    with _helpers(scenes, training, folder):
+        return _trained(scenes, training, device, folder, say)
+
+
+def start_from(weights: Weights, scenes: DrawnScenes, training: Training, folder: Path) -> None:
+    """Leave a checkpoint of these weights where the last round begins, unless a training has gone on from there."""
+    if (folder / CHECKPOINT).exists():
+        return
+    torch.manual_seed(training.seed)
+    state = _State(scenes, training, torch.device("cpu"))
+    state.begin(weights, _batch(scenes, replace(training, jobs=1), training.last_from, 0))
+    state.save(folder / CHECKPOINT, training.last_from)
+
+
+@contextmanager
+def _helpers(scenes: DrawnScenes, training: Training, folder: Path) -> Iterator[None]:
+    """This process and `jobs` - 1 others, each with its share of every batch, for as long as the context lasts."""
+    (folder / _MEETING).unlink(missing_ok=True)
+    made = torch.multiprocessing.get_context("spawn")
+    helpers = [made.Process(target=_help, args=(rank, scenes, training, folder), daemon=True)
+               for rank in range(1, training.jobs)]
+    for one in helpers:
+        one.start()
+    try:
+        _meet(0, training, folder)
+        yield
+    except RuntimeError as error:
+        for one in helpers:
+            one.join(1.0)  # one that has ended is not yet known to have
+        if all(one.is_alive() for one in helpers):
+            raise
+        raise HardwareError(f"one of the {training.jobs} processes that train has ended ({error}); the same command "
+                            "goes on from the last checkpoint, and --jobs 1 needs less memory") from None
+    finally:
+        if torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+        for one in helpers:
+            one.terminate()
+            one.join()
+
+
+def _help(rank: int, scenes: DrawnScenes, training: Training, folder: Path) -> None:
+    """All that a helper does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends the others
+    _meet(rank, training, folder)
+    _trained(scenes, training, "cpu", folder, None)
+
+
+def _meet(rank: int, training: Training, folder: Path) -> None:
+    """Over a file, and on this machine only."""
+    if sys.platform == "linux":
+        os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
+    meeting = (folder / _MEETING).resolve().as_uri()
+    torch.distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=training.jobs,
+                                         timeout=_MET_WITHIN)
+
+
+def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
+             say: Callable[[str], None] | None) -> Weights:
+    """What each process does; only the one with `say` keeps checkpoints."""
+    torch.set_num_threads(1)  # two are slower on shared cores: the layers are small
+    torch.manual_seed(training.seed)
+    state = _State(scenes, training, torch.device(device))
+    checkpoint = folder / CHECKPOINT
+    begin = state.load(checkpoint)
+    if begin and say is not None:
+        say(f"goes on at step {begin} of {training.steps}")
+    for step, batch in enumerate(_batches(scenes, training, begin), start=begin):
+        loss = state.learn(step, batch)
+        if say is None:
+            continue
+        if (step + 1) % _SAY_EVERY == 0:
+            say(f"step {step + 1} of {training.steps}: loss {loss:.3f}")
+        if (step + 1) % _CHECKPOINT_EVERY == 0 or step + 1 == training.steps:
+            state.save(checkpoint, step + 1)
+    return folded(state.average)
+
+
+def _made_by(scenes: DrawnScenes, training: Training) -> str:
+    """All that a checkpoint has to be of for a training to go on from it."""
+    return json.dumps({**asdict(training), "scenes": scenes.digest()})
+
+
+def _checkpoint(path: Path, made_by: str, device: Any) -> dict[str, Any] | None:
+    """What is kept there; None if nothing is. Raises ConfigError for a checkpoint of another training."""
+    if not path.exists():
+        return None
+    kept: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+    if kept["training"] != made_by:
+        raise ConfigError(f"{path} is of a training with other settings or scenes: {kept['training']}; remove it, "
+                          "or name another --out")
+    return kept
+
+
+class _State:
+    """Network, optimiser and average."""
+
+    def __init__(self, scenes: DrawnScenes, training: Training, device: Any) -> None:
+        self._training, self._made_by = training, _made_by(scenes, training)
+        self._device = device
+        self.network = Network().to(device=device, memory_format=torch.channels_last).train()
+        self._optimiser = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay)
+        self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimiser, training.rate_at)
+        self.average = self._copied()
+
+    def _copied(self) -> dict[str, Any]:
+        return {name: value.detach().clone() for name, value in self.network.state_dict().items()}
+
+    def begin(self, weights: Weights, batch: list[Sample]) -> None:
+        """Take those weights over, for the last round."""
+        begin_from(self.network, weights, self._on_device([one.image for one in batch]))
+        self.average = self._copied()
+        self._schedule.last_epoch = self._training.last_from
+
+    def learn(self, step: int, batch: list[Sample]) -> float:
+        """One step; its loss."""
+        loss = _loss(self.network(self._on_device([one.image for one in batch])), batch, self._on_device)
+        self._optimiser.zero_grad()
+        loss.backward()
+        self._agree()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
+        self._optimiser.step()
+        self._schedule.step()
+        share = min(_AVERAGED, (step + 1) / (step + 10))
+        for name, value in self.network.state_dict().items():
+            old = self.average[name]
+            self.average[name] = old.lerp(value.detach(), 1 - share) if value.is_floating_point() else value.clone()
+        return float(loss.detach())
+
+    def _agree(self) -> None:
+        """Gradients become the mean of all processes', so that all networks stay the same."""
+        if not torch.distributed.is_initialized():
+            return
+        gradients = [one.grad for one in self.network.parameters()]
+        together = torch.cat([one.flatten() for one in gradients])
+        torch.distributed.all_reduce(together)
+        for one, mean in zip(gradients, together.split([one.numel() for one in gradients]), strict=True):
+            one.copy_(mean.view_as(one) / torch.distributed.get_world_size())
+
+    def _on_device(self, arrays: list[Any]) -> Any:
+        return torch.from_numpy(np.stack(arrays)).to(self._device)
+
+    def save(self, path: Path, step: int) -> None:
+        """Written beside and moved, so that a cut leaves the one before."""
+        torch.save({
+            "training": self._made_by, "step": step, "network": self.network.state_dict(),
+            "average": self.average, "optimiser": self._optimiser.state_dict(), "schedule": self._schedule.state_dict(),
+        }, path.with_suffix(".part"))
+        path.with_suffix(".part").replace(path)
+
+    def load(self, path: Path) -> int:
+        """The step to go on from; 0 without a checkpoint. Raises ConfigError for one of another training."""
+        kept = _checkpoint(path, self._made_by, self._device)
+        if kept is None:
+            return 0
+        self.network.load_state_dict(kept["network"])
+        self.average = kept["average"]
+        self._optimiser.load_state_dict(kept["optimiser"])
+        self._schedule.load_state_dict(kept["schedule"])
+        return int(kept["step"])
+
+
+def _loss(given: Any, batch: list[Sample], on_device: Callable[[list[Any]], Any]) -> Any:
+    """Focal loss on the heat maps, distances on the geometry of the middle cells."""
+    geometry = given[:, len(LABELS) : OUTPUTS]
+    wanted, counts = on_device([one.heat for one in batch]), on_device([one.counts for one in batch])[:, None]
+    asked = _focal(given[:, : len(LABELS)], wanted[:, :-TAUGHT], counts)
+    taught = _focal(given[:, OUTPUTS:], wanted[:, -TAUGHT:], counts)
+    sure = on_device([one.sure for one in batch])[:, None]
+    off = (geometry - on_device([one.geometry for one in batch])).abs() * sure
+    return asked + _TAUGHT_WEIGHT * taught + _GEOMETRY_WEIGHT * off.sum() / sure.sum().clamp(min=1.0)
+
+
+def _focal(heat: Any, wanted: Any, counts: Any) -> Any:
+    """For each middle (Zhou et al., Objects as Points, 2019, equation 1)."""
+    likely = torch.sigmoid(heat)
+    is_middle = (wanted == 1.0).float()
+    found = is_middle * (1 - likely) ** 2 * torch.nn.functional.logsigmoid(heat)
+    empty = (1 - is_middle) * (1 - wanted) ** 4 * likely**2 * torch.nn.functional.logsigmoid(-heat)
+    return -((found + empty) * counts).sum() / is_middle.sum().clamp(min=1.0)
+
+
+def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[list[Sample]]:
+    """Prepared by a second thread, so that two cores have something to do; a few wait, no more."""
+    rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
+    with ThreadPoolExecutor(1) as pool:
+        waiting: deque[Future[list[Sample]]] = deque()
+        for step in range(first, training.steps):
+            for coming in range(step + len(waiting), min(step + _PREPARED, training.steps)):
+                waiting.append(pool.submit(_batch, scenes, training, coming, rank))
+            yield waiting.popleft().result()
+
+
+def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> list[Sample]:
+    """This process's share."""
+    size_px, count = (WHOLE_PX, training.batch // 2) if training.whole_at(step) else (CUT_PX, training.batch)
+    share, shown = max(1, count // training.jobs), training.shown_at(step, len(scenes.truths))
+    return [sample(scenes, shown, (training.seed, step, place), size_px)
+            for place in range(rank * share, (rank + 1) * share)]
+
+
+# `sightline train`: scenes, training, thresholds, ONNX file, judgement, model card. Shell (files).
+
+
+MODEL, CARD = "sightline.onnx", "sightline.md"
+
+
+@dataclass(frozen=True, slots=True)
+class TrainOptions:
+    """What `sightline train` was asked for."""
+
+    out: Path
+    scenes: int
+    training: Training
+    device: str
+    jobs: int
+    validated: int
+    """Scenes of each column that choose the thresholds."""
+    judged: int
+    """Scenes of each column that the model card's table is of."""
+    start: Weights | None = None
+    """What the last round begins from, in place of the rounds before it."""
+
+
+def run_training(options: TrainOptions, say: Callable[[str], None], progress: Progress) -> Path:
+    """Everything, in order; the model's path. What a run that was cut left in the folder is gone on with."""
+    with progress(options.scenes, "scenes") as advance:
+        scenes = drawn_scenes(options.out, options.scenes, options.jobs, advance)
+    if options.start is not None:
+        start_from(options.start, scenes, options.training, options.out)
+    weights = train(scenes, options.training, options.device, options.out, say)
+    say("thresholds are being chosen on scenes of other seeds")
+    thresholds = chosen_thresholds(options.out / "unchosen.onnx", weights, options.validated, options.jobs, progress)
+    model = options.out / MODEL
+    written(model, shifted(weights, thresholds))
+    say(f"{model}: {model.stat().st_size} bytes; it is being judged on scenes that nothing was trained on")
+    report = final_report(model, options.judged, progress)
+    digest = hashlib.sha256(model.read_bytes()).hexdigest()
+    parameters = sum(int(one.size) for one in weights.values())
+    card = Card(options.training, options.scenes, options.device, thresholds, parameters, model.stat().st_size, digest,
+                options.validated, report)
+    (options.out / CARD).write_text(card_text(card), "utf-8")
+    return model

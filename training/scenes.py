@@ -2,28 +2,37 @@
 
 import hashlib
 import json
+import math
+import numpy as np
+import numpy.typing as npt
+import simplejpeg
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
-
-import numpy as np
-import numpy.typing as npt
-
-from sightline.operator_side.worker_pool import worker_pool
+from sightline.evaluation.processes import worker_pool
 from sightline.protocol.errors import ConfigError
-from sightline.sim.scene_render import SceneRenderer
 from sightline.sim.scenes.model import (
+    Box,
+    Column,
+    DEFECTS,
     HARDER_FROM,
     HEIGHT_PX,
+    LABELS,
     LATER_FROM,
+    LabelledBox,
+    Random,
+    TRAINED,
     VALIDATED_FROM,
     WIDTH_PX,
-    Box,
-    LabelledBox,
     trained_column,
 )
+from sightline.sim.scenes.plan import with_defects
+from sightline.sim.scenes.render import SceneRenderer
+from sightline.training.network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
+from sightline.training.schedule import SceneRange
+from typing import Any, Final
+
 
 _SLICE: Final = 100
 """Scenes that one process draws before it says so."""
@@ -115,3 +124,152 @@ def _draw(pictures: Path, seeds: Sequence[int]) -> tuple[int, list[dict[str, Any
             rows.append({"truths": truths, "unclear": scene.unclear, "others": scene.others})
     store.flush()
     return seeds[0], rows
+
+
+# Scenes into what the network learns from: a spoiled cut-out, and the heat maps that it should give. Pure.
+
+
+CUT_PX: Final = (192, 160)
+"""Width and height of the cut-outs that most of the training sees: less than half the time of a whole picture."""
+WHOLE_PX: Final = (WIDTH_PX, HEIGHT_PX)
+_LEAST_LEFT: Final = 0.4  # of an object's box after the cut; with less left it is neither right nor wrong
+_NEW: Final = 0.5  # of the samples of a harder round: drawn from the scenes that it adds alone
+_AROUND_OTHERS: Final = 0.3  # of those samples: cut around what nobody asks for, where others are around objects
+_SPREAD: Final = 0.09  # standard deviation of the bump on the heat map, by the object's side
+_LEAST_SPREAD: Final = 0.6  # cells
+_SURE: Final = 0.4  # of the bump: cells from there up learn where the object's edges are
+
+Array = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One picture BGR (3, H, W) and what is wanted of it."""
+
+    image: npt.NDArray[np.uint8]
+    heat: Array
+    """(labels and `TAUGHT`, H/4, W/4), 1 in the middle cell of each object."""
+    geometry: Array
+    """(4, H/4, W/4)"""
+    sure: Array
+    """(H/4, W/4): how much a cell's geometry counts."""
+    counts: Array
+    """(H/4, W/4): 0 where nobody can say what is right."""
+
+
+def sample(scenes: DrawnScenes, shown: SceneRange, numbers: tuple[int, int, int], size_px: tuple[int, int]) -> Sample:
+    """One of the scenes, a cut, a side, defects; the same for the same seed, step, place in a batch."""
+    draw = np.random.default_rng(numbers)
+    number, around, column = (_harder if shown.harder else _plain)(draw, scenes, shown)
+    left, top = _cut(draw, around, size_px)
+    rgb = scenes.pictures[number][top : top + size_px[1], left : left + size_px[0]]
+    mirrored = bool(draw.random() < 0.5)
+    picture = np.ascontiguousarray(rgb[:, ::-1] if mirrored else rgb)
+    bgr = simplejpeg.decode_jpeg(with_defects(picture, column, draw), "BGR")
+    moved = [(one, _moved(one.box, left, top, size_px, mirrored)) for one in scenes.truths[number]]
+    unclear, others = ([_moved(one, left, top, size_px, mirrored) for one in boxes]
+                       for boxes in (scenes.unclear[number], scenes.others[number]))
+    return _wanted(np.ascontiguousarray(bgr.transpose(2, 0, 1)), moved, unclear, others)
+
+
+def _plain(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, list[Box], Column]:
+    """A scene, what of it a cut is made around, its defects."""
+    number = int(draw.integers(shown.known))
+    return number, [one.box for one in scenes.truths[number]], TRAINED
+
+
+def _harder(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, list[Box], Column]:
+    """The same, with more of the newest scenes, of what nobody asks for, of bad pictures."""
+    number = int(draw.integers(shown.newest if draw.random() < _NEW else 0, shown.known))
+    asked = [one.box for one in scenes.truths[number]]
+    around = list(scenes.others[number]) if draw.random() < _AROUND_OTHERS else asked
+    return number, around, DEFECTS[int(draw.integers(len(DEFECTS)))]
+
+
+def _cut(draw: Random, boxes: list[Box], size_px: tuple[int, int]) -> tuple[int, int]:
+    """The cut's corner: three times in four with the middle of one box in it."""
+    most = (WIDTH_PX - size_px[0], HEIGHT_PX - size_px[1])
+    corner = [int(draw.integers(0, one + 1)) for one in most]
+    if boxes and draw.random() < 0.75:
+        box = boxes[int(draw.integers(len(boxes)))]
+        for axis in (0, 1):
+            middle = (box[axis] + box[axis + 2]) / 2
+            corner[axis] = int(np.clip(middle - draw.uniform(0.05, 0.95) * size_px[axis], 0, most[axis]))
+    return corner[0], corner[1]
+
+
+def _moved(box: Box, left: int, top: int, size_px: tuple[int, int], mirrored: bool) -> Box:
+    x1, y1, x2, y2 = box[0] - left, box[1] - top, box[2] - left, box[3] - top
+    return (size_px[0] - x2, y1, size_px[0] - x1, y2) if mirrored else (x1, y1, x2, y2)
+
+
+def _wanted(image: npt.NDArray[np.uint8], objects: list[tuple[LabelledBox, Box]], unclear: list[Box],
+            others: list[Box]) -> Sample:
+    rows, columns = image.shape[1] // STRIDE, image.shape[2] // STRIDE
+    one = Sample(image, np.zeros((len(LABELS) + TAUGHT, rows, columns), np.float32),
+                 np.zeros((GEOMETRY, rows, columns), np.float32), np.zeros((rows, columns), np.float32),
+                 np.ones((rows, columns), np.float32))
+    for box in unclear:
+        _blank(one, box)
+    for truth, box in sorted(objects, key=lambda pair: -_area(pair[1])):
+        _mark(one, truth, box)
+    for box in others:
+        _mark_other(one, box)
+    return one
+
+
+def _area(box: Box) -> float:
+    return max(0.0, box[2] - box[0]) * max(0.0, box[3] - box[1])
+
+
+def _within(box: Box, one: Sample) -> Box:
+    height, width = one.image.shape[1:]
+    return max(0.0, box[0]), max(0.0, box[1]), min(float(width), box[2]), min(float(height), box[3])
+
+
+def _blank(one: Sample, box: Box) -> None:
+    x1, y1, x2, y2 = (int(edge // STRIDE) for edge in _within(box, one))
+    one.counts[y1 : y2 + 1, x1 : x2 + 1] = 0
+
+
+def _mark(one: Sample, truth: LabelledBox, whole: Box) -> None:
+    """A bump on the label's heat map; in its middle cells, where the edges are."""
+    box = _within(whole, one)
+    if _area(box) <= 0:
+        return
+    if _area(box) * truth.seen < _LEAST_LEFT * _area(whole):
+        _blank(one, box)
+        return
+    bump, middle = _bumped(one.heat[LABELS.index(truth.label)], box)
+    one.counts[middle] = 1.0
+    sure = bump >= _SURE
+    sure[middle] = True
+    one.sure[sure] = np.maximum(bump[sure], _SURE)
+    for part, values in zip(one.geometry, _edges(box, bump.shape), strict=True):
+        part[sure] = np.broadcast_to(np.asarray(values), bump.shape)[sure]
+
+
+def _mark_other(one: Sample, whole: Box) -> None:
+    """A bump on the last heat map, where enough is left of it."""
+    box = _within(whole, one)
+    if _area(box) > 0 and _area(box) >= _LEAST_LEFT * _area(whole):
+        _bumped(one.heat[-1], box)
+
+
+def _bumped(heat: Array, box: Box) -> tuple[Array, tuple[int, int]]:
+    """Raise the map about the box's middle; the bump, and the middle cell, which is 1."""
+    off_x, off_y, log_wide, log_high = _edges(box, heat.shape)
+    wide, high = (math.exp(one) * SIZE_PX / STRIDE for one in (log_wide, log_high))
+    bump = np.asarray(np.exp(-0.5 * (off_y / max(_SPREAD * high, _LEAST_SPREAD)) ** 2)
+                      * np.exp(-0.5 * (off_x / max(_SPREAD * wide, _LEAST_SPREAD)) ** 2), np.float32)
+    np.maximum(heat, bump, out=heat)
+    middle = int(np.abs(off_y).argmin()), int(np.abs(off_x).argmin())
+    heat[middle] = 1.0
+    return bump, middle
+
+
+def _edges(box: Box, shape: tuple[int, ...]) -> tuple[Array, Array, float, float]:
+    """What cells learn of a box: its middle off theirs by x (a row) and y (a column), log width, log height."""
+    x, y = (box[0] + box[2]) / 2 / STRIDE, (box[1] + box[3]) / 2 / STRIDE
+    off_x, off_y = x - (np.arange(shape[1]) + 0.5), y - (np.arange(shape[0])[:, None] + 0.5)
+    return off_x, off_y, math.log((box[2] - box[0]) / SIZE_PX), math.log((box[3] - box[1]) / SIZE_PX)

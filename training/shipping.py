@@ -1,11 +1,49 @@
 """From which score on a detection counts, chosen on scenes that are neither trained on nor judged. Pure."""
 
-from collections.abc import Mapping, Sequence
+import numpy as np
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import as_completed
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from sightline.evaluation.processes import worker_pool
+from sightline.evaluation.score.detector_report import (
+    LABELLED,
+    LIGHT_SHARE,
+    Report,
+    Subject,
+    check_lines,
+    detections,
+    detector_checks,
+    markdown,
+    scene_result,
+    score_scenes,
+    shown,
+)
+from sightline.evaluation.score.detectors import FrameResult, LabelMatches
+from sightline.sim.scenes.model import (
+    COLUMNS,
+    Column,
+    HARDER_FROM,
+    HEIGHT_PX,
+    LABELS,
+    LATER_FROM,
+    THINGS,
+    VALIDATED_FROM,
+    WIDTH_PX,
+)
+from sightline.sim.scenes.textures import JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED
+from sightline.training.export import MOST_BOXES, OPSET, onnx_bytes
+from sightline.training.network import Weights
+from sightline.training.schedule import LEAST_SHARE, Training, WHOLE_FROM
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.onnx.engine import open_engine, read_onnx_header
+from sightline.vision_side.detect.onnx.self_test import KEY, golden_picture, golden_text
+from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
+from sightline.vision_side.detect.registry import build_detector
 from typing import Final
 
-import numpy as np
-
-from sightline.evaluation.score.detectors import FrameResult, LabelMatches
 
 MOST_FALSE: Final = 0.02
 """Of false alarms and of wrong objects, in every column. A judge allows 5 of a hundred frames without a ball: what is
@@ -42,3 +80,158 @@ def label_threshold(found: LabelMatches) -> float:
         if balance > best:
             best, chosen = balance, score
     return float(np.clip(chosen, _TRIED[0], _TRIED[-1]))
+
+
+# The model card: what the file is, how it was made, how good it is. Pure.
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """All that stands on it."""
+
+    training: Training
+    scenes: int
+    device: str
+    thresholds: Sequence[float]
+    parameters: int
+    size_bytes: int
+    sha256: str
+    validated: int
+    report: Report
+
+
+def card_text(card: Card) -> str:
+    """Markdown."""
+    return "\n".join([
+        "# A detector of balls, traffic lights and legs", "",
+        f"Finds {', '.join(f'`{label}`' for label in LABELS)} in a picture: a heat-map network of {card.parameters} "
+        f"numbers, {card.size_bytes} bytes, ONNX opset {OPSET}.", "",
+        f"SHA-256 `{card.sha256}`", "", *_input(), "", "## How it was made", "", *_made(card), "",
+        "## How good it is", "", *_judged(card), "",
+        "## What it is not", "",
+        "It has only ever seen drawn scenes: balls, boxes, traffic lights of three lamps, legs as two cylinders. Try "
+        "it on your own robot's pictures (`sightline vision --shadow onnx`) before you let it drive.", "",
+    ])
+
+
+def _input() -> list[str]:
+    return [
+        f"- `image`: uint8 (1, {HEIGHT_PX}, {WIDTH_PX}, 3), BGR.",
+        f"- `boxes` ({MOST_BOXES}, 4): x1, y1, x2, y2 in pixels of the input; `scores` ({MOST_BOXES}); `labels` "
+        f"({MOST_BOXES}), indices into the metadata's `labels`.",
+        "- Overlaps are removed and boxes decoded inside; a box that a better one covers has the score 0.",
+        "- A detection counts from a score of 0.5 on (`min_score` of the metadata): each label's own threshold is "
+        "worked into the model.",
+    ]
+
+
+def _made(card: Card) -> list[str]:
+    training = card.training
+    thresholds = ", ".join(f"{label} {one:.2f}" for label, one in zip(LABELS, card.thresholds, strict=True))
+    steps = " ".join(f"--steps {one}" for one in training.rounds)
+    start = " --start MODEL" if training.start else ""
+    return [
+        f"`sightline train --scenes {card.scenes} {steps} --batch {training.batch} "
+        f"--seed {training.seed} --device {card.device} --jobs {training.jobs} --validated {card.validated}"
+        f"{start}`", "",
+        f"- Scenes: seeds 0 to {card.scenes - 1}, floors and walls of the families {_families(TRAINED)}; from seed "
+        f"{LATER_FROM} up {_families(TRAINED_LATER)}; from {HARDER_FROM} up {_families(TRAINED_HARDER)}, with more "
+        "legs and more boxes of the ball's colour. Defects are drawn anew each time a scene is shown; from the third "
+        "round on a third of the pictures are clear, and a third are dim, blurred and coarse at once.",
+        f"- Steps: {' and '.join(map(str, training.rounds))} of {training.batch} cut-outs (the last "
+        f"{100 * (1 - WHOLE_FROM):.0f} % of a round half as many whole pictures), AdamW, learning rate "
+        f"{training.rate:g} at first, half of that in each round that follows down to {training.rate * LEAST_SHARE:g}, "
+        "weights averaged.",
+        *([f"- The last round began from MODEL, of SHA-256 `{training.start}`."] if training.start else []),
+        f"- Thresholds: {thresholds}, chosen on {card.validated} scenes a column of the seeds from {VALIDATED_FROM}, "
+        f"with floors and walls of other families: {_families(VALIDATED)}.",
+    ]
+
+
+def _families(names: Sequence[str]) -> str:
+    return ", ".join(dict.fromkeys(names))
+
+
+def _judged(card: Card) -> list[str]:
+    report = card.report
+    last = report.first_seed + report.frames - 1
+    return [
+        f"{report.frames} scenes a column, seeds {report.first_seed} to {last}: floors and walls of the families "
+        f"{_families(JUDGED)}, and light from heights that training never saw. `sightline score detectors onnx:FILE "
+        f"--frames {report.frames} --demand` shows it again (`onnx` is the file that comes along). What it all means: "
+        "docs/learned-detector.md. `ms p50` is of a machine that may have had other work: `sightline bench pipeline` "
+        "measures time.", "", markdown(report), "", *_demanded(report),
+    ]
+
+
+def _demanded(report: Report) -> list[str]:
+    checks = detector_checks(report, "onnx")
+    broken = [one for one in checks if not one.ok]
+    kept = f"{len(checks) - len(broken)} of {len(checks)} demands are kept"
+    return [f"{kept}; these are not:", "", "```", *check_lines(broken), "```"] if broken else [f"{kept}."]
+
+
+# Trained weights into the file that ships: thresholds chosen, golden answer kept, judged. Shell (files, processes).
+
+
+COUNTS_FROM: Final = 0.5
+"""The score from which a detection counts, once each label's threshold has been worked into the model."""
+Progress = Callable[[int, str], AbstractContextManager[Callable[[int], None]]]
+"""Of how many, and of what; what it gives is told of each few that are done."""
+
+_ALL: Final = 0.02  # scores below are noise, and are not looked at when thresholds are chosen
+_LABELS: Final = (*COLUMNS.values(), THINGS)
+_SLICE: Final = 100
+"""Scenes that one process looks at before it says so."""
+
+
+def written(path: Path, weights: Weights) -> None:
+    """The ONNX file, with what it answers to the known picture in its metadata."""
+    properties = {"min_score": str(COUNTS_FROM)}
+    path.write_bytes(onnx_bytes(weights, properties))
+    header = read_onnx_header(path.read_bytes())
+    form = model_format(header, (), "auto")
+    picture = Picture(golden_picture(), 1)
+    pixels, fitting = fit_picture(picture, form)
+    found = read_outputs(open_engine(path, header, "cpu", 1).run(pixels), form, fitting, picture, COUNTS_FROM)
+    beside = path.with_suffix(".part")
+    beside.write_bytes(onnx_bytes(weights, {**properties, KEY: golden_text(found)}))
+    beside.replace(path)
+
+
+def chosen_thresholds(path: Path, weights: Weights, frames: int, jobs: int, progress: Progress) -> tuple[float, ...]:
+    """Each label's threshold, by `frames` scenes a column; the model without any goes to `path`."""
+    path.write_bytes(onnx_bytes(weights, {"min_score": str(_ALL)}))
+    last = VALIDATED_FROM + frames
+    slices = [range(first, min(first + _SLICE, last)) for first in range(VALIDATED_FROM, last, _SLICE)]
+    balls: dict[str, list[FrameResult]] = {name: [] for name in COLUMNS}
+    found = {label: LabelMatches() for label in LABELLED}
+    with progress(frames * len(_LABELS), "scenes that choose") as advance, worker_pool(jobs) as pool:
+        for done in as_completed([pool.submit(_seen, path, column, one) for column in _LABELS for one in slices]):
+            column, verdicts, marks = done.result()
+            if column in balls:
+                balls[column] += verdicts
+            for label, more in marks.items():
+                found[label].take(more)
+            advance(len(verdicts))
+    return tuple(ball_threshold(balls) if label == "ball" else label_threshold(found[label]) for label in LABELS)
+
+
+def _seen(path: Path, column: Column, seeds: Sequence[int]) -> tuple[str, list[FrameResult], dict[str, LabelMatches]]:
+    """The column's name, what is to be said of each scene's ball, and of lights and legs where those are asked for."""
+    verdicts, found = [], {label: LabelMatches() for label in LABELLED if column == THINGS}
+    for seen in shown(column, seeds, [_subject(path)], 1):
+        verdicts.append(scene_result(seen.answers[0], seen.scene))
+        for label, marks in found.items():
+            marks.add(label, detections(seen.answers[0]), seen.scene)
+    return column.name, verdicts, found
+
+
+def final_report(path: Path, frames: int, progress: Progress) -> Report:
+    """On the seeds that only judges use."""
+    with progress(int((len(COLUMNS) + LIGHT_SHARE) * frames), "scenes that judge") as advance:
+        return score_scenes([_subject(path)], frames, each=lambda _: advance(1))
+
+
+def _subject(path: Path) -> Subject:
+    return Subject("onnx", build_detector(f"onnx:{path}", {}, VisionConfig()))

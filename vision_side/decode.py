@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import MAX_SEGMENTS, read_jpeg_size
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 
 cv2.setNumThreads(1)  # one stream, one thread: pictures this small only lose by being split
 

@@ -8,8 +8,8 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, RequestId, ScanHeader, Twist
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder, Picture
-from sightline.vision_side.detect.checking import checked_results
-from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.plugin_calls import checked_results
+from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.port import (
     NO_DEADLINE,
     DetectFrame,

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError
 
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.around import PLUGIN_ERRORS
+from sightline.vision_side.detect.plugin_calls import PLUGIN_ERRORS
 
 LONGEST_DETAIL: Final = 160
 _CLASS: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")

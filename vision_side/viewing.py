@@ -1,34 +1,53 @@
-"""Shows people what vision sees: `overlay` and `preview`, only while somebody watches, newest only. Shell (a thread).
+"""Lets through no more than so many a second of what comes at a rate of its own. Pure."""
 
-The twist never waits for it: a frame is handed over after its answer is out, as the JPEG that came, and a thread of low
-priority decodes, draws and encodes. Nobody watches: one question to the link a frame, and no thread.
-"""
-
+import numpy as np
 import os
 import secrets
+import simplejpeg
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Final
-
-import numpy as np
-import simplejpeg
 from numpy.typing import NDArray
-
-from sightline.protocol.channels import OVERLAY, PREVIEW, Channel
-from sightline.protocol.clock import monotonic_us
+from sightline.protocol.channels import Channel, OVERLAY, PREVIEW
+from sightline.protocol.clock import RobotClock, monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import CameraModel, DetectionsHeader, Echo, FrameHeader
-from sightline.protocol.robot_clock import RobotClock
 from sightline.protocol.transports.link import LatestSlot, Link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.overlay import OverlayData, draw_overlay, draw_preview
-from sightline.vision_side.pace import RateLimiter
-from sightline.vision_side.pipeline import SOURCE, PipelineAnswer
+from sightline.vision_side.pipeline import PipelineAnswer, SOURCE
+from typing import Final
+
+
+_EARLY: Final = 0.25
+"""Share of a period that one may come early: else every second of 30 frames a second would often be a third."""
+
+
+class RateLimiter:
+    """At most `rate_hz` in the mean."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_us = 1e6 / rate_hz
+        self._due_us = float("-inf")
+
+    def is_due(self, now_us: int) -> bool:
+        """Whether one may pass now; then it has."""
+        if now_us < self._due_us - _EARLY * self._period_us:
+            return False
+        # Counted from when it was due, so that neither early nor late ones change the mean; after a pause, from now.
+        was_due_us = self._due_us if now_us - self._due_us < self._period_us else now_us
+        self._due_us = was_due_us + self._period_us
+        return True
+
+
+# Shows people what vision sees: `overlay` and `preview`, only while somebody watches, newest only. Shell (a thread).
+# The twist never waits for it: a frame is handed over after its answer is out, as the JPEG that came, and a thread of
+# low priority decodes, draws and encodes. Nobody watches: one question to the link a frame, and no thread.
+
 
 IDLE_S: Final = 2.0
 """Without anything to show for this long the thread ends; the next frame that is watched starts another."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from sightline.benchmarks.loop_course import Accepted, Course, course_of_headers
+from sightline.benchmarks.loop.figures import Accepted, Course, course_of_headers
 from sightline.benchmarks.loop.processes import BenchProcesses, free_port
 from sightline.benchmarks.loop.counters import children_of
 from sightline.benchmarks.loop.figures import LoopSetting
@@ -62,7 +62,7 @@ def running_services(setting: LoopSetting, folder: Path, crew: BenchProcesses) -
         config = {"robot": ROBOT, "connect": [endpoint]}
         slow = {"delay_ms": setting.detector_delay_ms, "busy_ms": setting.busy_ms}
         settings = {"config": config, "tally": str(tally), **slow}
-        vision = crew.start("vision", "sightline.benchmarks.loop_vision", json.dumps(settings))
+        vision = crew.start("vision", "sightline.benchmarks.loop.vision", json.dumps(settings))
         pids = {"driver": driver, "network": children_of(driver)[0], "vision": vision}
         ours = Ours(pids, (port,), endpoint, tally)
         link.subscribe(STATUS, ours.note)

@@ -4,15 +4,34 @@ Opens COUNT links, each with its own connection, and takes every frame; with NAP
 the transport's thread, so that its connection is read no faster than that.
 """
 
+import os
+import signal
 import sys
+import tempfile
 import threading
 import time
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-
-from sightline.benchmarks.loop.ours import ROBOT
+from dataclasses import dataclass, replace
+from pathlib import Path
+from sightline.benchmarks.loop.counters import high_water_mb, read_machine, taken_percent
+from sightline.benchmarks.loop.figures import (
+    ANSWERED_PERCENT,
+    Course,
+    LoopCheck,
+    LoopSetting,
+    TAKEN_BOUND_PERCENT,
+    at_most,
+    percentile,
+)
+from sightline.benchmarks.loop.ours import Ours, ROBOT, running_services
+from sightline.benchmarks.loop.pictures import write_pictures
+from sightline.benchmarks.loop.processes import BenchProcesses
+from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.protocol.channels import FRAME
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.open import open_link
+from typing import Final
 
 
 def main(endpoint: str, count: int, nap_s: float) -> None:
@@ -30,6 +49,110 @@ def main(endpoint: str, count: int, nap_s: float) -> None:
         seen.wait()
         print("watching", flush=True)
         threading.Event().wait()
+
+
+# `sightline bench watchers`: what viewers cost whoever drives; one never reads, one slowly. Shell (processes).
+#
+# First the loop alone, then with viewers who take the control stream itself: the worst that a viewer may do.
+
+
+P95_GROWTH_MS: Final = 3.0
+MEMORY_GROWTH_MB: Final = 5.0
+_SLOW_NAP_S: Final = 1.0
+_SETTLE_S: Final = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """When it was, the network process's high-water mark at its end, and what others took of the machine."""
+
+    begin_us: int
+    end_us: int
+    memory_mb: float
+    taken_percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """A stretch whose frames were looked at."""
+
+    course: Course
+    memory_mb: float
+    taken_percent: float
+
+
+def measure_watchers(setting: LoopSetting, viewers: int, say: Callable[[str], None]) -> list[LoopCheck]:
+    """Run `setting.seconds` without, and again with `viewers` (2 to 12); `setting.pictures` is filled in.
+
+    Taken again, `setting.tries` times at most, while others have the machine. Raises ConfigError for an unknown
+    transport, HardwareError for a process that does not run.
+    """
+    with terminated_like_interrupted(), tempfile.TemporaryDirectory(prefix="sightline-watchers-") as name:
+        ready = replace(setting, pictures=Path(name) / "pictures")
+        ready.pictures.mkdir()
+        write_pictures(ready.pictures, ready.width_px, ready.height_px)
+        pairs = []
+        for number in range(setting.tries):
+            folder = Path(name) / str(number)
+            folder.mkdir()
+            pairs.append(_measure(ready, viewers, folder, say))
+            if not any(map(_is_disturbed, pairs[-1])):
+                break
+        return _checks(*min(pairs, key=lambda pair: max(one.taken_percent for one in pair)))
+
+
+def _measure(setting: LoopSetting, viewers: int, folder: Path, say: Callable[[str], None]) -> tuple[Watch, Watch]:
+    with BenchProcesses(folder) as crew, running_services(setting, folder, crew) as ours:
+        alone = _stretch(ours, {}, setting.seconds)
+        say(f"without viewers: others had {alone.taken_percent:.1f} % of the machine's time")
+        crowded = _stretch(ours, start_viewers(crew, ours.endpoint, viewers), setting.seconds)
+        say(f"with {viewers} viewers: others had {crowded.taken_percent:.1f} %")
+        crew.check()
+        crew.end()
+        return _watch(ours, alone), _watch(ours, crowded)
+
+
+def start_viewers(crew: BenchProcesses, endpoint: str, viewers: int) -> dict[str, int]:
+    """Start them, each seen watching: one stopped by the kernel, one slow, the rest quick. Returns process ids."""
+    parts = {"stalled": (1, 0.0), "slow": (1, _SLOW_NAP_S), "quick": (viewers - 2, 0.0)}
+    pids = {}
+    for name, (count, nap_s) in parts.items():
+        if count:
+            pids[name] = crew.start(name, "sightline.benchmarks.loop.viewers", endpoint, str(count), str(nap_s))
+            crew.wait_line(name, "watching")
+    os.kill(pids["stalled"], signal.SIGSTOP)
+    return pids
+
+
+def _stretch(ours: Ours, viewers: Mapping[str, int], seconds: float) -> Stretch:
+    time.sleep(_SETTLE_S)
+    pids = {**ours.pids, **viewers}
+    before, begin_ns = read_machine(pids), time.monotonic_ns()
+    time.sleep(seconds)
+    after, end_ns = read_machine(pids), time.monotonic_ns()
+    taken = taken_percent(before, after, (end_ns - begin_ns) / 1e9)
+    return Stretch(begin_ns // 1000, end_ns // 1000, high_water_mb(ours.pids["network"]), taken)
+
+
+def _watch(ours: Ours, stretch: Stretch) -> Watch:
+    return Watch(ours.course(stretch.begin_us, stretch.end_us), stretch.memory_mb, stretch.taken_percent)
+
+
+def _is_disturbed(watch: Watch) -> bool:
+    return watch.taken_percent > TAKEN_BOUND_PERCENT
+
+
+def _checks(alone: Watch, crowded: Watch) -> list[LoopCheck]:
+    ages_ms = [[age_us / 1000 for _, age_us in one.course.ages_us] for one in (alone, crowded)]
+    first_ms, then_ms = (percentile(one, 95) for one in ages_ms)
+    later_ms = None if first_ms is None or then_ms is None else then_ms - first_ms
+    disturbed = sum(map(_is_disturbed, (alone, crowded)))
+    return [
+        at_most("p95 of age, more", later_ms, "ms", P95_GROWTH_MS),
+        at_most("not accepted", 100 - crowded.course.answered_percent, "%", 100 - ANSWERED_PERCENT),
+        at_most("memory, more", crowded.memory_mb - alone.memory_mb, "MB", MEMORY_GROWTH_MB),
+        at_most("samples disturbed by others", disturbed, "", 0.0),
+    ]
 
 
 if __name__ == "__main__":

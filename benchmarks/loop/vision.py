@@ -1,15 +1,29 @@
 """Sightline's own eyes for contestants of `bench loop`: one `Pipeline`, with a detector as slow as was asked. Shell."""
 
+import json
+import signal
+import sys
+import threading
 import time
-
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from sightline.benchmarks.loop.figures import LoopSetting, MAX_FPS
 from sightline.benchmarks.loop.pictures import camera_of
+from sightline.protocol.channels import MAX_HEADER_BYTES
+from sightline.protocol.codec import decode
 from sightline.protocol.messages import CameraModel, FrameHeader
 from sightline.protocol.text import format_twist
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.open import open_link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.port import Detection, PictureDetector
-from sightline.vision_side.pipeline import Frame, Pipeline
+from sightline.vision_side.pipeline import Frame, Pipeline, SOURCE
+from sightline.vision_side.serving.service import Service
+from statistics import median
+from typing import Final
 
 
 class SlowDetector:
@@ -52,3 +66,89 @@ class PipelineVision:
         if twist is None:
             raise ValueError(f"no command for the picture of {t_us} us: {dict(self._pipeline.skipped)}")
         return format_twist(twist).decode()
+
+
+# More pictures than can be detected, by a chosen factor: by their rate, else by a slower detector. Shell (a clock).
+# The robot service takes at most `MAX_FPS` pictures a second. Where the pipeline is quicker than that, the rate stays
+# as it was asked and every contestant's detector is made to work for as long as the factor demands.
+
+
+_STEPS: Final = 60
+_FRAME_US: Final = 33_333
+
+
+def overloaded(setting: LoopSetting, say: Callable[[str], None]) -> LoopSetting:
+    """`setting` with the rate, or the detector's time, that its `overload` asks for. Its pictures are written."""
+    step_ms = _step_ms(PipelineVision(setting.width_px, setting.height_px), setting.pictures)
+    found = with_overload(setting, step_ms)
+    say(f"overload {setting.overload:g}: one step takes {step_ms:.2f} ms; {found.fps:g} pictures a second, "
+        + (f"each detector works {found.busy_ms:.1f} ms" if found.busy_ms else "detectors as they are"))
+    return found
+
+
+def with_overload(setting: LoopSetting, step_ms: float) -> LoopSetting:
+    """For a pipeline that takes `step_ms`, decoding included."""
+    fps = 1000 * setting.overload / step_ms
+    if fps <= MAX_FPS:
+        return replace(setting, fps=round(fps, 1))
+    return replace(setting, busy_ms=1000 * setting.overload / setting.fps)
+
+
+def _step_ms(eyes: PipelineVision, pictures: Path) -> float:
+    """Median, without pauses: who is overloaded never pauses."""
+    jpegs = [path.read_bytes() for path in sorted(pictures.glob("*.jpg"))]
+    took_ms = []
+    for number in range(_STEPS):
+        began_ns = time.perf_counter_ns()
+        eyes.answer((number + 1) * _FRAME_US, jpegs[number % len(jpegs)])
+        took_ms.append((time.perf_counter_ns() - began_ns) / 1e6)
+    return median(took_ms)
+
+
+# The vision service with a tap: keeps what the frames' headers say, and may be made slow. Shell.  `python -m
+# sightline.benchmarks.loop.vision SETTINGS`. The service is `sightline.vision_side.serving.service.Service` as it is;
+# the tap costs an append per frame, and only a detector made slow is put into its pipeline.
+
+
+_WAIT_S = 0.2
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+class TappedService(Service):
+    """Remembers the header of every frame it was given."""
+
+    def __init__(self, config: VisionConfig, link: Link, delay_ms: float, busy_ms: float) -> None:
+        self._delay_ms, self._busy_ms = delay_ms, busy_ms
+        super().__init__(config, link, _say)
+        self.headers: list[bytes] = []
+
+    def _use(self, camera: CameraModel) -> None:
+        super()._use(camera)
+        if self._delay_ms or self._busy_ms:
+            self._pipeline = build_pipeline(self._config, camera, self._delay_ms, self._busy_ms)
+
+    def _frame(self, message: Message, started_ns: int) -> None:
+        self.headers.append(message.header)
+        super()._frame(message, started_ns)
+
+
+def main(settings: dict[str, object]) -> None:
+    """Serve until SIGTERM, then write the headers as (seq, t_us, latency_us)."""
+    config = VisionConfig.model_validate(settings["config"])
+    ending = threading.Event()
+    with open_link(config.robot, connect=config.connect, role=SOURCE) as link:
+        signal.signal(signal.SIGTERM, lambda *_: ending.set())
+        delay_ms, busy_ms = float(str(settings["delay_ms"])), float(str(settings["busy_ms"]))
+        service = TappedService(config, link, delay_ms, busy_ms)
+        while not ending.is_set():
+            service.turn(_WAIT_S)
+    headers = [decode(FrameHeader, header, MAX_HEADER_BYTES) for header in service.headers]
+    rows = [(header.seq, header.t_us, header.latency_us) for header in headers]
+    Path(str(settings["tally"])).write_text(json.dumps(rows))
+
+
+if __name__ == "__main__":
+    main(json.loads(sys.argv[1]))

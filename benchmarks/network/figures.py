@@ -1,10 +1,14 @@
 """What a robot's wheels were told, as its log drive notes it, held against when something was harmed. Pure."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final, NamedTuple
+from sightline.benchmarks.loop.figures import LoopCheck, at_most, percentile
+from sightline.benchmarks.network.cases import Case, HOLD_AGE_MS
+from sightline.benchmarks.network.watch import NOTED
+from sightline.robot_side.safety.limits import SafetyConfig, TICK_US, stop_bound
+from typing import Any, Final, NamedTuple
 
-from sightline.robot_side.safety.limits import TICK_US, SafetyConfig, stop_bound
 
 _LATE_US: Final = 2 * TICK_US
 """A decision holds for a tick; who notes a twist may hear it a little after the robot."""
@@ -76,3 +80,151 @@ def _stands(rows: Sequence[WheelCommand]) -> Iterator[tuple[int, int]]:
         elif begin_us is not None:
             yield begin_us, row.t_us
             begin_us = None
+
+
+# What a robot's own notes say of a row of `bench network`, and whether it is enough. Pure.
+
+
+DRIVING: Final = ("ACTIVE", "DEGRADED")
+_GAP_US: Final = 300_000
+"""Statuses come ten times a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """One phase as it went: `[begin_us, end_us)`, bounds in force from `judged_us`."""
+
+    begin_us: int
+    judged_us: int
+    end_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkFigures:
+    """Of one stretch. Ages are from capture to the accepted command; what came too late counts as infinitely old."""
+
+    p50_ms: float | None
+    p95_ms: float | None
+    fps: float
+    executed_ms: float
+    """The oldest frame that was driven on, as ten statuses a second show it."""
+    holds_s: tuple[float, ...]
+    flows_after_s: float | None
+    """From the beginning of the stretch to the first command accepted of a frame of it."""
+    window: int
+    bytes_per_frame: float
+    quality_percent: float
+    scale_percent: float
+    timeouts: int
+
+
+def figures_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: Stretch) -> NetworkFigures:
+    """The figures of `stretch`."""
+    frames = [row for row in notes["frames"] if stretch.judged_us <= row[1] < stretch.end_us]
+    statuses = [dict(zip(NOTED, row, strict=True)) for row in notes["statuses"]]
+    inside = [one for one in statuses if stretch.judged_us <= one["t_us"] < stretch.end_us]
+    seconds = (stretch.end_us - stretch.judged_us) / 1e6
+    late = inside[-1]["stale"] - inside[0]["stale"] if inside else 0
+    ages_ms = [*(age_us / 1000 for age_us in _ages_us(frames)), *[float("inf")] * late]
+    return NetworkFigures(
+        p50_ms=percentile(ages_ms, 50),
+        p95_ms=percentile(ages_ms, 95),
+        fps=(inside[-1]["accepted"] - inside[0]["accepted"]) / seconds if inside else 0.0,
+        executed_ms=max((one["frame_age_us"] or 0 for one in inside if one["state"] in DRIVING), default=0) / 1000,
+        holds_s=tuple(_holds_s(inside)),
+        flows_after_s=_flows_after_s(notes["frames"], stretch),
+        window=max((one["window"] for one in inside), default=0),
+        bytes_per_frame=sum(row[3] for row in frames) / max(1, len(frames)),
+        quality_percent=_mean([one["quality"] for one in inside]),
+        scale_percent=_mean([one["scale"] for one in inside]),
+        timeouts=inside[-1]["timeouts"] - inside[0]["timeouts"] if inside else 0,
+    )
+
+
+def sent_between(statuses: Sequence[Sequence[Any]], begin_us: int, end_us: int) -> float:
+    """How many frames the robot sent in that time, from counts that come ten times a second."""
+    counts = [(row[NOTED.index("t_us")], row[NOTED.index("sent")]) for row in statuses]
+    return _count_at(counts, end_us) - _count_at(counts, begin_us)
+
+
+def _count_at(counts: Sequence[tuple[int, int]], at_us: int) -> float:
+    """Between two counts it grew evenly."""
+    for (before_us, before), (after_us, after) in pairwise(counts):
+        if before_us <= at_us < after_us:
+            return before + (after - before) * (at_us - before_us) / (after_us - before_us)
+    return float(counts[-1][1] if counts and at_us >= counts[-1][0] else counts[0][1] if counts else 0)
+
+
+def _ages_us(frames: Sequence[Sequence[Any]]) -> Iterator[int]:
+    """A header whose latency is the one before it brings no news: nothing was accepted in between."""
+    for before, frame in pairwise(frames):
+        if frame[2] is not None and frame[2] != before[2]:
+            yield frame[2]
+
+
+def _holds_s(statuses: Sequence[Mapping[str, Any]]) -> Iterator[float]:
+    """How long it was held, each time, after it had driven."""
+    since_us: int | None = None
+    driven = False
+    for one in statuses:
+        driving = one["state"] in DRIVING
+        if driven and not driving and since_us is None:
+            since_us = one["t_us"]
+        if since_us is not None and (driving or one is statuses[-1]):
+            yield (one["t_us"] - since_us) / 1e6
+            since_us = None
+        driven = driven or driving
+
+
+def _flows_after_s(frames: Sequence[Sequence[Any]], stretch: Stretch) -> float | None:
+    """A command was accepted by the time a frame carries a latency that the one before did not."""
+    for before, frame in pairwise(frames):
+        accepted_us = before[1] if frame[2] != before[2] else None
+        if accepted_us is not None and before[1] >= stretch.begin_us:
+            return float(frame[1] - stretch.begin_us) / 1e6
+    return None
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else 0.0
+
+
+def network_checks(row: Case, figures: Sequence[NetworkFigures]) -> Iterator[LoopCheck]:
+    """Hold the last phase of a row against its bounds; `figures` are those of all its phases."""
+    last, first = figures[-1], figures[0]
+    if row.p50_ms is not None:
+        yield at_most("age p50", last.p50_ms, "ms", row.p50_ms)
+    if row.over_first_ms is not None:
+        over = None if last.p50_ms is None or first.p50_ms is None else last.p50_ms - first.p50_ms
+        yield at_most("p50 over loopback", over, "ms", row.over_first_ms)
+    if row.p95_ms is not None:
+        yield at_most("age p95", last.p95_ms, "ms", row.p95_ms)
+    if row.least_fps is not None:
+        yield LoopCheck("answered", last.fps, "fps", row.least_fps, last.fps >= row.least_fps)
+    if row.most_holds is not None:
+        yield at_most("holds", float(len(last.holds_s)), "", float(row.most_holds))
+    if row.longest_hold_s is not None:
+        yield at_most("longest hold", max(last.holds_s, default=0.0), "s", row.longest_hold_s)
+    if row.flows_again_s is not None:
+        yield at_most("flows again", last.flows_after_s, "s", row.flows_again_s)
+    yield at_most("oldest executed", max(one.executed_ms for one in figures), "ms", HOLD_AGE_MS)
+
+
+def worst_of(checks: Iterable[LoopCheck]) -> LoopCheck:
+    """Of one demand in several runs, the run that did worst: the farthest outside its bound, or the nearest inside."""
+    return max(checks, key=_badness)
+
+
+def _badness(check: LoopCheck) -> tuple[bool, float]:
+    away = float("inf") if check.value is None else abs(check.value - check.bound)
+    return (True, away) if not check.ok else (False, -away)
+
+
+def worst_of_seeds(name: str, runs: Sequence[Sequence[LoopCheck]]) -> list[LoopCheck]:
+    """The demands on the row `name`, each as the seed fared that did worst."""
+    label = f"{name}, worst of {len(runs)} seeds" if len(runs) > 1 else name
+    demands: dict[str, list[LoopCheck]] = {}
+    for checks in runs:
+        for check in checks:
+            demands.setdefault(check.name, []).append(check)
+    return [replace(worst_of(checks), name=f"{label}: {what}") for what, checks in demands.items()]

@@ -28,7 +28,7 @@ from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
 from sightline.robot_side.pipe import CommandAck
 from sightline.robot_side.ports import Picture
-from sightline.robot_side.sending import NetworkCore
+from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.network.stream import StreamConfig
 
 _STATUS_US = 100_000

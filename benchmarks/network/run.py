@@ -16,10 +16,10 @@ import numpy as np
 
 from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.benchmarks.loop.processes import BenchProcesses
-from sightline.benchmarks.loop_figures import LoopCheck, at_most
+from sightline.benchmarks.loop.figures import LoopCheck, at_most
 from sightline.benchmarks.loop.pictures import write_pictures
-from sightline.benchmarks.network_figures import Stretch, figures_of, network_checks
-from sightline.benchmarks.network_fleet import fleet
+from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks
+from sightline.benchmarks.network.scenes import fleet
 from sightline.benchmarks.network.cases import Case, spans_s
 from sightline.benchmarks.network.stage import (
     BenchWire,
@@ -32,7 +32,7 @@ from sightline.benchmarks.network.stage import (
     start_vision,
 )
 from sightline.benchmarks.network.scenes import moved, router, standby
-from sightline.benchmarks.network_uplink import uplink
+from sightline.benchmarks.network.scenes import uplink
 from sightline.benchmarks.network.figures import on_old_sight, read_wheel_commands
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError

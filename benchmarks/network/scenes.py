@@ -3,21 +3,28 @@
 Judged from what the wheels were told: they stop, and turn again.
 """
 
+import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Final
-
+from sightline.benchmarks.loop.figures import LoopCheck, at_most, percentile
+from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.processes import BenchProcesses
-from sightline.benchmarks.loop_figures import LoopCheck, at_most
 from sightline.benchmarks.network.cases import Case
-from sightline.benchmarks.network.stage import EVERYWHERE, BenchWire, NetworkRun, Stage, start_robot, start_vision
-from sightline.benchmarks.network.figures import WheelCommand, moves_again_s, read_wheel_commands
+from sightline.benchmarks.network.figures import WheelCommand, moves_again_s, read_wheel_commands, sent_between
+from sightline.benchmarks.network.robots import Settings
+from sightline.benchmarks.network.stage import BenchWire, EVERYWHERE, NetworkRun, Stage, start_robot, start_vision
+from sightline.benchmarks.network.stop_client import RESET, STOPPED
+from sightline.evaluation.faults.evidence import MotorRow, REQUESTED, measure_stop, moved_on_old_sight, wheel_mps
+from sightline.evaluation.faults.fixture import ROBOT, RobotFixture, Setup
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.errors import HardwareError
+from sightline.protocol.errors import HardwareError, SightlineError
+from sightline.sim.network_emulator import LinkShapes
 from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B, move_address
+from typing import Any, Final
+
 
 TAKES_OVER_S: Final = 1.5
 BACK_S: Final = 3.0
@@ -149,3 +156,220 @@ def _wait_again(stage: Stage, harmed_us: int) -> float | None:
 
 def _wheel_commands(stage: Stage) -> list[WheelCommand]:
     return read_wheel_commands(stage.wheels.read_text("ascii")) if stage.wheels.exists() else []
+
+
+# A row of `bench network`: what crosses the radio when many look at what one robot sees. Shell (processes).
+#
+# Vision and all others are at a router beyond the radio. First vision alone, then a standby, a second reader and a
+# viewer.
+
+
+MOST_SHARE: Final = 1.05
+UPLINK_LEAST_FPS: Final = 25.0
+"""With fewer, what is sent besides frames would weigh more on each."""
+READERS: Final = 2
+_AT_ROUTER: Final = "tcp/127.0.0.1:7447"
+_UPLINK_SETTLE_S: Final = 2.0
+
+
+def uplink(row: Case, stage: Stage) -> NetworkRun:
+    """Bytes from the robot for each frame it sent, crowded over alone."""
+    shapes = stage.seeded(row.phases[0].shapes)
+    with stage.wire() as wire, ExitStack() as ending:
+        before = wire.shape(shapes)
+        crews = {name: ending.enter_context(stage.crew(name)) for name in ("site", "standby")}
+        start_router(crews["site"], wire)
+        # The camera's own JPEGs: none is smaller than another because the machine had more to do.
+        start_robot(stage, crews["site"], wire.robot_side, connect=f"tcp/{ADDRESS_B}:7447", passes_through=True)
+        start_vision(stage, crews["site"], wire.far_side, _AT_ROUTER)
+        _start_notes(crews["site"], wire, stage)
+        alone = _stretch(wire, shapes, stage.setting.seconds / 2)
+        start_vision(stage, crews["standby"], wire.far_side, _AT_ROUTER)
+        crews["site"].start("watcher", "sightline.benchmarks.loop.viewers", _AT_ROUTER, str(READERS), "0", namespace=wire.far_side)
+        crews["site"].wait_line("watcher", "watching")
+        crowded = _stretch(wire, shapes, stage.setting.seconds / 2)
+        for crew in crews.values():
+            crew.check()
+        injected = wire.shape(LinkShapes()) - before
+        crews["site"].end()
+    notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
+    return _uplink_run(row, stage, injected, [_stream_of(notes, one) for one in (alone, crowded)])
+
+
+def _start_notes(crew: BenchProcesses, wire: BenchWire, stage: Stage) -> None:
+    crew.start("notes", "sightline.benchmarks.network.watch", _AT_ROUTER, str(stage.folder / "notes.json"), "statuses",
+               namespace=wire.far_side)
+    crew.wait_line("notes", "watching")
+
+
+def _stretch(wire: BenchWire, shapes: LinkShapes, seconds: float) -> tuple[int, int, int]:
+    """(from, until, bytes that came from the robot in between)."""
+    time.sleep(_UPLINK_SETTLE_S)
+    wire.shape(shapes)
+    begin_us, begin_bytes = monotonic_us(), wire.carried_bytes["ab"]
+    time.sleep(seconds)
+    wire.shape(shapes)
+    return begin_us, monotonic_us(), wire.carried_bytes["ab"] - begin_bytes
+
+
+def _stream_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: tuple[int, int, int]) -> tuple[float, float]:
+    """(bytes that crossed for each frame, frames per second)."""
+    begin_us, end_us, carried = stretch
+    sent = sent_between(notes["statuses"], begin_us, end_us)
+    return carried / max(1.0, sent), sent * 1e6 / (end_us - begin_us)
+
+
+def _uplink_run(row: Case, stage: Stage, injected: int, streams: Sequence[tuple[float, float]]) -> NetworkRun:
+    (alone_bytes, alone_fps), (crowded_bytes, crowded_fps) = streams
+    checks = (
+        LoopCheck("injected", float(injected), "", 1.0, injected >= 1),
+        at_most("bytes from the robot, over one stream", crowded_bytes / max(1.0, alone_bytes), "times", MOST_SHARE),
+        LoopCheck("frames while crowded", crowded_fps, "fps", UPLINK_LEAST_FPS, crowded_fps >= UPLINK_LEAST_FPS),
+    )
+    facts = {"alone_bytes_per_frame": alone_bytes, "crowded_bytes_per_frame": crowded_bytes, "alone_fps": alone_fps}
+    return NetworkRun(row, stage.seed, injected, (), checks, facts)
+
+
+# A row of `bench network`: twenty robots and one vision for all of them. Shell (processes).
+
+
+ROBOTS: Final = 20
+WIDTH_PX, HEIGHT_PX, FPS = 320, 240, 15.0
+FLEET_LEAST_FPS: Final = 14.0
+MOST_P95_MS: Final = 80.0
+_FLEET_SETTLE_S: Final = 3.0
+
+
+def fleet(row: Case, stage: Stage) -> NetworkRun:
+    """All of them for as long as there is time; judged by the robot that fared worst."""
+    pictures = stage.folder / "small"
+    pictures.mkdir()
+    write_pictures(pictures, WIDTH_PX, HEIGHT_PX)
+    settings = Settings(endpoint=f"tcp/{ADDRESS_B}:7447", robots=ROBOTS, fps=FPS, pictures=pictures,
+                        notes=stage.folder / "notes.json", seed=stage.seed)
+    with stage.wire() as wire, stage.crew("crew") as crew:
+        before = wire.shape(stage.seeded(row.phases[0].shapes))
+        crew.start("vision", "sightline.operator_side.cli.app", "vision", "--robot", "r*", "--listen", f"tcp/{EVERYWHERE}:7447",
+                   namespace=wire.far_side)
+        crew.wait_line("vision", "looking for robots")
+        crew.start("robots", "sightline.benchmarks.network.robots", settings.model_dump_json(), namespace=wire.robot_side)
+        crew.wait_line("robots", f"playing {ROBOTS} robots")
+        time.sleep(_FLEET_SETTLE_S)
+        begin_us = monotonic_us()
+        time.sleep(stage.setting.seconds)
+        end_us = monotonic_us()
+        crew.check()
+        injected = wire.shape(LinkShapes()) - before
+        crew.end()
+    answers = json.loads(settings.notes.read_text("utf-8"))
+    harmed = LoopCheck("injected", float(injected), "", 1.0, injected >= 1)
+    return NetworkRun(row, stage.seed, injected, (), (harmed, *fleet_checks(answers, begin_us, end_us)))
+
+
+def fleet_checks(
+    answers: Mapping[str, Sequence[Sequence[int]]], begin_us: int, end_us: int
+) -> tuple[LoopCheck, LoopCheck, LoopCheck]:
+    """The robot with the fewest answers, and the one with the oldest. `answers`: (captured_us, age_us) of each."""
+    seconds = (end_us - begin_us) / 1e6
+    ages_ms = [[age_us / 1000 for at_us, age_us in seen if begin_us <= at_us < end_us] for seen in answers.values()]
+    least_fps = min((len(one) / seconds for one in ages_ms), default=0.0)
+    p95_ms = [percentile(one, 95) for one in ages_ms]
+    known = [one for one in p95_ms if one is not None]
+    oldest_ms = max(known) if known and len(known) == len(p95_ms) else None
+    return (
+        LoopCheck("robots", float(len(answers)), "", float(ROBOTS), len(answers) >= ROBOTS),
+        LoopCheck("answered, least", least_fps, "fps", FLEET_LEAST_FPS, least_fps >= FLEET_LEAST_FPS),
+        at_most("age p95, worst robot", oldest_ms, "ms", MOST_P95_MS),
+    )
+
+
+# A row of `bench network`: one half-duplex medium, full of video, and a person beyond it who says STOP. Shell.
+#
+# Judged from the simulated motors' own log, with the fault bench's robot and judge.
+
+
+REACHES_MS: Final = 300.0
+REPORTED_MS: Final = REACHES_MS + 100.0
+"""By the robot's own status, ten times a second: as frames age, wheels slow down by themselves, before any STOP."""
+ZERO_MS: Final = 700.0
+"""Reached, and then the ramp from 0.5 m/s: as the fault bench demands of every STOP."""
+_READY_S: Final = 30.0
+_BESIDE_S: Final = 60.0
+
+
+def medium(row: Case, stage: Stage) -> NetworkRun:
+    """STOP, reset and so on for as long as there is time. Raises HardwareError if anything does not run."""
+    try:
+        with RobotFixture(stage.folder / "rig", Setup(wired=True, camera="heavy")) as rig:
+            return _medium_run(row, stage, rig)
+    except SightlineError as error:
+        raise HardwareError(str(error)) from None
+
+
+def _medium_run(row: Case, stage: Stage, rig: RobotFixture) -> NetworkRun:
+    assert rig.wire is not None
+    before = rig.wire.shape(stage.seeded(row.phases[0].shapes))
+    ledger = rig.folder / "person.ledger"
+    arguments = [rig.endpoint, ROBOT, str(ledger), str(stage.setting.seconds), str(stage.seed)]
+    rig.fleet.run("person", "sightline.benchmarks.network.stop_client", arguments, namespace=rig.wire.far_side)
+    rig.fleet.wait_line("person", "person ready", _READY_S)
+    if rig.fleet.exit_code("person", stage.setting.seconds + _BESIDE_S) != 0:
+        raise HardwareError(f"the person gave up: {rig.fleet.log('person').read_text('utf-8').strip()[-200:]}")
+    injected = rig.wire.shape(LinkShapes()) - before
+    told_us = [one.t_us for one in rig.noted("person", REQUESTED)]
+    rows = rig.motors()
+    checks = (
+        LoopCheck("injected", float(injected), "", 1.0, injected >= 1),
+        *stop_checks_of(rows, told_us, [one.t_us for one in rig.noted("person", RESET)]),
+        reported_check(told_us, [one.frame_us for one in rig.noted("person", STOPPED)]),
+        at_most("moved on frames over 400 ms", moved_on_old_sight(rows, rig.sent(), None), "lines", 0),
+    )
+    return NetworkRun(row, stage.seed, injected, (), checks, {"stops": len(told_us)})
+
+
+def stop_checks_of(rows: Sequence[MotorRow], told_us: Sequence[int], reset_us: Sequence[int]) -> Sequence[LoopCheck]:
+    """When each STOP, said at `told_us`, shows in what the motors were told, and when the wheels stood; each holds
+    until the wheels turn after its reset.
+    """
+    ends_us = [_again_us(rows, at_us) for at_us in reset_us]
+    pairs = list(zip(told_us, ends_us, strict=True))
+    reached = [reached_ms(_window(rows, at_us, end_us), at_us) for at_us, end_us in pairs]
+    zero = [measure_stop(rows, at_us, end_us).zero_ms for at_us, end_us in pairs]
+    return (
+        at_most(f"STOP reaches the wheels, p99 of {len(reached)}", _p99(reached), "ms", REACHES_MS),
+        at_most(f"wheels at zero, p99 of {len(zero)}", _p99(zero), "ms", ZERO_MS),
+    )
+
+
+def reported_check(told_us: Sequence[int], stopped_us: Sequence[int]) -> LoopCheck:
+    """When the robot itself said, in the status with that stamp, that it was stopped."""
+    said = [(stop_us - at_us) / 1000 for at_us, stop_us in zip(told_us, stopped_us, strict=False)]
+    value = percentile(said, 99) if len(stopped_us) == len(told_us) else None
+    return at_most(f"robot says STOPPED, p99 of {len(said)}", value, "ms", REPORTED_MS)
+
+
+def _again_us(rows: Sequence[MotorRow], reset_us: int) -> int:
+    """Just before the wheels turn after the reset; the end of the log if they do not."""
+    return next((row.t_us - 1 for row in rows if row.t_us > reset_us and wheel_mps(row) > 0), rows[-1].t_us)
+
+
+def _window(rows: Sequence[MotorRow], begin_us: int, end_us: int) -> list[MotorRow]:
+    """What they were told when it began, and all up to its end."""
+    before = [row for row in rows if row.t_us <= begin_us]
+    return [*before[-1:], *(row for row in rows if begin_us < row.t_us <= end_us)]
+
+
+def reached_ms(window: Sequence[MotorRow], told_us: int) -> float | None:
+    """From STOP to the first line of the fall after which the wheels stayed at zero; None if they turn to the end."""
+    zero = 1 + max((index for index, row in enumerate(window) if wheel_mps(row) > 0), default=-1)
+    if zero == len(window):
+        return None
+    first = zero
+    while first > 1 and wheel_mps(window[first - 2]) > wheel_mps(window[first - 1]):
+        first -= 1
+    return max(0, window[first].t_us - told_us) / 1000
+
+
+def _p99(values: Sequence[float | None]) -> float | None:
+    known = [one for one in values if one is not None]
+    return percentile(known, 99) if len(known) == len(values) else None

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from sightline.benchmarks.loop.processes import BenchProcesses
-from sightline.benchmarks.loop_figures import LoopCheck
+from sightline.benchmarks.loop.figures import LoopCheck
 from sightline.benchmarks.loop.ours import ROBOT
-from sightline.benchmarks.network_figures import NetworkFigures
+from sightline.benchmarks.network.figures import NetworkFigures
 from sightline.benchmarks.network.cases import WEBSOCKET, ZENOH, Case
 from sightline.protocol.errors import ConfigError
 from sightline.sim.network_emulator import LinkShapes

@@ -10,10 +10,10 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
-from sightline.operator_side.faults.ledger import REQUESTED, EventLog
+from sightline.evaluation.faults.evidence import REQUESTED, EventLog
 from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.protocol.messages import Reply, State, Status, Verb
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.zenoh.link import open_zenoh
 
 STOPPED: Final = "stopped"

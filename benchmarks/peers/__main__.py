@@ -15,9 +15,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from sightline.benchmarks.loop_tally import Tally
+from sightline.benchmarks.peers.contest import Tally
 from sightline.benchmarks.peers.contest import Vision
-from sightline.benchmarks.peers.film import Film
+from sightline.benchmarks.peers.contest import Film
 
 _RETRY_S: Final = 0.1
 

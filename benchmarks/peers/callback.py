@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.loop_tally import Tally
+    from sightline.benchmarks.peers.contest import Tally
     from sightline.benchmarks.peers.contest import Vision
-    from sightline.benchmarks.peers.film import Film
+    from sightline.benchmarks.peers.contest import Film
 
 STAMP: Final = struct.Struct("<Q")
 

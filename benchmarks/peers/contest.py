@@ -1,5 +1,9 @@
 """What every peer's vision is handed: something that answers pictures. Pure."""
 
+import json
+import time
+from pathlib import Path
+from sightline.protocol.clock import monotonic_us
 from typing import Protocol
 
 
@@ -9,3 +13,60 @@ class Vision(Protocol):
     def answer(self, t_us: int, jpeg: bytes, /) -> str:
         """The command for a picture captured at `t_us`. Raises ValueError for one that cannot be answered."""
         ...
+
+
+# A camera for the peers of `bench loop`: the recorded pictures at their pace, stamped when shown. Shell (a clock).
+#
+# The caller sleeps itself (`film.next_in_s()`), as its own loop does: a thread's sleep or a coroutine's. Pictures that
+# nobody came for in time are not made up for, as with the folder camera of the robot service.
+
+
+class Film:
+    """`fps` pictures a second, looped."""
+
+    def __init__(self, folder: Path, fps: float) -> None:
+        self._jpegs = [path.read_bytes() for path in sorted(folder.glob("*.jpg"))]
+        self._interval_s = 1 / fps
+        self._due_s = time.monotonic()
+        self._shown = 0
+
+    def next_in_s(self) -> float:
+        """How long to sleep until the next picture."""
+        now_s = time.monotonic()
+        self._due_s = max(self._due_s + self._interval_s, now_s)
+        return self._due_s - now_s
+
+    def shoot(self) -> tuple[int, bytes]:
+        """(capture time in microseconds, JPEG)."""
+        self._shown += 1
+        return time.monotonic_ns() // 1000, self._jpegs[self._shown % len(self._jpegs)]
+
+
+# What one contestant of `bench loop` captured, and when each answer was judged. Shell.  Kept in memory, at the cost of
+# an append, and written at the end. All processes of a machine share its monotonic clock.
+
+
+class Tally:
+    """Times in microseconds of the monotonic clock."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._captured_us: list[int] = []
+        self._judged_us: list[tuple[int, int]] = []
+        self.hot_us: float | None = None
+        """Median of one step without pacing, where it was measured."""
+
+    def capture(self, t_us: int) -> None:
+        """A picture was captured at `t_us`."""
+        self._captured_us.append(t_us)
+
+    def judge(self, t_us: int) -> None:
+        """The answer to the picture of `t_us` is there, parsed and ready for the motors."""
+        self._judged_us.append((t_us, monotonic_us()))
+        if len(self._judged_us) == 1:
+            print("first answer", flush=True)
+
+    def save(self) -> None:
+        """Write everything to the file."""
+        record = {"captured_us": self._captured_us, "judged_us": self._judged_us, "hot_us": self.hot_us}
+        self._path.write_text(json.dumps(record))

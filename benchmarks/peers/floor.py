@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 from sightline.protocol.text import parse_twist
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.loop_tally import Tally
+    from sightline.benchmarks.peers.contest import Tally
     from sightline.benchmarks.peers.contest import Vision
-    from sightline.benchmarks.peers.film import Film
+    from sightline.benchmarks.peers.contest import Film
 
 _HOT_STEPS: Final = 150
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import zmq
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.loop_tally import Tally
+    from sightline.benchmarks.peers.contest import Tally
     from sightline.benchmarks.peers.contest import Vision
-    from sightline.benchmarks.peers.film import Film
+    from sightline.benchmarks.peers.contest import Film
 
 Socket = zmq.Socket[bytes]
 

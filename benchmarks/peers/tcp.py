@@ -12,9 +12,9 @@ import time
 from typing import IO, TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.loop_tally import Tally
+    from sightline.benchmarks.peers.contest import Tally
     from sightline.benchmarks.peers.contest import Vision
-    from sightline.benchmarks.peers.film import Film
+    from sightline.benchmarks.peers.contest import Film
 
 HEAD: Final = struct.Struct("<IQ")
 """Bytes of JPEG, and the capture time in microseconds, by which the answer is told apart in measuring."""

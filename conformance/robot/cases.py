@@ -14,17 +14,17 @@ from sightline.conformance.robot import (
     legacy as robot_older,
     websocket as robot_sockets,
 )
-from sightline.protocol.conformance import (
-    robot_credit,
-    robot_doors,
-    robot_flow,
-    robot_messages,
-    robot_order,
-    robot_requests,
-    robot_stop,
-    robot_tokens,
+from sightline.conformance.robot import (
+    frames as robot_credit,
+    websocket as robot_doors,
+    frames as robot_flow,
+    websocket as robot_messages,
+    twists as robot_order,
+    requests as robot_requests,
+    arming as robot_stop,
+    websocket as robot_tokens,
 )
-from sightline.protocol.conformance.bench import Bench
+from sightline.conformance.case import Bench
 from sightline.conformance.case import GROUPS, Case, ConformanceError
 from sightline.conformance.robot.fixture import Robot, Sender
 from sightline.protocol.messages import State, Status

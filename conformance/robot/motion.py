@@ -7,11 +7,11 @@ import math
 from typing import Final
 
 from sightline.protocol.channels import STATUS
-from sightline.protocol.conformance.bench import Bench
+from sightline.conformance.case import Bench
 from sightline.conformance.case import Suite
 from sightline.conformance.robot.fixture import CRAWL, Robot, Sender, armed
 from sightline.protocol.messages import FrameHeader, Planar, State, Status
-from sightline.protocol.refusals import CLAMPED
+from sightline.protocol.errors import CLAMPED
 
 SUITE: Final = Suite("R")
 _STOPS_WITHIN_US: Final = 700_000

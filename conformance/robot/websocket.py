@@ -1,16 +1,24 @@
 """Cases that need sockets of their own: the handshake, hello and framing of `sightline.v1`. Shell (raw sockets)."""
 
+import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from sightline.conformance.case import Bench, NotApplicableError, Suite
+from sightline.conformance.raw_peers import BINARY, CONTINUED, Frame, PING, PONG, RawWebSocket, TEXT, split_url
+from sightline.conformance.robot.fixture import GOOD, Robot, Sender, as_json
+from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, REPLY, STATUS
+from sightline.protocol.errors import WireError
+from sightline.protocol.transports.websocket.framing import (
+    IncomingMessage,
+    MAX_BLOCK_BYTES,
+    MAX_HELLO_BYTES,
+    SUBPROTOCOL,
+    parse_hello,
+    unpack,
+)
 from typing import Any, Final
 
-from sightline.protocol.conformance.bench import Bench
-from sightline.conformance.case import NotApplicableError, Suite
-from sightline.conformance.raw_peers import BINARY, CONTINUED, TEXT, RawWebSocket, split_url
-from sightline.conformance.robot.fixture import as_json
-from sightline.protocol.errors import WireError
-from sightline.protocol.transports.websocket.framing import SUBPROTOCOL, IncomingMessage, parse_hello, unpack
 
 SUITE: Final = Suite("R")
 SWITCHED: Final = 101
@@ -232,3 +240,355 @@ def unknown_wants(bench: Bench) -> None:
     with spoken(bench, "status", "perfume", mood="calm") as raw:
         names = names_of(packets_of(raw, bench, PASSING_S))
         bench.expect("status" in names, f"there came {sorted(names)}")
+
+
+# Cases on the messages of `sightline.v1` after hello: framing, pings, and how a bad one ends. Shell (sockets).
+
+
+@SUITE.must("R-SOCK-16", "14.6 Messages", real=True)
+def messages_can_be_taken_apart(bench: Bench) -> None:
+    """Every message has a header block of at most 576 bytes that names its channel, and a header within 512."""
+    with spoken(bench, *(name for name in CHANNELS)) as raw:
+        packets = packets_of(raw, bench, PASSING_S)
+        bench.expect(packets, "nothing came")
+        for packet in packets:
+            good = packet.key and len(packet.header) <= MAX_HEADER_BYTES
+            bench.expect(good, f"{packet.key or 'no channel'}: {packet.payload[:60]!r}")
+
+
+@SUITE.must("R-SOCK-17", "14.6 Messages", real=True)
+def channel_anywhere(bench: Bench) -> None:
+    """`channel` need not be the first field of the block."""
+    with spoken(bench, "reply") as raw:
+        fields = {"v": 1, "source": bench.access.watcher, "session": SESSION, "seq": 1, "channel": "request"}
+        raw.send(BINARY, block(as_json(fields), b'{"id":1,"verb":"disarm"}'))
+        bench.expect(is_answered(raw, bench), "a request whose block names its channel last is not answered")
+
+
+@SUITE.must("R-SOCK-18", "14.6 Messages", real=True)
+def fragments(bench: Bench) -> None:
+    """A message may come in fragments, with pings between them."""
+    with spoken(bench, "reply") as raw:
+        message = disarm_request(bench)
+        raw.send(BINARY, message[:20], fin=False)
+        raw.send(PING, b"between")
+        raw.send(CONTINUED, message[20:40], fin=False)
+        raw.send(CONTINUED, message[40:])
+        bench.expect(is_answered(raw, bench), "a request in three fragments is not answered")
+
+
+@SUITE.must("R-SOCK-19", "14.8 Liveness", real=True)
+def pings_are_answered(bench: Bench) -> None:
+    """A ping is answered with its own data."""
+    with spoken(bench) as raw:
+        raw.send(PING, b"\0marco")
+        frame = _next(raw, PONG)
+        bench.expect(frame is not None and frame.data == b"\0marco", f"the answer is {frame}")
+
+
+def _next(raw: RawWebSocket, opcode: int) -> Frame | None:
+    until_s = time.monotonic() + SOON_S
+    while (left_s := until_s - time.monotonic()) > 0:
+        frame = raw.frame(left_s)
+        if frame is not None and frame.opcode == opcode:
+            return frame
+    return None
+
+
+def _breaks(
+    number: str, title: str, codes: tuple[int, ...], message: Callable[[RawWebSocket], None], within_s: float = SOON_S
+) -> None:
+    def run(bench: Bench) -> None:
+        with spoken(bench) as raw:
+            message(raw)
+            ends_with(raw, bench, codes, title, within_s)
+
+    run.__doc__ = title
+    SUITE.must(number, "14.9 Ends", real=True)(run)
+
+
+_breaks("R-SOCK-20", "A header block that is cut ends with 1007 or 1002.", (1002, 1007),
+        lambda raw: raw.send(BINARY, b"\x02\x00" + b'{"channel":"twist"}'))  # fmt: skip
+_breaks("R-SOCK-21", "A header block over 576 bytes ends with 1007, 1002 or 1009.", (1002, 1007, 1009),
+        lambda raw: raw.send(BINARY, block(b'{"channel":"ack","x":"' + b"x" * MAX_BLOCK_BYTES + b'"}')))  # fmt: skip
+_breaks("R-SOCK-22", "A header block that names no channel ends with 1007 or 1002.", (1002, 1007),
+        lambda raw: raw.send(BINARY, block(b'{"v":1,"source":"viewer"}')))  # fmt: skip
+_breaks("R-SOCK-23", "Text that is not UTF-8 ends with 1007.", (1007,),
+        lambda raw: raw.send(TEXT, b'{"v":1,"robot":"\xff\xfe"}'))  # fmt: skip
+_breaks("R-SOCK-24", "A message larger than the robot can want, 10 MB, ends with 1009.", (1009,),
+        lambda raw: raw.send(BINARY, b"\0" * 10_000_000), 5.0)  # fmt: skip
+_breaks("R-SOCK-25", "A frame of a client that is not masked ends with 1002.", (1002,),
+        lambda raw: raw.send(PING, b"bare", masked=False))  # fmt: skip
+_breaks("R-SOCK-26", "A reserved bit or opcode ends with 1002.", (1002,),
+        lambda raw: raw.send(5, b"?"))  # fmt: skip
+_breaks("R-SOCK-27", "A control frame over 125 bytes ends with 1002.", (1002,),
+        lambda raw: raw.send(PING, b"x" * 200))  # fmt: skip
+
+
+@SUITE.must("R-SOCK-28", "14.9 Ends", real=True)
+def bad_messages_end_nothing(bench: Bench) -> None:
+    """A message of an unknown channel or source, or whose header is no JSON, is dropped; the connection stays."""
+    with spoken(bench, "reply") as raw:
+        bad = b'{"channel":"perfume"}', b'{"channel":"twist","source":"../x"}', b'{"channel":"twist","v":1,,}'
+        for fields in bad:
+            raw.send(BINARY, block(fields, b"1|1"))
+        raw.send(BINARY, disarm_request(bench))
+        bench.expect(is_answered(raw, bench), "after them a request is not answered")
+
+
+@SUITE.must("R-SOCK-29", "14.8 Liveness", real=True)
+def pings_every_second(bench: Bench) -> None:
+    """The robot pings about every second."""
+    with spoken(bench) as raw:
+        packets_of(raw, bench, 3.2)
+        bench.expect(raw.pings >= 2, f"{raw.pings} pings in 3.2 s")
+
+
+@SUITE.must("R-SOCK-30", "14.8 Liveness", real=True)
+def the_deaf_are_dropped(bench: Bench) -> None:
+    """A peer that leaves pings unanswered is dropped within about two seconds."""
+    with RawWebSocket(endpoint_of(bench), offered(bench), answers_pings=False) as raw:
+        raw.send(TEXT, hello(bench))
+        began_s = time.monotonic()
+        end = raw.end(5.0)
+        took_s = time.monotonic() - began_s
+        bench.expect(end is not None and took_s < 4.0, f"after {took_s:.1f} s it is still connected")
+
+
+@SUITE.must("R-SOCK-31", "13.2 Bounds", real=True)
+def abrupt_ends(bench: Bench) -> None:
+    """Connections that break off anywhere disturb nobody else."""
+    endpoint_of(bench)
+    for opening in (b"", b"GET / HTTP/1.1\r\nHost: x", b"\x16\x03\x01\x02\0\x01\0" * 9):
+        with RawWebSocket(bench.endpoint, offered(bench)) as raw:
+            raw.write(opening)
+    with spoken(bench, "frame") as raw:
+        raw.send(BINARY, disarm_request(bench)[:9], fin=False)
+    mark = bench.mark()
+    bench.rest(1_000_000)
+    came = len(bench.heard(STATUS, mark))
+    bench.expect(came >= 7, f"{came} status within a second after it")
+
+
+@SUITE.should("R-SOCK-32", "14.4 Limits", real=True)
+def sixteen_clients(bench: Bench) -> None:
+    """After sixteen clients the next is refused with 503, and those before are served."""
+    with ExitStack() as ending:
+        statuses, opened = [], list[RawWebSocket]()
+        for _ in range(17):
+            raw = ending.enter_context(RawWebSocket(endpoint_of(bench), offered(bench)))
+            statuses.append(raw.status)
+            raw.send(TEXT, hello(bench, role="operator"))  # of those who only watch, fewer may come in
+            opened.append(raw)
+            for earlier in opened:
+                earlier.frame(0.001)  # answers its pings: on a slow machine the first may wait for seconds
+            if raw.status != SWITCHED:
+                break
+        bench.expect(statuses[-1] == 503, f"seventeen more clients: {statuses}")
+        mark = bench.mark()
+        bench.expect_within(lambda: len(bench.heard(STATUS, mark)) > 3, 1_500_000, "then nobody else is served")
+
+
+@SUITE.must("R-SOCK-33", "14.6 Messages", real=True)
+def says_hello_to_many_roles(bench: Bench) -> None:
+    """The `role` of the hello is the source of messages that name none."""
+    operator = Sender(Robot(bench), "operator", acks=False)
+    with spoken(bench, "reply", role="operator") as raw:
+        fields = {"channel": "request", "v": 1, "session": SESSION, "seq": 1}
+
+        def send() -> None:
+            raw.send(BINARY, block(as_json(fields), b'{"id":1,"verb":"disarm"}'))
+
+        verdict = operator.verdict(send)
+        last = operator.robot.status().last_refusal
+        told = verdict == "MALFORMED" and last is not None and last.source == "operator"
+        bench.expect(told, f"a header without source is {verdict or 'not counted'} as {last}")
+        bench.expect(not bench.heard(REPLY)[1:], "it was answered")
+
+
+# Cases on what `sightline.v1` says of blocks, hellos, late handshakes and detections. Shell (raw sockets).
+
+
+_HANDSHAKE_S: Final = 4.0
+"""Two seconds by the specification, and room for a slow machine."""
+
+
+def _reason_given(bench: Bench, send: Callable[[], None]) -> tuple[str, str]:
+    """What became of what `send` sends, and whom the robot took for its sender."""
+    watcher = Sender(Robot(bench), bench.access.watcher, acks=False)
+    verdict = watcher.verdict(send)
+    last = watcher.robot.status().last_refusal
+    return verdict, last.source if last else ""
+
+
+@SUITE.must("R-SOCK-41", "12.3 Passing on", real=True)
+def passes_detections_on(bench: Bench) -> None:
+    """Detections are passed on, header and payload as they came, to every other peer that wants them."""
+    _passed_on(bench, "detections", "vision", b'{"width_px":640, "height_px":480, "boxes":[]}')
+
+
+@SUITE.must("R-SOCK-47", "18.5 Passing on", real=True)
+def passes_missions_on(bench: Bench) -> None:
+    """Missions and reports are passed on as detections are."""
+    _passed_on(bench, "mission", "operator", b'{"id":4711, "name":"follow"}')
+    _passed_on(bench, "report", "vision", b'{"mission":"follow", "phase":"looking"}')
+
+
+def _passed_on(bench: Bench, channel: str, role: str, payload: bytes) -> None:
+    """Fail the case unless what `role` says on `channel` comes to another, once and as it was, and not back."""
+    fields: dict[str, Any] = {"v": 1, "source": role, "session": SESSION, "seq": 7, "note": "as it came"}
+    with spoken(bench, channel) as other, spoken(bench, channel, role=role) as speaker:
+        speaker.send(BINARY, block(b'{"channel":"%b",' % channel.encode() + as_json(fields)[1:], payload))
+        heard = _said_on(channel, other, bench, 1.0)
+        bench.expect(len(heard) == 1, f"another peer that wants `{channel}` gets {len(heard)} of one that was said")
+        bench.expect(heard[0].payload == payload, f"the payload came as {heard[0].payload[:80]!r}")
+        bench.expect(heard[0].header == as_json(fields), f"the header came as {heard[0].header[:120]!r}")
+        bench.expect(not _said_on(channel, speaker, bench, 0.3), f"who said `{channel}` gets it back")
+
+
+def _said_on(channel: str, raw: RawWebSocket, bench: Bench, for_s: float) -> list[IncomingMessage]:
+    return [one for one in packets_of(raw, bench, for_s) if f"/{channel}/" in one.key]
+
+
+@SUITE.must("R-SOCK-42", "14.4 Limits", real=True)
+def late_handshake(bench: Bench) -> None:
+    """Who connects and asks for nothing is dropped after two seconds."""
+    _tls, address, port = split_url(endpoint_of(bench))
+    with socket.create_connection((address, port), _HANDSHAKE_S) as near:
+        began_s = time.monotonic()
+        near.settimeout(_HANDSHAKE_S)
+        try:
+            said = near.recv(4096)
+            while said:
+                said = near.recv(4096)
+        except TimeoutError:
+            bench.expect(False, f"after {_HANDSHAKE_S:g} s without a word it is still connected")
+        except ConnectionError:
+            pass
+        took_s = time.monotonic() - began_s
+        bench.expect(took_s > 0.5, f"it had {took_s:.1f} s, and 2 s are its right")
+
+
+@SUITE.must("R-SOCK-43", "14.5 Hello", real=True)
+def long_hello(bench: Bench) -> None:
+    """A hello of more than 1024 bytes ends with 1009 or 1008."""
+    with RawWebSocket(endpoint_of(bench), offered(bench)) as raw:
+        bench.need(raw.status == SWITCHED, f"the handshake fails with {raw.status} (R-SOCK-01)")
+        raw.send(TEXT, hello(bench, "status", note="x" * MAX_HELLO_BYTES))
+        ends_with(raw, bench, (1008, 1009), "a hello of 1.1 kB")
+
+
+@SUITE.must("R-SOCK-44", "14.5 Hello", real=True)
+def hello_again_with_another_role(bench: Bench) -> None:
+    """A later hello replaces the role too: messages that name no source are that one's from then on."""
+    with spoken(bench, "reply", role="teleop") as raw:
+        raw.send(TEXT, hello(bench, "reply", role="operator"))
+        packets_of(raw, bench, 0.3)
+        fields = {"channel": "request", "v": 1, "session": SESSION, "seq": 1}
+        told = _reason_given(bench, lambda: raw.send(BINARY, block(as_json(fields), b'{"id":1,"verb":"disarm"}')))
+        bench.need(told[0] == "MALFORMED", f"a header without source is {told[0] or 'not counted'} (R-SOCK-33)")
+        bench.expect(told[1] == "operator", f"after a hello as operator it is taken for {told[1]}'s")
+
+
+@SUITE.must("R-SOCK-45", "14.6 Messages", real=True)
+def block_without_header(bench: Bench) -> None:
+    """A block of channel and source alone is a message without header: a guest's twist, or UNKNOWN_SOURCE."""
+    bench.need(not bench.access.is_guarded, "where keys are asked for no guest gets in")
+    with spoken(bench, role="guest") as raw:
+        verdict = _reason_given(bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","source":"guest"}', b"0.1|0")))[0]
+        bench.expect(verdict in (GOOD, "UNKNOWN_SOURCE"), f"it was {verdict or 'not counted'}")
+
+
+@SUITE.must("R-SOCK-46", "14.6 Messages", real=True)
+def header_that_is_no_json(bench: Bench) -> None:
+    """A block that begins with its channel is of it, whatever follows: what is no JSON is counted as MALFORMED."""
+    with spoken(bench, "reply", role="teleop") as raw:
+        verdict, _source = _reason_given(bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","v":1,,}', b"1|1")))
+        bench.expect(verdict == "MALFORMED", f"it was {verdict or 'not counted'}")
+        bench.expect(raw.end(0.3) is None, "the connection ended")
+
+
+# Cases on tokens: who may come in where a robot asks for one, and what a role may say then. Shell (raw sockets).
+
+
+_CLAUSE: Final = "14.3 Token"
+_WRONG_TOKENS: Final = "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"
+"""A token by its form, and nobody's."""
+
+
+def _token(bench: Bench) -> str:
+    endpoint_of(bench)
+    token = bench.access.token_of(bench.access.watcher)
+    bench.need(token, "no token was named (--token, or --secure): a robot on loopback need not ask for one")
+    return token
+
+
+def _answers(bench: Bench, status: int, what: str, **options: Any) -> None:
+    """Fail the case unless a client who comes so gets `status`."""
+    with RawWebSocket(endpoint_of(bench), **{"protocols": (SUBPROTOCOL,), **options}) as raw:
+        bench.expect(raw.status == status, f"{what}: HTTP {raw.status or 'nothing'}, expected {status}")
+
+
+@SUITE.must("R-SOCK-34", _CLAUSE, real=True)
+def no_token(bench: Bench) -> None:
+    """Who shows no token is refused with 401."""
+    _token(bench)
+    _answers(bench, 401, "no token")
+
+
+@SUITE.must("R-SOCK-35", _CLAUSE, real=True)
+def wrong_token(bench: Bench) -> None:
+    """A token that is nobody's, or a part of the right one, is refused with 401."""
+    token = _token(bench)
+    for what, wrong in (("nobody's token", _WRONG_TOKENS), ("all but its last letter", token[:-1]), ("an empty one", "")):
+        _answers(bench, 401, what, protocols=(SUBPROTOCOL, entry_of(wrong)))
+
+
+@SUITE.must("R-SOCK-36", _CLAUSE, real=True)
+def two_tokens(bench: Bench) -> None:
+    """Two tokens, though one of them be right, are refused with 401."""
+    token = _token(bench)
+    _answers(bench, 401, "a second entry", protocols=(SUBPROTOCOL, entry_of(token), entry_of(_WRONG_TOKENS)))
+    shown = (("Authorization", f"Bearer {_WRONG_TOKENS}"),)
+    _answers(bench, 401, "a second one as bearer", protocols=(SUBPROTOCOL, entry_of(token)), headers=shown)
+
+
+@SUITE.must("R-SOCK-37", _CLAUSE, real=True)
+def token_in_the_url(bench: Bench) -> None:
+    """A token in the URL, which is logged, opens nothing: 401."""
+    token = _token(bench)
+    _answers(bench, 401, "a token in the URL", path=f"/?token={token}")
+
+
+@SUITE.must("R-SOCK-38", _CLAUSE, real=True)
+def token_as_bearer(bench: Bench) -> None:
+    """The token is taken as `Authorization: Bearer` too, and HTTP has that word in any case."""
+    token = _token(bench)
+    for word in ("Bearer", "bearer"):
+        _answers(bench, SWITCHED, f"the token as {word}", headers=(("Authorization", f"{word} {token}"),))
+
+
+@SUITE.must("R-SOCK-39", _CLAUSE, real=True)
+def token_is_not_repeated(bench: Bench) -> None:
+    """Beside a token `sightline.v1` is selected, wherever it stands, and the token is never repeated."""
+    token = _token(bench)
+    for protocols in ((entry_of(token), SUBPROTOCOL), (SUBPROTOCOL, entry_of(token))):
+        with RawWebSocket(endpoint_of(bench), protocols) as raw:
+            bench.expect(raw.status == SWITCHED, f"offered {len(protocols)} entries: HTTP {raw.status}")
+            selected = raw.headers.get("sec-websocket-protocol")
+            bench.expect(selected == SUBPROTOCOL, "it selects the token" if token in str(selected) else f"{selected!r}")
+            bench.expect(not any(token in text for text in raw.headers.values()), "it repeats the token")
+
+
+@SUITE.must("R-SOCK-40", _CLAUSE, real=True)
+def roles_are_kept_apart(bench: Bench) -> None:
+    """What the token's role may not publish is dropped, and the connection stays: a vision asks for nothing."""
+    _token(bench)
+    bench.need(len(set(bench.access.tokens.values())) > 1, "one token stands for every role here")
+    with RawWebSocket(endpoint_of(bench), offered(bench, source="vision")) as raw:
+        raw.send(TEXT, hello(bench, "reply"))
+        bench.need(raw.frame(SOON_S), "hello is not answered (R-SOCK-07)")
+        raw.send(BINARY, disarm_request(bench))
+        bench.expect(not is_answered(raw, bench), "with the token of a vision an operator's request was carried out")
+        raw.send(BINARY, block(b'{"channel":"ack","source":"vision"}'))
+        bench.expect(raw.end(0.5) is None, "the connection ended")

@@ -8,14 +8,14 @@ from sightline.conformance.vision import (
     flow as vision_flow,
     hostile as vision_hostile,
 )
-from sightline.protocol.conformance import (
-    vision_doors,
-    vision_limits,
-    vision_reconnect,
-    vision_sockets,
-    vision_steering,
+from sightline.conformance.vision import (
+    websocket as vision_doors,
+    hostile as vision_limits,
+    flow as vision_reconnect,
+    websocket as vision_sockets,
+    answers as vision_steering,
 )
-from sightline.protocol.conformance.bench import Bench
+from sightline.conformance.case import Bench
 from sightline.conformance.case import Case
 from sightline.conformance.vision.fixture import RobotPlayed
 

@@ -4,9 +4,9 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
-from sightline.protocol.conformance.bench import Bench
+from sightline.conformance.case import Bench
 from sightline.conformance.case import Suite
-from sightline.protocol.conformance.vision_pictures import png
+from sightline.conformance.vision.drawing import png
 from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, Answer, RobotPlayed, Sent
 
 SUITE = Suite("V")

@@ -17,9 +17,9 @@ from typing import Any, Final, Self
 
 from sightline.protocol.channels import ACK, CAMERA, FRAME, STATUS, TWIST, Channel
 from sightline.protocol.codec import encode
-from sightline.protocol.conformance.bench import Bench, Heard
-from sightline.protocol.conformance.vision_pictures import CAMERA as LENS
-from sightline.protocol.conformance.vision_pictures import picture
+from sightline.conformance.case import Bench, Heard
+from sightline.conformance.vision.drawing import CAMERA as LENS
+from sightline.conformance.vision.drawing import picture
 from sightline.protocol.messages import CameraModel, FrameHeader, Stamp, State, Status
 
 ANSWER_US: Final = 500_000

@@ -1,10 +1,14 @@
 """What the laws of the older write-ups go by: the largest detection as centre, radius and area in pixels. Pure."""
 
 import math
+from collections import deque
 from dataclasses import dataclass
-
+from pydantic import Field
+from sightline.protocol.config import Config
+from sightline.protocol.messages import CameraModel, STILL, Twist
 from sightline.vision_side.detect.port import Detection
-from sightline.vision_side.missions.port import View
+from sightline.vision_side.missions.port import Plan, View
+from typing import Annotated
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,3 +33,168 @@ def _blob(one: Detection) -> Blob:
         return Blob(one, one.circle.cx_px, radius, math.pi * radius * radius)
     width, height = one.x2_px - one.x1_px, one.y2_px - one.y1_px
     return Blob(one, (one.x1_px + one.x2_px) / 2, max(width, height) / 2, width * height)
+
+
+# Band steering, a baseline: one of three fixed twists, by where the target is and how large it looks. Pure.
+#
+# The law of an older Gazebo robot, its numbers as defaults. `centre_share` is of the picture's whole width, as it was
+# there, so that the robot turns only when the target is almost out of sight; see docs/missions.md for sane numbers.
+
+
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class BandConfig(Config):
+    """The write-up's numbers. Shares are of the picture's width."""
+
+    min_radius_share: Share = 0.05
+    max_radius_share: Share = 1 / 3
+    """A target that looks smaller or larger than this is not followed."""
+    centre_share: Share = 0.30
+    """Within this to either side of the middle the robot drives straight on."""
+    averaged: Annotated[int, Field(ge=1, le=100)] = 5
+    """Positions of the target that are averaged."""
+    linear_mps: Annotated[float, Field(ge=0, le=5)] = 0.1
+    """Straight on and while turning alike."""
+    angular_rad_s: Annotated[float, Field(ge=0, le=10)] = 0.5
+
+
+class Band:
+    """Forward, left or right at fixed speeds, or stop."""
+
+    Config = BandConfig
+
+    def __init__(self, config: BandConfig, camera: CameraModel) -> None:
+        self._config, self._width_px = config, camera.width_px
+        self._seen_px: deque[float] = deque(maxlen=config.averaged)
+
+    def step(self, view: View) -> Plan:
+        """The plan for one frame."""
+        blob = largest(view)
+        if blob is None:
+            return Plan(STILL, "no target")
+        self._seen_px.append(blob.x_px)
+        middle_px = round(sum(self._seen_px) / len(self._seen_px)) - (self._width_px // 2 - 1)  # whole pixels, as there
+        config, share = self._config, blob.radius_px / self._width_px
+        if not config.min_radius_share <= share <= config.max_radius_share:
+            return Plan(STILL, "too near" if share > config.max_radius_share else "too far", target=blob.detection)
+        if abs(middle_px) <= config.centre_share * self._width_px:
+            return Plan(Twist(linear_mps=config.linear_mps, angular_rad_s=0.0), "forward", target=blob.detection)
+        left = middle_px < 0
+        turn = config.angular_rad_s if left else -config.angular_rad_s
+        return Plan(Twist(linear_mps=config.linear_mps, angular_rad_s=turn), "left" if left else "right",
+                    target=blob.detection)
+
+
+# P steering in pixels at five commands a second, a baseline. Pure.  The law of an older ball-chasing car, its numbers
+# as defaults: whatever it decided holds for 0.2 s, however the target moves meanwhile. See docs/missions.md for sane
+# numbers.
+
+
+Pixels = Annotated[float, Field(ge=0, le=1e4)]
+
+
+class PixelPConfig(Config):
+    """The write-up's numbers, in pixels of the encoded picture."""
+
+    angular_rad_s_per_px: Annotated[float, Field(ge=0, le=1)] = 0.009
+    min_radius_px: Pixels = 10.0
+    """A target that looks no larger is none."""
+    stop_radius_px: Pixels = 50.0
+    """A target that looks larger is near enough: only turn."""
+    centred_px: Pixels = 20.0
+    """Nearer to the middle than this: drive fast."""
+    fast_mps: Annotated[float, Field(ge=0, le=5)] = 0.5
+    slow_mps: Annotated[float, Field(ge=0, le=5)] = 0.2
+    period_s: Annotated[float, Field(ge=0, le=5)] = 0.2
+    """From one decision to the next; 0: with each picture."""
+
+
+class PixelP:
+    """Turns by the pixels off the middle; two speeds."""
+
+    Config = PixelPConfig
+
+    def __init__(self, config: PixelPConfig, camera: CameraModel) -> None:
+        self._config, self._width_px = config, camera.width_px
+        self._decided_us: int | None = None
+        self._plan = Plan(STILL, "no target")
+
+    def step(self, view: View) -> Plan:
+        """The plan for one frame: a new one when it is time, else the last."""
+        t_us = view.header.t_us
+        if self._decided_us is None or t_us - self._decided_us >= self._config.period_s * 1e6:
+            self._decided_us = t_us
+            self._plan = self._decide(largest(view))
+        return self._plan
+
+    def _decide(self, blob: Blob | None) -> Plan:
+        config = self._config
+        if blob is None or blob.radius_px <= config.min_radius_px:
+            return Plan(STILL, "no target")
+        off_px = self._width_px // 2 - int(blob.x_px)  # left positive, whole pixels, as there
+        turn = config.angular_rad_s_per_px * off_px
+        if blob.radius_px > config.stop_radius_px:
+            return Plan(Twist(linear_mps=0.0, angular_rad_s=turn), "near", target=blob.detection)
+        centred = abs(off_px) < config.centred_px
+        speed = config.fast_mps if centred else config.slow_mps
+        return Plan(Twist(linear_mps=speed, angular_rad_s=turn), "straight" if centred else "turning",
+                    target=blob.detection)
+
+
+# PI steering in pixels, a baseline: the nearer the target looks the slower, and an integral without time. Pure.  The
+# law of an older robot that was split over a WebSocket, its numbers as defaults: speed 200 / area, whatever that comes
+# to, and an integral per picture that nothing bounds. What else was wrong there (the position of another outline than
+# the largest, an integral that began anew with each picture) is not repeated. See docs/missions.md for sane numbers.
+
+
+Bound = Annotated[float | None, Field(gt=0, le=1e6)]
+
+
+class PixelPiConfig(Config):
+    """The write-up's numbers, in pixels of the encoded picture; None is no bound, as there."""
+
+    area_mps: Annotated[float, Field(gt=0, le=1e5)] = 200.0
+    """Speed for an area of one pixel; it falls with the area."""
+    angular_rad_s_per_px: Annotated[float, Field(ge=-1, le=1)] = -0.005
+    integral_share: Annotated[float, Field(ge=0, le=10)] = 0.007
+    dead_band_rad_s: Annotated[float, Field(ge=0, le=10)] = 0.1
+    """Smaller corrections are none; the integral goes on."""
+    min_area_px: Annotated[float, Field(ge=0, le=1e6)] = 40.0
+    """A target that looks no larger is not followed."""
+    stop_area_px: Bound = None
+    """From this area on only turn."""
+    max_linear_mps: Bound = None
+    max_integral_rad_s: Bound = None
+    """Of the sum of all corrections."""
+
+
+class PixelPi:
+    """Turns by proportion and sum of the pixels off the middle."""
+
+    Config = PixelPiConfig
+
+    def __init__(self, config: PixelPiConfig, camera: CameraModel) -> None:
+        self._config, self._width_px = config, camera.width_px
+        self._sum_rad_s = 0.0
+
+    def step(self, view: View) -> Plan:
+        """The plan for one frame."""
+        blob, config = largest(view), self._config
+        if blob is None or blob.area_px <= config.min_area_px:
+            return Plan(STILL, "no target")
+        correction = (blob.x_px - self._width_px / 2) * config.angular_rad_s_per_px
+        self._sum_rad_s = _bounded(self._sum_rad_s + correction, config.max_integral_rad_s)
+        steady = abs(correction) <= config.dead_band_rad_s
+        angular = 0.0 if steady else correction + config.integral_share * self._sum_rad_s
+        near = config.stop_area_px is not None and blob.area_px >= config.stop_area_px
+        linear = 0.0 if near else _bounded(config.area_mps / blob.area_px, config.max_linear_mps)
+        twist = Twist(linear_mps=linear, angular_rad_s=_bounded(angular, _SANITY))
+        return Plan(twist, "straight" if steady else "turning", target=blob.detection)
+
+
+_SANITY = 100.0  # rad/s: an integral that grew for an hour is still a number that fits on the wire
+
+
+def _bounded(value: float, limit: float | None) -> float:
+    return value if limit is None else max(-limit, min(limit, value))

@@ -1,18 +1,40 @@
 """One block on the terminal that shows how a demo goes; one line a second where there is no terminal. Shell."""
 
 import math
+import os
+import socket
 import sys
+import tempfile
 import time
-from types import TracebackType
-from typing import Final, Protocol, Self
-
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
-
+from sightline.evaluation.demo.shaped_vision import Shape
+from sightline.evaluation.processes import Processes, terminated_like_interrupted
+from sightline.evaluation.scenario_config import robot_of, robot_table, vision_config, vision_table
+from sightline.operator_side.client.requests import Operator, SOURCE
 from sightline.operator_side.client.status import millis, twist_text
+from sightline.operator_side.config.loading import load_service
+from sightline.operator_side.config.toml_text import toml_text
+from sightline.operator_side.recording.recorder import Recorder
+from sightline.operator_side.recording.replay import VISION_CONFIG
+from sightline.protocol.errors import ConfigError, HardwareError, SightlineError
 from sightline.protocol.messages import Status
+from sightline.protocol.transports.open import open_link
+from sightline.sim.bus import TruthReader
+from sightline.sim.scenario import Scenario, load_scenario
+from sightline.sim.toml_file import laid_over
 from sightline.sim.truth import Truth
+from sightline.vision_side.detect.registry import BOXES, check_choice
+from sightline.vision_side.missions.registry import configured_mission
+from types import TracebackType
+from typing import Any, Final, Protocol, Self
+
 
 REFRESH_S: Final = 0.2
 PLAIN_S: Final = 1.0
@@ -104,3 +126,227 @@ class PlainLines:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         pass
+
+
+# `sightline demo`: simulation, robot and vision as processes of their own, armed, watched, ended. Shell.
+#
+# The three run what `sightline sim`, `robot` and `vision` run by hand; their configuration lies in the run folder.
+
+
+ROBOT: Final = "r1"
+READY_S: Final = 30.0
+"""For one process to say that it is ready; a first start reads hundreds of megabytes from disk."""
+ARM_S: Final = 15.0
+_DYING_S: Final = 1.0
+_SILENT_S: Final = 2.0
+"""Without a word from the simulation: longer than a busy machine keeps it from its turn."""
+RECORDING: Final = "run.mcap"
+MOTOR_LOG: Final = "motors.csv"
+TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{}", "legacy": "ws-legacy://127.0.0.1:{}"}
+"""How vision reaches the robot; the person and the recorder are on Zenoh in any case."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoOptions:
+    """What a person asked for. `seconds` 0 runs until Ctrl-C."""
+
+    scenario: str = "circle"
+    seconds: float = 20.0
+    seed: int = 1
+    latency_ms: float = 0.0
+    loss: float = 0.0
+    out: Path | None = None
+    transport: str = "zenoh"
+    mission: str | None = None
+    """In place of the scenario's own."""
+    detector: str | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for what cannot be run."""
+        if not 0 <= self.seconds <= 3600 or not 0 <= self.latency_ms <= 10_000 or not 0 <= self.loss < 1:
+            raise ConfigError("--seconds 0 to 3600, --latency-ms 0 to 10000 and --loss 0 to below 1, e.g. --loss 0.1")
+        if not 0 <= self.seed < 2**32:
+            raise ConfigError(f"--seed {self.seed}: 0 to 4294967295")
+        if self.transport not in TRANSPORTS:
+            raise ConfigError(f"--transport {self.transport!r}: {', '.join(TRANSPORTS)}")
+
+
+@dataclass(slots=True)
+class DemoRun:
+    """What a run left, beside the files in `folder`."""
+
+    options: DemoOptions
+    scenario: Scenario
+    folder: Path
+    samples: list[Truth] = field(default_factory=list)
+    dropped_by_recorder: int = 0
+    recorder_failed: str = ""
+    killed: list[str] = field(default_factory=list)
+    interrupted: bool = False
+
+
+def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
+    """Run it. Raises ConfigError, LinkError or the failure of a process; nothing is left running in any case."""
+    scenario = load_scenario(options.scenario)
+    _check_vision(options, scenario)
+    run = DemoRun(options, scenario, _run_folder(options, scenario))
+    with ExitStack() as ending:
+        ending.enter_context(terminated_like_interrupted())
+        sockets = ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
+        processes = ending.enter_context(Processes(run.folder))
+        try:
+            _drive(run, processes, sockets, say)
+        except KeyboardInterrupt:
+            run.interrupted = True
+        except SightlineError:
+            processes.check(_DYING_S)  # who ended is the cause; what it broke here is not
+            raise
+        run.killed = processes.end()
+    return run
+
+
+def _check_vision(options: DemoOptions, scenario: Scenario) -> None:
+    """Raise ConfigError for a mission or detector that vision would refuse, before anything is started."""
+    config = vision_config(scenario, robot_of(scenario), options.seed, options.mission)
+    configured_mission(config)
+    kind = options.detector
+    if kind is None or (kind == BOXES and scenario.labels):
+        return
+    if kind == BOXES:
+        raise ConfigError(f"--detector {BOXES}: nobody finds boxes in {scenario.name}; take one that looks itself, "
+                          "e.g. hsv")
+    check_choice(kind, {}, config)
+
+
+def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str], None]) -> None:
+    options, endpoint = run.options, TRANSPORTS["zenoh"].format(_free_port())
+    for_vision = endpoint if options.transport == "zenoh" else TRANSPORTS[options.transport].format(_free_port())
+    listen = [part for end in dict.fromkeys((endpoint, for_vision)) for part in ("--listen", end)]
+    _write_configuration(run, sockets)
+    say(f"simulation, robot and vision start as three processes; their logs are in {run.folder}")
+    # What the run is about is said on the command lines: the environment, which lies over files, may say the rest.
+    processes.start("sim", ["sim", "--config", str(run.folder / "sim.toml"), "--scenario", options.scenario,
+                            "--seed", str(options.seed), "--motor-log", str(run.folder / MOTOR_LOG),
+                            "--socket-dir", sockets])
+    processes.wait_line("sim", "simulation ready", READY_S)
+    processes.start("robot", ["robot", "--robot", ROBOT, "--config", str(run.folder / "robot.toml"), *listen])
+    processes.wait_line("robot", f"robot {ROBOT}: on", READY_S)
+    with (
+        open_link(ROBOT, connect=[endpoint], role=SOURCE) as link,
+        Recorder(link, run.folder / RECORDING, _about(run)) as recorder,
+        _truth(sockets) as truth,
+        display(options.seconds, run.scenario.stand_off_m) as block,
+    ):
+        operator = Operator(link)
+        if run.scenario.labels:
+            processes.start("labels", ["labels", ROBOT, "--connect", endpoint, "--socket-dir", sockets])
+        processes.start("vision", _vision_arguments(run, for_vision))
+        _arm(operator, processes)
+        try:
+            _watch(run, processes, operator, truth, block)
+        finally:
+            recorder.close()
+            run.dropped_by_recorder, run.recorder_failed = recorder.dropped, recorder.failed
+
+
+def _arm(operator: Operator, processes: Processes) -> None:
+    """As a person would: ask until the robot sees live commands, and give up with its own reason."""
+    deadline_s = time.monotonic() + ARM_S
+    while True:
+        processes.check()
+        operator.wait_report()
+        reply = operator.arm(patience_s=0.5)
+        if reply.ok:
+            return
+        if time.monotonic() > deadline_s:
+            raise SightlineError(f"the robot would not be armed: {reply.detail}")
+
+
+def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthReader, block: Display) -> None:
+    """Collect truth and show it until the time is over."""
+    _discard_old(truth)
+    started_s = time.monotonic()
+    end_s = started_s + run.options.seconds if run.options.seconds else float("inf")
+    while time.monotonic() < end_s:
+        processes.check()
+        sample = truth.read(timeout_s=_SILENT_S)
+        if sample is None:
+            raise HardwareError("the simulation says nothing any more; see sim.log in the run folder")
+        run.samples.append(sample)
+        report = operator.report
+        block.show(time.monotonic() - started_s, report.status if report else None, sample)
+
+
+def _discard_old(truth: TruthReader) -> None:
+    while truth.read(timeout_s=0.0) is not None:
+        pass
+
+
+# --- what the processes are given --------------------------------------------------------------------------------
+
+
+def _write_configuration(run: DemoRun, sockets: str) -> None:
+    """Leave each service's file in the run folder, so that a person can start the same by hand."""
+    device = {"kind": "sim", "options": {"socket_dir": sockets}}
+    options, model = run.options, robot_of(run.scenario)
+    legacy = options.transport == "legacy"
+    files: dict[str, dict[str, Any]] = {
+        "sim": {
+            "scenario": options.scenario, "seed": options.seed, "socket_dir": sockets,
+            "motor_log": str(run.folder / MOTOR_LOG),
+        },
+        "robot": laid_over(robot_table(model), {
+            "robot": ROBOT, "state_dir": str(run.folder / "state"), "camera": device, "drive": device,
+            "safety": {"guests": legacy},
+        }),
+        "vision": {
+            "robot": ROBOT, **vision_table(run.scenario, model, options.seed, options.mission),
+            # The older dialect carries no camera model.
+            **({"camera": model.camera.camera_model().model_dump()} if legacy else {}),
+        },
+    }
+    if options.detector is not None:
+        files["vision"] = laid_over(files["vision"], {"detector": {"kind": options.detector}})
+    for name, table in files.items():
+        (run.folder / f"{name}.toml").write_text(toml_text(table), "utf-8")
+
+
+def _vision_arguments(run: DemoRun, endpoint: str) -> list[str]:
+    options = run.options
+    arguments = ["vision", "--robot", ROBOT, "--config", str(run.folder / "vision.toml"), "--connect", endpoint]
+    if options.latency_ms or options.loss:
+        arguments += ["--shape", Shape(options.latency_ms, options.loss, options.seed).text()]
+    return arguments
+
+
+def _about(run: DemoRun) -> dict[str, str]:
+    loaded = load_service("vision", file=str(run.folder / "vision.toml"), environ=os.environ)
+    return {VISION_CONFIG: loaded.config.model_dump_json(), "scenario": run.options.scenario}
+
+
+def _run_folder(options: DemoOptions, scenario: Scenario) -> Path:
+    name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{scenario.name}-{options.seed}"
+    folder = (options.out or Path("runs") / name).expanduser().absolute()
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=options.out is not None)
+            return folder
+        except OSError as error:
+            if options.out is not None or not isinstance(error, FileExistsError):
+                raise ConfigError(f"run folder {folder}: {error.strerror}; choose another with --out") from None
+            folder = folder.with_name(folder.name + "-again")  # another run began in the same second
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def _truth(sockets: str) -> Iterator[TruthReader]:
+    reader = TruthReader(sockets)
+    try:
+        yield reader
+    finally:
+        reader.close()

@@ -4,18 +4,25 @@
 what is due on a thread of its own. What it did is counted, so that a run in which nothing was injected shows.
 """
 
+import json
+import signal
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from random import Random
+from sightline.protocol.channels import Channel, Direction
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.transports.memory import Leg, split_legs
+from sightline.protocol.transports.open import open_link
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.pipeline import SOURCE
+from sightline.vision_side.serving.process import serve
 from types import TracebackType
 from typing import Any, Final, Self
 
-from sightline.protocol.channels import Channel, Direction
-from sightline.protocol.clock import monotonic_us
-from sightline.protocol.transports.link import LatestSlot, Link, Message
-from sightline.protocol.transports.memory import Leg, split_legs
 
 MAX_WAITING: Final = 256
 """Messages under way on one leg; more are dropped and counted: 8 s of frames at 30 fps."""
@@ -143,3 +150,52 @@ class ShapedLink:
                 next_us = min((line.next_us for line in self._lines.values() if line.next_us is not None), default=None)
                 self._changed.wait(None if next_us is None else max(0.0, (next_us - monotonic_us()) / 1e6))
             return due
+
+
+# The vision service on a link made worse on purpose: `demo --latency-ms --loss` runs it. Shell.
+
+
+INJECTED = "injected: "
+"""How the line begins that says, at the end, what the legs did."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What to add to the network: latency in all, loss 0..1 on each leg."""
+
+    latency_ms: float
+    loss: float
+    seed: int
+
+    def text(self) -> str:
+        """As `parse` reads it."""
+        return f"{self.latency_ms:g},{self.loss:g},{self.seed}"
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read `latency_ms,loss,seed`. Raises ConfigError."""
+        try:
+            latency_ms, loss, seed = text.split(",")
+            return cls(float(latency_ms), float(loss), int(seed))
+        except ValueError:
+            raise ConfigError(f"--shape {text!r} is none: write latency_ms,loss,seed, e.g. 50,0.1,1") from None
+
+
+def run_shaped(config: VisionConfig, shape: str) -> int:
+    """Serve until SIGTERM or SIGINT, with `shape` between the link and the service. Raises as the service does."""
+    wanted = Shape.parse(shape)
+    ending = threading.Event()
+
+    def end(_number: int, _frame: Any) -> None:
+        ending.set()
+
+    with ShapedLink(
+        open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
+                   max_frame_bytes=config.max_frame_bytes),
+        wanted.latency_ms, wanted.loss, wanted.seed,
+    ) as link:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, end)
+        serve(config, link, ending, lambda line: print(line, flush=True))
+        print(INJECTED + json.dumps({leg: asdict(count) for leg, count in link.counts.items()}), flush=True)
+    return 0

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from sightline.operator_side.faults.ledger import INJECTED, EventLog
+from sightline.evaluation.faults.evidence import INJECTED, EventLog
 from sightline.protocol.errors import HardwareError
 from sightline.robot_side.ports import Picture
 from sightline.sim.bus import SimCamera, SimSocketConfig

@@ -1,19 +1,30 @@
 """Rows: vision dies, hangs or slows; the network process does; the driver process is starved or ended. Shell."""
 
+import itertools
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from sightline.evaluation.checks import Check, at_least, at_most
+from sightline.evaluation.faults.evidence import INJECTED, MotorRow, REQUESTED, most_gain_mps2, wheel_mps
+from sightline.evaluation.faults.fixture import READY_S, RobotFixture, Setup
+from sightline.evaluation.faults.load_clients import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
+from sightline.evaluation.faults.runner import Case, Injected
+from sightline.evaluation.faults.sampler import Hole
+from sightline.operator_side.config.errors import no_such_name
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.websocket.server import MAX_CLIENTS
+from sightline.robot_side.kinematics import DiffDriveConfig
+from sightline.robot_side.safety.limits import SafetyConfig, TICK_US
+from sightline.sim.network_emulator import LinkShape, LinkShapes
+from sightline.vision_side.config import TrackConfig
 from typing import Final
 
-from sightline.evaluation.checks import at_most
-from sightline.operator_side.faults.rig import RobotFixture, Setup
-from sightline.evaluation.faults.runner import Case, Injected
-from sightline.protocol.clock import monotonic_us
 
 STOPPED_S: Final = 3.0
 SETTLED_S: Final = 1.5
@@ -162,3 +173,434 @@ PROCESS_CASES: Final = (
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     ),
 )
+
+
+# Rows: what a radio does to packets, through the wire between two network namespaces. Shell.
+
+
+DISTURBED_S: Final = 6.0
+CUT: Final = LinkShape(cut=True)
+LOSSY: Final = LinkShape(loss=0.2)
+FLAP_S: Final = 0.5
+FLAPS: Final = 6
+
+
+def shape(rig: RobotFixture, shapes: LinkShapes) -> int:
+    """Put `shapes` in force; returns how many packets were harmed so far."""
+    assert rig.wire is not None
+    return rig.wire.shape(shapes)
+
+
+def _cut(rig: RobotFixture, shapes: LinkShapes, seconds: float) -> Injected:
+    """Cut for a while: nothing sent after the cut is obeyed until the wire is whole again."""
+    before = shape(rig, shapes)
+    at_us = monotonic_us()
+    rig.watch(seconds)
+    harmed, resumed_us = shape(rig, LinkShapes()) - before, monotonic_us()
+    return Injected(harmed, at_us, resumed_us, drives_again(rig))
+
+
+def _worsen(rig: RobotFixture, shapes: LinkShapes) -> Injected:
+    """Bad for a while, but not cut: frames that are still young may be driven on."""
+    before = shape(rig, shapes)
+    at_us = monotonic_us()
+    rig.watch(DISTURBED_S)
+    return Injected(shape(rig, LinkShapes()) - before, at_us, again=drives_again(rig))
+
+
+def _flap(rig: RobotFixture) -> Injected:
+    before = shape(rig, LinkShapes())
+    at_us = monotonic_us()
+    for _ in range(FLAPS):
+        shape(rig, LinkShapes(ab=CUT, ba=CUT))
+        rig.watch(FLAP_S)
+        harmed = shape(rig, LinkShapes()) - before
+        rig.watch(FLAP_S)
+    return Injected(harmed, at_us, again=drives_again(rig))
+
+
+_WIRED: Final = Setup(wired=True)
+_HEAVY: Final = Setup(wired=True, camera="heavy")
+_SLOW: Final = LinkShape(delay_ms=300)
+_MIXED: Final = LinkShape(delay_ms=10, jitter_ms=5, reorder=0.1, duplicate=0.1)
+_THIN: Final = LinkShape(rate_bit_s=1e6)
+
+NETWORK_CASES: Final = (
+    Case("wire.cut3", "network: partition 3 s", partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=3.0), _WIRED,
+        blind=True, again=True, short=True),
+    Case("wire.cut15", "network: partition 15 s", partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=15.0), _WIRED,
+        blind=True, again=True),
+    Case("wire.no_frames", "network: one direction only, frames lost", partial(_cut, shapes=LinkShapes(ab=CUT), seconds=3.0),
+        _WIRED, blind=True, by_frame=True, again=True),
+    Case("wire.no_commands", "network: one direction only, commands lost",
+        partial(_cut, shapes=LinkShapes(ba=CUT), seconds=3.0), _WIRED, blind=True, again=True),
+    Case("wire.delay", "network: 300 ms each way", partial(_worsen, shapes=LinkShapes(ab=_SLOW, ba=_SLOW)), _WIRED,
+        stops=False, again=True),
+    Case("wire.loss", "network: 20 % loss each way", partial(_worsen, shapes=LinkShapes(ab=LOSSY, ba=LOSSY)), _WIRED,
+        stops=False, again=True),
+    Case("wire.mixed", "network: 10 % reordered, 10 % duplicated", partial(_worsen, shapes=LinkShapes(ab=_MIXED, ba=_MIXED)),
+        _WIRED, stops=False, again=True),
+    Case("wire.thin", "network: 1 Mbit/s under a camera of 4 Mbit/s",
+        partial(_worsen, shapes=LinkShapes(ab=_THIN, ba=_THIN)), _HEAVY, stops=False, again=True),
+    Case("wire.flaps", "network: gone and back every 0.5 s", _flap, _WIRED, stops=False, again=True),
+)
+
+
+# Rows: commands that lie about what they answer, that are no commands, or too many; and who may drive. Shell.
+
+
+ATTACKED_S: Final = 3.0
+LEASE_US: Final = SafetyConfig().lease_ms * 1000
+GAIN_MPS2: Final = SafetyConfig().max_acceleration_mps2 * 1.05
+"""Five percent for rounding in the log."""
+ENOUGH: Final = 30
+FLOOD_AT_LEAST: Final = 20_000
+
+
+def _attack(rig: RobotFixture, at_least_times: int = ENOUGH) -> Injected:
+    """From the trigger on, only what must be refused is sent."""
+    at_us = rig.trigger()
+    rig.watch(ATTACKED_S)
+    times = rig.injected()
+    return Injected(times, at_us, checks=(at_least("sent", times, "times", at_least_times),))
+
+
+def _reverse(rig: RobotFixture) -> Injected:
+    at_us = rig.trigger()
+    rig.watch(2.0 + SETTLED_S)
+    gain = at_most("hardest change", most_gain_mps2(rig.motors(), at_us), "m/s2", GAIN_MPS2)
+    return Injected(rig.injected(), at_us, checks=(gain,))
+
+
+def _replay_earlier(rig: RobotFixture) -> Injected:
+    """Record a session, start the robot anew, drive, and then play the recording to it."""
+    recording = rig.folder / "earlier.txt"
+    rig.start_peer("recorder", "driver", source="teleop", recording=recording, seconds=3.0)
+    rig.until(lambda: recording.exists() and len(recording.read_text("ascii").splitlines()) > 30, 15.0, "a recording")
+    rig.fleet.exit_code("recorder", 15.0)
+    rig.fleet.kill("peer")
+    rig.fleet.end_one("robot")
+    rig.start_robot()
+    rig.start_peer("replayer", "driver", fault="replay", recording=recording)
+    rig.wait_speed(rig.setup.at_speed_mps)
+    at_us = rig.trigger("replayer")
+    rig.watch(ATTACKED_S)
+    return Injected(rig.injected("replayer"), at_us)
+
+
+def _two_visions(rig: RobotFixture) -> Injected:
+    """A second vision asks for the opposite all the time; then both die."""
+    rig.start_peer("second", "driver", linear_mps=-0.5, angular_rad_s=0.0)
+    rig.until(lambda: len(rig.sent("second")) > 30, 15.0, "a second vision")
+    last = [row for row in rig.motors() if row.t_us >= rig.sent("second")[0].t_us]
+    backwards = sum(row.left_rad_s + row.right_rad_s < 0 for row in last)
+    slowest_mps = min(map(wheel_mps, last))
+    at_us = monotonic_us()
+    rig.fleet.kill("second")
+    rig.fleet.kill("peer")
+    rig.watch(SETTLED_S)
+    checks = (
+        at_most("obeyed the second", backwards, "lines", 0),
+        at_least("speed kept", slowest_mps, "m/s", 0.4),
+    )
+    return Injected(len(rig.sent("second")), at_us, checks=checks)
+
+
+def _take_over(rig: RobotFixture) -> Injected:
+    """A person takes over at full speed and drives back, then is lost: a stop that vision does not end."""
+    rig.start_peer("person", "driver", source="teleop", linear_mps=-0.4, angular_rad_s=0.0)
+    rig.until(lambda: _goes_back(rig), 15.0, "a takeover")
+    took_ms = (monotonic_us() - rig.sent("person")[0].t_us) / 1000
+    rig.watch(0.5)
+    at_us = monotonic_us()
+    rig.fleet.kill("person")
+    rig.watch(SETTLED_S + 1.0)
+    return Injected(1, at_us, checks=(at_most("person obeyed after", took_ms, "ms", 1000.0),))
+
+
+def _goes_back(rig: RobotFixture) -> bool:
+    last = rig.motors()[-1]
+    return last.left_rad_s < 0 and last.right_rad_s < 0 and wheel_mps(last) > 0.39
+
+
+def _holder_dies(rig: RobotFixture) -> Injected:
+    """The driver dies while another waits: a stop first, the other only when the lease is over."""
+    rig.start_peer("second", "driver", linear_mps=0.3)
+    rig.until(lambda: len(rig.sent("second")) > 10, 15.0, "a second driver")
+    at_us = monotonic_us()
+    rig.fleet.kill("peer")
+    rig.watch(ATTACKED_S)
+    last_us = rig.sent("peer")[-1].t_us
+    moving = [row.t_us for row in rig.motors() if row.t_us > last_us + LEASE_US // 2 and wheel_mps(row) > 0]
+    waited_ms = (moving[0] - last_us) / 1000 if moving else 0.0
+    checks = (at_least("next driver after", waited_ms, "ms", LEASE_US / 1000 - 20),)
+    return Injected(1, at_us, last_us + LEASE_US - 20_000, bool(moving), checks)
+
+
+def _command_case(name: str, what: str, *, short: bool = False) -> Case:
+    return Case(f"command.{name}", f"commands: {what}", _attack, Setup(fault=name), short=short)
+
+
+COMMAND_CASES: Final = (
+    _command_case("late", "each 500 ms after its frame"),
+    _command_case("replay", "this session's, replayed", short=True),
+    Case("command.earlier", "commands: an earlier session's, replayed", _replay_earlier, Setup()),
+    _command_case("never_issued", "citing frames never issued"),
+    _command_case("from_future", "citing frames from the future"),
+    _command_case("wrapped", "their numbers wrap"),
+    _command_case("malformed", "nan, inf, 1e400, underscores, full-width, empty, 3 fields, 257 bytes, 10 MB, binary ..."),
+    Case("command.flood", "commands: an old one at 10 kHz", partial(_attack, at_least_times=FLOOD_AT_LEAST),
+        Setup(fault="flood"), also=f">= {FLOOD_AT_LEAST} sent", short=True, alone=True),
+    Case("command.reversal", "commands: full speed ahead and back at 50 Hz", _reverse, Setup(fault="reversal"),
+        also=f"speed changes by <= {GAIN_MPS2:g} m/s2"),
+    _command_case("heartbeat", "none, but frames are acknowledged and the link is alive", short=True),
+    Case("driver.two", "drivers: two visions, then none", _two_visions, Setup(), also="the second is not obeyed"),
+    Case("driver.person", "drivers: a person takes over at full speed, and is lost", _take_over, Setup(), blind=True,
+        also="obeyed <= 1000 ms; vision does not resume by itself"),
+    Case("driver.dies", "drivers: the holder dies while another waits", _holder_dies, Setup(), blind=True, again=True,
+        also="the other drives only after the lease"),
+)
+
+
+# Rows: many who want to watch, some of them badly, while somebody drives; and how punctual the driver stays. Shell.
+
+
+LOADED_S: Final = 6.0
+KEPT_MPS: Final = 0.4
+TICK_MS: Final = 40.0
+STARVED_S: Final = 24.0
+TICKS: Final = 1000
+"""Fewer have no 99.9th percentile."""
+HONEST_MS: Final = 10.0
+"""The simulation stamps what it receives up to so much late while its own physics holds the interpreter."""
+
+
+def _load(rig: RobotFixture, kind: str, at_least_times: int) -> Injected:
+    """They come while the robot is driven and stay; then whoever drives dies."""
+    came_us = monotonic_us()
+    rig.start_crowd(kind)
+    rig.fleet.wait_line("crowd", READY, READY_S)
+    rig.watch(LOADED_S)
+    slowest_mps = min(wheel_mps(row) for row in rig.motors() if row.t_us > came_us)
+    times = len(rig.noted("crowd", INJECTED))
+    at_us = monotonic_us()
+    rig.fleet.kill("peer")
+    rig.watch(SETTLED_S)
+    checks = [at_least("came", times, "times", at_least_times), at_least("speed kept", slowest_mps, "m/s", KEPT_MPS)]
+    if kind == "viewers":
+        checks.append(at_least("admitted", len(rig.noted("crowd", ADMITTED)), "times", MAX_CLIENTS))
+        checks.append(at_least("pictures seen", len(rig.noted("crowd", SEEN)), "", MAX_CLIENTS))
+    return Injected(times, at_us, checks=tuple(checks))
+
+
+# --- punctuality -------------------------------------------------------------------------------------------------
+
+
+def _keep_time(rig: RobotFixture) -> Injected:
+    """Drive beside busy processes for long enough to tell a 99.9th percentile; then the driving peer dies."""
+    rig.start_peer("person", "operator", fault="lateness")
+    rig.fleet.wait_line("person", "person ready", AGAIN_S)
+    with busy_processes():
+        since_us = monotonic_us()
+        rig.watch(STARVED_S)
+        rows = [row for row in rig.motors() if row.t_us > since_us]
+        rig.trigger("person")
+        rig.fleet.wait_line("person", "late by", AGAIN_S)
+        at_us = monotonic_us()
+        rig.fleet.kill("peer")
+        rig.watch(SETTLED_S)
+    said = rig.fleet.log("person").read_text("utf-8").rpartition("late by ")[2]
+    return Injected(BUSY, at_us, checks=tuple(_tick_checks(rows, rig.holes(), int(said.split()[0]))))
+
+
+def _tick_checks(rows: Sequence[MotorRow], holes: Sequence[Hole], published_us: int) -> list[Check]:
+    gaps_us = undisturbed_gaps_us(rows, holes)
+    ticks = sum(gaps_us) // TICK_US
+    worst_ms = max(gaps_us, default=0) / 1000
+    hidden_ms = max(0.0, worst_ms - TICK_US / 1000 - published_us / 1000)
+    return [
+        at_least("ticks", ticks, "", TICKS),
+        at_most("tick p99.9", permille_us(gaps_us, ticks) / 1000, "ms", TICK_MS),
+        at_least("published lateness", published_us / 1000, "ms", 0.0),
+        at_most("unpublished lateness", hidden_ms, "ms", HONEST_MS),
+    ]
+
+
+def undisturbed_gaps_us(rows: Sequence[MotorRow], holes: Sequence[Hole]) -> list[int]:
+    """Times between two motor commands, without those in which this machine itself stood still."""
+    pairs = itertools.pairwise(row.t_us for row in rows)
+    return [b - a for a, b in pairs if not any(hole.from_us < b and hole.to_us > a for hole in holes)]
+
+
+def permille_us(gaps_us: Sequence[int], ticks: int) -> int:
+    """The gap that one tick in a thousand exceeds. Commands that arrive make more, shorter gaps; they do not count."""
+    return sorted(gaps_us, reverse=True)[ticks // 1000] if gaps_us else 0
+
+
+_WEB: Final = Setup(web=True)
+_DRIVEN: Final = f"speed stays >= {KEPT_MPS:g} m/s while they are there"
+
+CLIENT_CASES: Final = (
+    Case("crowd.viewers", f"drivers: {VIEWERS} WebSocket viewers, one never reading; then the driver dies",
+        partial(_load, kind="viewers", at_least_times=VIEWERS), _WEB, also=_DRIVEN, alone=True),
+    Case("crowd.handshakes", f"drivers: {HANDSHAKES} half-open handshakes; then the driver dies",
+        partial(_load, kind="handshakes", at_least_times=HANDSHAKES), _WEB, also=_DRIVEN, alone=True),
+    Case("driver.tick", "robot: four busy processes beside it for 24 s; then the driver dies", _keep_time, Setup(),
+        also=f"p99.9 of ticks <= {TICK_MS:g} ms, lateness published", alone=True),
+)
+
+
+# Rows: the camera fails; STOP in every situation; wall clocks that are wrong. Shell.
+
+
+BAD_S: Final = 3.0
+STOP_ZERO_MS: Final = 700.0
+LOSSY_STOP_ZERO_MS: Final = 2000.0
+"""A lost packet is sent again after 200 ms at the earliest, and the next loss doubles that."""
+COASTED_MS: Final = TrackConfig().coast_s * 1000 + 700.0
+DAY_S: Final = 86_400
+
+
+# --- the camera --------------------------------------------------------------------------------------------------
+
+
+def _spoil_camera(rig: RobotFixture, mode: str) -> Injected:
+    at_us = rig.camera_mode(mode)
+    rig.watch(BAD_S)
+    times, resumed_us = rig.injected("camera"), rig.camera_mode("")
+    return Injected(times, at_us, resumed_us, drives_again(rig))
+
+
+def _blacken(rig: RobotFixture) -> Injected:
+    """Nothing is seen, on young frames: vision may coast and then turn to search, but not drive on."""
+    at_us = rig.camera_mode("black")
+    rig.watch(BAD_S)
+    forward = [row.t_us for row in rig.motors() if row.t_us > at_us and abs(_forward_mps(row)) > 0.02]
+    times = rig.injected("camera")
+    rig.camera_mode("")
+    coasted = at_most("drove on for", (max(forward, default=at_us) - at_us) / 1000, "ms", COASTED_MS)
+    return Injected(times, at_us, again=drives_again(rig), checks=(coasted,))
+
+
+def _forward_mps(row: MotorRow) -> float:
+    return (row.left_rad_s + row.right_rad_s) / 2 * DiffDriveConfig().wheel_radius_m
+
+
+# --- STOP --------------------------------------------------------------------------------------------------------
+
+
+def _send_stop(rig: RobotFixture, fault: str = "") -> int:
+    """A person says STOP; returns when it was first sent."""
+    rig.start_peer("person", "operator", fault=fault)
+    rig.fleet.wait_line("person", "person ready", AGAIN_S)
+    rig.trigger("person")
+    rig.until(lambda: rig.injected("person") > 0, 5.0, "a STOP")
+    return rig.noted("person", REQUESTED)[0].t_us
+
+
+def _stop(rig: RobotFixture, fault: str = "") -> Injected:
+    at_us = _send_stop(rig, fault)
+    rig.watch(BAD_S)
+    return Injected(rig.injected("person"), at_us)
+
+
+def _stop_lossy(rig: RobotFixture) -> Injected:
+    before = shape(rig, LinkShapes())
+    rig.start_peer("person", "operator")
+    rig.fleet.wait_line("person", "person ready", AGAIN_S)
+    shape(rig, LinkShapes(ab=LOSSY, ba=LOSSY))
+    rig.trigger("person")
+    rig.until(lambda: rig.injected("person") > 0, 5.0, "a STOP")
+    rig.watch(2 * BAD_S)
+    return Injected(shape(rig, LinkShapes()) - before, rig.noted("person", REQUESTED)[0].t_us)
+
+
+def _stop_then_commands(rig: RobotFixture) -> Injected:
+    at_us = _send_stop(rig)
+    rig.watch(SETTLED_S)
+    rig.trigger()
+    rig.watch(BAD_S)
+    times = rig.injected()
+    return Injected(times, at_us, checks=(at_least("commands after it", times, "times", 1000),))
+
+
+def _stop_then_restart(rig: RobotFixture) -> Injected:
+    at_us = _send_stop(rig)
+    rig.watch(SETTLED_S)
+    before = rig.fleet.child("robot")
+    rig.signal_network(signal.SIGKILL)
+    rig.until(lambda: rig.fleet.child("robot") not in (0, before), AGAIN_S, "a new network process")
+    since_us = monotonic_us()
+    rig.until(lambda: rig.sent("peer")[-1].t_us > since_us, AGAIN_S, "commands after the restart")
+    rig.watch(BAD_S)
+    return Injected(1, at_us)
+
+
+def _reset_moving(rig: RobotFixture) -> Injected:
+    """Reset while the wheels still turn; the wheels must come to zero and vision must not take it up again."""
+    injected = _stop(rig, "reset")
+    refused = "reset False" in rig.fleet.log("person").read_text("utf-8")
+    return Injected(injected.count, injected.at_us, checks=(at_least("reset refused", refused, "", 1),))
+
+
+# --- clocks ------------------------------------------------------------------------------------------------------
+
+
+def _drive_on(rig: RobotFixture) -> Injected:
+    """Drive with the wrong clock for a while, then let vision die."""
+    rig.watch(BAD_S)
+    slowest_mps = min((wheel_mps(row) for row in rig.motors() if row.t_us > monotonic_us() - BAD_S * 1e6), default=0.0)
+    at_us = monotonic_us()
+    rig.fleet.kill("peer")
+    rig.watch(SETTLED_S)
+    checks = (at_least("speed kept", slowest_mps, "m/s", 0.4),)
+    return Injected(len(rig.noted("clock", "injected")), at_us, checks=checks)
+_STAYS: Final = "and stays at zero"
+
+OPERATOR_CASES: Final = (
+    Case("camera.unplugged", "camera: unplugged 3 s", partial(_spoil_camera, mode="unplugged"), _VISION, again=True),
+    Case("camera.frozen", "camera: frozen 3 s, with new stamps", partial(_spoil_camera, mode="frozen"), _SCRIPT,
+        blind=True, again=True, short=True),
+    Case("camera.black", "camera: black 3 s", _blacken, _VISION, stops=False, again=True,
+        also=f"forward speed zero <= {COASTED_MS:g} ms"),
+    Case("camera.slow", "camera: 5 fps for 3 s", partial(_spoil_camera, mode="slow"), _SCRIPT, stops=False, again=True),
+    Case("camera.bomb", "camera: a JPEG that claims 65500 x 65500, 3 s", partial(_spoil_camera, mode="bomb"), _VISION,
+        blind=True, again=True),
+    Case("camera.resized", "camera: the picture changes size, 3 s", partial(_spoil_camera, mode="resized"), _VISION,
+        blind=True, again=True),
+    Case("stop.driving", "STOP: while driving", _stop, _SCRIPT, blind=True, also=_STAYS, short=True),
+    Case("stop.lossy", "STOP: while 20 % of packets are lost", _stop_lossy, Setup(wired=True), blind=True,
+        zero_ms=LOSSY_STOP_ZERO_MS, distance_m=1.0, also=_STAYS),
+    Case("stop.commands", "STOP: then 1000 commands", _stop_then_commands, Setup(fault="thousand"), blind=True,
+        also=_STAYS),
+    Case("stop.restart", "STOP: then the network process is killed", _stop_then_restart, _SCRIPT, blind=True,
+        also=_STAYS),
+    Case("stop.reset", "STOP: then reset while moving", _reset_moving, _SCRIPT, blind=True, also="refused; " + _STAYS),
+    Case("clock.ahead", "clocks: a day ahead, then vision: SIGKILL", _drive_on, Setup(clock=f"{DAY_S}")),
+    Case("clock.behind", "clocks: a day behind, then vision: SIGKILL", _drive_on, Setup(clock=f"-{DAY_S}")),
+    Case("clock.steps", "clocks: an hour forth and back every 0.5 s", _drive_on,
+        Setup(clock="3600 * (int(2 * right()) % 3 - 1)")),
+)
+
+
+# All rows of the fault bench, and the choice among them. Shell (what the rows inject is).
+
+
+CASES: Final[tuple[Case, ...]] = (
+    *PROCESS_CASES, *NETWORK_CASES, *COMMAND_CASES, *CLIENT_CASES, *OPERATOR_CASES,
+)
+
+
+def chosen(only: Sequence[str], *, short: bool) -> list[Case]:
+    """The rows named by id or by what comes before the dot; all without names. Raises ConfigError for no such row."""
+    for name in only:
+        if not any(_is_named(row, name) for row in CASES):
+            raise ConfigError(no_such_name("fault", name, [row.id for row in CASES]))
+    return [
+        row for row in CASES
+        if (not only or any(_is_named(row, name) for name in only)) and (row.short or not short)
+    ]
+
+
+def _is_named(row: Case, name: str) -> bool:
+    return name in (row.id, row.id.partition(".")[0])

@@ -4,13 +4,16 @@ Nothing here believes the software under test: the motors' log is stamped by the
 """
 
 import itertools
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from sightline.evaluation.checks import Check, at_most
+from sightline.protocol.clock import monotonic_us
+from sightline.robot_side.kinematics import DiffDriveConfig
+from sightline.robot_side.safety.limits import SafetyConfig, TICK_US, stop_bound
 from typing import Final
 
-from sightline.evaluation.checks import Check, at_most
-from sightline.robot_side.kinematics import DiffDriveConfig
-from sightline.robot_side.safety.limits import TICK_US, SafetyConfig, stop_bound
 
 FALLS_MS: Final = 340.0
 ZERO_MS: Final = 700.0
@@ -193,3 +196,32 @@ def stop_checks(stop: Stop, zero_ms: float = ZERO_MS, distance_m: float = DISTAN
     ]
 
 
+# What the bench's own processes note while they run, whatever becomes of them: one line per event. Shell (files).
+#
+# good,T_US,FRAME_US      a command that the robot should obey was sent, citing the frame captured at FRAME_US
+# injected,T_US,0         the fault was done once more
+# told,T_US,0             a person's request was sent
+
+
+GOOD: Final = "good"
+INJECTED: Final = "injected"
+REQUESTED: Final = "told"
+
+
+class EventLog:
+    """Appends; a line is in the file when `note` returns."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+
+    def note(self, kind: str, frame_us: int = 0) -> None:
+        """Note one event, now."""
+        os.write(self._file, f"{kind},{monotonic_us()},{frame_us}\n".encode())
+
+
+def read_events(path: Path, kind: str) -> list[SentCommand]:
+    """The events of `kind`, oldest first; none while there is no file."""
+    if not path.exists():
+        return []
+    rows = [line.split(",") for line in path.read_text("ascii").split("\n")[:-1]]
+    return [SentCommand(int(t), int(frame)) for what, t, frame in rows if what == kind]

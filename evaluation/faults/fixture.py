@@ -1,15 +1,32 @@
 """The bench's processes: as `Processes`, and started in namespaces, signalled, killed and looked into. Shell."""
 
+import json
 import os
 import signal
+import socket
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from sightline.evaluation.faults import camera, evidence as judge
+from sightline.evaluation.faults.evidence import GOOD, INJECTED, MotorRow, SentCommand, read_events, wheel_mps
+from sightline.evaluation.faults.peer import PeerOptions, Role
+from sightline.evaluation.faults.sampler import Hole, read_holes, stalled_us
+from sightline.evaluation.processes import END_S, Processes
+from sightline.operator_side.config.toml_text import toml_text
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import HardwareError, SightlineError
+from sightline.robot_side.safety.limits import TICK_US
+from sightline.sim.bus import SimDrive, SimSocketConfig
+from sightline.sim.network_emulator import LinkShapes
+from sightline.sim.tun_emulator import ADDRESS_A, namespaces
+from types import TracebackType
+from typing import Any, Final, IO, Self
 
-from sightline.operator_side.processes import END_S, Processes
 
 COMMAND_LINE: Final = "sightline.operator_side.cli.app"
 _RESIDENT: Final = "RssAnon:"
@@ -93,3 +110,323 @@ def raise_priority(pid: int) -> bool:
     except OSError:
         return False
     return True
+
+
+# The bench's end of `sim/tun_emulator.py`: two namespaces and the wire between them, shaped while it runs. Shell.
+
+
+_END_S: Final = 2.0
+_PLAIN: Final = ("taken", "delivered", "delivered_bytes")
+
+
+class BenchWire:
+    """`ab` is from the robot, `ba` towards it. Use it in a `with`."""
+
+    def __init__(self, log: Path) -> None:
+        self.robot_side, self.far_side = (f"sightline-{os.getpid()}-{end}" for end in "ab")
+        self._log = log
+        self._ending = ExitStack()
+        self._process: subprocess.Popen[str] | None = None
+        self.carried_bytes = {"ab": 0, "ba": 0}
+        """What came out at the far end of each direction, up to the last `shape`."""
+
+    def __enter__(self) -> Self:
+        with self._ending:
+            self._ending.enter_context(namespaces(self.robot_side, self.far_side))
+            log = self._ending.enter_context(self._log.open("wb"))
+            self._process = subprocess.Popen(
+                [sys.executable, "-u", "-m", "sightline.sim.tun_emulator", self.robot_side, self.far_side],
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True,
+            )
+            self._ending.callback(self._end, self._process)
+            if "ready" not in _file(self._process.stdout).readline():
+                raise HardwareError(f"the wire does not start; see {self._log}")
+            self._ending = self._ending.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.close()
+
+    def shape(self, shapes: LinkShapes) -> int:
+        """Put `shapes` in force; returns how many packets the wire has harmed so far."""
+        assert self._process is not None
+        stdin = _file(self._process.stdin)
+        stdin.write(shapes.model_dump_json() + "\n")
+        stdin.flush()
+        counts = json.loads(_file(self._process.stdout).readline())
+        self.carried_bytes = {leg: count["delivered_bytes"] for leg, count in counts.items()}
+        return sum(count for leg in counts.values() for name, count in leg.items() if name not in _PLAIN)
+
+    @staticmethod
+    def _end(process: subprocess.Popen[str]) -> None:
+        _file(process.stdin).close()
+        try:
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _file(pipe: IO[str] | None) -> IO[str]:
+    assert pipe is not None
+    return pipe
+
+
+# A wall clock that is wrong, in every Python process that starts with this folder on its path. Shell (files).
+
+
+def write_wrong_clock(folder: Path, offset_s: str) -> None:
+    """Leave a `sitecustomize` that adds the Python expression `offset_s` to `time.time`; each process notes it."""
+    (folder / "sitecustomize.py").write_text(
+        f"""import time
+right, right_ns = time.time, time.time_ns
+time.time = lambda: right() + ({offset_s})
+time.time_ns = lambda: right_ns() + int(({offset_s}) * 1e9)
+with open({str(folder / "clock.ledger")!r}, "a") as ledger:
+    ledger.write(f"{INJECTED},{{time.monotonic_ns() // 1000}},0\\n")
+""",
+        "utf-8",
+    )
+
+
+# One robot at speed, about to be hurt: simulation, robot and who drives, as processes of their own. Shell.
+
+
+ROBOT: Final = "r1"
+READY_S: Final = 30.0
+AT_SPEED_S: Final = 25.0
+STEADY_US: Final = 500_000
+PORT: Final = 7447
+_POLL_S: Final = 0.01
+_TAIL_BYTES: Final = 8192
+"""More than a second of the motors' log."""
+_PROBES: Final = 25
+_CHASE: Final[dict[str, Any]] = {
+    "summary": "a ball on a circle at 0.4 m/s", "stand_off_m": 0.8, "look": "plain",
+    "target": {"kind": "path", "speed_mps": 0.4, "path": [{"length_m": 12.566371, "turn_deg": 360.0}]},
+    "start": {"distance_m": [0.8, 0.9], "bearing_deg": [-5.0, 5.0], "approach_deg": [170.0, 190.0]},
+}
+_EMPTY: Final[dict[str, Any]] = {
+    "summary": "an empty floor", "look": "plain", "target": {"kind": "static"},
+    "start": {"distance_m": [30.0, 30.0], "bearing_deg": [180.0, 180.0], "approach_deg": [0.0, 0.0]},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """Who drives and through what. `fault` is what the driving peer does when triggered."""
+
+    driver: Role = "driver"
+    fault: str = ""
+    wired: bool = False
+    clock: str = ""
+    """Python expression that is added to the wall clock of vision and robot, in seconds; "" leaves it."""
+    camera: str = ""
+    """Camera mode from the beginning."""
+    web: bool = False
+    """The robot listens for WebSocket clients too."""
+
+    @property
+    def at_speed_mps(self) -> float:
+        """A scripted driver asks for 0.5 m/s; vision follows a ball at 0.4 m/s."""
+        return 0.3 if self.driver == "vision" else 0.48
+
+
+class RobotFixture:
+    """Use it in a `with`: everything runs, and the wheels are at speed, once inside."""
+
+    def __init__(self, folder: Path, setup: Setup) -> None:
+        self.folder, self.setup = folder, setup
+        self._ending = ExitStack()
+        self.fleet = Fleet(folder)
+        self.wire: BenchWire | None = None
+        self.endpoint = self.web_endpoint = ""
+        self._peers: list[str] = []
+        self._before_kib: dict[tuple[str, bool], int] = {}
+        self._sockets = ""
+
+    def __enter__(self) -> Self:
+        with self._ending:
+            self._start()
+            self._ending = self._ending.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.close()
+
+    def _start(self) -> None:
+        self.folder.mkdir(parents=True)
+        self._sockets = self._ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
+        self._ending.enter_context(self.fleet)
+        if self.setup.wired:
+            self.wire = self._ending.enter_context(BenchWire(self.folder / "wire.log"))
+        self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"tcp/127.0.0.1:{_free_port()}"
+        self.web_endpoint = f"ws://127.0.0.1:{_free_port()}" if self.setup.web else ""
+        self._write_files(self._sockets)
+        self.fleet.run("sim", COMMAND_LINE, ["sim", "--config", str(self.folder / "sim.toml")])
+        self.fleet.run("sampler", "sightline.evaluation.faults.sampler", [str(self.folder / "holes.csv")])
+        self.fleet.wait_line("sim", "simulation ready", READY_S)
+        self.fleet.wait_line("sampler", "sampling", READY_S)
+        for name in ("sim", "sampler"):
+            raise_priority(self.fleet.pid(name))
+        self.start_robot()
+        self.start_peer("peer", self.setup.driver, fault=self.setup.fault)
+        self.wait_speed(self.setup.at_speed_mps)
+        self._before_kib = self.fleet.memory_kib(self._judged)
+
+    def _write_files(self, sockets: str) -> None:
+        device = {"kind": "sim", "options": {"socket_dir": sockets}}
+        eye = {"kind": "sightline.evaluation.faults.camera:FaultyCamera",
+               "options": {"socket_dir": sockets, "folder": str(self.folder)}}
+        camera.write_spares(self.folder)
+        self.camera_mode(self.setup.camera)
+        files: dict[str, dict[str, Any]] = {
+            "scenario": _CHASE if self.setup.driver == "vision" else _EMPTY,
+            "sim": {"scenario": str(self.folder / "scenario.toml"), "socket_dir": sockets, "seed": 1,
+                    "motor_log": str(self.folder / "motors.csv")},
+            "robot": {"robot": ROBOT, "state_dir": str(self.folder / "state"), "camera": eye, "drive": device,
+                      "range_sensor": device, "safety": {"auto_arm": True}},
+            "vision": {"robot": ROBOT},
+        }
+        for name, table in files.items():
+            (self.folder / f"{name}.toml").write_text(toml_text(table), "utf-8")
+        if self.setup.clock:
+            write_wrong_clock(self.folder, self.setup.clock)
+
+    # --- processes -----------------------------------------------------------------------------------------------
+
+    def start_robot(self) -> None:
+        """Start the robot and wait until it listens."""
+        arguments = ["robot", "--config", str(self.folder / "robot.toml"), "--listen", self.endpoint]
+        arguments += ["--listen", self.web_endpoint] if self.web_endpoint else []
+        self.fleet.log("robot").unlink(missing_ok=True)
+        self.fleet.run("robot", COMMAND_LINE, arguments, namespace=self.wire.robot_side if self.wire else "",
+                       environment=self._environment())
+        self.fleet.wait_line("robot", f"robot {ROBOT}: on", READY_S)
+
+    def start_peer(self, name: str, role: Role, **changes: Any) -> None:
+        """Start a vision, a scripted driver or a person."""
+        options = PeerOptions(
+            role=role, endpoint=self.endpoint, ledger=self.folder / f"{name}.ledger",
+            config=self.folder / "vision.toml" if role == "vision" else None, **changes,
+        )
+        self._peers.append(name)
+        self.fleet.run(name, "sightline.evaluation.faults.peer", [options.model_dump_json()],
+                       namespace=self.wire.far_side if self.wire else "", environment=self._environment())
+
+    def start_crowd(self, kind: str) -> None:
+        """Let many WebSocket clients come; what they do is noted as by a peer called `crowd`."""
+        arguments = [kind, self.web_endpoint, str(self.folder / "crowd.ledger")]
+        self.fleet.run("crowd", "sightline.evaluation.faults.load_clients", arguments)
+
+    def _environment(self) -> dict[str, str]:
+        return {"PYTHONPATH": str(self.folder)} if self.setup.clock else {}
+
+    def trigger(self, name: str = "peer") -> int:
+        """Let a peer's fault begin; returns when that was."""
+        at_us = monotonic_us()
+        self.fleet.signal(name, signal.SIGUSR1)
+        return at_us
+
+    def camera_mode(self, mode: str) -> int:
+        """From the next picture on the camera does this; returns when it was told."""
+        at_us, new = monotonic_us(), self.folder / "camera.new"
+        new.write_text(mode, "ascii")
+        new.replace(self.folder / camera.MODE)
+        return at_us
+
+    def signal_network(self, number: signal.Signals) -> int:
+        """Send the robot's network process a signal; returns when that was."""
+        at_us = monotonic_us()
+        os.kill(self.fleet.child("robot"), number)
+        return at_us
+
+    # --- waiting -------------------------------------------------------------------------------------------------
+
+    def watch(self, seconds: float) -> None:
+        """Let it run on."""
+        time.sleep(seconds)
+
+    def until(self, happened: Callable[[], bool], seconds: float, what: str) -> None:
+        """Wait for a fact. Raises SightlineError naming `what` when it takes longer."""
+        deadline_s = time.monotonic() + seconds
+        while not happened():
+            if time.monotonic() > deadline_s:
+                raise SightlineError(f"fault bench: {what} did not happen within {seconds:g} s; see {self.folder}")
+            time.sleep(_POLL_S)
+
+    def wait_speed(self, mps: float, seconds: float = AT_SPEED_S) -> None:
+        """Wait until the wheels have turned at `mps` or faster for half a second."""
+        self.until(lambda: self._is_steady(mps), seconds, f"{mps} m/s")
+
+    def _is_steady(self, mps: float) -> bool:
+        late = [row for row in self._latest_motors() if row.t_us > monotonic_us() - STEADY_US]
+        return len(late) > STEADY_US / 40_000 and all(wheel_mps(row) >= mps for row in late)
+
+    def probe_motors(self) -> float:
+        """With the robot gone: the last speed it told a wheel, m/s. Then tells zero itself, so that the log goes on."""
+        last_mps = wheel_mps(self.motors()[-1])
+        drive = SimDrive(SimSocketConfig(socket_dir=self._sockets))
+        for _ in range(_PROBES):
+            drive.set(0.0, 0.0)
+            time.sleep(TICK_US / 1e6)
+        drive.close()
+        return last_mps
+
+    # --- evidence ------------------------------------------------------------------------------------------------
+
+    def motors(self) -> list[MotorRow]:
+        """The motors' log so far."""
+        path = self.folder / "motors.csv"
+        return judge.read_motors(path.read_text("ascii")) if path.exists() else []
+
+    def _latest_motors(self) -> list[MotorRow]:
+        """The end of the motors' log: who waits looks often, and the log grows."""
+        path = self.folder / "motors.csv"
+        if not path.exists():
+            return []
+        with path.open("rb") as log:
+            log.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+            return judge.read_motors(log.read().decode("ascii"))  # its first line, cut or a heading, is left out
+
+    def sent(self, name: str | None = None) -> list[SentCommand]:
+        """Good commands by one peer, or by all, oldest first."""
+        names = self._peers if name is None else [name]
+        return sorted((one for peer in names for one in self.noted(peer, GOOD)), key=lambda one: one.t_us)
+
+    def noted(self, name: str, kind: str) -> list[SentCommand]:
+        """What a peer, `camera` or `clock` noted of one kind."""
+        return read_events(self.folder / f"{name}.ledger", kind)
+
+    def injected(self, name: str = "peer") -> int:
+        """How often the fault was done."""
+        return len(self.noted(name, INJECTED))
+
+    @property
+    def _judged(self) -> tuple[str, ...]:
+        """Sightline's own processes; what a scripted driver needs to send 10 MB is its own affair."""
+        return ("sim", "robot", "peer") if self.setup.driver == "vision" else ("sim", "robot")
+
+    def grown_mb(self) -> float:
+        """The most that any judged process has grown since the wheels were at speed."""
+        after_kib = self.fleet.memory_kib(self._judged)
+        grown_kib = (after_kib[who] - before for who, before in self._before_kib.items() if who in after_kib)
+        return max(grown_kib, default=0) / 1024
+
+    def stalled_us(self, from_us: int, to_us: int) -> int:
+        """The longest time in the window for which stamps cannot be trusted."""
+        return stalled_us(self.holes(), from_us, to_us)
+
+    def holes(self) -> list[Hole]:
+        """When this machine stood still."""
+        return read_holes(self.folder / "holes.csv")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -16,17 +16,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sightline.operator_side.faults.ledger import INJECTED, EventLog
+from sightline.evaluation.faults.evidence import INJECTED, EventLog
 from sightline.protocol.channels import FRAME
 from sightline.protocol.codec import encode
 from sightline.protocol.transports.websocket.client import Client
-from sightline.protocol.transports.websocket_endpoints import parse_websocket_endpoint
+from sightline.protocol.transports.endpoints import parse_websocket_endpoint
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, Hello
-from sightline.protocol.transports.websocket_peer import OPEN_S
+from sightline.protocol.transports.websocket.peer import OPEN_S
 from sightline.protocol.transports.websocket.server import RESERVED_SLOTS
 
 if TYPE_CHECKING:
-    from sightline.protocol.transports.websocket_wire import Connection
+    from sightline.protocol.transports.websocket.connection import Connection
 
 ADMITTED: Final = "admitted"
 SEEN: Final = "seen"

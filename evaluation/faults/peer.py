@@ -5,16 +5,33 @@
 It does its part until SIGUSR1, and from then on what `fault` names.
 """
 
+import os
+import secrets
 import signal
 import sys
 import threading
-from collections.abc import Callable
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType
-from typing import Literal
-
-from sightline.operator_side.faults.ledger import EventLog
+from sightline.evaluation.faults.evidence import EventLog, GOOD, INJECTED, REQUESTED
+from sightline.operator_side.client.requests import Operator, SOURCE as OPERATOR_SOURCE
+from sightline.operator_side.config.loading import load_service
+from sightline.protocol.channels import ACK, Channel, FRAME, MAX_HEADER_BYTES, TWIST, key_for
+from sightline.protocol.codec import decode, encode
 from sightline.protocol.config import Config
+from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, MAX_INTEGER, Twist, Verb
+from sightline.protocol.text import format_twist
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
+from sightline.protocol.transports.zenoh.session import open_session
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.color.hsv import HsvDetector
+from sightline.vision_side.pipeline import SOURCE as VISION_SOURCE
+from sightline.vision_side.serving.process import serve
+from types import FrameType, TracebackType
+from typing import Any, Final, Literal, Self, TYPE_CHECKING
+
 
 Role = Literal["vision", "driver", "operator"]
 
@@ -60,16 +77,327 @@ def main() -> int:
 def _entry(role: Role) -> Callable[[PeerOptions, threading.Event, EventLog], int]:
     """Imported late: only vision needs OpenCV."""
     if role == "vision":
-        from sightline.operator_side.faults.vision import run_vision
 
         return run_vision
     if role == "driver":
-        from sightline.operator_side.faults.driver import run_driver
 
         return run_driver
-    from sightline.operator_side.faults.person import run_operator
 
     return run_operator
+
+
+# A driver by script: answers each frame with one twist, citing it properly, until its fault is triggered. Shell.
+
+
+KEPT: Final = 256
+WAIT_S: Final = 0.05
+
+
+class Script:
+    """What an attack works with: the link, the newest frame, everything sent so far."""
+
+    def __init__(self, options: "PeerOptions", link: ZenohLink, ledger: EventLog) -> None:
+        self.options, self.link = options, link
+        self.session = secrets.token_hex(4)
+        self.seq = 0
+        self.sent: deque[tuple[bytes, bytes]] = deque(maxlen=KEPT)
+        self.twist = Twist(linear_mps=options.linear_mps, angular_rad_s=options.angular_rad_s)
+        self._ledger = ledger
+        self._frames: LatestSlot[Message] = link.latest(FRAME)
+        self._recording = options.recording.open("a") if options.recording and not options.fault else None
+
+    def frame(self, wait_s: float = WAIT_S) -> FrameHeader | None:
+        """The header of the newest frame not yet taken, waiting a little for one."""
+        message = self._frames.take(wait_s)
+        return decode(FrameHeader, message.header) if message else None
+
+    def answer(self, frame: FrameHeader, **changes: object) -> AnswerHeader:
+        """The header of a command that answers `frame`; `changes` falsify what it cites."""
+        cited = {"session": frame.session, "seq": frame.seq, "t_us": frame.t_us, **changes}
+        echo = Echo.model_validate({"channel": "frame", **cited})
+        self.seq += 1
+        return AnswerHeader(source=self.options.source, session=self.session, seq=self.seq, echo=echo)
+
+    def drive(self, frame: FrameHeader, twist: Twist | None = None) -> None:
+        """Send a good command."""
+        header, text = encode(self.answer(frame)), format_twist(twist or self.twist)
+        self.sent.append((header, text))
+        if self._recording:
+            self._recording.write(f"{header.hex()} {text.hex()}\n")
+            self._recording.flush()
+        self._ledger.note(GOOD, frame.t_us)
+        self.link.publish(TWIST, header, text, self.options.source)
+
+    def attack(self, header: AnswerHeader | bytes, text: bytes | None = None) -> None:
+        """Send what must not move the wheels."""
+        data = header if isinstance(header, bytes) else encode(header)
+        self._ledger.note(INJECTED)
+        self.link.publish(TWIST, data, format_twist(self.twist) if text is None else text, self.options.source)
+
+    def injected(self) -> None:
+        """Note that the fault was done in another way than by `attack`."""
+        self._ledger.note(INJECTED)
+
+    @property
+    def key(self) -> str:
+        """The exact key of this driver's twists."""
+        return key_for(self.link.robot, TWIST, self.options.source)
+
+
+def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
+    """Drive, then do what `options.fault` names, for ever or for `options.seconds`."""
+
+    end_s = time.monotonic() + options.seconds if options.seconds else float("inf")
+    with open_zenoh(options.robot, connect=[options.endpoint], role=options.source, timeout_s=15) as link:
+        script = Script(options, link, ledger)
+        while not (pulled.is_set() and options.fault) and time.monotonic() < end_s:
+            frame = script.frame()
+            if frame is not None:
+                script.drive(frame)
+        if options.fault:
+            ATTACKS[options.fault](script)
+    return 0
+
+
+# Commands that must not move the wheels, and good ones that must not hurt: what a scripted driver sends. Shell.
+
+
+LATE_S: Final = 0.5
+FLOOD_HZ: Final = 10_000
+FLOOD_BATCH: Final = 50
+FLOOD_S: Final = 3.0
+REVERSE_S: Final = 0.02
+HUGE_BYTES: Final = 10_000_000
+MALFORMED: Final = (
+    b"nan|0", b"0.5|nan", b"inf|0", b"-inf|0", b"1e400|0", b"1_0|0", "０.５|０".encode(), b"", b"|", b"0.5",
+    b"0.5|0|0", b" 0.5|0", b"0.5|0\n", b"0.5,0", b"0x1p-1|0", b"\xff\xfe|\x00", bytes(range(32)),
+)
+OVERSIZED: Final = (b"0" * 63 + b"|0", b"0.5|" + b"0" * 253, b"0.5|" + b"0" * HUGE_BYTES)
+
+
+def _frames(script: Script) -> Iterator[FrameHeader]:
+    """Every new frame, for ever; while none comes (who sends nonsense gets few) the last again, 20 times a second."""
+    last: FrameHeader | None = None
+    while True:
+        last = script.frame() or last
+        if last is not None:
+            yield last
+
+
+def late(script: Script) -> None:
+    """Each command half a second after its frame, or later where no newer frame is as old as that."""
+    waiting: deque[FrameHeader] = deque(maxlen=64)
+    while True:
+        frame = script.frame()
+        if frame is not None:
+            waiting.append(frame)
+        while len(waiting) > 1 and _is_late(waiting[1]):
+            waiting.popleft()
+        if waiting and _is_late(waiting[0]):
+            script.attack(script.answer(waiting[0]))
+
+
+def _is_late(frame: FrameHeader) -> bool:
+    return time.monotonic() - frame.t_us / 1e6 > LATE_S
+
+
+def replay(script: Script) -> None:
+    """What was sent before, again and again: this session's, or a recording of an earlier one."""
+    recording = script.options.recording
+    earlier = [tuple(map(bytes.fromhex, line.split())) for line in recording.open()] if recording else script.sent
+    messages = list(earlier)
+    while True:
+        for header, text in messages[-50:]:
+            script.attack(header, text)
+            time.sleep(0.005)
+
+
+def never_issued(script: Script) -> None:
+    """Frames that the robot never sent."""
+    for frame in _frames(script):
+        script.attack(script.answer(frame, seq=frame.seq + 1000))
+
+
+def from_future(script: Script) -> None:
+    """The frame's own number with a time to come, and the next frame before it is issued."""
+    for frame in _frames(script):
+        script.attack(script.answer(frame, t_us=frame.t_us + 1_000_000))
+        script.attack(script.answer(frame, seq=frame.seq + 1, t_us=frame.t_us + 33_333))
+
+
+def wrapped(script: Script) -> None:
+    """The highest number of all, then from zero again."""
+    frames = _frames(script)
+    script.seq = MAX_INTEGER - 1
+    script.drive(next(frames))
+    script.seq = -1
+    for frame in frames:
+        script.attack(script.answer(frame))
+
+
+def malformed(script: Script) -> None:
+    """Every text that is no twist, with a header that would do."""
+    with open_session((), [script.options.endpoint], 5.0) as stranger:
+        for frame in _frames(script):
+            for text in MALFORMED:
+                script.attack(script.answer(frame), text)
+            for text in OVERSIZED:  # the link would refuse to send these
+                script.injected()
+                stranger.put(script.key, text, attachment=encode(script.answer(frame)))
+            script.attack(b"{" * MAX_HEADER_BYTES)
+            time.sleep(0.1)
+
+
+def flood(script: Script) -> None:
+    """One old command at 10 kHz."""
+    header, text = script.sent[0]
+    started_s, batches = time.monotonic(), 0
+    while time.monotonic() - started_s < FLOOD_S:
+        for _ in range(FLOOD_BATCH):
+            script.attack(header, text)
+        batches += 1
+        time.sleep(max(0.0, started_s + batches * FLOOD_BATCH / FLOOD_HZ - time.monotonic()))
+
+
+def reversal(script: Script) -> None:
+    """Full speed ahead and back at 50 Hz, citing properly; then silence."""
+    end_s, sign = time.monotonic() + 2.0, 1.0
+    frame = next(_frames(script))
+    while time.monotonic() < end_s:
+        frame, sign = script.frame(0.0) or frame, -sign
+        script.drive(frame, Twist(linear_mps=0.5 * sign, angular_rad_s=0.0))
+        script.injected()
+        time.sleep(REVERSE_S)
+
+
+def heartbeat(script: Script) -> None:
+    """Acknowledges every frame, stays connected, commands nothing."""
+    for frame in _frames(script):
+        script.injected()
+        script.link.publish(ACK, encode(script.answer(frame)), b"", script.options.source)
+
+
+def thousand(script: Script) -> None:
+    """A thousand good commands, quickly, then on as before."""
+    frame = next(_frames(script))
+    for _ in range(1000):
+        frame = script.frame(0.0) or frame
+        script.attack(script.answer(frame))
+        time.sleep(0.001)
+    for frame in _frames(script):
+        script.attack(script.answer(frame))
+
+
+ATTACKS: Final[dict[str, Callable[[Script], None]]] = {
+    attack.__name__: attack
+    for attack in (late, replay, never_issued, from_future, wrapped, malformed, flood, reversal, heartbeat, thousand)
+}
+
+
+# A person at the robot, as a process: asks for STOP (then reset), or for what the robot says of itself. Shell.
+
+
+def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
+    """Wait for the trigger, ask, and say what was answered."""
+    with open_zenoh(options.robot, connect=[options.endpoint], role=OPERATOR_SOURCE, timeout_s=15) as link:
+        operator = Operator(link)
+        operator.wait_report(10.0)
+        print("person ready", flush=True)
+        pulled.wait()
+        if options.fault == "lateness":
+            print(f"late by {operator.wait_report(10.0).status.tick_late_max_us} us", flush=True)
+            return 0
+        ledger.note(REQUESTED)
+        ledger.note(INJECTED)
+        print(f"state {operator.stop(lambda: None).state}", flush=True)
+        if options.fault == "reset":
+            reply = operator.ask(Verb.RESET)
+            print(f"reset {reply.ok}: {reply.detail}", flush=True)
+    return 0
+
+
+# The real vision service with a ledger between it and the link, and a detector that can be made to fail. Shell.
+
+
+SLOW_S: Final = 0.33
+"""Ten frame intervals at 30 fps."""
+
+
+class LoggingLink:
+    """A link that notes every twist before it leaves; a `Link` itself."""
+
+    def __init__(self, link: Link, ledger: EventLog) -> None:
+        self.robot = link.robot
+        self._link, self._ledger = link, ledger
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        """As `Link` says."""
+        if channel is TWIST:
+            self._ledger.note(GOOD, decode(AnswerHeader, header).echo.t_us)
+        return self._link.publish(channel, header, payload, source)
+
+    def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
+        """As `Link` says."""
+        self._link.subscribe(channel, callback)
+
+    def latest(self, channel: Channel) -> LatestSlot[Message]:
+        """As `Link` says."""
+        return self._link.latest(channel)
+
+    def ignore(self, channel: Channel) -> None:
+        """As `Link` says."""
+        self._link.ignore(channel)
+
+    def has_listener(self, channel: Channel) -> bool:
+        """As `Link` says."""
+        return self._link.has_listener(channel)
+
+    def close(self) -> None:
+        """As `Link` says."""
+        self._link.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _raise() -> None:
+    raise RuntimeError("the detector fails, as the bench told it to")
+
+
+FAULTS: Final[dict[str, Callable[[], None]]] = {
+    "raises": _raise, "hangs": lambda: time.sleep(3600), "slow": lambda: time.sleep(SLOW_S),
+}
+
+
+def _spoil_detector(fault: str, pulled: threading.Event, ledger: EventLog) -> None:
+    """Every detector built from now on does `fault` before it detects, once the trigger is pulled."""
+    detect = HsvDetector.detect
+
+    def spoiled(self: HsvDetector, picture: Any) -> Any:
+        if pulled.is_set():
+            ledger.note(INJECTED)
+            FAULTS[fault]()
+        return detect(self, picture)
+
+    HsvDetector.detect = spoiled  # type: ignore[method-assign]
+
+
+def run_vision(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
+    """Serve for ever."""
+    if options.fault:
+        _spoil_detector(options.fault, pulled, ledger)
+    loaded = load_service("vision", file=str(options.config) if options.config else None,
+                          options={"connect": (options.endpoint,)}, environ=os.environ)
+    config = loaded.config
+    assert isinstance(config, VisionConfig)
+    with LoggingLink(open_zenoh(config.robot, connect=config.connect, role=VISION_SOURCE, timeout_s=15), ledger) as link:
+        serve(config, link, threading.Event(), lambda line: print(line, flush=True))
+    return 0
 
 
 if __name__ == "__main__":

@@ -1,14 +1,37 @@
 """One row of the fault bench: what is injected and what is demanded. Pure."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-from sightline.evaluation.checks import Check
-from sightline.evaluation.faults.evidence import DISTANCE_M, FALLS_MS, OLD_US, ZERO_MS
+import multiprocessing
+import shutil
+import time
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from multiprocessing import connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from sightline.evaluation.checks import Check, at_least, at_most
+from sightline.evaluation.faults.evidence import (
+    Blind,
+    DISTANCE_M,
+    FALLS_MS,
+    MEMORY_MB,
+    OLD_US,
+    Stop,
+    ZERO_MS,
+    last_valid_us,
+    measure_stop,
+    moved_on_old_sight,
+    stop_checks,
+)
+from sightline.evaluation.faults.fixture import RobotFixture
+from sightline.evaluation.faults.sampler import STALL_US
+from sightline.evaluation.processes import terminated_like_interrupted
+from sightline.protocol.errors import SightlineError
+from sightline.sim.tun_emulator import why_impossible
+from typing import Final, NamedTuple, TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sightline.operator_side.faults.rig import RobotFixture, Setup
+    from sightline.evaluation.faults.fixture import RobotFixture, Setup
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,3 +97,174 @@ class Outcome:
     def ok(self) -> bool:
         """Every check held; a row that was skipped is not ok."""
         return bool(self.checks) and not self.trouble and all(check.ok for check in self.checks)
+
+
+# Runs a row of the fault bench and judges it. Shell (processes, files).
+
+
+MOST_TRIES: Final = 3
+_TO_THE_END_US: Final = 10**9
+_WATCHED_US: Final = 1_000_000
+"""After the injection: the time in which a stop is measured, and a stalled sampler spoils it."""
+
+
+def run_case(row: Case, folder: Path, run: int = 1) -> Outcome:
+    """Run a row, again while its sampler stalled; its files stay in `folder` unless all was well."""
+    if row.setup.wired and (why := why_impossible()):
+        return Outcome(row, skipped=why)
+    for number in range(1, MOST_TRIES + 1):
+        place = folder / f"{row.id}-{run}-{number}"
+        shutil.rmtree(place, ignore_errors=True)
+        try:
+            checks, stalled_us = _run_once(row, place)
+        except (SightlineError, OSError) as error:  # OSError: a process that was to be hurt is gone
+            return Outcome(row, trouble=" ".join(str(error).split()))
+        if stalled_us <= STALL_US:
+            break
+    else:
+        return Outcome(row, checks, trouble=f"inconclusive: sampler stalled {stalled_us / 1000:.0f} ms each time")
+    outcome = Outcome(row, checks)
+    if outcome.ok:
+        shutil.rmtree(place)
+    return outcome
+
+
+def _run_once(row: Case, place: Path) -> tuple[tuple[Check, ...], int]:
+    """The checks, and for how long the sampler stalled."""
+    with RobotFixture(place, row.setup) as rig:
+        injected = row.inject(rig)
+        grown_mb = rig.grown_mb()
+        checks = (
+            at_least("injected", injected.count, "times", 1),
+            *_motion_checks(row, rig, injected),
+            at_most("memory", grown_mb, "MB", MEMORY_MB),
+            *injected.checks,
+        )
+        return checks, rig.stalled_us(injected.at_us, injected.at_us + watched_us(checks))
+
+
+def watched_us(checks: Sequence[Check]) -> int:
+    """How long after the injection stamps must be right: as long as a stop takes, or for good where something failed.
+
+    A motor's log is stamped by the simulation, which may have stood still between a command and its stamp.
+    """
+    return _WATCHED_US if all(check.ok for check in checks) else _TO_THE_END_US
+
+
+def _motion_checks(row: Case, rig: RobotFixture, injected: Injected) -> Iterable[Check]:
+    rows, sent = rig.motors(), rig.sent()
+    blind = Blind(injected.at_us, injected.resumed_us, row.by_frame) if row.blind else None
+    if row.stops:
+        until_us = injected.resumed_us or rows[-1].t_us
+        since_us = last_valid_us(sent, blind or Blind(until_us))
+        stop = measure_stop(rows, since_us, injected.resumed_us) if since_us else Stop(None, None, 0.0)
+        yield from stop_checks(stop, row.zero_ms, row.distance_m)
+    yield at_most("on old sight", moved_on_old_sight(rows, sent, blind), "lines", 0)
+    if row.again:
+        yield at_least("drives again", bool(injected.again), "", 1)
+
+
+# Runs rows side by side, each in a process of its own, and says how long the rest will take. Shell (processes).
+
+
+_FORK: Final = multiprocessing.get_context("fork")  # nothing is open here that a copy could spoil: no link, no thread
+_END_S: Final = 30.0
+"""A row that was interrupted ends its own processes within this."""
+
+
+class Progress(NamedTuple):
+    """How far the whole is; `left_s` is a guess from what has run."""
+
+    done: int
+    total: int
+    left_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Turn:
+    """One run of one row; `index` is the row's place in the report."""
+
+    index: int
+    row: Case
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Running:
+    turn: _Turn
+    process: BaseProcess
+    answer: connection.Connection
+
+
+def run_cases(
+    rows: Sequence[Case], repeat: int, folder: Path, jobs: int, say: Callable[[Outcome, Progress], None]
+) -> list[list[Outcome]]:
+    """Every row `repeat` times, `jobs` at once, those that want it alone last. What is skipped is not repeated."""
+    results: list[list[Outcome]] = [[] for _ in rows]
+    turns = [_Turn(index, row, number) for index, row in enumerate(rows) for number in range(1, repeat + 1)]
+    turns.sort(key=lambda turn: turn.row.alone)  # stable: otherwise in the report's order
+    began_s, done, total = time.monotonic(), 0, len(turns)
+    with terminated_like_interrupted(), closing(_outcomes(turns, folder, jobs, results)) as outcomes:
+        for turn, outcome in outcomes:
+            results[turn.index].append(outcome)
+            done += 1
+            left_s = (time.monotonic() - began_s) / done * (total - done)
+            say(outcome, Progress(done, total, left_s))
+    return [[one for one in row if not one.skipped] or row[:1] for row in results]
+
+
+def _outcomes(
+    turns: list[_Turn], folder: Path, jobs: int, results: Sequence[Sequence[Outcome]]
+) -> Generator[tuple[_Turn, Outcome], None, None]:
+    waiting, running = list(turns), list[_Running]()
+    try:
+        while waiting or running:
+            while waiting and _may_start(waiting[0].row, running, jobs):
+                turn = waiting.pop(0)
+                skipped = next((one for one in results[turn.index] if one.skipped), None)
+                if skipped is not None:
+                    yield turn, skipped
+                else:
+                    running.append(_start(turn, folder))
+            for ready in connection.wait([one.answer for one in running]) if running else ():
+                ended = next(one for one in running if one.answer is ready)
+                running.remove(ended)
+                yield ended.turn, _collect(ended)
+    finally:
+        for one in running:
+            one.process.terminate()
+        for one in running:
+            one.process.join(_END_S)
+
+
+def _may_start(row: Case, running: Sequence[_Running], jobs: int) -> bool:
+    if not running:
+        return True
+    return len(running) < jobs and not row.alone and not running[0].turn.row.alone
+
+
+def _start(turn: _Turn, folder: Path) -> _Running:
+    ours, theirs = _FORK.Pipe(duplex=False)
+    process = _FORK.Process(target=_run, args=(turn, folder, theirs))
+    process.start()
+    theirs.close()
+    return _Running(turn, process, ours)
+
+
+def _run(turn: _Turn, folder: Path, answer: connection.Connection) -> None:
+    """In the process of its own; whoever waits is told what became of the row, whatever did."""
+    with suppress(KeyboardInterrupt), terminated_like_interrupted():
+        outcome = run_case(turn.row, folder, turn.number)
+        answer.send((outcome.checks, outcome.skipped, outcome.trouble))
+
+
+def _collect(ended: _Running) -> Outcome:
+    outcome = Outcome(ended.turn.row)
+    try:
+        checks, skipped, trouble = ended.answer.recv()
+        outcome = replace(outcome, checks=checks, skipped=skipped, trouble=trouble)
+    except EOFError:
+        outcome = replace(outcome, trouble="the bench's own process for this row ended; it said why above")
+    ended.answer.close()
+    ended.process.join()
+    return outcome

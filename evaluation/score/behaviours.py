@@ -1,11 +1,38 @@
 """What stands on docs/behaviours.md, in its order: scenarios, their laws, the light they are seen in. Pure."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, as_completed
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Final
+from pathlib import Path
+from sightline.evaluation.checks import Check, number
+from sightline.evaluation.lockstep import Conditions, run_lockstep
+from sightline.evaluation.plots import ROBOT_COLOUR
+from sightline.evaluation.processes import worker_pool
+from sightline.evaluation.scenario_config import robot_of
+from sightline.evaluation.score.figures import (
+    BOUNDS,
+    EXACT,
+    HARDEST_MPS2,
+    REACHED_WITHIN_M,
+    READ_WITHIN_M,
+    SETTLED_S,
+    Score,
+    UNITS,
+    checks_of,
+    figures_of,
+    median_and_worst,
+    score,
+)
+from sightline.evaluation.score.runs import Case, run_of
+from sightline.operator_side.preflight import needs
+from sightline.sim.scenario import Scenario, Start, load_scenario
+from sightline.sim.truth import Truth
+from typing import Any, Final, TYPE_CHECKING
 
-from sightline.evaluation.score.runs import Case
-from sightline.sim.scenario import load_scenario
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 LATENCY_MS, LOSS = 50.0, 0.1
 LOOKS: Final = ("dim", "bright", "warm", "desaturated", "quality30")
@@ -81,3 +108,326 @@ CHARACTER: Final = {
     "there is no way. With none it goes round the cylinder.",
 }
 """What an older law is like, and why it fails where it does."""
+
+
+# How the Thymio speeds up and slows down on a free way, by the default law and by the older one. Pure.
+
+
+LAWS: Final = ("goto", "goto-baseline")
+GOALS_M: Final = (0.2, 2.0, 10.0)
+"""Those of the older write-up's plots."""
+_SLOWEST_MPS: Final = 0.2  # what either law keeps up on a free way, and then some time to settle
+_SETTLES_S: Final = 8.0
+_ACROSS: Final = 5  # samples to either side: an acceleration over 0.2 s, for the physics' own steps are noise
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedCase:
+    """One drive to make."""
+
+    law: str
+    goal_m: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedRun:
+    """What came of it, in world truth: one entry of each list per sample."""
+
+    wish: SpeedCase
+    times_s: list[float]
+    speeds_mps: list[float]
+    accelerations_mps2: list[float]
+    arrived_s: float | None
+    """When it first was at the waypoint."""
+    off_m: float
+    """From the waypoint, at the end."""
+
+    @property
+    def top_mps(self) -> float:
+        """The highest speed."""
+        return max(self.speeds_mps)
+
+
+def speed_cases(seed: int) -> list[SpeedCase]:
+    """Every law to every waypoint."""
+    return [SpeedCase(law, goal_m, seed) for law in LAWS for goal_m in GOALS_M]
+
+
+def free_way(goal_m: float) -> Scenario:
+    """The Thymio's scenario with nothing in the way and the waypoint straight ahead."""
+    thymio = load_scenario("thymio")
+    return thymio.model_copy(update={
+        "things": (), "goals_m": ((goal_m, 0.0),), "start": Start(at_m=(0.0, 0.0)),
+        "target": thymio.target.model_copy(update={"at_m": (goal_m, 0.0)}),
+        "seconds": goal_m / _SLOWEST_MPS + _SETTLES_S,
+    })
+
+
+def speed_run(wish: SpeedCase) -> SpeedRun:
+    """Drive it, under the conditions of the page."""
+    scenario = free_way(wish.goal_m)
+    mission = None if wish.law == scenario.mission else wish.law
+    run = run_lockstep(scenario, robot_of(scenario), wish.seed, Conditions(LATENCY_MS, LOSS), mission=mission)
+    return speeds_of(wish, run.samples)
+
+
+def speeds_of(wish: SpeedCase, samples: Sequence[Truth]) -> SpeedRun:
+    """The figures of a drive along x."""
+    times_s = [(truth.t_us - samples[0].t_us) / 1e6 for truth in samples]
+    speeds_mps = [truth.linear_mps for truth in samples]
+    off_m = [abs(complex(truth.x_m - wish.goal_m, truth.y_m)) for truth in samples]
+    arrived_s = next((t_s for t_s, off in zip(times_s, off_m, strict=True) if off <= REACHED_WITHIN_M), None)
+    return SpeedRun(wish, times_s, speeds_mps, _slopes(times_s, speeds_mps), arrived_s, off_m[-1])
+
+
+def _slopes(times_s: Sequence[float], values: Sequence[float]) -> list[float]:
+    last = len(values) - 1
+    ends = [(max(0, at - _ACROSS), min(last, at + _ACROSS)) for at in range(len(values))]
+    return [(values[end] - values[begin]) / (times_s[end] - times_s[begin]) for begin, end in ends]
+
+
+# thymio-speeds.png: speed and acceleration over time, a column per waypoint, both laws. Shell (writes a file).
+
+
+_COLOURS = dict(zip(LAWS, (ROBOT_COLOUR, "tab:red"), strict=True))
+
+
+def plot_speeds(path: Path, runs: Sequence[SpeedRun]) -> None:
+    """Draw `runs`. Raises ConfigError without Matplotlib."""
+    with needs("report"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    figure = Figure(figsize=(12, 6), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    for column, goal_m in enumerate(GOALS_M):
+        here = [run for run in runs if run.wish.goal_m == goal_m]
+        upper, lower = (figure.add_subplot(2, len(GOALS_M), row * len(GOALS_M) + column + 1) for row in (0, 1))
+        _plot(upper, here, "speed (m/s)", [run.speeds_mps for run in here])
+        _plot(lower, here, "acceleration (m/s2)", [run.accelerations_mps2 for run in here])
+        upper.set_title(f"to a waypoint {goal_m:g} m ahead")
+        lower.set_xlabel("time (s)")
+    figure.suptitle(f"Thymio on a free way, seed {runs[0].wish.seed}")
+    canvas.print_png(path)  # type: ignore[no-untyped-call]
+
+
+def _plot(axes: "Axes", runs: Sequence[SpeedRun], label: str, values: Sequence[Sequence[float]]) -> None:
+    axes.axhline(0.0, color="0.7", linewidth=1)
+    for run, each in zip(runs, values, strict=True):
+        axes.plot(run.times_s, each, color=_COLOURS[run.wish.law], label=run.wish.law)
+    axes.set_ylabel(label)
+    axes.legend(loc="best")
+
+
+# The text of docs/behaviours.md, from the scores of its runs. Pure.
+
+
+Results = Mapping[Case, Score]
+SPEEDS: Final = "thymio-speeds.png"
+_ALSO_OF_BASELINES: Final = ("unseen_percent", "target_contacts")
+_UNITS: Final = {**UNITS, "unseen_percent": "%"}
+_IN_LIGHT: Final = ("wrong_states_percent", "crossed_on_red", "crossed_late", "least_crossings", "start_s")
+
+
+def picture_name(case: Case) -> str:
+    """The file of the picture of this run."""
+    return "-".join(part for part in (case.scenario, case.robot and f"on-{case.robot}", case.mission) if part) + ".png"
+
+
+def kept(row: Row, results: Results, seeds: Sequence[int]) -> bool:
+    """Whether every run kept every bound; nothing is demanded of a baseline."""
+    return bool(row.baseline) or all(
+        check.ok for case in row.all_cases(seeds) for check in _checks(row, results[case])
+    )
+
+
+def page_lines(
+    rows: Sequence[Row], results: Results, seeds: Sequence[int], folder: str, speeds: Sequence[SpeedRun]
+) -> Iterator[str]:
+    """The page, block by block; pictures lie in `folder`."""
+    names = ",".join(map(str, seeds))
+    yield "# Behaviours\n"
+    yield (
+        f"Every behaviour by name, in lockstep on {len(seeds)} starts (seeds {names}), +{LATENCY_MS:g} ms latency, "
+        f"{LOSS:.0%} loss on each leg, judged from\nworld truth: the median over the starts, then the worst. A "
+        "baseline is an older write-up's law with its own numbers, beside what drives\nby default; nothing is "
+        "demanded of it. [robots.md](robots.md) says what each robot and scenario is, and whose it was.\n"
+    )
+    yield (
+        f"Written by `sightline score --page docs/behaviours.md --seeds {names}`. See one with `sightline demo\n"
+        "--scenario NAME`, judge one with `sightline score --scenario NAME`. Times count from the start, shares and "
+        "errors from the first\nacquisition to the end; a `least_` figure must not fall below its bound, every other "
+        "must not exceed it; contacts are physics\nsteps of 4 ms.\n"
+    )
+    yield from _overview(rows, results, seeds)
+    for row in rows:
+        yield from (_baseline if row.baseline else _behaviour)(row, results, seeds, folder)
+        if row == Row("thymio") and speeds:
+            yield from _speeds(speeds, folder)
+
+
+def _overview(rows: Sequence[Row], results: Results, seeds: Sequence[int]) -> Iterator[str]:
+    yield "| scenario | law | starts that kept every bound | most of a bound that was used |\n|---|---|---:|---|"
+    for row in (row for row in rows if not row.baseline):
+        cases = row.all_cases(seeds)
+        judged = [_checks(row, results[case]) for case in cases]
+        good = sum(all(check.ok for check in checks) for checks in judged)
+        yield (f"| [{row.title.replace('`', '')}](#{row.anchor}) | `{row.law}` | {good} of {len(cases)} | "
+               f"{_tightest(row, [check for checks in judged for check in checks])} |")
+    yield ""
+
+
+def _tightest(row: Row, checks: Sequence[Check]) -> str:
+    """The figure that came nearest to its bound, of those that leave room."""
+    names = set(BOUNDS[row.scenario]) - set(EXACT)
+    shares = [(_share(check), check) for check in checks if check.name in names and check.value is not None]
+    share, check = max(shares, key=lambda one: one[0], default=(0.0, None))
+    return f"{check.name} {_figure(check.value, check.unit)}, {share:.0%}" if check else ""
+
+
+def _share(check: Check) -> float:
+    value = check.value or 0.0
+    if not check.name.startswith("least_"):
+        return value / check.bound
+    return check.bound / value if value else 9.99
+
+
+def _checks(row: Row, result: Score) -> list[Check]:
+    return checks_of(row.scenario, result, LATENCY_MS)
+
+
+def _head(row: Row) -> Iterator[str]:
+    scenario = load_scenario(row.scenario)
+    yield f"## {row.title}\n"
+    yield (f"{scenario.summary[0].upper()}{scenario.summary[1:]}. Robot `{row.robot or scenario.robot}`, law "
+           f"`{row.law}`.\n")
+
+
+def _behaviour(row: Row, results: Results, seeds: Sequence[int], folder: str) -> Iterator[str]:
+    yield from _head(row)
+    yield "| figure | median | worst | bound | |\n|---|---:|---:|---:|---|"
+    runs = [results[case] for case in row.cases(seeds)]
+    for same in zip(*(_checks(row, run) for run in runs), strict=True):
+        verdict = "ok" if all(check.ok for check in same) else "**not kept**"
+        name = same[0].name
+        yield f"| {name} | {_both(runs, name)} | {_figure(same[0].bound, same[0].unit)} | {verdict} |"
+    if row.looks:
+        yield from _in_other_light(row, results, seeds)
+    yield _shown(row, seeds, folder)
+
+
+def _in_other_light(row: Row, results: Results, seeds: Sequence[int]) -> Iterator[str]:
+    """The same starts in each light of `looks`: the worst of each figure."""
+    yield (
+        f"\nIn other light (`--look`), the worst of {len(seeds)} starts each. A frame is misread if it does not name "
+        f"the lit colour, from\n{SETTLED_S:g} s after each change and from {READ_WITHIN_M:g} m before the line on; "
+        f"late is who crosses on yellow and could have stopped with {HARDEST_MPS2:g} m/s2.\n"
+    )
+    yield f"| look | {' | '.join(_IN_LIGHT)} | |\n|---|{'---:|' * len(_IN_LIGHT)}---|"
+    for look in row.looks:
+        runs = [results[case] for case in row.cases(seeds, look)]
+        verdict = "ok" if all(check.ok for run in runs for check in _checks(row, run)) else "**not kept**"
+        worst = [_figure(median_and_worst(runs, name)[1], _UNITS[name]) for name in _IN_LIGHT]
+        yield f"| {look} | {' | '.join(worst)} | {verdict} |"
+
+
+def _baseline(row: Row, results: Results, seeds: Sequence[int], folder: str) -> Iterator[str]:
+    yield from _head(row)
+    yield f"{CHARACTER[row.baseline]} {_failures(row, results, seeds)}\n"
+    default = row.default
+    yield f"| figure | `{row.law}` median | worst | `{default.law}` median | worst |\n|---|---:|---:|---:|---:|"
+    runs, others = ([results[case] for case in one.cases(seeds)] for one in (row, default))
+    names = [check.name for check in _checks(row, runs[0])]
+    for name in [*names, *(name for name in _ALSO_OF_BASELINES if name not in names)]:
+        yield f"| {name} | {_both(runs, name)} | {_both(others, name)} |"
+    yield _shown(row, seeds, folder)
+
+
+def _shown(row: Row, seeds: Sequence[int], folder: str) -> str:
+    about = row.title.replace("`", "")
+    return f"\n![{about}: the ways and the figures over time]({folder}/{picture_name(row.cases(seeds)[0])})\n"
+
+
+def _failures(row: Row, results: Results, seeds: Sequence[int]) -> str:
+    """Which of the bounds it would break, and how often."""
+    judged = [_checks(row, results[case]) for case in row.cases(seeds)]
+    broken = [(same[0].name, sum(not check.ok for check in same)) for same in zip(*judged, strict=True)]
+    said = ", ".join(f"{name} ({count})" for name, count in broken if count)
+    if not said:
+        return f"It keeps every bound of `{row.default.law}` here."
+    return f"Of the bounds of `{row.default.law}` it breaks, on so many of {len(seeds)} starts: {said}."
+
+
+def _speeds(speeds: Sequence[SpeedRun], folder: str) -> Iterator[str]:
+    yield "### Speed and acceleration\n"
+    yield ("The same robot to a waypoint straight ahead, with nothing in the way. `goto` is as slow as its sensors are "
+           "short-sighted: whatever\nstands just beyond their 0.2 m must still be left its clearance. The older law "
+           "drives as if it saw further.\n")
+    yield ("| law | waypoint | arrived | top speed | most acceleration | hardest braking | off at the end |\n"
+           "|---|---:|---:|---:|---:|---:|---:|")
+    for run in speeds:
+        arrived = "never" if run.arrived_s is None else f"{run.arrived_s:.1f} s"
+        yield (f"| `{run.wish.law}` | {run.wish.goal_m:g} m | {arrived} | {run.top_mps:.2f} m/s | "
+               f"{max(run.accelerations_mps2):.2f} m/s2 | {-min(run.accelerations_mps2):.2f} m/s2 | "
+               f"{run.off_m * 100:.1f} cm |")
+    yield f"\n![speed and acceleration of both laws on three ways]({folder}/{SPEEDS})\n"
+
+
+def _both(runs: Sequence[Score], name: str) -> str:
+    median, worst = median_and_worst(runs, name)
+    return f"{_figure(median, _UNITS[name])} | {_figure(worst, _UNITS[name])}"
+
+
+def _figure(value: float | None, unit: str) -> str:
+    return "never" if value is None else f"{number(value)} {unit}"
+
+
+# docs/behaviours.md: every behaviour and its baseline in lockstep, with figures and a picture each. Shell (files).
+#
+# A picture is of the first seed. The page says which command wrote it; no figure in it is typed by hand.
+
+
+Progress = Callable[[int], AbstractContextManager[Callable[[], None]]]
+
+
+def write_page(page: Path, seeds: Sequence[int], jobs: int, progress: Progress, rows: Sequence[Row] = ROWS) -> bool:
+    """Run all rows and write `page`, and its pictures into a folder beside it. True if every bound was kept."""
+    wanted = list(dict.fromkeys(case for row in rows for case in row.all_cases(seeds)))
+    wishes = speed_cases(seeds[0]) if any(row.scenario == "thymio" for row in rows) else []
+    pictures = page.parent / page.stem
+    pictures.mkdir(parents=True, exist_ok=True)
+    with progress(len(wanted) + len(wishes)) as advance, worker_pool(jobs) as pool:
+        runs = {pool.submit(_run, case, _picture(pictures, case, seeds)): case for case in wanted}
+        drives = [pool.submit(speed_run, wish) for wish in wishes]
+        everything: list[Future[Any]] = [*runs, *drives]
+        for future in as_completed(everything):
+            future.result()  # a run that failed ends the others here
+            advance()
+    results = {case: run.result() for run, case in runs.items()}
+    speeds = [drive.result() for drive in drives]
+    _draw_speeds(pictures / SPEEDS, speeds)
+    page.write_text("\n".join(page_lines(rows, results, seeds, pictures.name, speeds)) + "\n", "utf-8")
+    return all(kept(row, results, seeds) for row in rows)
+
+
+def _picture(folder: Path, case: Case, seeds: Sequence[int]) -> Path | None:
+    """Where the picture of this run goes; only the first seed's run in the scenario's own light has one."""
+    return folder / picture_name(case) if case.seed == seeds[0] and case.look is None else None
+
+
+def _run(case: Case, picture: Path | None) -> Score:
+    with needs("report"):
+        from sightline.evaluation.plots import plot_run
+    scenario, run = run_of(case)
+    if picture is not None:
+        whose = f" on {case.robot}" if case.robot else ""
+        law = case.mission or scenario.mission
+        plot_run(picture, run.samples, scenario, f"{scenario.name}{whose}, {law}, seed {case.seed}")
+    return score(run.samples, scenario.stand_off_m, figures_of(scenario, run.samples, run.said))
+
+
+def _draw_speeds(path: Path, speeds: Sequence[SpeedRun]) -> None:
+    with needs("report"):
+        pass
+    if speeds:
+        plot_speeds(path, speeds)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from sightline.sim.scenes.model import LabelledBox, Scene
-from sightline.vision_side.detect.overlap import corners, overlap
+from sightline.vision_side.detect.port import corners, overlap
 from sightline.vision_side.detect.port import Detection
 
 BALL_LABELS: Final = ("ball", "target")

@@ -3,24 +3,24 @@
 Each run is a process's own, so that they share the machine's cores; a run itself repeats bit for bit.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import groupby, product
-from typing import Any, Final
-
-from sightline.evaluation.checks import Check
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from sightline.evaluation.checks import Check, number
 from sightline.evaluation.lockstep import Conditions, Run, run_lockstep
+from sightline.evaluation.processes import worker_pool
 from sightline.evaluation.scenario_config import robot_of, vision_config
-from sightline.evaluation.score.figures import Score, median_and_worst, score
-from sightline.operator_side.score_bounds import checks_of
-from sightline.operator_side.score_course import figures_of
-from sightline.operator_side.worker_pool import worker_pool
+from sightline.evaluation.score.figures import Score, checks_of, figures_of, median_and_worst, score
 from sightline.protocol.errors import ConfigError
-from sightline.sim.look import look_named
-from sightline.sim.scenario import Scenario, load_scenario
+from sightline.sim.scenario import Scenario, load_scenario, look_named
 from sightline.vision_side.detect.registry import check_choice
 from sightline.vision_side.missions.registry import REGISTRY, configured_mission
+from typing import Any, Final
+
 
 _MOST_NOTICES: Final = 3
 """Of each group: later ones repeat the first with higher counts."""
@@ -170,3 +170,33 @@ def _scored_figure(group: str, checks: list[Check], results: list[Score]) -> Sco
     first = checks[0]
     median, worst = median_and_worst(results, first.name)
     return ScoredFigure(group, first.name, median, worst, first.unit, first.bound, all(check.ok for check in checks))
+
+
+# How `sightline score` shows itself: a progress bar on stderr, a table of median and worst. Shell (a terminal).
+
+
+@contextmanager
+def progress(total: int) -> Iterator[Callable[[], None]]:
+    """A bar over `total` runs, gone when it is full; silent where stderr is no terminal."""
+    console = Console(stderr=True)
+    columns = (TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("runs", total=total)
+        yield lambda: bar.advance(task)
+
+
+def score_text(report: ScoreReport) -> str:
+    """One line per figure, under the name of its group and what its detector had to say."""
+    lines: list[str] = []
+    group = ""
+    for one in report.judged:
+        if one.group != group:
+            group = one.group
+            lines += [group, *(f"  {line}" for line in report.news.get(group, ()))]
+        lines.append(_line(one))
+    return "\n".join([*lines, f"{len(report.runs)} runs, {'all within bounds' if report.ok else 'NOT within bounds'}"])
+
+
+def _line(one: ScoredFigure) -> str:
+    figures = f"median {number(one.median):>7}  worst {number(one.worst):>7} {one.unit:<5}"
+    return f"  {one.name:<16} {figures}  bound {number(one.bound):>6}  {'ok' if one.ok else 'FAIL'}"

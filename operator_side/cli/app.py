@@ -13,26 +13,26 @@ from typing import Final
 import typer
 
 from sightline.operator_side.cli.bench import register_benches as register_bench
-from sightline.operator_side.cli_calibrate import register_calibrate
-from sightline.operator_side.cli_capture import register_capture
-from sightline.operator_side.cli_config import register_config
-from sightline.operator_side.cli_conform import register_conform
-from sightline.operator_side.cli_detector import register_detector
-from sightline.operator_side.cli_doctor import register_doctor
-from sightline.operator_side.cli_faults import register_faults
-from sightline.operator_side.cli_install import register_install
+from sightline.operator_side.cli.calibrate import register_calibrate
+from sightline.operator_side.cli.watch import register_capture
+from sightline.operator_side.cli.services import register_config
+from sightline.operator_side.cli.conform import register_conform
+from sightline.operator_side.cli.detector import register_detector
+from sightline.operator_side.cli.admin import register_doctor
+from sightline.operator_side.cli.evaluate import register_faults
+from sightline.operator_side.cli.admin import register_install
 from sightline.operator_side.cli.evaluate import register_demo_and_score as register_judge
 from sightline.operator_side.cli.admin import register_keys
-from sightline.operator_side.cli_metrics import register_metrics
-from sightline.operator_side.cli_mission import register_missions as register_mission
+from sightline.operator_side.cli.services import register_metrics
+from sightline.operator_side.cli.operate import register_missions as register_mission
 from sightline.operator_side.cli.operate import register_operator as register_people
-from sightline.operator_side.cli_pick_color import register_pick_color
-from sightline.operator_side.cli_scenarios import register_scenarios
+from sightline.operator_side.cli.calibrate import register_pick_color
+from sightline.operator_side.cli.services import register_scenarios
 from sightline.operator_side.cli.services import register_services
-from sightline.operator_side.cli_teleop import register_teleop
-from sightline.operator_side.cli_train import register_train
+from sightline.operator_side.cli.operate import register_teleop
+from sightline.operator_side.cli.evaluate import register_train
 from sightline.operator_side.cli.watch import register_watch
-from sightline.operator_side.settings_errors import no_such_name
+from sightline.operator_side.config.errors import no_such_name
 from sightline.protocol.errors import SightlineError
 
 INTERRUPTED: Final = 130

@@ -1,19 +1,22 @@
 """`sightline bench`: what things cost on this machine. Shell. Exit code 5 when a check is outside its bound."""
 
 import json
+import tempfile
+import typer
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
-
-from sightline.operator_side.cli_bench_detector import register_detector_benches
-from sightline.operator_side.cli_bench_loop import register_loop_benches
-from sightline.operator_side.cli_bench_network import register_network_bench
 from sightline.operator_side.cli.options import CHECK_FAILED, Json, numbers
 from sightline.operator_side.preflight import needs
+from sightline.protocol.errors import ConfigError
+from typing import Annotated, Any, Protocol, TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from sightline.benchmarks.loop.figures import LoopCheck
+    from sightline.benchmarks.loop.race import Race
+    from sightline.benchmarks.network.stage import NetworkRun
     from sightline.evaluation.checks import Check
 
 
@@ -44,7 +47,7 @@ def codec(*, as_json: Json = False) -> int:
 
 def gate(*, as_json: Json = False) -> int:
     """Judge one command and decide one step, as the driver does."""
-    from sightline.benchmarks.gate import GATE_BOUND_US, measure_gate
+    from sightline.benchmarks.costs import GATE_BOUND_US, measure_gate
     from sightline.evaluation.checks import Check
 
     took_us = measure_gate()
@@ -127,7 +130,7 @@ def demo(
         from sightline.benchmarks.real_time import Kinds, measure_demos
         from sightline.evaluation.checks import number
         from sightline.evaluation.score.figures import AT_LEAST
-        from sightline.operator_side.score_bounds import EXACT
+        from sightline.evaluation.score.figures import EXACT
         from sightline.sim.scenario import load_scenario, scenario_names
     names = scenario_names() if scenario == "all" else scenario.split(",")
     for name in names:
@@ -168,3 +171,382 @@ def print_checks(checks: "list[Check]", as_json: bool) -> int:
     else:
         typer.echo("\n".join(check_line(check) for check in checks))
     return 0 if ok else CHECK_FAILED
+
+
+# `sightline bench loop` and `bench watchers`: is the whole loop fresh, and does it stay so? Shell.
+
+
+_ALONE = (
+    "Peers see as the older write-ups do. With `+our eyes` they have Sightline's pipeline instead: what their "
+    "transport alone costs, without credit, age or a gate; shown, not judged."
+)
+Transport = Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")]
+
+
+class AnyCheck(Protocol):
+    """A check, whichever bench made it."""
+
+    @property
+    def name(self) -> str:
+        """What is demanded."""
+        ...
+
+    @property
+    def value(self) -> float | None:
+        """What was measured."""
+        ...
+
+    @property
+    def unit(self) -> str:
+        """Of value and bound."""
+        ...
+
+    @property
+    def bound(self) -> float:
+        """The most that is allowed."""
+        ...
+
+    @property
+    def ok(self) -> bool:
+        """Whether it holds."""
+        ...
+
+
+def register_loop_benches(group: typer.Typer) -> None:
+    """Add the commands to the `bench` group."""
+    group.command(epilog="Example: sightline bench loop --detector-delay-ms 80 --seconds 20 --out runs/loop")(loop)
+    group.command(epilog="Example: sightline bench watchers --viewers 10 --seconds 20")(watchers)
+    group.command(epilog="Example: sightline bench camera --seconds 30")(camera)
+
+
+def loop(
+    *,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Of the pictures, in pixels.")] = "640x480",
+    fps: Annotated[float, typer.Option(help="Pictures a second, 1 to 240.")] = 30.0,
+    transport: Transport = "zenoh",
+    detector_delay_ms: Annotated[float, typer.Option(help="Make every detector this much slower, 0 to 300.")] = 0.0,
+    overload: Annotated[
+        float, typer.Option(help="So many times more pictures than can be detected, e.g. 2; sets rate or detector.")
+    ] = 0.0,
+    seconds: Annotated[float, typer.Option(help="Of each contestant, 2 to 600.")] = 10.0,
+    peers: Annotated[str, typer.Option(help="all, none, or of older, lekiwi, openpi, callback.")] = "all",
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Leave loop.json and loop.png here.")] = None,
+    as_json: Json = False,
+) -> int:
+    """Capture to the driver's verdict, beside the in-process floor, bare TCP and what others build."""
+    with needs("bench"):
+        from sightline.benchmarks.loop.race import run_race
+        from sightline.benchmarks.loop.figures import LoopSetting, peers_of, size_of
+
+        if peers != "none":
+            import zmq  # noqa: F401  # a peer's need; said here, not by a process that dies
+    width_px, height_px = size_of(size)
+    setting = LoopSetting(
+        Path(), width_px, height_px, fps, transport, detector_delay_ms, overload, seconds=seconds, peers=peers_of(peers)
+    )
+    race = run_race(setting, lambda line: typer.echo(line, err=True))
+    result = _race_result(race)
+    if out is not None:
+        _leave(out, race, result)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        typer.echo("\n".join([*_table(race), "", *_check_lines(race.checks)]))
+    return 0 if result["ok"] else CHECK_FAILED
+
+
+def watchers(
+    *,
+    viewers: Annotated[int, typer.Option(min=2, max=12, help="One never reads, one reads once a second.")] = 10,
+    seconds: Annotated[float, typer.Option(min=3, max=600, help="Without viewers, and again with them.")] = 20.0,
+    transport: Transport = "zenoh",
+    as_json: Json = False,
+) -> int:
+    """What viewers of the robot's pictures cost whoever drives: age of the commands, memory of the robot."""
+    with needs("all"):
+        from sightline.benchmarks.loop.figures import LoopSetting
+        from sightline.benchmarks.loop.viewers import measure_watchers
+
+    setting = LoopSetting(Path(), transport=transport, seconds=seconds)
+    return _print_loop_checks(measure_watchers(setting, viewers, lambda line: typer.echo(line, err=True)), as_json)
+
+
+def camera(
+    *,
+    seconds: Annotated[float, typer.Option(min=3, max=600, help="Of pictures at 30 fps.")] = 30.0,
+    as_json: Json = False,
+) -> int:
+    """What passing a camera's own JPEGs through costs the network process; the device is a stand-in."""
+    with needs("camera"):
+        from sightline.benchmarks.camera import BOUND_MS, MISSED_BOUND, measure_camera
+    from sightline.benchmarks.loop.figures import at_most
+
+    seen = measure_camera(seconds)
+    name = f"camera pass-through, CPU a frame (until the frame is ready {seen.ready_ms:.2f})"
+    checks = [
+        at_most(name, seen.cpu_ms, "ms", BOUND_MS),
+        at_most(f"missed frames of {seen.jpeg_bytes:.0f} bytes", seen.missed, "", MISSED_BOUND),
+    ]
+    return _print_loop_checks(checks, as_json)
+
+
+def _print_loop_checks(checks: "Sequence[LoopCheck]", as_json: bool) -> int:
+    ok = all(check.ok for check in checks)
+    if as_json:
+        typer.echo(json.dumps({"ok": ok, "checks": [asdict(check) for check in checks]}))
+    else:
+        typer.echo("\n".join(_check_lines(checks)))
+    return 0 if ok else CHECK_FAILED
+
+
+def _race_result(race: "Race") -> dict[str, Any]:
+    return {
+        "ok": all(check.ok for check in race.checks),
+        "checks": [asdict(check) for check in race.checks],
+        "setting": {**asdict(race.setting), "pictures": None, "jpeg_bytes": race.jpeg_bytes},
+        "contestants": [asdict(figures) for figures in race.figures.values()],
+    }
+
+
+def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
+    with needs("report"):
+        from sightline.benchmarks.loop.plot import draw_race
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "loop.json").write_text(json.dumps(result, indent=1), "utf-8")
+        draw_race(folder / "loop.png", race)
+    except OSError as error:
+        raise ConfigError(f"--out {folder}: {error.strerror}; choose a folder that can be written") from None
+
+
+def _table(race: "Race") -> list[str]:
+    from sightline.benchmarks.loop.figures import OUR_DETECTOR
+
+    names = f"{'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'bytes':>8} {'others':>7}"
+    head = f"{'':18} {names}  CPU ms a picture; MB"
+    alone = [_ALONE] if any(name.endswith(OUR_DETECTOR) for name in race.figures) else []
+    return [head, *(_row(name, race) for name in race.figures), *alone]
+
+
+def _row(name: str, race: "Race") -> str:
+    one = race.figures[name]
+    ages = " ".join(f"{'never' if age is None else f'{age:.1f}':>8}" for age in (one.p50_ms, one.p95_ms, one.p99_ms))
+    cpu = " ".join(f"{process} {cpu_ms:.2f}" for process, cpu_ms in one.cpu_ms.items())
+    memory = " ".join(f"{megabytes:.0f}" for megabytes in one.memory_mb.values())
+    carried = f"{one.bytes_per_picture or 0:8.0f} {one.taken_percent:5.1f} %"
+    return f"{name:18} {one.answered_percent:7.1f} % {ages}    {carried}  {cpu}; {memory}"
+
+
+def _check_lines(checks: "Sequence[AnyCheck]") -> list[str]:
+    from sightline.evaluation.checks import Check, check_line
+
+    return [check_line(Check(one.name, one.value, one.unit, one.bound, one.ok)) for one in checks]
+
+
+# `sightline bench network`: two machines and a bad network between them, on this one. Shell. Needs root.
+
+
+def register_network_bench(group: typer.Typer) -> None:
+    """Add the command to the `bench` group."""
+    group.command(epilog="Example: sightline bench network --only radio --seeds 1,2,3,4,5 --seconds 60")(network)
+
+
+def network(
+    *,
+    only: Annotated[list[str] | None, typer.Option("--only", metavar="ROW", help="A row; repeatable.")] = None,
+    transport: Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")] = "zenoh",
+    seconds: Annotated[float, typer.Option(help="Of each row, 4 to 600.")] = 20.0,
+    seeds: Annotated[str, typer.Option(help="Of what the wire loses, for rows where it loses; by commas.")] = "1",
+    as_json: Json = False,
+) -> int:
+    """Robots, visions and people in two network namespaces: what slow, lossy, far, broken and shared wires cost."""
+    with needs("all"):
+        from sightline.benchmarks.network.run import Progress, run_network
+        from sightline.benchmarks.network.cases import chosen
+        from sightline.benchmarks.network.stage import NetworkSetting
+        from sightline.evaluation.faults.fixture import BenchWire
+        from sightline.benchmarks.network.scenes import medium
+    setting = NetworkSetting(transport, seconds, tuple(numbers("--seeds", seeds, int)))
+    telling = Progress(lambda line: typer.echo(line, err=True), lambda run: _print_run(run, as_json=as_json))
+    runs = run_network(chosen(only or (), transport), setting, BenchWire, telling, {"medium": medium})
+    result = _network_result(runs, transport)
+    if as_json:
+        typer.echo(json.dumps(result))
+    elif len(setting.seeds) > 1:
+        _print_worst(runs)
+    return 0 if result["ok"] else CHECK_FAILED
+
+
+def _network_result(runs: "Sequence[NetworkRun]", transport: str) -> dict[str, Any]:
+    checks = [asdict(check) for check in _worst(runs)]
+    rows = [
+        {"row": run.row.name, "seed": run.seed, "injected": run.injected, "facts": run.facts,
+         "checks": [asdict(check) for check in run.checks], "phases": [asdict(of) for of in run.figures]}
+        for run in runs
+    ]
+    return {"ok": bool(checks) and all(one["ok"] for one in checks), "checks": checks, "transport": transport,
+            "rows": rows}
+
+
+def _worst(runs: "Sequence[NetworkRun]") -> "Iterator[LoopCheck]":
+    """Of each demand on a row, the seed that did worst."""
+    from sightline.benchmarks.network.figures import worst_of_seeds
+
+    for name in dict.fromkeys(run.row.name for run in runs):
+        yield from worst_of_seeds(name, [run.checks for run in runs if run.row.name == name])
+
+
+def _print_run(run: "NetworkRun", *, as_json: bool) -> None:
+    from sightline.evaluation.checks import number
+
+    typer.echo(f"{run.row.name} ({run.row.what}), seed {run.seed}", err=as_json)
+    for last in run.figures[-1:]:
+        typer.echo(
+            f"  age p50 {number(last.p50_ms)} p95 {number(last.p95_ms)} ms, "
+            f"{last.fps:.1f} fps of {last.bytes_per_frame / 1000:.0f} kB, quality {last.quality_percent:.0f} %, "
+            f"size {last.scale_percent:.0f} %, window up to {last.window}, {last.timeouts} unanswered, "
+            f"holds {', '.join(f'{one:.1f} s' for one in last.holds_s) or 'none'}", err=as_json,
+        )
+    if run.facts:
+        typer.echo("  " + ", ".join(f"{name} {number(fact)}" for name, fact in run.facts.items()), err=as_json)
+    _print_network_checks(run.checks, as_json=as_json)
+
+
+def _print_worst(runs: "Sequence[NetworkRun]") -> None:
+    typer.echo("worst of all seeds")
+    _print_network_checks(list(_worst(runs)), as_json=False)
+
+
+def _print_network_checks(checks: "Sequence[LoopCheck]", *, as_json: bool) -> None:
+    from sightline.evaluation.checks import Check, check_line
+
+    for check in checks:
+        typer.echo("  " + check_line(Check(check.name, check.value, check.unit, check.bound, check.ok)), err=as_json)
+
+
+# `sightline bench detector` and `bench streams`: what eyes elsewhere cost, and one service for many. Shell.
+
+
+_READY_S = 30.0
+_BOUND_US = {"zenoh": 1_000.0, "oip+http": 2_000.0}
+"""The median that asking elsewhere on the same machine may add, hot; the rest is only told."""
+
+
+def register_detector_benches(group: typer.Typer) -> None:
+    """Add the commands to the `bench` group."""
+    group.command(epilog="Example: sightline bench detector oip+http://127.0.0.1:8000/ball_jpeg")(detector)
+    group.command(epilog="Example: sightline bench streams --streams 40 --seconds 60")(streams)
+
+
+def detector(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="zenoh, or the address of a server that runs.")] = "zenoh",
+    *,
+    frames: Annotated[int, typer.Option(min=30, max=10_000, help="Hot, and again paced at 30 a second.")] = 300,
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option of the detector's own Config.")
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """What a detector elsewhere adds to the time of the same frames here (hsv), 320x240."""
+    from sightline.operator_side.cli.detector import own_options
+
+    with needs("vision"):
+        from sightline.benchmarks.detector import HOT_S, PACED_S, measure_cost
+        from sightline.evaluation.checks import Check
+        from sightline.vision_side.config import VisionConfig
+        from sightline.vision_side.detect.plugin_calls import attach_detector, close_detector
+        from sightline.vision_side.detect.registry import build_detector
+    with tempfile.TemporaryDirectory(prefix="sightline-") as folder, _service(name, Path(folder)) as robot:
+        here = build_detector("hsv", {}, VisionConfig())
+        there = build_detector(name, own_options(sets or ()), VisionConfig())
+        if robot is not None:
+            attach_detector(there, robot)
+        try:
+            jpeg = _picture(Path(folder))
+            costs = {way: measure_cost(here, there, jpeg, (320, 240), frames=frames, period_s=period_s, robot=robot)
+                     for way, period_s in (("hot", HOT_S), ("paced", PACED_S))}
+        finally:
+            close_detector(there)
+    bound, checks, most = _BOUND_US.get(name.partition(":")[0], float("inf")), [], 0.01 * frames
+    for way, cost in costs.items():
+        what = f"{name}: added, {way} (here {cost.here_us:.0f}, there {cost.there_us:.0f}, medians)"
+        judged = bound if way == "hot" else float("inf")
+        checks.append(Check(what, cost.added_us, "us", judged, cost.added_us <= judged))
+        checks.append(Check(f"{name}: not answered of {frames}", cost.unanswered, "", most, cost.unanswered <= most))
+    return _print(checks, as_json)
+
+
+def streams(
+    *,
+    streams: Annotated[int, typer.Option(min=2, max=200, help="Robots, each with 30 frames a second.")] = 40,
+    seconds: Annotated[float, typer.Option(min=5, max=3600, help="How long.")] = 60.0,
+    as_json: Json = False,
+) -> int:
+    """Many robots at one detector service that can look at half of their frames: age, fairness, memory."""
+    with needs("vision"):
+        from sightline.benchmarks import detector as bench
+        from sightline.evaluation.checks import Check
+
+    with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
+        load = bench.measure_streams(_free_endpoint(), Path(folder), streams, seconds)
+    missing = streams - len(load.answered)
+    checks = [
+        Check("offered per answered frame", load.overload, "", bench.OVERLOAD, load.overload >= 0.9 * bench.OVERLOAD),
+        Check("age of boxes, p95", load.p95_ms, "ms", bench.DEADLINE_MS, load.p95_ms <= bench.DEADLINE_MS),
+        Check("furthest from an equal share", load.unfair_percent, "%", bench.FAIRNESS_PERCENT,
+              load.unfair_percent <= bench.FAIRNESS_PERCENT),
+        Check("robots never answered", missing, "", 0, missing == 0),
+        Check("memory of the service grew", load.growth_mb, "MB", bench.MEMORY_MB, load.growth_mb <= bench.MEMORY_MB),
+    ]
+    return _print(checks, as_json)
+
+
+@contextmanager
+def _service(name: str, folder: Path) -> "Iterator[Any]":
+    """For `zenoh` a service, and a link that is both the robot's and vision's, where they meet; else None."""
+    from sightline.evaluation.processes import Processes
+    from sightline.protocol.transports.open import open_link
+
+    if name != "zenoh":
+        yield None
+        return
+    endpoint = _free_endpoint()
+    with ExitStack() as ending:
+        robot = ending.enter_context(open_link("r1", listen=[endpoint]))
+        processes = ending.enter_context(Processes(folder))
+        processes.start("detector", ["detector", "--serve", "hsv", "--connect", endpoint])
+        processes.wait_line("detector", "for robots", _READY_S)
+        _publish_status(robot, processes)
+        yield robot
+
+
+def _publish_status(robot: Any, processes: Any) -> None:
+    """Until the service has taken note."""
+    from sightline.protocol.channels import STATUS
+    from sightline.protocol.codec import encode
+    from sightline.protocol.messages import Stamp, State, Status
+
+    stamp, status = encode(Stamp(session="0000abcd", seq=1, t_us=1)), encode(Status(state=State.HOLD, reason="bench"))
+    while "looks at the pictures" not in processes.log("detector").read_text("utf-8", "replace"):
+        robot.publish(STATUS, stamp, status)
+        processes.check(0.1)
+
+
+def _picture(folder: Path) -> bytes:
+    from sightline.benchmarks.loop.pictures import write_pictures
+
+    write_pictures(folder, 320, 240)
+    return min(folder.glob("*.jpg")).read_bytes()
+
+
+def _free_endpoint() -> str:
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _print(checks: "list[Check]", as_json: bool) -> int:
+
+    return print_checks(checks, as_json)

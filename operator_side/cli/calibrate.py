@@ -1,20 +1,46 @@
 """`sightline robot test-wheels` and `sightline calibrate drive`: tools of who builds a robot. Shell."""
 
+import json
+import math
 import os
+import re
 import sys
-from pathlib import Path
-from typing import Annotated, Any, Final
-
+import threading
+import time
 import typer
-
-from sightline.operator_side.cli.options import ConfigFile, Sets, numbers
-from sightline.operator_side.out_file import check_out_file
-from sightline.operator_side.service_settings import load_service
-from sightline.operator_side.settings_errors import no_such_name
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from pathlib import Path
 from sightline.operator_side.calibrate.wheels import check_confirmed, opened_drive, try_wheels, turn_for
+from sightline.operator_side.cli.options import (
+    ConfigFile,
+    Connect,
+    DEFAULT_CONNECT,
+    Json,
+    Port,
+    RobotName,
+    Secure,
+    ServiceConnect,
+    Sets,
+    numbers,
+)
+from sightline.operator_side.client.pictures import Pictures, viewer_role
+from sightline.operator_side.config.errors import no_such_name
+from sightline.operator_side.config.loading import load_service
+from sightline.operator_side.preflight import check_out_file, needs
+from sightline.protocol.channels import FRAME
 from sightline.protocol.errors import ConfigError
-from sightline.robot_side.config import RobotConfig
+from sightline.protocol.transports.open import open_link
+from sightline.robot_side.config import DEFAULT_ENDPOINT, RobotConfig
 from sightline.robot_side.hardware.gpio import table_of, table_text
+from typing import Annotated, Any, Final, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sightline.operator_side.calibrate.camera import Ball, Board, Calibration, Mounting
+    from sightline.operator_side.calibrate.color import Box, Image, Ranges
+    from sightline.operator_side.calibrate.color_page import Gallery
+
 
 TASKS: Final = ("test-wheels",)
 _CHECK_FAILED: Final = 5
@@ -105,3 +131,357 @@ def _distance_m(question: str) -> float:
 def _prompt(question: str) -> str:
     answer: str = typer.prompt(question, default="", show_default=False, prompt_suffix=": ")
     return answer
+
+
+# `sightline calibrate camera`: measures a camera and writes its model. Shell; heavy imports are inside.
+
+
+_BOARD = re.compile(r"([0-9]{1,2})x([0-9]{1,2})")
+_BALL_PICTURES = 20
+_MOST_IN_FOLDER = 100  # all of a folder is used, within reason: the fit's time grows with every view
+
+PluginName = Annotated[
+    str | None, typer.Option("--camera", metavar="KIND", help="A camera of this machine: v4l2, picamera, video, ...")
+]
+PluginSets = Annotated[
+    list[str] | None,
+    typer.Option("--camera-set", metavar="KEY=VALUE", help="One of its options, e.g. device=/dev/video2."),
+]
+Metres = Annotated[float | None, typer.Option(help="Where the lens is, from the axle's middle on the floor.")]
+
+
+def register_calibrate(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    group = typer.Typer(help="Measure what a robot is made of.", rich_markup_mode=None)
+    group.callback()(_calibrate)
+    group.command(epilog="Example: sightline calibrate camera --camera v4l2 --board 9x6 --square-m 0.025")(camera)
+    group.command(epilog="Example: sightline calibrate drive --config raspberry-car.toml")(drive)
+    app.add_typer(group, name="calibrate")
+
+
+def _calibrate() -> None:
+    """Measure what a robot is made of."""
+
+
+def camera(
+    *,
+    pictures: Annotated[Path | None, typer.Option(metavar="DIR", help="A folder of JPEGs.")] = None,
+    camera: PluginName = None,
+    camera_sets: PluginSets = None,
+    robot: RobotName = None,
+    connect: ServiceConnect = None,
+    secure: Secure = "",
+    board: Annotated[str, typer.Option(metavar="CxR", help="Inner corners of the chessboard.")] = "9x6",
+    square_m: Annotated[float, typer.Option(min=0.001, max=1, help="Side of one square, metres.")] = 0.025,
+    ball_radius_m: Annotated[float | None, typer.Option(min=0.005, max=2, help="Use a ball of this radius.")] = None,
+    distance_m: Annotated[float | None, typer.Option(min=0.1, max=20, help="Lens to ball, over the floor.")] = None,
+    config: Annotated[str | None, typer.Option(metavar="FILE", help="Vision's TOML: the ball's colour.")] = None,
+    views: Annotated[int, typer.Option(min=5, max=100, help="Views of the board to take from a live camera.")] = 15,
+    seconds: Annotated[float, typer.Option(min=1, max=600, help="Look at a live camera for at most this.")] = 90.0,
+    x_m: Metres = None,
+    y_m: Metres = None,
+    z_m: Metres = None,
+    pitch_rad: Annotated[float | None, typer.Option(help="Tilt of the lens, up positive.")] = None,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The model to write.")] = Path("camera.toml"),
+    as_json: Json = False,
+) -> None:
+    """Measure a camera with a chessboard, or with a ball of known size at a known distance, and write its model.
+
+    Pictures come from --pictures, from --camera, or from a running robot (--robot, --connect).
+    """
+    check_out_file(out)
+    wanted = _subject(board, square_m, ball_radius_m, distance_m)
+    given = {"x_m": x_m, "y_m": y_m, "z_m": z_m, "pitch_rad": pitch_rad}
+    with needs("vision"), ExitStack() as ending:
+        source, mounted = _source(ending, pictures, (camera, camera_sets or []), (robot, connect, secure), seconds)
+        mounting = _mounting(mounted, given)
+        say = _quiet if as_json else _print_board
+        most = _MOST_IN_FOLDER if pictures is not None else views
+        made = _measure(source, wanted, mounting, views=most, config=config, say=say)
+    _write(out, made)
+    typer.echo(json.dumps(_as_object(out, made)) if as_json else _summary(out, made))
+
+
+def _subject(board: str, square_m: float, radius_m: float | None, distance_m: float | None) -> "Board | Ball":
+    with needs("vision"):
+        from sightline.operator_side.calibrate.camera import Ball, Board
+    if radius_m is not None and distance_m is not None:
+        return Ball(radius_m, distance_m)
+    if radius_m is not None or distance_m is not None:
+        raise ConfigError("a ball needs both --ball-radius-m and --distance-m")
+    match = _BOARD.fullmatch(board)
+    if match is None or min(int(match[1]), int(match[2])) < 3:
+        raise ConfigError(f"--board {board!r} is no board: inner corners as COLUMNSxROWS, each at least 3, e.g. 9x6")
+    return Board(int(match[1]), int(match[2]), square_m)
+
+
+def _source(
+    ending: ExitStack,
+    folder: Path | None,
+    plugin: tuple[str | None, list[str]],
+    robot: tuple[str | None, list[str] | None, str],
+    seconds: float,
+) -> tuple[Iterator[bytes], dict[str, float]]:
+    """The pictures, and the mounting that is known already. Exactly one source must be named."""
+    from sightline.operator_side.calibrate import camera as sources
+
+    if sum((folder is not None, plugin[0] is not None, robot[:2] != (None, None))) != 1:
+        raise ConfigError("say where the pictures come from, once: --pictures DIR, --camera KIND, or --robot ID")
+    if folder is not None:
+        return sources.folder_pictures(folder), {}
+    if plugin[0] is not None:
+        from sightline.operator_side.calibrate.local_camera import local_camera
+
+        opened = ending.enter_context(local_camera(plugin[0], plugin[1]))
+        return sources.camera_pictures(opened, seconds), {}
+    from sightline.operator_side.client.pictures import viewer_role
+    from sightline.protocol.transports.open import open_link
+
+    name, connect, secure = robot
+    role = viewer_role(secure) if secure else sources.ROLE
+    at = connect or [DEFAULT_ENDPOINT]
+    link = ending.enter_context(open_link(name or "r1", connect=at, role=role, secure=secure))
+    model = sources.robot_model(link)
+    mounted = {"x_m": model.x_m, "y_m": model.y_m, "z_m": model.z_m, "pitch_rad": model.pitch_rad}
+    return sources.robot_pictures(link, seconds, role, secure), mounted
+
+
+def _mounting(known: dict[str, float], given: dict[str, float | None]) -> "Mounting":
+    from sightline.operator_side.calibrate.camera import Mounting
+
+    return Mounting(**{**known, **{name: value for name, value in given.items() if value is not None}})
+
+
+def _measure(
+    pictures: Iterator[bytes],
+    wanted: "Board | Ball",
+    mounting: "Mounting",
+    *,
+    views: int,
+    config: str | None,
+    say: Callable[[str], None],
+) -> "Calibration":
+    from sightline.operator_side.calibrate import camera as calibrate
+    from sightline.operator_side.calibrate.camera import collect
+
+    if isinstance(wanted, calibrate.Board):
+        boards = collect(pictures, lambda _: lambda jpeg: calibrate.find_board(jpeg, wanted), calibrate.is_new_view,
+                         views, say)
+        return calibrate.from_boards(boards.found, wanted, boards.size, boards.given, mounting)
+    hsv = _vision_config(config).hsv
+    balls = collect(pictures, lambda size: calibrate.ball_finder(size, hsv), lambda *_: True, _BALL_PICTURES, _quiet)
+    return calibrate.from_balls(balls.found, wanted, balls.size, balls.given, mounting)
+
+
+def _vision_config(file: str | None) -> Any:
+    from sightline.operator_side.config.loading import load_service
+
+    return load_service("vision", file=file, environ=os.environ).config
+
+
+def _write(path: Path, made: "Calibration") -> None:
+    from sightline.operator_side.config.toml_text import toml_text
+
+    head = f"# {made.used} of {made.given} pictures, {made.error:.2f} {made.error_unit}\n"
+    try:
+        path.write_text(head + toml_text(made.model.model_dump(mode="json")), "utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}; see --out") from None
+
+
+def _hfov_deg(made: "Calibration") -> float:
+    return math.degrees(2 * math.atan(made.model.width_px / 2 / made.model.fx_px))
+
+
+def _summary(path: Path, made: "Calibration") -> str:
+    model = made.model
+    return (
+        f"{model.width_px}x{model.height_px}: fx {model.fx_px:.1f}, fy {model.fy_px:.1f} px ({_hfov_deg(made):.1f} "
+        f"degrees wide), from {made.used} of {made.given} pictures, {made.error:.2f} {made.error_unit}\n"
+        f"{path} is written; use it: sightline robot --set camera.options.model_file={path}"
+    )
+
+
+def _as_object(path: Path, made: "Calibration") -> dict[str, Any]:
+    return {
+        "ok": True, "file": str(path), "model": made.model.model_dump(mode="json"), "used": made.used,
+        "given": made.given, "error": made.error, "error_unit": made.error_unit,
+    }
+
+
+def _print_board(line: str) -> None:
+    typer.echo(f"board {line}; move it, and tilt it")
+
+
+def _quiet(_line: str) -> None:
+    """Nothing to say: a ball lies still, and with --json only the object is printed."""
+
+
+# The command `pick-color`: a place in a picture becomes a colour range that vision follows. Shell.
+
+
+_MASK = Path("pick-color-mask.png")
+_WAIT_S = 0.2
+_LAST_WORD_S = 0.3  # for the page to hear what became of it
+
+
+def register_pick_color(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command("pick-color", epilog="Example: sightline pick-color r1 --config vision.toml")(pick_color)
+
+
+def pick_color(
+    robot: Annotated[str | None, typer.Argument(metavar="[ROBOT]", help="Its pictures [default: r1].")] = None,
+    *,
+    picture: Annotated[Path | None, typer.Option("--picture", metavar="FILE", help="From a picture instead.")] = None,
+    video: Annotated[Path | None, typer.Option("--video", metavar="FILE", help="From a video instead.")] = None,
+    at: Annotated[str | None, typer.Option("--at", metavar="X,Y", help="Pick this pixel; no browser.")] = None,
+    box: Annotated[str | None, typer.Option("--box", metavar="X,Y,W,H", help="Pick this box; no browser.")] = None,
+    frames: Annotated[int, typer.Option("--frames", min=1, max=200, help="Pictures that the range is tried on.")] = 20,
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="FILE", help="Vision's configuration, to write it into.")
+    ] = None,
+    mask: Annotated[
+        Path | None, typer.Option("--mask", metavar="FILE", help="What it marks [default: pick-color-mask.png].")
+    ] = None,
+    port: Port = 0,
+    connect: Connect = DEFAULT_CONNECT,
+    secure: Secure = "",
+    as_json: Json = False,
+) -> None:
+    """Click, or draw a box, on what is to be followed: gives its colour range, tries it, and writes it where told.
+
+    Opens a page for a browser on this machine; with --at or --box it needs none.
+    """
+    sources = [name for name, given in (("ROBOT", robot), ("--picture", picture), ("--video", video)) if given]
+    if len(sources) > 1:
+        raise ConfigError(f"{' and '.join(sources)}: pictures come from one of them; give one")
+    place = place_of(at, box)
+    if as_json and place is None:
+        raise ConfigError("--json is for scripts, which have no browser: add --at X,Y or --box X,Y,W,H")
+    with needs("vision"):
+        from sightline.operator_side.calibrate.color_file import check_config
+    config = config.expanduser() if config else None
+    if config is not None:
+        check_config(config)
+    source = _Source(robot or "r1", picture, video, connect, secure)
+    if place is None:
+        _on_page(source, frames, config, port)
+    else:
+        _at_once(source.pictures(frames), place, config, mask or _MASK, as_json)
+
+
+def place_of(at: str | None, box: str | None) -> "Box | None":
+    """The place of `--at` or `--box`; None for neither. Raises ConfigError for what is no place."""
+    with needs("vision"):
+        from sightline.operator_side.calibrate.color import Box
+    if at and box:
+        raise ConfigError("--at is one pixel and --box a part of the picture; give one of them")
+    for option, text, form in (("--at", at, "X,Y"), ("--box", box, "X,Y,W,H")):
+        if text is None:
+            continue
+        parts = [part.strip() for part in text.split(",")]
+        right = len(parts) == form.count(",") + 1 and all(p.isascii() and p.isdigit() and len(p) < 6 for p in parts)
+        if not right or (option == "--box" and "0" in (parts[2].lstrip("0") or "0", parts[3].lstrip("0") or "0")):
+            raise ConfigError(f"{option} {text!r} is no place: write {form} in whole pixels, e.g. {option} "
+                              f"{'160,120' if option == '--at' else '150,110,20,20'}")
+        return Box(*(int(part) for part in parts))
+    return None
+
+
+class _Source:
+    """Where pictures come from."""
+
+    def __init__(self, robot: str, picture: Path | None, video: Path | None, connect: list[str], secure: str) -> None:
+        self._robot, self._picture, self._video, self._connect, self._secure = robot, picture, video, connect, secure
+
+    def pictures(self, frames: int) -> "list[Image]":
+        """At most `frames`, the newest last."""
+        from sightline.operator_side.calibrate.color_page import of_robot
+
+        still = self._of_file(frames)
+        if still is not None:
+            return still
+        role = viewer_role(self._secure)
+        with open_link(self._robot, connect=self._connect, role=role, secure=self._secure) as link:
+            return of_robot(Pictures(link, role, FRAME, self._secure), frames)
+
+    @contextmanager
+    def gallery(self, frames: int) -> "Iterator[Gallery]":
+        """For a page."""
+        from sightline.operator_side.calibrate.color_page import LiveGallery, StillGallery
+        from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
+
+        still = self._of_file(frames)
+        if still is not None:
+            yield StillGallery(still)
+            return
+        role, ending = viewer_role(self._secure), threading.Event()
+        with open_link(self._robot, connect=self._connect, role=role, secure=self._secure) as link:
+            pictures, reel = Pictures(link, role, FRAME, self._secure), FrameBuffer(frames)
+            filling = threading.Thread(target=fill, args=(reel, pictures, ending), name="pictures", daemon=True)
+            filling.start()
+            try:
+                yield LiveGallery(reel)
+            finally:
+                ending.set()
+                filling.join(2.0)
+
+    @property
+    def title(self) -> str:
+        """What the page is about."""
+        return str(self._picture or self._video or f"robot {self._robot}")
+
+    def _of_file(self, frames: int) -> "list[Image] | None":
+        from sightline.operator_side.calibrate.color_page import of_picture, of_video
+
+        if self._picture is not None:
+            return of_picture(self._picture.expanduser())
+        return of_video(self._video.expanduser(), frames) if self._video is not None else None
+
+
+def _at_once(pictures: "list[Image]", place: "Box", config: Path | None, mask: Path, as_json: bool) -> None:
+    from sightline.operator_side.calibrate.color import check_trial, pick, ranges_text, trial_text, try_out
+    from sightline.operator_side.calibrate.color_file import write_mask
+
+    ranges = pick(pictures[-1], place)
+    trial = try_out(ranges, pictures)
+    write_mask(mask.expanduser(), ranges, pictures[-1])
+    check_trial(trial)
+    said = _use(ranges, config)
+    if as_json:
+        found: dict[str, Any] = {"ranges": [one.model_dump() for one in ranges], "trial": asdict(trial)}
+        typer.echo(json.dumps({**found, "mask": str(mask), "written": str(config) if config else None}))
+        return
+    typer.echo(f"{ranges_text(ranges)}\n{trial_text(trial)}\nmask: {mask}\n{said}")
+
+
+def _on_page(source: _Source, frames: int, config: Path | None, port: int) -> None:
+    from sightline.operator_side.cockpit.http_server import served
+    from sightline.operator_side.calibrate.color_page import PickPage
+
+    said: list[str] = []
+
+    def use(ranges: "Ranges") -> str:
+        said.append(_use(ranges, config))
+        return f"written into {config}; restart vision to see by it" if config else "printed in the terminal"
+
+    with source.gallery(frames) as gallery:
+        picking = PickPage(gallery, source.title, use)
+        with served(picking.routes, port) as address:
+            typer.echo(f"pick-color: {source.title} is on {address} for a browser on this machine; Ctrl-C ends it")
+            while not picking.done.wait(_WAIT_S):
+                pass
+            time.sleep(_LAST_WORD_S)
+    typer.echo(said[-1])
+
+
+def _use(ranges: "Ranges", config: Path | None) -> str:
+    """Write the ranges where told, and say what was done, or what a person can paste."""
+    from sightline.operator_side.calibrate.color_file import write_ranges
+    from sightline.operator_side.calibrate.color_file import ranges_toml
+
+    if config is None:
+        return f"for vision's configuration:\n[hsv]\nranges = {ranges_toml(ranges)}"
+    write_ranges(config, ranges)
+    return f"written: {config}, hsv.ranges"

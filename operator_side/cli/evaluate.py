@@ -1,17 +1,29 @@
 """Commands that judge: `demo`, `score`. Shell. Exit code 5 when a check is outside its bound."""
 
+import hashlib
 import json
 import os
+import tempfile
+import typer
 import webbrowser
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from sightline.operator_side.cli.options import CHECK_FAILED, ConfigFile, Device, Json, Sets, numbers
+from sightline.operator_side.config.loading import load_service
+from sightline.operator_side.preflight import check_out_file, needs
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.training.schedule import Training
+from typing import Annotated, Any, Literal, TYPE_CHECKING
 
-import typer
-
-from sightline.operator_side.cli.options import CHECK_FAILED, Json, numbers
-from sightline.operator_side.cli_score_detectors import detectors
-from sightline.operator_side.preflight import needs
+if TYPE_CHECKING:
+    from sightline.evaluation.checks import Check
+    from sightline.evaluation.faults.report import Results
+    from sightline.evaluation.score.detector_report import Report, ScoredScene, Sheet, Subject
+    from sightline.operator_side.config.loading import Loaded
+    from sightline.training.network import Weights
 
 
 def register_demo_and_score(app: typer.Typer) -> None:
@@ -46,7 +58,7 @@ def demo(
     """
     _check_installed("pybullet", "av", "matplotlib", "mcap")
     with needs("all"):
-        from sightline.operator_side.demo import DemoOptions, run_demo
+        from sightline.evaluation.demo.run import DemoOptions, run_demo
         from sightline.evaluation.demo.report import report, summary
     say = _to_stderr if as_json else typer.echo
     lasting_s = _seconds(scenario, seconds)
@@ -107,7 +119,7 @@ def score(
         return 0
     with needs("all"):
         from sightline.evaluation.score.runs import cases, run_cases
-        from sightline.operator_side.score_table import progress, score_text
+        from sightline.evaluation.score.runs import progress, score_text
         from sightline.sim.scenario import scenario_names
     if page is not None:
         return _write_page(page, numbers("--seeds", seeds, int), jobs or os.cpu_count() or 1)
@@ -124,8 +136,317 @@ def score(
 
 def _write_page(page: Path, seeds: list[int], jobs: int) -> int:
     with needs("all"):
-        from sightline.operator_side.behaviours import write_page
-        from sightline.operator_side.score_table import progress
+        from sightline.evaluation.score.behaviours import write_page
+        from sightline.evaluation.score.runs import progress
     return 0 if write_page(page, seeds, jobs, progress) else CHECK_FAILED
 
 
+# Command `score detectors`: any set of detectors on the same labelled scenes. Shell.
+
+
+COMPARED = ("hsv", "onnx")
+FRAMES = 100
+FROM = 900_000
+"""As sim/scenes/model.py has it; that file needs more than the command line may at its start. A test compares them."""
+
+
+def detectors(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="Of `sightline detector list` [default: hsv onnx].")
+    ] = None,
+    *,
+    frames: Annotated[
+        int | None, typer.Option(min=1, max=100_000, help="Scenes in each column [default: 100; with --demand 500].")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=0, max=10**9, metavar="FROM", help="The first scene's seed.")] = FROM,
+    column: Annotated[str, typer.Option(help="`all`, or names separated by commas, e.g. blur,all at once.")] = "all",
+    looks: Annotated[int, typer.Option(min=1, max=100, help="Each scene this often: `adaptive` has to make sure.")] = 1,
+    demand: Annotated[
+        bool, typer.Option("--demand", help="Judge by what is demanded of a learned detector; exit code 5 if it fails.")
+    ] = False,
+    device: Device = None,
+    config: ConfigFile = None,
+    sets: Sets = None,
+    sheet: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a PNG of scenes and answers.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> int:
+    """Compare detectors on drawn scenes: hits, wrong objects, false alarms, centre error, time. Seeds from 900000 are
+    for judging only: nothing may be trained or tuned on them.
+    """
+    with needs("all"):
+        from sightline.evaluation.score.detector_report import FRAMES as DEMANDED_FRAMES
+        from sightline.evaluation.score.detector_report import all_detector_checks
+        from sightline.evaluation.score.detector_report import LIGHT_SHARE, close_subjects, score_scenes
+        from sightline.evaluation.score.detector_report import Sheet
+        from sightline.evaluation.score.runs import progress
+    if demand and seeds < FROM:
+        raise ConfigError(f"--demand judges, which only seeds from {FROM} up are for, not {seeds}")
+    if sheet is not None:
+        check_out_file(sheet)
+    columns, shown = _columns(column), frames or (DEMANDED_FRAMES if demand else FRAMES)
+    asked = _subjects(names or COMPARED, config, sets or (), device)
+    try:
+        drawn = Sheet(asked) if sheet else None
+        with progress(int((len(columns) + LIGHT_SHARE) * shown)) as advance:
+            report = score_scenes(asked, shown, seeds, looks=looks, columns=columns, each=_each(advance, drawn))
+    finally:
+        close_subjects(asked)
+    code = _print_report(report, all_detector_checks(report) if demand else None, as_json)
+    if sheet and drawn:
+        _write_sheet(sheet, drawn)
+    return code
+
+
+def _subjects(
+    names: Sequence[str], file: str | None, sets: Sequence[str], device: str | None
+) -> "list[Subject]":
+    """As `sightline vision` with the same options would build them; only the detectors, nothing that goes around."""
+    from sightline.evaluation.score.detector_report import subjects
+
+    loaded = load_service("vision", file=file, sets=sets, options={"detector.device": device}, environ=os.environ)
+    settings: Any = loaded.config
+    _check_device(names, settings)
+    return subjects(names, settings, {_whose_options(names, loaded): settings.detector.options})
+
+
+def _whose_options(names: Sequence[str], loaded: "Loaded") -> str:
+    """Of the detector that the configuration names, or else of the only one that is compared."""
+    settings: Any = loaded.config
+    is_named = loaded.origin(("detector", "kind")) != "default"
+    whose: str = names[0] if len(names) == 1 and not is_named else settings.detector.kind
+    if settings.detector.options and not is_named and whose not in names:
+        raise ConfigError("detector.options are one detector's: say whose with --set detector.kind=NAME")
+    return whose
+
+
+def _check_device(names: Sequence[str], settings: Any) -> None:
+    """Raise ConfigError where none of them has a device to choose."""
+    from sightline.vision_side.detect.registry import check_device
+
+    alone = {"fallback": "", "shadow": ""}
+    errors = []
+    for name in names:
+        own = settings.detector.model_copy(update={"kind": name, **alone})
+        try:
+            check_device(settings.model_copy(update={"detector": own}))
+        except ConfigError as error:
+            errors.append(error)
+    if len(errors) == len(names):
+        raise errors[0]
+
+
+def _print_report(report: "Report", checks: "list[Check] | None", as_json: bool) -> int:
+    from sightline.operator_side.cli.options import CHECK_FAILED
+    from sightline.evaluation.score.detector_report import check_lines, silence_lines, text
+
+    ok = all(check.ok for check in checks or ())
+    judged = {} if checks is None else {"ok": ok, "checks": [asdict(check) for check in checks]}
+    for line in silence_lines(report):
+        typer.echo(line, err=True)
+    if as_json:
+        typer.echo(json.dumps({**judged, **report.to_dict()}))
+    else:
+        typer.echo("\n".join([text(report), *check_lines(checks or ())]))
+    return 0 if ok else CHECK_FAILED
+
+
+def _columns(asked: str) -> list[str]:
+    from sightline.operator_side.config.errors import no_such_name
+    from sightline.sim.scenes.model import COLUMNS
+
+    names = list(COLUMNS) if asked == "all" else [one.strip() for one in asked.split(",")]
+    for one in names:
+        if one not in COLUMNS:
+            raise ConfigError(f"--column: {no_such_name('column', one, list(COLUMNS))}")
+    return names
+
+
+def _each(advance: Callable[[], None], drawn: "Sheet | None") -> Callable[["ScoredScene"], None]:
+    def each(seen: "ScoredScene") -> None:
+        advance()
+        if drawn is not None:
+            drawn.add(seen)
+
+    return each
+
+
+def _write_sheet(path: Path, drawn: "Sheet") -> None:
+    import cv2
+
+    try:
+        path.write_bytes(cv2.imencode(".png", drawn.picture())[1].tobytes())
+    except OSError as error:
+        raise ConfigError(f"--sheet {path}: {error.strerror}") from None
+
+
+# The command `faults`: break things on purpose and judge what the wheels did. Shell. Exit code 5 when a row fails.
+
+
+JOBS = min(4, (os.cpu_count() or 1) + 1)
+"""A row waits more than it computes; a row that was disturbed too much says so and runs again."""
+SAFETY_PAGE = "safety.md"
+
+
+def register_faults(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command(epilog="Example: sightline faults --only vision.kill --only wire")(faults)
+
+
+def faults(
+    *,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", metavar="ID", help="A row, or a group such as `wire`; repeatable.")
+    ] = None,
+    short: Annotated[bool, typer.Option("--short", help="The short set, as in CI.")] = False,
+    repeat: Annotated[int, typer.Option(min=1, max=100, help="Run each row so often.")] = 1,
+    jobs: Annotated[
+        int, typer.Option(min=1, max=16, help="Rows at once; those that take the whole machine run alone.")
+    ] = JOBS,
+    listing: Annotated[bool, typer.Option("--list", help="Name the rows and what each demands; run nothing.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write the report (with --only, its rows into it); worst values go to safety.md."
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> int:
+    """Start real processes, break one thing at a time, and judge from the simulated motors' own log."""
+    with needs("all"):
+        from sightline.evaluation.faults.report import describe_machine
+        from sightline.evaluation.faults.runner import run_cases
+        from sightline.evaluation.faults.report import markdown, passed, progress_line, to_dict, with_rows_of
+        from sightline.evaluation.faults.cases import chosen
+    rows = chosen(only or (), short=short)
+    if listing:
+        typer.echo("\n".join(f"{row.id:<22} {row.what}: {row.demanded}" for row in rows))
+        return 0
+    if out is not None:
+        check_out_file(out)
+    machine, folder = describe_machine(), Path(tempfile.mkdtemp(prefix="sightline-faults-"))
+    results = run_cases(
+        rows, repeat, folder, jobs, lambda one, progress: typer.echo(progress_line(one, *progress), err=as_json)
+    )
+    _remove_if_empty(folder)
+    if out is not None:
+        report = markdown(results, machine, _command(only, short, repeat, jobs), repeat)
+        _write_report(out, with_rows_of(out.read_text("utf-8"), report) if only and out.exists() else report)
+    typer.echo(json.dumps(to_dict(results)) if as_json else _summary(results, folder))
+    return 0 if passed(results) else CHECK_FAILED
+
+
+def _write_report(out: Path, report: str) -> None:
+    """The report, and its worst values into the page of promises beside it."""
+    from sightline.evaluation.faults.report import page_with_summary
+
+    out.write_text(report, "utf-8")
+    page = out.with_name(SAFETY_PAGE)
+    if page.exists():
+        page.write_text(page_with_summary(page.read_text("utf-8"), report), "utf-8")
+
+
+def _command(only: list[str] | None, short: bool, repeat: int, jobs: int) -> str:
+    options = [*(f" --only {name}" for name in only or ()), " --short" * short, f" --repeat {repeat} --jobs {jobs}"]
+    return "sightline faults" + "".join(options)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with suppress(OSError):  # a row that failed left its logs
+        folder.rmdir()
+
+
+def _summary(results: "Results", folder: Path) -> str:
+    ran = [outcomes for outcomes in results if not outcomes[0].skipped]
+    good = sum(all(one.ok for one in outcomes) for outcomes in ran)
+    left = f"; logs of what failed are in {folder}" if folder.exists() else ""
+    return f"{good} of {len(ran)} rows passed, {len(results) - len(ran)} could not run here{left}"
+
+
+# Command `train`: make the learned detector again, or one's own. Shell.
+
+
+STEPS = [15_000, 14_000, 13_000, 14_000, 20_000, 20_000]
+SCENES = 100_000
+BATCH = 32
+VALIDATED = 5000
+"""These are those of the model that ships, so that the same command makes one of its kind; a test compares. (That one's
+rounds were trained one by one, the last from the file before, as its card says.)"""
+OUT = Path("runs/train")
+_STEPS = "Of one round; say it again for one more, which starts the learning rate anew and takes in more scenes."
+_START = "A model that this command made: train the last round alone, from there on."
+_LEAST_SHARE = 8
+"""Of a batch for each process that trains: the normalisation needs a few pictures."""
+
+
+def register_train(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command(epilog="Example: sightline train --out runs/eyes")(train)
+
+
+def train(
+    *,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Scenes, checkpoint, model and card go here.")] = OUT,
+    scenes: Annotated[int, typer.Option(min=8, max=800_000, help="Drawn once, seeds from 0 up.")] = SCENES,
+    steps: Annotated[list[int], typer.Option(min=1, max=10_000_000, metavar="<int range>", help=_STEPS)] = STEPS,
+    batch: Annotated[int, typer.Option(min=2, max=1024, help="Cut-outs of scenes in each step.")] = BATCH,
+    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Draws weights, cuts and defects.")] = 1,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What trains.")] = "cpu",
+    jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Processes [default: one per core].")] = None,
+    start: Annotated[Path | None, typer.Option(metavar="MODEL", help=_START)] = None,
+    validated: Annotated[int, typer.Option(min=5, max=100_000, help="Scenes a column for thresholds.")] = VALIDATED,
+    judged: Annotated[int, typer.Option(min=5, help="Scenes a column for the card's table.")] = 500,
+) -> None:
+    """Draw labelled scenes, train the detector, write sightline.onnx and its card. Cut off, it goes on where it was."""
+    with needs("train"):
+        import torch
+
+        from sightline.training.loop import TrainOptions, run_training
+    if device == "cuda" and not torch.cuda.is_available():
+        raise HardwareError("--device cuda: this PyTorch sees no GPU; check `nvidia-smi` and that PyTorch is a CUDA "
+                            "build, or take --device cpu")
+    processes = jobs or os.cpu_count() or 1
+    weights, digest = _begun(start) if start else (None, "")
+    sharing = _sharing(batch, processes) if device == "cpu" else 1
+    training = Training(tuple(steps), batch, seed=seed, jobs=sharing, start=digest)
+    options = TrainOptions(out, scenes, training, device, processes, validated, judged, weights)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        model = run_training(options, _print_line, _progress)
+    except OSError as error:
+        raise ConfigError(f"--out {out}: {error.strerror or error}") from None
+    _print_line(f"{model}, {model.with_suffix('.md').name}: try it with `sightline score detectors onnx:{model}`")
+
+
+def _begun(model: Path) -> "tuple[Weights, str]":
+    """The model's weights, and its SHA-256."""
+    from sightline.training.export import weights_in
+
+    try:
+        data = model.read_bytes()
+        return weights_in(data), hashlib.sha256(data).hexdigest()
+    except OSError as error:
+        raise ConfigError(f"--start {model}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise ConfigError(f"--start {model}: {error}; name a model that `sightline train` made") from None
+
+
+def _sharing(batch: int, processes: int) -> int:
+    """How many processes share a batch evenly."""
+    return max(n for n in range(1, processes + 1) if n == 1 or (batch % n == 0 and batch // n >= _LEAST_SHARE))
+
+
+def _print_line(line: str) -> None:
+    typer.echo(line)
+
+
+@contextmanager
+def _progress(total: int, what: str) -> Iterator[Callable[[int], None]]:
+    """A bar where there is a terminal; silent elsewhere."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda done: bar.advance(task, done)

@@ -1,27 +1,40 @@
 """Commands that run a service: `sim`, `robot`, `vision`. Shell."""
 
+import json
 import os
-from importlib import import_module
-from typing import Annotated, Any
-
+import signal
+import threading
 import typer
-
+from importlib import import_module
+from pathlib import Path
+from pydantic import BaseModel
 from sightline.operator_side.cli.options import (
     ConfigFile,
+    Connect,
+    DEFAULT_CONNECT,
     Listen,
     LogForm,
     MaybeSecure,
+    Robot,
     RobotName,
     Secure,
     ServiceConnect,
     Sets,
     SocketDir,
 )
+from sightline.operator_side.config.loading import load_service, model_of
+from sightline.operator_side.config.toml_text import toml_text
 from sightline.operator_side.preflight import needs
-from sightline.operator_side.service_settings import load_service
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import set_log_format
-from sightline.robot_side.config import DEFAULT_ENDPOINT
+from sightline.protocol.transports.open import open_link
+from sightline.robot_side.config import DEFAULT_ENDPOINT, RobotConfig
+from sightline.robot_side.plugins import load_device
+from sightline.sim.process import SimConfig
+from sightline.sim.robot import load_robot
+from sightline.sim.scenario import load_scenario
+from sightline.vision_side.config import VisionConfig
+from typing import Annotated, Any
 
 
 def register_services(app: typer.Typer) -> None:
@@ -49,7 +62,7 @@ def sim(
     log: LogForm = None,
 ) -> int:
     """Simulate a robot's hardware, in place of a real one, until Ctrl-C."""
-    from sightline.sim.service import run
+    from sightline.sim.process import run
 
     set_log_format(log, "sim")
     options = {
@@ -155,7 +168,7 @@ def vision(
         if dry_run:
             return _dry_run(loaded.config, camera, camera_sets or [])
         if shape is not None:
-            from sightline.operator_side.shaped_vision import run_shaped
+            from sightline.evaluation.demo.shaped_vision import run_shaped
 
             return run_shaped(loaded.config, shape)  # type: ignore[arg-type]
         from sightline.vision_side.serving.process import run
@@ -200,3 +213,203 @@ def _dry_run(config: Any, camera: str | None, camera_sets: list[str]) -> int:
 
 def _ends(endpoints: list[str] | None) -> tuple[str, ...] | None:
     return tuple(endpoints) if endpoints else None
+
+
+# Commands `scenarios`, which lists them and writes what each needs, and `labels`, which plays a detector. Shell.
+
+
+def register_scenarios(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    app.command(epilog="Example: sightline scenarios thymio --out runs/thymio")(scenarios)
+    app.command(epilog="Example: sightline labels r1")(labels)
+
+
+def scenarios(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="One of them, or a .toml file.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write sim, robot and vision.toml for it.")] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Draws the start.")] = 1,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """List what can be simulated; for one scenario, show or write the configuration that its three services need."""
+    if name is None:
+        if out is not None:
+            raise ConfigError("--out writes the configuration of one scenario: name it, e.g. sightline scenarios ball")
+        _list(as_json)
+        return
+    files = _files(name, seed)
+    if out is not None:
+        _write(out, name, files)
+    elif as_json:
+        typer.echo(json.dumps(files))
+    else:
+        for service, table in files.items():
+            typer.echo(f"# {service}.toml\n{toml_text(table)}")
+
+
+def _list(as_json: bool) -> None:
+    from sightline.sim.scenario import load_scenario, scenario_names
+
+    all_of_them = [load_scenario(name) for name in scenario_names()]
+    if as_json:
+        keys = {"name", "summary", "robot", "mission", "seconds"}
+        typer.echo(json.dumps({"scenarios": [one.model_dump(include=keys) for one in all_of_them]}))
+        return
+    for one in all_of_them:
+        typer.echo(f"{one.name:<20} {one.robot:<13} {one.mission:<20} {one.summary}")
+
+
+def _files(name: str, seed: int) -> dict[str, dict[str, Any]]:
+    with needs("vision"):
+        from sightline.evaluation.scenario_config import (
+            robot_config,
+            robot_of,
+            robot_table,
+            vision_config,
+            vision_table,
+        )
+        from sightline.sim.scenario import load_scenario
+        from sightline.vision_side.missions.registry import configured_mission
+    scenario = load_scenario(name)
+    model = robot_of(scenario)
+    robot_config(model)
+    configured_mission(vision_config(scenario, model, seed))
+    return {
+        "sim": {"scenario": name, "robot": scenario.robot, "seed": seed}, "robot": robot_table(model),
+        "vision": vision_table(scenario, model, seed),
+    }
+
+
+def _write(out: Path, name: str, files: dict[str, dict[str, Any]]) -> None:
+    from sightline.sim.scenario import load_scenario
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for service, table in files.items():
+            (out / f"{service}.toml").write_text(toml_text(table), "utf-8")
+    except OSError as error:
+        raise ConfigError(f"--out {out}: {error.strerror}") from None
+    typer.echo(f"sightline sim --config {out}/sim.toml\nsightline robot --profile sim --config {out}/robot.toml\n"
+               f"sightline vision --config {out}/vision.toml")
+    if load_scenario(name).labels:
+        typer.echo("sightline labels r1")
+
+
+def labels(
+    robot: Annotated[str, typer.Argument(metavar="[ROBOT]", help="The robot's id.")] = "r1",
+    connect: Annotated[
+        list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Where the robot or router listens.")
+    ] = None,
+    secure: Annotated[str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`.")] = "",
+    socket_dir: Annotated[
+        str | None, typer.Option("--socket-dir", metavar="DIR", help="Where the simulation's sockets are.")
+    ] = None,
+) -> int:
+    """Publish what the simulation labels in its pictures as boxes, in place of a detector, until Ctrl-C."""
+    with needs("zenoh"):
+        from sightline.evaluation.labels import run
+        from sightline.sim.bus import default_socket_dir
+
+        return run(robot, connect or [DEFAULT_ENDPOINT], secure, socket_dir or default_socket_dir(), _print_line)
+
+
+def _print_line(line: str) -> None:
+    print(line, flush=True)
+
+
+# Commands about configuration: `config check | show | schema`. Shell.
+
+
+ServiceName = Annotated[str, typer.Argument(metavar="SERVICE", help="robot, vision or sim.")]
+File = Annotated[str | None, typer.Argument(metavar="[FILE]", help="The service's TOML file.")]
+Profile = Annotated[str | None, typer.Option(help="Lay this profile under it, e.g. sim.")]
+
+
+def register_config(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    group = typer.Typer(
+        help="Check, show and describe a service's configuration: defaults < profile < file < environment < --set.",
+        no_args_is_help=False, rich_markup_mode=None,
+    )
+    group.command(epilog="Example: sightline config check robot robot.toml")(check)
+    group.command(epilog="Example: sightline config show robot robot.toml --origin")(show)
+    group.command(epilog="Example: sightline config schema vision")(schema)
+    app.add_typer(group, name="config")
+
+
+def check(service: ServiceName, file: File = None, profile: Profile = None, sets: Sets = None) -> None:
+    """Say whether a configuration is good; exit 2 and name what is wrong if not."""
+    loaded = load_service(service, profile=profile, file=file, sets=sets or (), environ=os.environ)
+    _check_names(loaded.config)
+    typer.echo(f"{file or service}: ok, {len(loaded.given)} values set, the rest by default")
+
+
+def _check_names(config: BaseModel) -> None:
+    """What the configuration names, with its options: devices, scenario, robot, detectors, missions. Opens none."""
+    if isinstance(config, RobotConfig):
+        named = {"cameras": config.camera, "drives": config.motors, "range_sensors": config.ranging}
+        for group, choice in named.items():
+            if choice is not None:
+                load_device(group, choice)
+    if isinstance(config, SimConfig):
+        load_robot(config.robot or load_scenario(config.scenario).robot)
+    if isinstance(config, VisionConfig):
+        with needs("vision"):
+            from sightline.vision_side.detect.registry import check_vision
+        check_vision(config)
+
+
+def show(
+    *,
+    service: ServiceName,
+    file: File = None,
+    profile: Profile = None,
+    sets: Sets = None,
+    origin: Annotated[bool, typer.Option("--origin", help="Say where each value comes from.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """Print the configuration that a service would run with, as a TOML file that it would accept."""
+    loaded = load_service(service, profile=profile, file=file, sets=sets or (), environ=os.environ)
+    table = loaded.config.model_dump(mode="json")
+    if as_json:
+        origins = {".".join(key): given.origin for key, given in loaded.given.items()}
+        typer.echo(json.dumps({"config": table, "origins": origins} if origin else table, indent=2))
+    else:
+        typer.echo(toml_text(table, loaded.origin if origin else lambda _key: ""), nl=False)
+
+
+def schema(service: ServiceName) -> None:
+    """Print a service's configuration as JSON Schema, for editors."""
+    typer.echo(json.dumps(model_of(service).model_json_schema(), indent=2))
+
+
+# `sightline metrics`: a robot's status for Prometheus. Shell.
+
+
+ROLE = "metrics"
+
+
+def register_metrics(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command(epilog="Example: sightline metrics r1 --connect tcp/192.168.1.20:7447 --port 9464")(metrics)
+
+
+def metrics(
+    robot: Robot = "r1",
+    connect: Connect = DEFAULT_CONNECT,
+    secure: Secure = "",
+    host: Annotated[str, typer.Option(help="Address to serve on; 0.0.0.0 is a decision.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 9464,
+) -> int:
+    """Serve a robot's status to Prometheus at /metrics, and whether it is heard at /health, until Ctrl-C."""
+    with needs("metrics"):
+        import_module("prometheus_client")
+    from sightline.operator_side.cockpit.metrics import Watched
+    from sightline.operator_side.cockpit.metrics import serving
+
+    ending = threading.Event()
+    with open_link(robot, connect=connect, role=ROLE, secure=secure) as link, serving(Watched(link), host, port) as at:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda _number, _frame: ending.set())
+        typer.echo(f"metrics of {robot}: http://{host}:{at}/metrics")
+        ending.wait()
+    return 0

@@ -3,24 +3,27 @@
 import json
 import sys
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
-from typing import Annotated
-
 import typer
-
-from sightline.operator_side.client.messages import ChannelInbox
-from sightline.operator_side.channel_text import message_line, message_object
-from sightline.operator_side.cli.options import DEFAULT_CONNECT, Connect, Json, Port, Robot, Secure
-from sightline.operator_side.mission_asking import MissionClient
-from sightline.operator_side.mission_text import mission_lines
-from sightline.operator_side.pictures import viewer_role
-from sightline.operator_side.settings_errors import no_such_name
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, suppress
+from pathlib import Path
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+from sightline.operator_side.cli.options import Connect, DEFAULT_CONNECT, Json, Port, Robot, Secure
+from sightline.operator_side.client.messages import ChannelInbox, message_line, message_object
+from sightline.operator_side.client.missions import MissionClient, mission_lines
+from sightline.operator_side.client.pictures import Pictures, viewer_role
 from sightline.operator_side.client.status import status_lines
-from sightline.protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, Channel, Direction
+from sightline.operator_side.config.errors import no_such_name
+from sightline.operator_side.preflight import needs
+from sightline.protocol.channels import CHANNELS, Channel, Direction, FRAME, OVERLAY, PREVIEW
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
+from types import TracebackType
+from typing import Annotated, Final, Self
+
 
 _SHOWN = (OVERLAY.name, PREVIEW.name, FRAME.name)
 _TEXT_PERIOD_S = 0.25
@@ -109,7 +112,6 @@ def _why_silent(channel: Channel) -> str:
 
 
 def _show_text(link: Link, ends_s: float) -> int:
-    from sightline.operator_side.live_text import LiveText
 
     desk = MissionClient(link)
     with LiveText() as live:
@@ -123,3 +125,83 @@ def _show_text(link: Link, ends_s: float) -> int:
             live.show([*status_lines(link.robot, status), *(mission_lines(mission) if mission else ())])
             time.sleep(_TEXT_PERIOD_S)
     return 0
+
+
+# Lines on the terminal that are shown anew in place; one block a second where there is no terminal. Shell.
+
+
+PLAIN_S: Final = 1.0
+
+
+class LiveText:
+    """`with LiveText() as live: live.show(lines)`."""
+
+    def __init__(self) -> None:
+        console = Console()
+        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        self._due_s = 0.0
+
+    def show(self, lines: Sequence[str]) -> None:
+        """The newest; called as often as one likes."""
+        if self._live is not None:
+            self._live.update(Text("\n".join(lines), no_wrap=True, overflow="ellipsis"), refresh=True)
+        elif time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + PLAIN_S
+            print("\n".join(lines) + "\n", file=sys.stdout, flush=True)
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+
+# The command `capture`: a snapshot or a video of what a robot sees. Shell.
+
+
+_SECONDS = 5.0
+
+
+def register_capture(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command(epilog="Example: sightline capture r1 --overlay --seconds 10 --out run.mp4")(capture)
+
+
+def capture(
+    robot: Robot = "r1",
+    *,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="x.png, x.jpg or x.mp4 [default: ROBOT-DATE-TIME.png].")
+    ] = None,
+    overlay: Annotated[bool, typer.Option("--overlay", help="With what vision drew over it.")] = False,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0.1, max=3600, help="A video of this length [default: 5].")
+    ] = None,
+    connect: Connect = DEFAULT_CONNECT,
+    secure: Secure = "",
+    as_json: Json = False,
+) -> None:
+    """Save what a robot sees: one picture, or with --seconds or an .mp4 a video. Ctrl-C ends a video early."""
+    with needs("vision"):
+        from sightline.operator_side.recording.film import PICTURES, check_target, film, snapshot
+    kind = "mp4" if seconds is not None else "png"
+    path = (out or Path(f"{robot}-{time.strftime('%Y%m%d-%H%M%S')}.{kind}")).expanduser()
+    check_target(path, seconds)
+    wanted, role = OVERLAY if overlay else FRAME, viewer_role(secure)
+    with open_link(robot, connect=connect, role=role, secure=secure) as link:
+        pictures = Pictures(link, role, wanted, secure)
+        if path.suffix.lower() in PICTURES:
+            got = snapshot(pictures, path, wanted)
+        else:
+            got = film(pictures, path, wanted, _SECONDS if seconds is None else seconds)
+    if as_json:
+        typer.echo(json.dumps({"robot": robot, "file": str(path), "channel": wanted.name, "frames": got.frames,
+                               "seconds": round(got.seconds, 3), "width_px": got.width_px, "height_px": got.height_px}))
+        return
+    length = f", {got.frames} pictures in {got.seconds:.1f} s" if path.suffix.lower() == ".mp4" else ""
+    typer.echo(f"{path}: {wanted.name} of {robot}, {got.width_px}x{got.height_px}{length}")

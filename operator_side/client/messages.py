@@ -1,11 +1,18 @@
 """What is said on one channel, for who prints it: words in order, of pictures the newest. Shell (a queue)."""
 
+import math
 import queue
-from typing import Final
-
+from collections.abc import Mapping
 from sightline.operator_side.client.pictures import Viewer
-from sightline.protocol.channels import FRAME, JPEG, Channel
+from sightline.protocol.channels import Channel, FRAME, JPEG, SCAN, TWIST
+from sightline.protocol.codec import decode, decode_ranges
+from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.messages import WireModel
+from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
+from typing import Any, Final
+
 
 MAX_WAITING: Final = 64
 """Words that wait to be printed; what comes while they do is dropped and counted."""
@@ -48,3 +55,93 @@ class ChannelInbox:
             self._words.put_nowait(message)
         except queue.Full:
             self._refused += 1
+
+
+# Any message of any channel as one line for a person, or as one object for a script. Pure.
+
+
+_LEFT_OUT: Final = ("v",)
+_EMPTY: Final[tuple[Any, ...]] = (None, "", {}, [], ())
+
+
+def message_object(message: Message) -> dict[str, Any]:
+    """Header and payload, decoded, in full; what cannot be read is said in `error`. JSON types only."""
+    read: dict[str, Any] = {"channel": message.channel.name}
+    if message.source:
+        read["source"] = message.source
+    try:
+        return {**read, "header": _header(message), "payload": _payload(message)}
+    except WireError as error:
+        return {**read, "error": str(error), "header_bytes": len(message.header), "payload_bytes": len(message.payload)}
+
+
+def message_line(message: Message) -> str:
+    """One line: who, which, and what matters of it; pictures and scans only as their measures."""
+    read = message_object(message)
+    name = message.channel.name + (f"/{message.source}" if message.source else "")
+    if "error" in read:
+        return f"{name}: refused: {read['error']}"
+    header, payload = read["header"] or {}, read["payload"]
+    number = f" #{header['seq']}" if "seq" in header else " (no header)"
+    rest = _words({key: value for key, value in header.items() if key not in ("seq", *_LEFT_OUT)})
+    return f"{name}{number}: {_payload_text(message.channel, payload)}" + (f"   [{rest}]" if rest else "")
+
+
+def _header(message: Message) -> dict[str, Any] | None:
+    if not message.header:
+        return None
+    return _plain(decode(message.channel.header, message.header))
+
+
+def _payload(message: Message) -> Any:
+    channel, payload = message.channel, message.payload
+    if channel.payload is not None:
+        return _plain(decode(channel.payload, payload, channel.max_payload_bytes))
+    if channel.encoding == JPEG:
+        size = read_jpeg_size(payload)
+        return {"width_px": size.width_px, "height_px": size.height_px, "bytes": len(payload)}
+    if channel is TWIST:
+        return _plain(parse_twist(payload))
+    if channel is SCAN:
+        return {"ranges_m": [None if math.isinf(one) else round(one, 4) for one in decode_ranges(payload)]}
+    return None
+
+
+def _plain(model: WireModel) -> dict[str, Any]:
+    return model.model_dump(mode="json")
+
+
+def _payload_text(channel: Channel, payload: Any) -> str:
+    if payload is None:
+        return "-"
+    if channel.encoding == JPEG:
+        return f"{payload['width_px']}x{payload['height_px']} JPEG, {payload['bytes']} bytes"
+    if channel is TWIST:
+        return f"{payload['linear_mps']:+.4f} m/s {payload['angular_rad_s']:+.4f} rad/s"
+    if channel is SCAN:
+        return _scan_text(payload["ranges_m"])
+    return _words(payload)
+
+
+def _scan_text(ranges_m: list[float | None]) -> str:
+    seen = [one for one in ranges_m if one is not None]
+    nearest = f"nearest {min(seen):.2f} m" if seen else "nothing near"
+    return f"{len(ranges_m)} rays, {len(seen)} see something, {nearest}"
+
+
+def _words(values: Mapping[str, Any]) -> str:
+    """`name=value`, what is empty left out."""
+    return " ".join(f"{name}={_word(value)}" for name, value in values.items()
+                    if name not in _LEFT_OUT and value not in _EMPTY)
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + _words(value) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_word(one) for one in value) + "]"
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.1f}"
+    if isinstance(value, str):
+        return value if value.isprintable() and value and " " not in value else repr(value)
+    return str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,8 +1,20 @@
 """A thread for each connection, while there is a place: what serves beside a robot stays small. Shell (threads)."""
 
+import json
 import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from html import escape
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from importlib.resources import files
+from pathlib import Path
+from sightline.protocol.errors import LinkError, SightlineError
+from sightline.protocol.transports.diagnosis import port_owner
 from socketserver import ThreadingMixIn
 from typing import Any, Final
+from urllib.parse import parse_qsl, urlsplit
+
 
 MAX_CONNECTIONS: Final = 32
 """Security limit: one more is closed at once. A browser holds six."""
@@ -31,3 +43,135 @@ class BoundedThreads(ThreadingMixIn):
             super().process_request_thread(request, client_address)
         finally:
             self._places.release()
+
+
+# A small page for one person on this machine: routes over HTTP, on loopback only. Shell (an HTTP server).  Foreign
+# sites are kept out: a request must name this machine as its host, and what changes something must come from the page
+# itself.
+
+
+HOST: Final = "127.0.0.1"
+MAX_BODY_BYTES: Final = 4096
+"""Security limit: what a page posts."""
+SILENCE_S: Final = 20.0
+"""Security limit: a connection that says nothing for this long is closed."""
+_MAX_FIELDS: Final = 16
+_NAMES: Final = ("127.0.0.1", "localhost", "[::1]")
+_POLICY: Final = "default-src 'self'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+_KINDS: Final = {".html": "text/html; charset=utf-8", ".mjs": "text/javascript; charset=utf-8"}
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What is sent back."""
+
+    body: bytes = b""
+    kind: str = "application/json"
+    status: int = 200
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+PageRequest = Mapping[str, str]
+Route = Callable[[PageRequest, bytes], Answer]
+
+
+def as_json(value: Any, status: int = 200) -> Answer:
+    """`value` as an answer."""
+    return Answer(json.dumps(value).encode(), status=status)
+
+
+def page(name: str, **words: str) -> Answer:
+    """A file of `operator_side/cockpit/pages`, with `{{word}}` filled in; what the words say is text, never HTML."""
+    text = files("sightline.operator_side").joinpath("pages", name).read_text("utf-8")
+    for word, value in words.items():
+        text = text.replace("{{" + word + "}}", escape(value))
+    return Answer(text.encode(), _KINDS[Path(name).suffix])
+
+
+@contextmanager
+def served(routes: Mapping[str, Route], port: int) -> Iterator[str]:
+    """Serve `routes` ("GET /", "POST /pick" ...) while inside; gives the address. Port 0 is any that is free.
+
+    Raises LinkError for a port in use.
+    """
+    try:
+        server = _Server((HOST, port), type("Handler", (_Handler,), {"routes": dict(routes)}))
+    except (OSError, OverflowError) as error:
+        owner = port_owner(port)
+        cause = f"port {port} is in use by {owner}; choose another with --port" if owner else str(error)
+        raise LinkError(f"cannot serve a page on {HOST}:{port}: {cause}") from None
+    threading.Thread(target=server.serve_forever, args=(0.05,), name="page", daemon=True).start()
+    try:
+        yield f"http://{HOST}:{server.server_port}/"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def _answered(route: Route, query: str, body: bytes) -> Answer:
+    """What the route says; what was asked in a wrong way is said as such."""
+    try:
+        return route(dict(parse_qsl(query, max_num_fields=_MAX_FIELDS)), body)
+    except SightlineError as error:
+        return as_json({"error": str(error)}, 400)
+    except (ValueError, KeyError, TypeError) as error:
+        return as_json({"error": f"this is not asked rightly: {error}"}, 400)
+
+
+class _Server(BoundedThreads, HTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that goes away in the middle is no news."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """One connection. Its class carries what is served."""
+
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "sightline", ""
+    timeout = SILENCE_S
+    routes: Mapping[str, Route]
+
+    def do_GET(self) -> None:
+        self._answer("GET")
+
+    def do_POST(self) -> None:
+        self._answer("POST")
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Never a line per request."""
+
+    def _answer(self, method: str) -> None:
+        refusal = self._refusal(method)
+        if refusal is not None:
+            self.close_connection = True  # the body, if any, is not read
+            self._send(refusal)
+            return
+        target = urlsplit(self.path)
+        route = self.routes.get(f"{method} {target.path}")
+        body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
+        if route is None:
+            self._send(as_json({"error": "no such page"}, 404))
+        else:
+            self._send(_answered(route, target.query, body))
+
+    def _refusal(self, method: str) -> Answer | None:
+        host = self.headers.get("Host", "")
+        if host.rpartition(":")[0] not in _NAMES and host not in _NAMES:
+            return as_json({"error": "this page is for this machine alone"}, 403)
+        if method == "POST" and (self.headers.get("Origin", f"http://{host}") != f"http://{host}"
+                                 or self.headers.get("Content-Type") != "application/json"):
+            return as_json({"error": "this is not the page itself"}, 403)
+        length = self.headers.get("Content-Length") or "0"
+        if not (length.isascii() and length.isdigit() and len(length) < 8 and int(length) <= MAX_BODY_BYTES):
+            return as_json({"error": f"at most {MAX_BODY_BYTES} bytes"}, 413)
+        return None
+
+    def _send(self, answer: Answer) -> None:
+        self.send_response(answer.status)
+        fixed = {"Content-Type": answer.kind, "Content-Length": str(len(answer.body)), "Cache-Control": "no-store",
+                 "Cross-Origin-Resource-Policy": "same-origin", "X-Content-Type-Options": "nosniff",
+                 "Content-Security-Policy": _POLICY}
+        for name, value in {**fixed, **answer.headers}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(answer.body)

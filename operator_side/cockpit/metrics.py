@@ -7,18 +7,27 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final, Protocol
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
-
+from sightline.operator_side.client.requests import read_report
 from sightline.operator_side.cockpit.http_server import BoundedThreads
-from sightline.protocol.errors import LinkError
+from sightline.protocol.channels import STATUS
+from sightline.protocol.errors import LinkError, WireError
+from sightline.protocol.messages import State, Status, StreamStatus
 from sightline.protocol.transports.diagnosis import port_owner
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.security import ROBOT_ROLE
+from sightline.protocol.transports.zenoh.presence import PeerInfo
+from typing import Any, Final, Protocol, TYPE_CHECKING
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 if TYPE_CHECKING:
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
+
+if TYPE_CHECKING:
     Family = GaugeMetricFamily | CounterMetricFamily
 
 _IDLE_S: Final = 20
@@ -108,3 +117,99 @@ def _listening(host: str, port: int, answer: Callable[..., Iterable[bytes]]) -> 
         by = f" by {owner}" if owner else ""
         cause = f"port {port} is in use{by}; choose another" if owner else error.strerror
         raise LinkError(f"cannot serve on {host}:{port}: {cause}") from None
+
+
+# A robot's status for Prometheus. Shell (a link).
+
+
+FRESH_S: Final = 2.0
+"""A robot that was not heard for longer is down."""
+
+
+class Watched:
+    """The newest status of one robot, and when it came. A Prometheus collector."""
+
+    def __init__(self, link: Link) -> None:
+        self._robot = link.robot
+        self._newest: tuple[Status, float] | None = None
+        self._entered: Counter[str] = Counter()
+        self._peers: Callable[[], list[PeerInfo]] = getattr(link, "peers", list)
+        link.subscribe(STATUS, self._on_status)
+
+    def _on_status(self, message: Message) -> None:
+        try:
+            status = read_report(message).status
+        except WireError:
+            return
+        before = self._newest
+        self._entered[status.state.value] += before is not None and before[0].state is not status.state
+        self._newest = (status, time.monotonic())
+
+    def fresh(self) -> Status | None:
+        """The status, unless it is too old."""
+        newest = self._newest
+        return newest[0] if newest is not None and time.monotonic() - newest[1] <= FRESH_S else None
+
+    def is_heard(self) -> bool:
+        """Whether the robot is heard."""
+        return self.fresh() is not None
+
+    def collect(self) -> Iterator[Family]:
+        """All that is known now; only `sightline_up` of a robot that is not heard."""
+        status = self.fresh()
+        yield self._gauge("up", "whether the robot is heard", float(status is not None))
+        if status is not None:
+            yield from self._of(status)
+            yield from self._drops(status.stream)
+            yield from self._round_trip()
+
+    def _of(self, status: Status) -> Iterator[Family]:
+        stream = status.stream
+        yield gauge("state", "1 for the state it is in",
+                    {(self._robot, one.value): float(one is status.state) for one in State}, "robot", "state")
+        yield self._gauge("linear_mps", "forward speed applied", status.applied[0])
+        yield self._gauge("angular_rad_s", "turning speed applied, left positive", status.applied[1])
+        yield from self._times(status)
+        yield self._gauge("stream_fps", "frames sent in the last second", stream.fps)
+        yield self._gauge("stream_window", "frames that may be in flight", stream.window)
+        yield self._counter("frames_sent", "frames sent", stream.sent)
+        yield self._counter("frames_unanswered", "frames whose answer never came", stream.credit_timeouts)
+        yield self._counter("commands_accepted", "commands accepted", status.accepted)
+        yield self._by("commands_refused", "commands refused", "reason", status.refused)
+        yield self._counter("network_restarts", "restarts of the network process", status.network_restarts)
+        yield self._counter("holds", "times it was seen to begin to hold, at ten looks a second",
+                            self._entered[State.HOLD.value])
+
+    def _times(self, status: Status) -> Iterator[Family]:
+        for name, about, value_us in (
+            ("frame_age_seconds", "age of the frame behind the applied command", status.frame_age_us),
+            ("latency_seconds", "capture to command, as the robot measures it", status.latency_us),
+            ("tick_late_max_seconds", "latest tick of the driver's loop", status.tick_late_max_us),
+        ):
+            if value_us is not None:
+                yield self._gauge(name, about, value_us / 1e6)
+
+    def _drops(self, stream: StreamStatus) -> Iterator[Family]:
+        """What was replaced by something newer, slot by slot."""
+        yield self._counter("commands_dropped", "commands the driver had no room for", stream.dropped_commands)
+        yield self._counter("captures_missed", "captures that the stream asked for too late", stream.missed_captures)
+        yield self._counter("frames_overtaken", "frames that a newer one replaced on the way", stream.overtaken)
+        yield self._counter("pictures_refused", "pictures of the camera that were no usable JPEG",
+                            stream.refused_pictures)
+        yield self._by("messages_dropped", "messages replaced on the way out", "channel", stream.dropped)
+
+    def _round_trip(self) -> Iterator[Family]:
+        """Asked of the robot's network process at every look; nothing where that cannot be asked."""
+        for peer in self._peers():
+            if peer.presence.role == ROBOT_ROLE and peer.presence.robot == self._robot:
+                yield self._gauge("round_trip_seconds", "there and back on the link", peer.round_trip_us / 1e6)
+                return
+
+    def _gauge(self, name: str, about: str, value: float) -> Family:
+        return gauge(name, about, {(self._robot,): value}, "robot")
+
+    def _counter(self, name: str, about: str, value: float) -> Family:
+        return counter(name, about, {(self._robot,): value}, "robot")
+
+    def _by(self, name: str, about: str, label: str, counts: dict[str, int]) -> Family:
+        return counter(name, about, {(self._robot, key): value for key, value in counts.items()}, "robot", label)

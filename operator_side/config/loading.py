@@ -7,20 +7,18 @@ Environment names are SIGHTLINE_<SERVICE>__<KEY>, `__` for each dot: SIGHTLINE_R
 """
 
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
-
 from pydantic import ValidationError
-
-from sightline.operator_side.settings_errors import explain, no_such_name
-from sightline.operator_side.config.errors import is_known, known_keys
+from sightline.operator_side.config.errors import explain, is_known, known_keys, no_such_name
 from sightline.protocol.channels import check_robot_id
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import LOG_FORMAT_VARIABLE
 from sightline.protocol.transports.open import check_endpoint
+from typing import Any, Final
+
 
 SERVICES: Final = ("robot", "vision", "sim")
 ENV_PREFIX: Final = "SIGHTLINE_"
@@ -65,7 +63,7 @@ def model_of(service: str) -> type[Config]:
 
         return VisionConfig
     if service == "sim":
-        from sightline.sim.service import SimConfig
+        from sightline.sim.process import SimConfig
 
         return SimConfig
     raise ConfigError(no_such_name("service", service, SERVICES))
@@ -265,3 +263,34 @@ def _label(given: Mapping[Key, Given], key: Key) -> str:
     if one.origin == "--set":
         return f"--set {dotted}"
     return one.origin if one.origin.startswith((ENV_PREFIX, "--")) else f"{one.origin}: {dotted}"
+
+
+# The configuration a service is started with: what was given, and what that implies. Shell.
+
+
+def load_service(
+    service: str,
+    *,
+    environ: Mapping[str, str],
+    profile: str | None = None,
+    file: str | None = None,
+    sets: Sequence[str] = (),
+    options: Mapping[str, Any] | None = None,
+) -> Loaded:
+    """As `settings.load`, with the values implied by others filled in. Raises ConfigError as it does."""
+    given: dict[str, Any] = {
+        "profile": profile, "file": file, "sets": sets, "options": options, "environ": environ,
+    }
+    loaded = load(service, **given)
+    implied = tuple(_implied(loaded))
+    return load(service, **given, implied=implied) if implied else loaded
+
+
+def _implied(loaded: Loaded) -> Iterator[Given]:
+    """A robot told where to connect need not listen, nor a vision box told to listen connect."""
+    service = loaded.service
+    listens, connects = (loaded.origin((name,)) != "default" for name in ("listen", "connect"))
+    if service == "robot" and connects and not listens:
+        yield Given(("listen",), (), "implied by connect")
+    if service == "vision" and listens and not connects:
+        yield Given(("connect",), (), "implied by listen")

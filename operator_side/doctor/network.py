@@ -11,20 +11,20 @@ from statistics import median, quantiles
 
 from sightline.operator_side.client.pictures import Viewer
 from sightline.operator_side.doctor.finding import Finding, histogram, trouble
-from sightline.operator_side.pictures import viewer_role
+from sightline.operator_side.client.pictures import viewer_role
 from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.client.status import encoding_text, stream_is_whole
 from sightline.protocol.channels import FRAME
 from sightline.protocol.errors import SightlineError
 from sightline.protocol.messages import Status
-from sightline.protocol.transports import endpoints, websocket_endpoints
+from sightline.protocol.transports import endpoints, endpoints as websocket_endpoints
 from sightline.protocol.transports.link import Link
 from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.zenoh.presence import QUERY_ROUNDS, PeerInfo, best_round_trips
 from sightline.protocol.transports.security import ROBOT_ROLE
 from sightline.protocol.transports.zenoh.discovery import find_listeners
 from sightline.protocol.transports.zenoh.session import LOOPBACK
-from sightline.protocol.transports.zenoh_presence import software_version
+from sightline.protocol.transports.zenoh.presence import software_version
 
 ROLE = "doctor"
 ARP_TABLE = Path("/proc/net/arp")

@@ -1,16 +1,26 @@
 """JPEG from a robot -> all of its pixels, bounded as vision bounds it. Pure."""
 
-from functools import lru_cache
+from __future__ import annotations
 
+import cv2
 import numpy as np
 import simplejpeg
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
 from numpy.typing import NDArray
-
-from sightline.protocol.errors import WireError
+from pathlib import Path
+from sightline.operator_side.client.pictures import Pictures, Shot
+from sightline.operator_side.preflight import check_out_file, needs
+from sightline.protocol.channels import Channel, OVERLAY
+from sightline.protocol.errors import ConfigError, LinkError, RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.refusals import RejectReason
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
+from types import TracebackType
+from typing import Any, Final, Self
 
 
 def jpeg_pixels(jpeg: bytes) -> NDArray[np.uint8]:
@@ -27,3 +37,170 @@ def jpeg_pixels(jpeg: bytes) -> NDArray[np.uint8]:
 @lru_cache(maxsize=4)
 def _checker(width_px: int, height_px: int) -> Decoder:
     return Decoder(width_px, height_px, VisionConfig().max_pixels)
+
+
+# A film on disk, H.264 in MP4, each picture at its own time. Shell (writes a file).
+
+
+Image = NDArray[np.uint8]
+_TICKS_PER_S: Final = 90_000  # what players expect of H.264
+_TIME_BASE: Final = Fraction(1, _TICKS_PER_S)
+_ENCODING: Final = {"preset": "veryfast", "crf": "23"}
+
+
+class Film:
+    """`with Film(path, fps) as film: film.add(picture, t_us)`. Pictures of another size are made to fit the first."""
+
+    def __init__(self, path: Path, fps: int) -> None:
+        """`fps` is only told to the encoder. Raises ConfigError without PyAV or for a place that cannot be written."""
+        with needs("report"):
+            import av
+        try:
+            self._container = av.open(str(path), "w", options={"movflags": "+faststart"})
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from None
+        self._av, self._fps = av, fps
+        self._stream: Any = None
+        self._first_us = self._last_ticks = -1
+        self.frames = 0
+
+    def add(self, picture: Image, t_us: int) -> bool:
+        """One more picture (BGR); False, and left out, if it is not later than the last."""
+        if self._stream is None:
+            self._first_us = t_us
+            self._stream = self._opened(picture)
+        ticks = (t_us - self._first_us) * _TICKS_PER_S // 1_000_000
+        if ticks <= self._last_ticks:
+            return False
+        self._last_ticks = ticks
+        frame = self._av.VideoFrame.from_ndarray(self._fitted(picture), format="bgr24")
+        frame.pts, frame.time_base = ticks, _TIME_BASE
+        self._container.mux(self._stream.encode(frame))
+        self.frames += 1
+        return True
+
+    @property
+    def seconds(self) -> float:
+        """From the first picture to the last."""
+        return max(0, self._last_ticks) / _TICKS_PER_S
+
+    def close(self) -> None:
+        """Write what the encoder still holds, and the index."""
+        if self._stream is not None:
+            self._container.mux(self._stream.encode(None))
+        self._container.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _opened(self, picture: Image) -> Any:
+        stream = self._container.add_stream("libx264", rate=self._fps)
+        height, width = picture.shape[:2]
+        stream.width, stream.height = max(2, width - width % 2), max(2, height - height % 2)
+        stream.pix_fmt = "yuv420p"  # what every player shows; it wants even sides
+        stream.time_base = stream.codec_context.time_base = _TIME_BASE
+        stream.options = dict(_ENCODING)
+        return stream
+
+    def _fitted(self, picture: Image) -> Image:
+        size = (self._stream.width, self._stream.height)
+        if (picture.shape[1], picture.shape[0]) == size:
+            return np.ascontiguousarray(picture)
+        if (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2) == size:
+            return np.ascontiguousarray(picture[: size[1], : size[0]])
+        return np.ascontiguousarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+# Takes a snapshot or a video of what a robot sees. Shell (waits, writes files).
+
+
+PICTURES: Final = (".png", ".jpg", ".jpeg")
+VIDEO: Final = ".mp4"
+PATIENCE_S: Final = 5.0
+_WAIT_S: Final = 0.5
+_FPS: Final = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """What was written."""
+
+    path: Path
+    frames: int
+    seconds: float
+    width_px: int
+    height_px: int
+
+
+def check_target(path: Path, seconds: float | None) -> None:
+    """Raise ConfigError for a file that is neither picture nor video, or that cannot be there."""
+    kind = path.suffix.lower()
+    if kind not in (*PICTURES, VIDEO):
+        raise ConfigError(f"{path}: a snapshot ends in .png or .jpg, a video in .mp4")
+    if kind in PICTURES and seconds is not None:
+        raise ConfigError(f"--seconds is for a video, and {path} is a picture: write --out NAME.mp4")
+    check_out_file(path)
+
+
+def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
+    """Write the next picture to `path`: as PNG, or as the JPEG that came. Raises LinkError if none comes."""
+    ends_s = time.monotonic() + PATIENCE_S
+    while (shot := _wanted(pictures, wanted, ends_s)) is not None:
+        with suppress(WireError):  # the next one may be whole
+            data = shot.jpeg if path.suffix.lower() != ".png" else cv2.imencode(".png", jpeg_pixels(shot.jpeg))[1]
+            _write(path, bytes(data))
+            return Captured(path, 1, 0.0, shot.width_px, shot.height_px)
+    raise LinkError(_silence(pictures, wanted))
+
+
+def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Captured:
+    """Write what is seen for `seconds`, or until Ctrl-C, to `path`. Raises LinkError if no picture comes."""
+    unfinished = path.with_name(f".{path.name}.part.mp4")
+    size = (0, 0)
+    try:
+        with Film(unfinished, _FPS) as made, suppress(KeyboardInterrupt):
+            ends_s = 0.0  # from the first picture on
+            while (shot := _wanted(pictures, wanted, ends_s or time.monotonic() + PATIENCE_S)) is not None:
+                ends_s = ends_s or time.monotonic() + seconds
+                size = size if any(size) else (shot.width_px, shot.height_px)
+                with suppress(WireError):  # one lost picture
+                    made.add(jpeg_pixels(shot.jpeg), shot.t_us)
+        if not made.frames:
+            raise LinkError(_silence(pictures, wanted))
+        unfinished.replace(path)
+        return Captured(path, made.frames, made.seconds, *size)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _wanted(pictures: Pictures, wanted: Channel, ends_s: float) -> Shot | None:
+    """The next picture of that channel; None at the end."""
+    while (left_s := ends_s - time.monotonic()) > 0:
+        shot = pictures.take(min(left_s, _WAIT_S))
+        if shot is not None and shot.channel is wanted:
+            return shot
+    return None
+
+
+def _silence(pictures: Pictures, wanted: Channel) -> str:
+    robot = pictures.robot
+    if not pictures.is_heard:
+        return f"robot {robot!r} is not heard within {PATIENCE_S:g} s; `sightline robots` lists who is"
+    if wanted is OVERLAY:
+        return f"no overlay of robot {robot!r} within {PATIENCE_S:g} s; does `sightline vision` run for it?"
+    return f"no picture of robot {robot!r} within {PATIENCE_S:g} s; does its camera deliver? see `sightline status`"
+
+
+def _write(path: Path, data: bytes) -> None:
+    unfinished = path.with_name(f".{path.name}.part")
+    try:
+        unfinished.write_bytes(data)
+        unfinished.replace(path)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None

@@ -21,11 +21,11 @@ from sightline.protocol.messages import (
     RequestId,
     Stamp,
 )
-from sightline.protocol.mission_messages import MissionRequest
+from sightline.protocol.messages import MissionRequest
 from sightline.protocol.transports.link import Message
 from sightline.protocol.text import format_twist
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.boxes import BoxReader
+from sightline.vision_side.tracking.locate import BoxReader
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.missions.registry import requested_mission
 from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, PipelineAnswer

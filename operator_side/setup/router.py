@@ -10,8 +10,8 @@ from contextlib import closing
 
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints
 from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
-from sightline.protocol.transports.zenoh_log import log_rejected_peers
-from sightline.protocol.transports.zenoh_session import open_session
+from sightline.protocol.transports.zenoh.access_log import log_rejected_peers
+from sightline.protocol.transports.zenoh.session import open_session
 
 _REACH_S = 5.0
 

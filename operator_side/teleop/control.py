@@ -1,43 +1,203 @@
-"""`sightline teleop`: a person drives, holding a key. Keys, frames and status in; messages for the robot out. Pure.
-
-Every command cites the newest frame seen, so the robot itself judges how old the link is, as it does with any driver. A
-person who lets go sends zeros and keeps the lease; one who is gone loses it, and the robot stops.
-"""
+"""How fast teleop drives: speeds that keys change, and a ramp for speeding up. Pure."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from enum import Enum
-from typing import Final
-
 from sightline.operator_side.client.requests import Report, read_report
-from sightline.operator_side.teleop_keys import (
-    FRESH_US,
-    HAND_OVER,
-    MOST_AT_ONCE,
-    MOVES,
-    SPEEDS,
-    STOPS,
-    Hold,
-    split_keys,
-)
-from sightline.operator_side.teleop_speed import Speeds, SpeedUp
-from sightline.protocol.channels import ACK, REPLY, REQUEST, TWIST, Channel
+from sightline.protocol.channels import ACK, Channel, REPLY, REQUEST, TWIST
 from sightline.protocol.codec import decode, encode
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import (
-    STILL,
     AnswerHeader,
     Echo,
     FrameHeader,
     Reply,
     Request,
     RequestHeader,
+    STILL,
     State,
+    Status,
     Twist,
     Verb,
 )
-from sightline.protocol.refusals import RejectReason
-from sightline.protocol.transports.link import Message
 from sightline.protocol.text import format_twist
+from sightline.protocol.transports.link import Message
+from typing import Final
+
+
+_STEP: Final = 1.1
+"""A key press changes a speed by 10 %."""
+_LEAST_MPS: Final = 0.02
+_LEAST_RAD_S: Final = 0.1
+_RAMP_MPS2: Final = 0.8
+_RAMP_RAD_S2: Final = 5.0
+_FIRST_STEP_US: Final = 30_000
+"""A press moves the robot with the very first command."""
+_LONGEST_STEP_US: Final = 100_000
+
+
+@dataclass(slots=True)
+class Speeds:
+    """Wanted top speeds, within what the robot says it can do."""
+
+    linear_mps: float
+    angular_rad_s: float
+    most_mps: float = 3.0
+    most_rad_s: float = 10.0
+
+    def change(self, linear: int, angular: int) -> None:
+        """By 10 % up (1) or down (-1) each."""
+        self.linear_mps *= _STEP**linear
+        self.angular_rad_s *= _STEP**angular
+        self._keep()
+
+    def limit(self, status: Status) -> None:
+        """The robot's own limits; a robot that says none keeps what was."""
+        self.most_mps = status.max_linear_mps or self.most_mps
+        self.most_rad_s = status.max_angular_rad_s or self.most_rad_s
+        self._keep()
+
+    def _keep(self) -> None:
+        self.linear_mps = max(min(_LEAST_MPS, self.most_mps), min(self.most_mps, self.linear_mps))
+        self.angular_rad_s = max(min(_LEAST_RAD_S, self.most_rad_s), min(self.most_rad_s, self.angular_rad_s))
+
+
+class SpeedUp:
+    """Brings the twist to its goal: up by a ramp, down at once. A release is zero in the very next command."""
+
+    def __init__(self) -> None:
+        self.twist = STILL
+        self._stepped_us: int | None = None
+
+    def step(self, goal: Twist, now_us: int) -> Twist:
+        """The twist to command now."""
+        elapsed_us = _FIRST_STEP_US if self._stepped_us is None else min(_LONGEST_STEP_US, now_us - self._stepped_us)
+        self._stepped_us = now_us
+        self.twist = Twist(
+            linear_mps=_towards(self.twist.linear_mps, goal.linear_mps, _RAMP_MPS2 * elapsed_us / 1e6),
+            angular_rad_s=_towards(self.twist.angular_rad_s, goal.angular_rad_s, _RAMP_RAD_S2 * elapsed_us / 1e6),
+        )
+        return self.twist
+
+
+def _towards(speed: float, goal: float, change: float) -> float:
+    """`goal` where that is slower the same way; else nearer to it by `change`, from zero where the way reverses."""
+    start = speed if speed * goal > 0 else 0.0
+    if abs(goal) <= abs(start):
+        return goal
+    return min(goal, start + change) if goal > 0 else max(goal, start - change)
+
+
+# What keys mean to `sightline teleop`, and whether one is still held. Pure.  A terminal tells presses and repeats,
+# never releases. So a key counts as held for a little longer than its repeats are apart, which is learnt from the
+# repeats themselves; before the first repeat, a little longer than the terminal's delay.
+
+
+MOVES: Final[dict[str, tuple[int, int]]] = {
+    "u": (1, 1), "i": (1, 0), "o": (1, -1),
+    "j": (0, 1), "l": (0, -1),
+    "m": (-1, -1), ",": (-1, 0), ".": (-1, 1),
+    "\x1b[A": (1, 0), "\x1b[B": (-1, 0), "\x1b[D": (0, 1), "\x1b[C": (0, -1),
+}  # fmt: skip
+"""Key -> share of (linear, angular) speed. Back and to the left turns clockwise, as a car that backs up does."""
+SPEEDS: Final[dict[str, tuple[int, int]]] = {
+    "q": (1, 1), "z": (-1, -1), "w": (1, 0), "x": (-1, 0), "e": (0, 1), "c": (0, -1),
+}  # fmt: skip
+"""Key -> whether (linear, angular) speed goes up or down."""
+STOPS: Final = ("k", " ", "\x1b[E")
+HAND_OVER: Final = "a"
+MOST_AT_ONCE: Final = 4
+"""Keys of one read that hands on a keyboard may bring: at 30 repeats a second, what comes in 130 ms."""
+
+_FIRST_DELAY_US: Final = 500_000
+"""From a press to its first repeat on most desktops, until it is learnt."""
+_SLACK: Final = 1.3
+_LONGEST_FIRST_US: Final = 900_000
+_FIRST_INTERVAL_US: Final = 35_000
+_INTERVALS: Final = 3
+_SHORTEST_HOLD_US: Final = 80_000
+LONGEST_HOLD_US: Final = 120_000
+"""With the period of the commands on top, a release is a zero command within 150 ms."""
+_REPEATS_WITHIN_US: Final = 150_000
+"""What comes later is another press."""
+_FORGOTTEN_US: Final = 1_000_000
+FRESH_US: Final = 300_000
+"""A press after this long without any is a new decision to drive: only such a one arms a robot."""
+
+
+def split_keys(text: str) -> list[str]:
+    """The keys of what was read: an arrow is three characters. What is cut off or unknown stays as single ones."""
+    keys: list[str] = []
+    at = 0
+    while at < len(text):
+        length = 3 if text[at : at + 2] in ("\x1b[", "\x1bO") else 1
+        keys.append(text[at : at + length].replace("\x1bO", "\x1b["))
+        at += length
+    return keys
+
+
+@dataclass(slots=True)
+class Hold:
+    """The movement key that is held, as far as repeats tell."""
+
+    key: str = ""
+    delay_us: int = _FIRST_DELAY_US
+    interval_us: int = _FIRST_INTERVAL_US
+    _presses: int = 0
+    _first_gap_us: int = 0
+    _last_us: int | None = None
+
+    def press(self, key: str, now_us: int) -> bool:
+        """A movement key came, pressed or repeated. True for a fresh press, after a while without any."""
+        gap_us = _FORGOTTEN_US if self._last_us is None else now_us - self._last_us
+        if gap_us == 0 and key == self.key:
+            return False  # several repeats of one read
+        self._last_us = now_us
+        if self._is_repeat(key, gap_us):
+            self._learn(gap_us)
+            self._presses += 1
+            return False
+        self.key, self._presses = key, 1
+        return gap_us >= FRESH_US
+
+    def _is_repeat(self, key: str, gap_us: int) -> bool:
+        """The first repeat comes after the terminal's delay, the others soon after one another."""
+        return key == self.key and gap_us < (_FORGOTTEN_US if self._presses == 1 else _REPEATS_WITHIN_US)
+
+    def _learn(self, gap_us: int) -> None:
+        """The delay is believed once a quick repeat has followed it: somebody who taps has none."""
+        if self._presses == 1:
+            self._first_gap_us = gap_us
+            return
+        if self._presses == 2 and self._first_gap_us > _REPEATS_WITHIN_US:
+            self.delay_us = self._first_gap_us
+        self.interval_us += (gap_us - self.interval_us) // 4
+
+    def release(self) -> None:
+        """Nothing is held any more."""
+        self.key, self._presses = "", 0
+
+    def miss(self, now_us: int) -> None:
+        """Keys came that tell nothing of now; what follows them is no fresh press."""
+        self.release()
+        self._last_us = now_us
+
+    def is_held(self, now_us: int) -> bool:
+        """Whether the key has to be taken as held."""
+        return bool(self.key) and self._last_us is not None and now_us - self._last_us <= self.patience_us
+
+    @property
+    def patience_us(self) -> int:
+        """How long after the last press or repeat the key counts as held."""
+        if self._presses <= 1:
+            return min(_LONGEST_FIRST_US, round(self.delay_us * _SLACK))
+        return max(_SHORTEST_HOLD_US, min(LONGEST_HOLD_US, _INTERVALS * self.interval_us))
+
+
+# `sightline teleop`: a person drives, holding a key. Keys, frames and status in; messages for the robot out. Pure.
+# Every command cites the newest frame seen, so the robot itself judges how old the link is, as it does with any
+# driver. A person who lets go sends zeros and keeps the lease; one who is gone loses it, and the robot stops.
+
 
 SOURCE: Final = "teleop"
 PERIOD_US: Final = 30_000

@@ -28,7 +28,7 @@ from sightline.protocol.spec.message_cases import (
     packed,
     without,
 )
-from sightline.protocol.legacy import decode_picture, encode_picture, parse_boxes, parse_dashed
+from sightline.protocol.text import decode_picture, encode_picture, parse_boxes, parse_dashed
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, parse_hello, unpack
 
 Fields = dict[str, Any]

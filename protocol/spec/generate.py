@@ -17,11 +17,11 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from sightline.protocol.spec import golden
-from sightline.protocol import refusals
+from sightline.protocol import errors as refusals
 from sightline.protocol.spec.asyncapi import document
 from sightline.protocol.channels import CHANNELS, key_for
 from sightline.protocol.spec.field_docs import doc_of, unit_of
-from sightline.protocol.refusals import CLAMPED, RejectReason
+from sightline.protocol.errors import CLAMPED, RejectReason
 from sightline.protocol.transports.websocket.framing import Hello
 
 HERE: Final = Path(__file__).parent.parent

@@ -19,7 +19,7 @@ from sightline.protocol.channels import ACK, JPEG, SCAN, TWIST, Channel, parse_k
 from sightline.protocol.codec import check_sizes, decode, decode_ranges
 from sightline.protocol.errors import WireError
 from sightline.protocol.spec.message_cases import MessageCase
-from sightline.protocol.golden_cases import CASES
+from sightline.protocol.spec.message_cases import CASES
 from sightline.protocol.spec.framing_cases import FRAMING_CASES, FramingCase, framing_outcome
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.text import parse_twist

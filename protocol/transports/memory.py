@@ -19,7 +19,7 @@ from typing import Final, NamedTuple, Self
 
 from sightline.protocol.channels import FRAME, Channel, Direction, parse_key, pattern_for
 from sightline.protocol.transports.link import LatestSlot, Message
-from sightline.protocol.transports.link_rules import LinkRules
+from sightline.protocol.transports.link import LinkRules
 
 MAX_IN_FLIGHT: Final = 4096
 """Messages under way in one network; what would go over is dropped and counted as `overflow`."""
@@ -211,7 +211,7 @@ class MemoryLink:
 
     @property
     def refused(self) -> Counter[str]:
-        """Messages turned away, by reason (see `sightline.protocol.transports.link_rules`)."""
+        """Messages turned away, by reason (see `sightline.protocol.transports.link`)."""
         return self._rules.refused
 
     @property

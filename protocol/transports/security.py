@@ -6,14 +6,21 @@ denied: whoever listens denies all that is not listed here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hmac
+import ipaddress
+import re
+import select
+import socket
+import ssl
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from sightline.protocol.channels import CHANNELS, Channel, Direction, KEY_PREFIX, MAX_HEADER_BYTES, REQUEST
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_zenoh_endpoint, with_allowed
 from typing import Any, Final
 
-from sightline.protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REQUEST, Channel, Direction
-from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
 
 ROBOT_ROLE: Final = "robot"
 SOURCES_OF_ROLE: Final[dict[str, tuple[str, ...]]] = {
@@ -150,3 +157,160 @@ def _presence_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
         ("asks", "ingress", ["query"], all_of_it),
         ("is answered", "egress", ["declare_queryable", "reply"], all_of_it),
     ]
+
+
+# The tokens of roles in a `--secure` folder, one file each: `vision.token`, `operator.token` ... Shell (reads files).
+#
+# Who shows the text of one comes in as that role.
+
+
+_TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{16,128}")
+
+
+def read_tokens(folder: str) -> Mapping[str, str]:
+    """Token -> role, of every token file in `folder`; none without a folder. Raises ConfigError for a bad one."""
+    if not folder:
+        return {}
+    files = {role: Path(folder).expanduser() / f"{role}.token" for role in ROLES}
+    tokens = {_read(file): role for role, file in files.items() if file.is_file()}
+    if len(tokens) < sum(file.is_file() for file in files.values()):
+        raise ConfigError(f"{folder} holds one token for two roles; give each its own")
+    return tokens
+
+
+def own_token(folder: str, source: str) -> str:
+    """What a link of role `source` shows when it connects; "" if it has none."""
+    file = Path(folder).expanduser() / f"{certificate_role(source)}.token"
+    return _read(file) if folder and file.is_file() else ""
+
+
+def _read(file: Path) -> str:
+    try:
+        token = file.read_text("ascii").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file} cannot be read: {error}") from None
+    if not _TOKEN.fullmatch(token):
+        raise ConfigError(f"{file} holds no token: 16 to 128 letters, digits, '_' or '-'; try `openssl rand -hex 16`")
+    return token
+
+
+# TLS for `wss://`, with certificates from a `--secure` folder. Shell (files, sockets).
+#
+# <role>.pem <role>.key  what this end shows when it listens, e.g. robot.pem
+# ca.pem                 whose signature this end trusts when it connects
+
+
+def server_tls_context(folder: str, source: str) -> ssl.SSLContext:
+    """TLS for who listens. Raises ConfigError for a certificate or key that is missing or does not fit."""
+    role = certificate_role(source)
+    certificate, key = (Path(folder).expanduser() / f"{role}.{kind}" for kind in ("pem", "key"))
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(certificate, key)
+    except FileNotFoundError:
+        raise ConfigError(f"wss:// needs {role}.pem and {role}.key in a folder: give it with --secure DIR") from None
+    except (OSError, ssl.SSLError) as error:
+        raise ConfigError(f"{certificate} and {key} are no certificate and its key: {error}") from None
+    return context
+
+
+def client_tls_context(folder: str) -> ssl.SSLContext:
+    """TLS for who connects: trusts the folder's `ca.pem`, or without a folder what this machine trusts."""
+    authority = Path(folder).expanduser() / "ca.pem"
+    try:
+        return ssl.create_default_context(cafile=str(authority) if folder else None)
+    except (OSError, ssl.SSLError) as error:
+        raise ConfigError(f"{authority} holds no certificate of an authority: {error}") from None
+
+
+def tls_handshake(near: socket.socket, context: ssl.SSLContext, host: str, deadline_s: float) -> ssl.SSLSocket:
+    """`near` with TLS agreed on; `host` is whom this end connects to, "" for who listens.
+
+    Raises TimeoutError at `deadline_s` however slowly the other end goes on, and SSLError for one that does not agree.
+    """
+    near.setblocking(False)
+    wrapped = context.wrap_socket(
+        near, server_side=not host, server_hostname=host or None, do_handshake_on_connect=False
+    )
+    try:
+        _finish_handshake(wrapped, deadline_s)
+    except BaseException:
+        wrapped.close()
+        raise
+    return wrapped
+
+
+def _finish_handshake(wrapped: ssl.SSLSocket, deadline_s: float) -> None:
+    waiting = select.poll()
+    while (left_s := deadline_s - time.monotonic()) > 0:
+        try:
+            wrapped.do_handshake()
+            return
+        except ssl.SSLWantReadError:
+            waiting.register(wrapped, select.POLLIN)
+        except ssl.SSLWantWriteError:
+            waiting.register(wrapped, select.POLLOUT)
+        waiting.poll(left_s * 1000)
+    raise TimeoutError
+
+
+# Who may come in at a WebSocket endpoint, and as what: by token, or in the older dialect by address. Pure.
+
+
+NOT_LISTED: Final = "NOT_LISTED"
+"""Counted for a client of the older dialect from an address that its owner did not list."""
+NO_TOKEN: Final = "NO_TOKEN"
+"""Counted for a client that showed no token, or none of ours."""
+
+_BEARER: Final = "bearer "
+_ENTRY: Final = "sightline.token."
+
+
+def check_listening(endpoint: WebSocketEndpoint, tokens: Mapping[str, str]) -> None:
+    """Raise ConfigError for an endpoint that would let anybody in from beyond this machine."""
+    if endpoint.is_loopback:
+        return
+    if endpoint.legacy is None and not tokens:
+        raise ConfigError(
+            f"{endpoint.text} listens beyond this machine, where anybody could drive: give --secure DIR with a token "
+            "for each role (DIR/vision.token ...), or listen on 127.0.0.1"
+        )
+    if endpoint.legacy is not None and not endpoint.allow_from:
+        option = with_allowed(endpoint.text, ["192.168.1.7"])
+        raise ConfigError(
+            f"{endpoint.text} listens beyond this machine to clients that carry no token: list who may come in, "
+            f'legacy.allow_from = ["192.168.1.7"] or {option}'
+        )
+
+
+def client_address_problem(address: str, allow_from: Sequence[str]) -> str:
+    """Why a client at `address` may not come in; "" if it may. An empty list allows every address that gets here."""
+    here = ipaddress.ip_address(address.partition("%")[0])
+    here = getattr(here, "ipv4_mapped", None) or here
+    if not allow_from or any(here in ipaddress.ip_network(network) for network in allow_from):
+        return ""
+    return f"{address} is not listed in legacy.allow_from: the robot's owner lists who may come in here"
+
+
+def role_of_token(tokens: Mapping[str, str], authorizations: Sequence[str], offers: Sequence[str]) -> str | None:
+    """The role of who sent these `Authorization` and `Sec-WebSocket-Protocol` headers; None without a token of ours.
+
+    Every token is compared, and in constant time, so that no clock tells how much of a guess was right.
+    """
+    shown = [text[len(_BEARER) :].strip() for text in authorizations if text.lower().startswith(_BEARER)]
+    entries = [entry.strip() for offer in offers for entry in offer.split(",")]
+    shown += [entry[len(_ENTRY) :] for entry in entries if entry.startswith(_ENTRY)]
+    if len(shown) != 1:
+        return None
+    matches = [role for token, role in tokens.items() if hmac.compare_digest(token.encode(), shown[0].encode())]
+    return matches[0] if matches else None
+
+
+def bearer_header(token: str) -> str:
+    """The `Authorization` header that shows `token`."""
+    return f"Bearer {token}"
+
+
+def grants_of_role(role: str) -> frozenset[tuple[str, ...]]:
+    """(channel, source) of all that `role` may publish; from a robot just (channel,)."""
+    return frozenset(tuple(key.replace("/*/", "/", 1).split("/")[1:]) for key in may_publish(role))

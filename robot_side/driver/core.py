@@ -22,7 +22,7 @@ from sightline.protocol.messages import (
     StreamStatus,
     WireModel,
 )
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.link import Message
 from sightline.protocol.text import parse_twist
 from sightline.robot_side.config import RobotConfig

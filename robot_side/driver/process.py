@@ -1,8 +1,4 @@
-"""The driver process: owns gate and motors, is the parent of the network process, has no network. Shell.
-
-Motors latch, so whoever owns them must outlive every fault beside it. The network process may hang, die or hold its
-interpreter lock for ever; this loop still reads its own clock 50 times a second and brings the wheels to zero.
-"""
+"""Refusals in words for the robot's log, so that neither a flood nor a vision left running fills it. Pure."""
 
 import secrets
 import select
@@ -10,26 +6,68 @@ import signal
 import struct
 from collections import Counter
 from contextlib import ExitStack, suppress
-from types import FrameType
-
 from sightline.protocol.channels import REQUEST, TWIST, check_robot_id
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import LastRejection, State, StreamStatus
 from sightline.robot_side import pipe as ipc
-from sightline.robot_side.child import DriverEnd
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.dead_zone import BlindZoneError, check_blind_zone
 from sightline.robot_side.driver.core import DriverCore
-from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
-from sightline.robot_side.driver.persistence import StopLatch
-from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
+from sightline.robot_side.driver.persistence import BackgroundWriter, StopLatch
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS, SystemdNotifier, request_real_time
+from sightline.robot_side.pipe import DriverEnd
 from sightline.robot_side.plugins import build_device
-from sightline.robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
-from sightline.robot_side.refusal_log import RejectionLog
-from sightline.robot_side.scribe import BackgroundWriter
-from sightline.robot_side.supervision import SystemdNotifier, request_real_time
+from sightline.robot_side.ports import Drive, RangeSensor, Ranges, WheelAngles
+from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
+from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
+from types import FrameType
+from typing import Final
+
+
+_FIRST_PERIOD_US: Final = 1_000_000
+_LONGEST_PERIOD_US: Final = 60_000_000
+_FORGOTTEN_US: Final = 10_000_000
+"""A reason that was not given for so long is news again."""
+
+
+class RejectionLog:
+    """Per reason a line at once, then after 1, 2, 4 ... 60 s for as long as it goes on, each with how often."""
+
+    def __init__(self) -> None:
+        self._untold: Counter[str] = Counter()
+        self._period_us: dict[str, int] = {}
+        self._told_us: dict[str, int] = {}
+        self._seen_us: dict[str, int] = {}
+
+    def line(self, refusal: LastRejection, now_us: int, times: int = 1) -> str:
+        """What to log of a refusal, given `times` since the last call; "" while its reason has had its share."""
+        reason = refusal.reason
+        self._untold[reason] += times
+        if not self._is_due(reason, now_us):
+            return ""
+        count = self._untold.pop(reason)
+        often = f" ({count} times)" if count > 1 else ""
+        return f"refused {reason} from {refusal.source or 'somebody'}{often}: {refusal.detail}"
+
+    def _is_due(self, reason: str, now_us: int) -> bool:
+        silent_us = now_us - self._seen_us.get(reason, now_us - _FORGOTTEN_US)
+        self._seen_us[reason] = now_us
+        if silent_us >= _FORGOTTEN_US:
+            self._period_us[reason] = _FIRST_PERIOD_US
+        elif now_us - self._told_us[reason] < self._period_us[reason]:
+            return False
+        else:
+            self._period_us[reason] = min(2 * self._period_us[reason], _LONGEST_PERIOD_US)
+        self._told_us[reason] = now_us
+        return True
+
+
+# The driver process: owns gate and motors, is the parent of the network process, has no network. Shell.
+#
+# Motors latch, so whoever owns them must outlive every fault beside it. The network process may hang, die or hold its
+# interpreter lock for ever; this loop still reads its own clock 50 times a second and brings the wheels to zero.
+
 
 _SHUTDOWN_US = 2_000_000
 _WATCHDOG_PERIOD_US = 100_000

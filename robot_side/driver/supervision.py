@@ -1,10 +1,60 @@
 """Which signals end the driver. Pure, and light: the robot's tools need no driver for it."""
 
+import ctypes
+import gc
+import os
 import signal
+import socket
+from collections.abc import Iterator
 from typing import Final
+
 
 EXIT_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """Whatever a key or a terminal can send ends it by way of zero, Ctrl-\\ and Ctrl-Z too: a driver that is killed or held
 up on the spot leaves the wheels turning."""
 IGNORED_SIGNALS: Final = (signal.SIGTTIN, signal.SIGTTOU)
 """Nor may a terminal that it is in the background of hold it up."""
+
+
+# What the driver asks of the operating system: punctuality, and somebody who watches it. Shell.
+#
+# Each part that is not permitted is said once at start; the robot runs without it.
+
+
+_PRIORITY: Final = 50  # above ordinary threads and the kernel's own soft work, below its watchdogs
+_MCL_CURRENT_AND_FUTURE: Final = 3
+
+
+def request_real_time() -> Iterator[str]:
+    """Freeze the garbage collector's survivors, ask for real-time scheduling and locked memory; yields what failed."""
+    gc.collect()
+    gc.freeze()
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
+    except (OSError, AttributeError):
+        yield "real-time scheduling is not permitted (needs CAP_SYS_NICE or LimitRTPRIO); ticks may be late under load"
+    libc = ctypes.CDLL(None, use_errno=True)
+    if not hasattr(libc, "mlockall") or libc.mlockall(_MCL_CURRENT_AND_FUTURE) != 0:
+        yield "locking memory is not permitted (needs CAP_IPC_LOCK or LimitMEMLOCK); swapping may delay a tick"
+
+
+class SystemdNotifier:
+    """systemd's notification socket (sd_notify(3)); without one every call does nothing."""
+
+    def __init__(self) -> None:
+        address = os.environ.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + address[1:] if address.startswith("@") else address
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if address else None
+
+    @property
+    def is_there(self) -> bool:
+        """Whether somebody watches."""
+        return self._socket is not None
+
+    def tell(self, state: str) -> None:
+        """Send e.g. READY=1, WATCHDOG=1, STOPPING=1; never waits."""
+        if self._socket is not None:
+            try:
+                self._socket.sendto(state.encode(), socket.MSG_DONTWAIT, self._address)
+            except OSError:
+                return  # whoever watches will notice the silence

@@ -3,15 +3,25 @@
 `sightline calibrate drive` writes the file; `drive.options.table_file` of the drive `gpio` names it.
 """
 
+from __future__ import annotations
+
 import itertools
+import math
+import os
+import sys
+import time
 import tomllib
-from collections.abc import Sequence
-from typing import Annotated
-
-from pydantic import Field, ValidationError, field_validator
-
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from pydantic import Field, ValidationError, field_validator, model_validator
+from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.robot_side.hardware.gpio_low import import_lgpio, leave_low
+from sightline.robot_side.ports import WheelAngles
+from typing import Annotated, Any, Final, Literal, Protocol, Self
+
 
 Duty = Annotated[float, Field(gt=0, le=1)]
 RimSpeed = Annotated[float, Field(gt=0, le=3)]
@@ -85,3 +95,342 @@ def table_text(rows: Sequence[tuple[float, float]], head: str) -> str:
     """A table file with `head` as its comment; `table_of` reads it."""
     lines = "".join(f"  [{duty:.3f}, {speed:.4f}],\n" for duty, speed in rows)
     return f"# {head}\ntable = [ # duty, metres per second at the rim\n{lines}]\n"
+
+
+# A Raspberry Pi's output pins through gpiozero and lgpio: PWM, enable lines, and how they are left behind. Shell.
+#
+# Both libraries are imported when the pins are opened; the robot's base install has neither.
+
+
+_SPI_DEVICE: Final = Path("/dev/spidev0.0")
+_SPI_PINS: Final = frozenset(range(7, 12))
+_INSTALL: Final = "pip install 'sightline[robot-pi]', or sudo apt install python3-gpiozero python3-lgpio"
+
+
+class Pins(Protocol):
+    """Output pins by BCM number. All methods may raise whatever the library raises."""
+
+    def write(self, number: int, duty: float) -> None:
+        """Drive a pin high for that share (0..1) of each PWM period."""
+        ...
+
+    def enable(self, wanted: bool) -> None:
+        """The enable lines high or low, where there are any."""
+        ...
+
+    def close(self) -> None:
+        """All low, then given back."""
+        ...
+
+
+class WiredPins(Protocol):
+    """What is asked of a configuration here."""
+
+    @property
+    def pins(self) -> tuple[int, int, int, int]: ...
+    @property
+    def enable_pins(self) -> tuple[int, ...]: ...
+    @property
+    def pwm_hz(self) -> int: ...
+
+
+def open_pins(config: WiredPins) -> Pins:
+    """All pins low.
+
+    Raises ConfigError without gpiozero or lgpio, HardwareError where the pins cannot be had.
+    """
+    _warn_of_spi(config.pins)
+    try:
+        import gpiozero
+    except ImportError:
+        raise ConfigError(f"drive gpio needs gpiozero: {_INSTALL}") from None
+    made = _ensure_factory(gpiozero)
+    try:
+        return GpiozeroPins(gpiozero, config, made)
+    except Exception as error:
+        raise HardwareError(
+            f"GPIO pins cannot be opened: {_line(error)}; does another program hold them (a robot service, SPI)?"
+        ) from None
+
+
+class GpiozeroPins:
+    """`made`: whether the pin factory is ours to close."""
+
+    def __init__(self, gpiozero: Any, config: WiredPins, made: bool) -> None:
+        self._device_class, self._made = gpiozero.Device, made
+        self._numbers = (*config.enable_pins, *config.pins)
+        self._enables: list[Any] = []
+        self._motors: dict[int, Any] = {}
+        try:
+            # gpiozero's Motor takes no frequency, so each pin is a device of its own.
+            for number in config.enable_pins:
+                self._enables.append(gpiozero.DigitalOutputDevice(number))
+            for number in config.pins:
+                self._motors[number] = gpiozero.PWMOutputDevice(number, frequency=config.pwm_hz)
+        except Exception:
+            self.close()
+            raise
+
+    def write(self, number: int, duty: float) -> None:
+        """Drive a pin high for that share of each PWM period."""
+        self._motors[number].value = duty
+
+    def enable(self, wanted: bool) -> None:
+        """The enable lines high or low."""
+        for device in self._enables:
+            device.value = int(wanted)
+
+    def close(self) -> None:
+        """Enable lines first, then the motors' pins; idempotent."""
+        for device in (*self._enables, *self._motors.values()):
+            with suppress(Exception):  # the rest still has to go down
+                device.value = 0
+        for device in (*self._enables, *self._motors.values()):
+            with suppress(Exception):
+                device.close()
+        self._enables, self._motors = [], {}
+        if self._made:
+            self._made = False
+            self._give_back()
+
+    def _give_back(self) -> None:
+        """gpiozero leaves pins as inputs without a pull, and an L298N takes a floating input for high."""
+        factory, self._device_class.pin_factory = self._device_class.pin_factory, None
+        chip = getattr(factory, "chip", None)
+        with suppress(Exception):
+            factory.close()
+        if chip is not None:
+            with suppress(Exception):
+                leave_low(self._numbers, chip)
+
+
+def _ensure_factory(gpiozero: Any) -> bool:
+    """lgpio, unless GPIOZERO_PIN_FACTORY or the program chose another; gpiozero's own fall-backs have no PWM."""
+    device = gpiozero.Device
+    if device.pin_factory is not None:
+        return False
+    if os.environ.get("GPIOZERO_PIN_FACTORY"):
+        device.ensure_pin_factory()
+        return True
+    try:
+        import_lgpio()
+        from gpiozero.pins.lgpio import LGPIOFactory
+
+        device.pin_factory = LGPIOFactory()
+    except ImportError:
+        raise ConfigError(f"drive gpio needs lgpio: {_INSTALL}") from None
+    except Exception as error:
+        raise HardwareError(
+            f"no GPIO here: {_line(error)}; this drive needs a Raspberry Pi and a user in the group gpio "
+            "(`--set drive.kind=log` tries the rest without wheels)"
+        ) from None
+    return True
+
+
+def _warn_of_spi(numbers: Sequence[int]) -> None:
+    used = sorted(_SPI_PINS.intersection(numbers))
+    if used and _SPI_DEVICE.exists():
+        named = ", ".join(map(str, used))
+        print(
+            f"drive gpio: pins {named} are SPI0's and SPI is switched on ({_SPI_DEVICE}): switch it off "
+            "(`sudo raspi-config nonint do_spi 1`, restart) or use other pins",
+            file=sys.stderr, flush=True,
+        )  # fmt: skip
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+# Two motors on an H-bridge (L298N) at a Raspberry Pi's pins: duty by a calibration table, no encoders. Shell.
+#
+# One pin of a motor is low before the other is driven; every end and every failure leaves all of them low.
+
+
+BcmPin = Annotated[int, Field(ge=2, le=27)]
+"""Broadcom's number, not the position on the header. 0 and 1 belong to the memory of add-on boards."""
+_REVERSAL_PERIODS = 2
+"""Of the PWM: a new duty begins with the next period, so both pins are low for two before the other one is driven."""
+
+
+class GpioDriveConfig(TableConfig):
+    """The pins are BCM numbers; the defaults are the older write-up's car, its PWM of 2 kHz too."""
+
+    left_forward_pin: BcmPin = 10
+    left_backward_pin: BcmPin = 9
+    right_forward_pin: BcmPin = 8
+    right_backward_pin: BcmPin = 7
+    enable_pins: Annotated[tuple[BcmPin, ...], Field(max_length=2)] = ()
+    """ENA and ENB of the bridge, on one pin or two: high from the first motion until a failure or the end."""
+    pwm_hz: Annotated[int, Field(ge=400, le=10_000)] = 2_000
+    left_reversed: bool = False
+    right_reversed: bool = False
+    swapped: bool = False
+    """The motor on the left pins is the right one."""
+    trim: Annotated[float, Field(ge=-0.3, le=0.3)] = 0.0
+    """Share by which the left wheel is slowed (negative: the right one), for a car that bends to the right (left)."""
+    table_file: Path | None = None
+    """As `sightline calibrate drive` writes it, in place of `table`."""
+    odometry: Literal["table", "none"] = "table"
+    """Without encoders: how far the wheels should have turned by the table, or nothing at all."""
+    wheel_radius_m: Annotated[float, Field(gt=0.005, lt=1.0)]
+    """Comes from the robot's own `wheels.wheel_radius_m`."""
+
+    @property
+    def pins(self) -> tuple[int, int, int, int]:
+        """Those of the motors: left forward and backward, right forward and backward."""
+        return self.left_forward_pin, self.left_backward_pin, self.right_forward_pin, self.right_backward_pin
+
+    @model_validator(mode="after")
+    def _are_distinct(self) -> Self:
+        numbers = [*self.pins, *self.enable_pins]
+        twice = sorted({number for number in numbers if numbers.count(number) > 1})
+        if twice:
+            raise ValueError(f"pin {twice[0]} is named twice; each wire has its own")
+        if self.table_file is not None and "table" in self.model_fields_set:
+            raise ValueError("table and table_file are both set; keep one")
+        return self
+
+
+class GpioDrive:
+    """`opening` and `pause` are seams for tests; the pins are low when it is constructed and when it is closed."""
+
+    Config = GpioDriveConfig
+
+    def __init__(
+        self,
+        config: GpioDriveConfig,
+        opening: Callable[[GpioDriveConfig], Pins] = open_pins,
+        pause: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._config = config
+        self.table = DutyTable(_rows(config))
+        self._pins: Pins | None = opening(config)
+        left, right = _Motor(config.pins[:2], config.left_reversed), _Motor(config.pins[2:], config.right_reversed)
+        self._motors = (right, left) if config.swapped else (left, right)
+        self._pause = pause
+        self._enabled = self._failed = False
+        self._expected_mps = (0.0, 0.0)
+        self._angles = WheelAngles(0.0, 0.0, monotonic_us())
+
+    def set(self, left_rad_s: float, right_rad_s: float) -> None:
+        """Give wheel speeds; takes two PWM periods where a wheel reverses, else no time."""
+        if not (math.isfinite(left_rad_s) and math.isfinite(right_rad_s)):
+            self._all_low()
+            raise HardwareError(f"wheel speeds ({left_rad_s}, {right_rad_s}) are no numbers; the pins are low")
+        radius_m, (left, right) = self._config.wheel_radius_m, self._shares
+        duties = self.table.duty(left_rad_s * radius_m * left), self.table.duty(right_rad_s * radius_m * right)
+        self.set_duty(*duties)
+
+    def set_duty(self, left: float, right: float) -> None:
+        """Give duties, -1..1, forward positive. Raises HardwareError, with the pins low, when a pin fails."""
+        self._angles = self._expected()
+        pins, moves = self._opened(), bool(left or right)
+        if self._failed and moves:  # a gate that ramps down must not bring the wheels up again
+            raise HardwareError("GPIO has failed; its pins stay low until it is told zero")
+        try:
+            wanted = list(zip(self._motors, (left, right), strict=True))
+            reversing = [motor.let_go(pins, duty) for motor, duty in wanted]
+            if any(reversing):
+                self._pause(_REVERSAL_PERIODS / self._config.pwm_hz)
+            self._enable(moves or self._enabled)
+            for motor, duty in wanted:
+                motor.drive(pins, duty)
+        except Exception as error:
+            self._failed = True
+            self._all_low()
+            raise HardwareError(f"GPIO: {error}; the pins are low, look at the wiring") from None
+        self._failed = False
+        self._expected_mps = self._speeds(left, right)
+
+    def wheels(self) -> WheelAngles | None:
+        """How far the wheels should have turned, by the table: an expectation. None if the configuration wants none."""
+        return self._expected() if self._config.odometry == "table" else None
+
+    def close(self) -> None:
+        """All pins low, then given back; idempotent."""
+        if self._pins is not None:
+            self._all_low()
+            self._pins.close()
+            self._pins = None
+
+    @property
+    def _shares(self) -> tuple[float, float]:
+        trim = self._config.trim
+        return 1 - max(0.0, trim), 1 - max(0.0, -trim)
+
+    def _speeds(self, left: float, right: float) -> tuple[float, float]:
+        """At the rims. A wheel that is trimmed is the quicker one: it turns as fast as the other with less."""
+        shares = self._shares
+        return self.table.speed(left) / shares[0], self.table.speed(right) / shares[1]
+
+    def _expected(self) -> WheelAngles:
+        now_us = monotonic_us()
+        seconds, radius_m = (now_us - self._angles.t_us) / 1e6, self._config.wheel_radius_m
+        left, right = (speed / radius_m * seconds for speed in self._expected_mps)
+        return WheelAngles(self._angles.left_rad + left, self._angles.right_rad + right, now_us)
+
+    def _opened(self) -> Pins:
+        if self._pins is None:
+            raise HardwareError("the GPIO drive is closed")
+        return self._pins
+
+    def _enable(self, wanted: bool) -> None:
+        if wanted != self._enabled:
+            self._opened().enable(wanted)
+            self._enabled = wanted
+
+    def _all_low(self) -> None:
+        """Each pin by itself: one that fails must not keep the others up."""
+        self._angles, self._expected_mps = self._expected(), (0.0, 0.0)
+        with suppress(Exception):
+            self._enable(False)
+        for motor in self._motors:
+            motor.low(self._pins)
+
+
+class _Motor:
+    """One motor's two pins, and what they were last told."""
+
+    def __init__(self, pins: tuple[int, ...], is_reversed: bool) -> None:
+        self._pins = (pins[1], pins[0]) if is_reversed else (pins[0], pins[1])
+        self._told = dict.fromkeys(pins, 0.0)
+
+    def let_go(self, pins: Pins, duty: float) -> bool:
+        """Put low what `duty` does not drive; whether a pin that was driven has to make way for the other one."""
+        idle = [self._pins[duty > 0]] if duty else [*self._pins]
+        was_driven = [self._write(pins, number, 0.0) for number in idle]
+        return any(was_driven) and duty != 0
+
+    def drive(self, pins: Pins, duty: float) -> None:
+        """Drive the pin of that direction; the other is low."""
+        if duty:
+            self._write(pins, self._pins[duty < 0], min(1.0, abs(duty)))
+
+    def low(self, pins: Pins | None) -> None:
+        """Both, whatever happens."""
+        for number in self._pins:
+            try:
+                if pins is not None:
+                    pins.write(number, 0.0)
+            except Exception:  # the others still have to go down
+                continue
+            self._told[number] = 0.0
+
+    def _write(self, pins: Pins, number: int, duty: float) -> bool:
+        if self._told[number] == duty:
+            return False
+        pins.write(number, duty)
+        self._told[number] = duty
+        return True
+
+
+def _rows(config: GpioDriveConfig) -> tuple[tuple[float, float], ...]:
+    path = config.table_file
+    if path is None:
+        return config.table
+    try:
+        return table_of(path.expanduser().read_text("utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        said = error.strerror if isinstance(error, OSError) else "is no text"
+        raise ConfigError(f"{path}: cannot be read: {said}; `sightline calibrate drive` writes one") from None

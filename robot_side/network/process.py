@@ -1,35 +1,59 @@
-"""The network process: camera and link; forwards raw commands to the driver, publishes for it. Shell.
+"""Where others reach a robot that listens on every address of its machine, for the line at its start. Shell (Linux)."""
 
-Started by `sightline.robot_side.child` with its ends of two socket pairs; it ends when the first closes.
-"""
-
+import fcntl
 import os
 import signal
 import socket
+import struct
 import sys
 import threading
 import time
 import zlib
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
-
 from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import HardwareError, SightlineError, WireError
 from sightline.protocol.log import log_line, set_log_format
 from sightline.protocol.transports.link import Link, Message
-from sightline.protocol.transports.open import open_link
-from sightline.protocol.transports.relay import Relay
-from sightline.protocol.transports.zenoh_log import log_rejected_peers
+from sightline.protocol.transports.open import Relay, open_link
+from sightline.protocol.transports.zenoh.access_log import log_rejected_peers
 from sightline.robot_side import pipe as ipc
-from sightline.robot_side.addresses import reachable_endpoints
-from sightline.robot_side.network.core import CameraAdaptation
-from sightline.robot_side.child import NetworkSetup
-from sightline.robot_side.parent import NetworkEnd
+from sightline.robot_side.network.core import CameraAdaptation, NetworkCore
+from sightline.robot_side.pipe import NetworkEnd, NetworkSetup
 from sightline.robot_side.plugins import build_device
 from sightline.robot_side.ports import Camera, Picture
-from sightline.robot_side.sending import NetworkCore
+from typing import Final
+
+
+_ASK_ADDRESS: Final = 0x8915  # SIOCGIFADDR of linux/sockios.h
+_ANYWHERE: Final = ("/0.0.0.0:", "/[::]:")
+
+
+def reachable_endpoints(endpoints: Sequence[str]) -> list[str]:
+    """Those of `endpoints` that listen on every address, with each address in place of none."""
+    open_ends = [(endpoint, anywhere) for endpoint in endpoints for anywhere in _ANYWHERE if anywhere in endpoint]
+    here = own_addresses() if open_ends else []
+    return [endpoint.replace(anywhere, f"/{address}:") for endpoint, anywhere in open_ends for address in here]
+
+
+def own_addresses() -> list[str]:
+    """The IPv4 address of every interface that has one, loopback left out."""
+    found: list[str] = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        for _, name in socket.if_nameindex():
+            with suppress(OSError):  # an interface without an address
+                reply = fcntl.ioctl(asking.fileno(), _ASK_ADDRESS, struct.pack("256s", name.encode()))
+                found.append(socket.inet_ntoa(reply[20:24]))
+    return [address for address in dict.fromkeys(found) if not address.startswith("127.")]
+
+
+# The network process: camera and link; forwards raw commands to the driver, publishes for it. Shell.
+#
+# Started by `sightline.robot_side.pipe` with its ends of two socket pairs; it ends when the first closes.
+
 
 _STREAM_STATUS_US = 200_000
 _CAMERA_TIMEOUT_S = 0.2

@@ -19,7 +19,7 @@ from sightline.protocol.messages import (
     Twist,
     Verb,
 )
-from sightline.protocol.refusals import CLAMPED, RejectReason
+from sightline.protocol.errors import CLAMPED, RejectReason
 from sightline.robot_side.safety.guard import RangeGuard
 from sightline.robot_side.safety.validation import (
     AcceptedCommand,

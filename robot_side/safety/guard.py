@@ -7,14 +7,15 @@ A stale sensor counts as an obstacle all around.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated
-
 from pydantic import Field
-
 from sightline.protocol.config import Config
+from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, Twist
 from sightline.robot_side.ports import Ranges
+from typing import Annotated
+
 
 # First the speed gives way; without it a turn can come too close to a point looked at before, so it gives way in the
 # second pass, and for all points in the third. At zero speed a smaller turn is safe for every point: no fourth.
@@ -112,3 +113,39 @@ class RangeGuard:
     def is_fresh(self, now_us: int) -> bool:
         """Whether the newest scan is young enough to be believed."""
         return self._scan_us is not None and 0 <= now_us - self._scan_us <= self._config.max_scan_age_ms * 1000
+
+
+# What stands inside a range sensor's dead zone is not seen: all of it must lie within the guard's stop zone. Pure.
+#
+# Otherwise a robot that creeps up to something loses sight of it before the guard has stopped it, and drives on.
+
+
+class BlindZoneError(ConfigError):
+    """A sensor that is blind beyond the stop zone."""
+
+
+def check_blind_zone(guard: GuardConfig, scan: Ranges) -> None:
+    """Raise DeadZoneError unless whatever this sensor cannot see is nearer to the robot than `guard.stop_m`.
+
+    Of `scan`, what counts is where the sensor looks and its minimum, not what it saw. Raises ValueError where one of
+    these is no number: a bad reading, which a later one may mend.
+    """
+    said = (scan.range_min_m, scan.angle_min_rad, scan.angle_increment_rad)
+    if not all(map(math.isfinite, said)):
+        raise ValueError(f"the range sensor's least range and angles are {said}: no numbers")
+    reach_m = max(_blind(guard, scan), default=0.0)
+    if reach_m >= guard.stop_m:
+        raise BlindZoneError(
+            f"guard.stop_m = {guard.stop_m:g}: the range sensor sees nothing nearer than {scan.range_min_m:.3g} m, "
+            f"which reaches {reach_m:.3f} m beyond the robot's outline; set guard.stop_m above that (docs/robots.md)"
+        )
+
+
+def _blind(guard: GuardConfig, scan: Ranges) -> Iterator[float]:
+    """Clearance of the furthest spots that each ray is blind for: both ends, for an outline that is convex."""
+    for index in range(len(scan.ranges_m)):
+        angle_rad = scan.angle_min_rad + index * scan.angle_increment_rad
+        for range_m in (0.0, scan.range_min_m):
+            x_m, y_m = guard.sensor_x_m + range_m * math.cos(angle_rad), range_m * math.sin(angle_rad)
+            ahead_m, aside_m = max(x_m - guard.front_m, -guard.rear_m - x_m), abs(y_m) - guard.half_width_m
+            yield math.hypot(max(0.0, ahead_m), max(0.0, aside_m))

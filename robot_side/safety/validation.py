@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import AnswerHeader, Echo, State, Twist
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 
 _KEPT_PER_CHANNEL = 256  # 8 s of 30 fps frames; anything older is STALE long before
 _KEPT_SENDERS = 64

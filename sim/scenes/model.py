@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sightline.sim.light import State
-from sightline.sim.things import Color
+from sightline.sim.scenario import State
+from sightline.sim.scenario import Color
 
 JUDGED_FROM: Final = 900_000
 """Seeds from here on are for judging only."""

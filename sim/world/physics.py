@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from sightline.protocol.errors import ConfigError
-from sightline.sim.body import UrdfBody, urdf_body
+from sightline.sim.robot import UrdfBody, urdf_body
 from sightline.sim.world.engine import pybullet
-from sightline.sim.frames import Transform
-from sightline.sim.path import Place
+from sightline.sim.urdf import Transform
+from sightline.sim.scenario import Place
 from sightline.sim.robot import RobotModel
 from sightline.sim.scenario import Wall
 

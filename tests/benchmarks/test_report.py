@@ -7,7 +7,7 @@ import pytest
 
 from sightline.benchmarks import report
 from sightline.benchmarks.report import page_with, sections_named, write_report
-from sightline.benchmarks.report_sections import SECTIONS
+from sightline.benchmarks.report import SECTIONS
 from sightline.operator_side.cli.app import app
 from sightline.protocol.errors import ConfigError
 

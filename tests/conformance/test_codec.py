@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from sightline.protocol.conformance import codec_process
+from sightline.conformance import codec as codec_process
 from sightline.conformance.case import Level
-from sightline.protocol.conformance.codec import CASES, END, run_codec
+from sightline.conformance.codec import CASES, END, run_codec
 from sightline.conformance.codec import (
     MAX_ANSWER_BYTES,
     ProgramError,
@@ -21,7 +21,7 @@ from sightline.conformance.codec import (
     read_question,
     same,
 )
-from sightline.protocol.conformance.codec_questions import VECTORS, codec_cases
+from sightline.conformance.codec import VECTORS, codec_cases
 from sightline.conformance.runner import Outcome
 from sightline.protocol.errors import ConfigError
 from tests.conformance.codec_broken import WRONG

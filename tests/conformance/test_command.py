@@ -11,9 +11,9 @@ from sightline.operator_side.cli import app as cli
 from sightline.operator_side.setup import keys
 from sightline.operator_side.cli.conform import access_for
 from sightline.conformance.vision import cases as vision
-from sightline.protocol.conformance.bench import Access
+from sightline.conformance.case import Access
 from sightline.conformance.case import Case, Level
-from sightline.protocol.conformance.html_report import to_html
+from sightline.conformance.report import to_html
 from sightline.conformance.report import summary, to_dict, to_junit, to_page
 from sightline.conformance.robot.cases import CASES
 from sightline.conformance.runner import Outcome, Result

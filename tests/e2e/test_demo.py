@@ -11,7 +11,7 @@ from pathlib import Path
 import av
 import pytest
 
-from sightline.operator_side.processes import ProcessError, Processes
+from sightline.evaluation.processes import ProcessError, Processes
 from sightline.protocol.errors import SightlineError
 
 pytestmark = pytest.mark.slow

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from sightline.operator_side.demo import MOTOR_LOG, RECORDING, DemoOptions, DemoRun, run_demo
+from sightline.evaluation.demo.run import MOTOR_LOG, RECORDING, DemoOptions, DemoRun, run_demo
 from sightline.operator_side.recording.replay import replay
 from sightline.sim.scenario import Scenario, load_scenario, scenario_names
 from sightline.sim.truth import Truth

@@ -14,7 +14,7 @@ from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader
-from sightline.protocol.transports.denied import WHY
+from sightline.protocol.transports.zenoh.access_log import WHY
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving

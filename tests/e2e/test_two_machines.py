@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sightline.operator_side.faults.wires import BenchWire
+from sightline.evaluation.faults.fixture import BenchWire
 from sightline.sim.network_emulator import LinkShape, LinkShapes
 from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B, why_impossible
 from tests.fixtures.links import until

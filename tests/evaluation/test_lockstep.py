@@ -4,7 +4,7 @@ import pytest
 
 from sightline.evaluation.lockstep import Conditions, run_lockstep
 from sightline.evaluation.score.figures import score
-from sightline.operator_side.score_bounds import checks_of
+from sightline.evaluation.score.figures import checks_of
 from sightline.protocol.messages import State
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario

@@ -7,7 +7,7 @@ import pytest
 
 from sightline.evaluation.lockstep import Conditions, Run, run_lockstep
 from sightline.evaluation.scenario_config import robot_of
-from sightline.operator_side.score_course import STEP_S
+from sightline.evaluation.score.figures import STEP_S
 from sightline.protocol.messages import State
 from sightline.sim.scenario import load_scenario, scenario_names
 from sightline.sim.truth import Truth

@@ -6,7 +6,7 @@ from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 
-from sightline.operator_side.worker_pool import worker_pool
+from sightline.evaluation.processes import worker_pool
 from sightline.protocol.errors import HardwareError
 
 

@@ -7,7 +7,7 @@ from sightline.evaluation.scenario_config import robot_config, robot_of, vision_
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.safety.limits import stop_bound
-from sightline.sim.body import outline
+from sightline.sim.robot import outline
 from sightline.sim.robot import load_robot, robot_names
 from sightline.sim.scenario import load_scenario, scenario_names
 from sightline.vision_side.config import VisionConfig

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator
 
 from sightline.protocol.messages import State, Verb
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 
 _COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),

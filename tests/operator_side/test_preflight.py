@@ -2,7 +2,7 @@
 
 import pytest
 
-from sightline.operator_side.out_file import check_out_file
+from sightline.operator_side.preflight import check_out_file
 from sightline.protocol.errors import ConfigError
 
 

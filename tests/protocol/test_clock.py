@@ -4,7 +4,7 @@ from random import Random
 
 import pytest
 
-from sightline.protocol.robot_clock import RobotClock
+from sightline.protocol.clock import RobotClock
 
 
 @pytest.mark.parametrize("seed", [1, 29, 400])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import JpegSize
-from sightline.protocol.legacy import (
+from sightline.protocol.text import (
     MAX_BOXES,
     LegacyBox,
     decode_picture,
@@ -19,7 +19,7 @@ from sightline.protocol.legacy import (
     parse_dashed,
     text_bound,
 )
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.text import parse_twist
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)

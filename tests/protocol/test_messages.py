@@ -21,7 +21,7 @@ from sightline.protocol.channels import (
 )
 from sightline.protocol.codec import check_sizes, decode, decode_ranges, encode, encode_ranges
 from sightline.protocol.errors import ConfigError, WireError
-from sightline.protocol.golden_cases import CASES
+from sightline.protocol.spec.message_cases import CASES
 from sightline.protocol.messages import (
     MAX_INTEGER,
     AnswerHeader,
@@ -32,7 +32,7 @@ from sightline.protocol.messages import (
     ScanHeader,
     Stamp,
 )
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 
 MODELS = sorted(
     {channel.header for channel in CHANNELS.values()} | {c.payload for c in CHANNELS.values() if c.payload},

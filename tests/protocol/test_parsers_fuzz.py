@@ -15,7 +15,7 @@ from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, SCAN, check_
 from sightline.protocol.codec import decode, decode_ranges, encode, encode_ranges
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.legacy import (
+from sightline.protocol.text import (
     MAX_BOXES,
     MAX_BOXES_BYTES,
     decode_picture,
@@ -26,7 +26,7 @@ from sightline.protocol.legacy import (
     text_bound,
 )
 from sightline.protocol.messages import WireModel
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
 from sightline.protocol.text import MAX_TWIST_BYTES, format_twist, parse_twist
 

@@ -14,7 +14,7 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.spec.message_cases import jpeg, segments
 from sightline.protocol.jpeg import MAX_SEGMENTS, JpegSize, read_jpeg_size
 from sightline.protocol.messages import Twist
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.text import MAX_TWIST_BYTES, format_twist, parse_twist
 
 ABNF_NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"

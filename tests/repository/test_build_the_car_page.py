@@ -9,9 +9,9 @@ import pytest
 import typer
 
 from sightline.operator_side.cli import app as cli
-from sightline.operator_side.service_settings import load_service
+from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.teleop.terminal import KEYS
-from sightline.robot_side.hardware.gpio_drive import GpioDriveConfig
+from sightline.robot_side.hardware.gpio import GpioDriveConfig
 
 ROOT = Path(__file__).parent.parent.parent
 DOCS = ROOT / "docs"

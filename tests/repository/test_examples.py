@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sightline.operator_side.service_settings import load_service
+from sightline.operator_side.config.loading import load_service
 from sightline.robot_side.plugins import build_device
 from sightline.robot_side.ports import WheelAngles
 from tests.fixtures.links import free_endpoint, until

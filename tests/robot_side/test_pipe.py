@@ -11,7 +11,7 @@ import pytest
 
 from sightline.protocol.clock import monotonic_us
 from sightline.robot_side import pipe as ipc, plugins
-from sightline.robot_side.child import DriverEnd
+from sightline.robot_side.pipe import DriverEnd
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import JPEG, RobotProcess

@@ -11,13 +11,13 @@ import numpy as np
 import simplejpeg
 
 from sightline.evaluation.labels import Labels, boxes_message
-from sightline.operator_side.labels_service import LabelPublisher
+from sightline.evaluation.labels import LabelPublisher
 from sightline.protocol.channels import DETECTIONS, FRAME
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import Detections, DetectionsHeader, FrameHeader
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.sim.bus import SimCamera, TruthReader
-from sightline.sim.label_bus import Label, LabelReader, to_json
+from sightline.sim.bus import Label, LabelReader, to_json
 from sightline.sim.scenario import Wall, load_scenario
 from sightline.sim.world.world import World
 from tests.fixtures.sim import robot_with, seen_at

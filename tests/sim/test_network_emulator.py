@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.operator_side.faults.wires import BenchWire
+from sightline.evaluation.faults.fixture import BenchWire
 from sightline.protocol.errors import ConfigError
 from sightline.sim.network_emulator import (
     IP_HEADER_BYTES,

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from sightline.protocol.errors import ConfigError
 from sightline.sim.process import PeriodicTimer
-from sightline.sim.look import look_named
-from sightline.sim.motors import Motor
-from sightline.sim.path import ClosedPath, Leg, Place
+from sightline.sim.scenario import look_named
+from sightline.sim.world.world import Motor
+from sightline.sim.scenario import ClosedPath, Leg, Place
 from sightline.sim.robot import load_robot, robot_names
 from sightline.sim.scenario import OnPath, load_scenario, scenario_names
 

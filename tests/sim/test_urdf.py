@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import pytest
 
 from sightline.protocol.errors import ConfigError
-from sightline.sim.body import outline, urdf_body, urdf_from_model
+from sightline.sim.robot import outline, urdf_body, urdf_from_model
 from sightline.sim.robot import ROBOTS, load_robot, robot_names
 from sightline.sim.urdf import Urdf
 

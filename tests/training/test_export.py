@@ -13,7 +13,7 @@ import cv2
 from sightline.operator_side.cli import app as cli
 from sightline.training.network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
 from sightline.training.schedule import SceneRange
-from sightline.operator_side.train_samples import CUT_PX, WHOLE_PX, sample
+from sightline.training.scenes import CUT_PX, WHOLE_PX, sample
 from sightline.training.scenes import DrawnScenes, drawn_scenes
 from sightline.protocol.errors import ConfigError
 from sightline.sim.scenes.model import HEIGHT_PX, LABELS, WIDTH_PX, LabelledBox
@@ -234,7 +234,7 @@ class TestGraph:
         assert made.stat().st_size < 1_000_000
 
     def test_boxes_lie_in_the_picture_and_no_two_cover_each_other(self, made):
-        from sightline.vision_side.detect.overlap import overlap
+        from sightline.vision_side.detect.port import overlap
 
         boxes, scores, labels = self.outputs(made, self.picture())
         kept = boxes[scores > 0]

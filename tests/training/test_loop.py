@@ -15,13 +15,13 @@ import torch
 
 from sightline.operator_side.cli import app as cli
 from sightline.training import export as train_export
-from sightline.operator_side import train_run
+from sightline.training import loop as train_run
 from sightline.training.export import onnx_bytes, weights_in
-from sightline.operator_side.train_loop import train
+from sightline.training.loop import train
 from sightline.training.loop import Network, begin_from, folded
 from sightline.training.network import AGAINST, OUTPUTS, Layer, network
 from sightline.training.schedule import Training
-from sightline.operator_side.train_samples import CUT_PX
+from sightline.training.scenes import CUT_PX
 from sightline.training.scenes import DrawnScenes
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.sim.scenes.model import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED_FROM, WIDTH_PX, LabelledBox
@@ -51,17 +51,17 @@ def test_a_training_that_was_cut_ends_as_if_it_had_not_been(tmp_path, monkeypatc
     training = Training((2, 2), batch=2, seed=4)
     (tmp_path / "whole").mkdir()
     whole = train(scenes(), training, "cpu", tmp_path / "whole", lambda _: None)
-    monkeypatch.setattr("sightline.operator_side.train_loop._CHECKPOINT_EVERY", 2)
+    monkeypatch.setattr("sightline.training.loop._CHECKPOINT_EVERY", 2)
     cut = tmp_path / "cut"
     cut.mkdir()
 
     def fall(line):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sightline.operator_side.train_loop._SAY_EVERY", 3)
+    monkeypatch.setattr("sightline.training.loop._SAY_EVERY", 3)
     with pytest.raises(KeyboardInterrupt):
         train(scenes(), training, "cpu", cut, fall)
-    monkeypatch.setattr("sightline.operator_side.train_loop._SAY_EVERY", 100)
+    monkeypatch.setattr("sightline.training.loop._SAY_EVERY", 100)
     said = []
     resumed = train(scenes(), training, "cpu", cut, said.append)
     assert said == ["goes on at step 2 of 4"]

@@ -9,10 +9,10 @@ import pytest
 pytest.importorskip("pybullet")
 pytest.importorskip("onnx")
 
-from sightline.operator_side.train_card import Card, card_text
+from sightline.training.shipping import Card, card_text
 from sightline.training.export import shifted
 from sightline.training.schedule import Training
-from sightline.operator_side.train_shipping import chosen_thresholds, final_report, written
+from sightline.training.shipping import chosen_thresholds, final_report, written
 from sightline.sim.scenes.model import COLUMNS, LABELS
 from tests.training.fixture import weights
 from sightline.vision_side.config import VisionConfig

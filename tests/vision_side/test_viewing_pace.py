@@ -5,7 +5,7 @@ from random import Random
 
 import pytest
 
-from sightline.vision_side.pace import RateLimiter
+from sightline.vision_side.viewing import RateLimiter
 
 
 def passed(rate_hz: float, frames_hz: float, seconds: float, jitter: float = 0.0, seed: int = 0) -> list[int]:

@@ -1,11 +1,25 @@
 """Combinator: only detections with certain labels count. Pure."""
 
+import cv2
+import numpy as np
 from collections.abc import Sequence
-from dataclasses import replace
-
-from sightline.vision_side.detect.around import DetectorWrapper
-from sightline.vision_side.detect.labels import COLOR_LABEL
-from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
+from dataclasses import dataclass, replace
+from sightline.protocol.errors import WireError
+from sightline.vision_side.config import HsvRange
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.color.hsv import color_table
+from sightline.vision_side.detect.per_robot import PerSession
+from sightline.vision_side.detect.plugin_calls import DetectorWrapper
+from sightline.vision_side.detect.port import (
+    COLOR_LABEL,
+    DetectFrame,
+    Detection,
+    DetectionResult,
+    Detector,
+    corners,
+    overlap,
+)
+from typing import Final
 
 
 class LabelFilter(DetectorWrapper):
@@ -22,3 +36,115 @@ class LabelFilter(DetectorWrapper):
     def _kept(self, result: DetectionResult) -> DetectionResult:
         kept = tuple(one for one in result.detections if one.label in self._labels)
         return result if len(kept) == len(result.detections) else replace(result, detections=kept)
+
+
+# Combinator: of what a detector finds, only what has the colours: the model says ball, the colour says which. Pure.
+
+
+LEAST_SHARE: Final = 0.3
+"""Of the pixels in the box's middle: shade and shine take some of a ball's colour, another ball has none of it."""
+_MIDDLE: Final = 0.6
+"""The middle part of a box lies wholly on a ball, whose disc leaves the box's corners out."""
+
+
+class ColorFilter(DetectorWrapper):
+    """A detector that leaves out what another one finds in other colours."""
+
+    def __init__(self, detector: Detector, ranges: tuple[HsvRange, ...]) -> None:
+        super().__init__(detector)
+        self._table = color_table(ranges)
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        """What the other finds, less what has another colour; no answer where there is no picture to tell by."""
+        results = self.inner.detect(frames, deadline_us)
+        return [one and self._kept(frame, one) for frame, one in zip(frames, results, strict=True)]
+
+    def _kept(self, frame: DetectFrame, result: DetectionResult) -> DetectionResult | None:
+        try:
+            picture = frame.picture()
+        except WireError:
+            return None
+        kept = tuple(one for one in result.detections if self._share(picture, one) >= LEAST_SHARE)
+        return result if len(kept) == len(result.detections) else replace(result, detections=kept)
+
+    def _share(self, picture: Picture, one: Detection) -> float:
+        """How much of the box's middle has the colour."""
+        columns = _middle(one.x1_px, one.x2_px, picture.scale, picture.bgr.shape[1])
+        rows = _middle(one.y1_px, one.y2_px, picture.scale, picture.bgr.shape[0])
+        part = np.ascontiguousarray(picture.bgr[rows, columns])
+        codes = cv2.cvtColor(part, cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
+        return float(np.count_nonzero(self._table[codes])) / codes.size
+
+
+def _middle(low_px: float, high_px: float, scale: int, size: int) -> slice:
+    """At least one pixel of the decoded picture."""
+    cut = (high_px - low_px) * (1 - _MIDDLE) / 2
+    first = min(size - 1, max(0, int((low_px + cut) / scale)))
+    return slice(first, max(first + 1, min(size, int((high_px - cut) / scale) + 1)))
+
+
+# Combinator: gives what is found in one frame after the other the same `track_id`, by how much boxes overlap. Pure.
+#
+# The clock is the frames' capture time. An id is never given twice in a session, and what was away for longer than a
+# second comes back as another one: better two ids for one thing than one id for two.
+
+
+KEPT_US: Final = 1_000_000
+LEAST_OVERLAP: Final = 0.2
+"""Intersection over union; a thing that moves by half its width from frame to frame still has 0.33."""
+MAX_TRACKS: Final = 64
+"""Of one robot; every pair is compared. The best so many detections of a frame get ids, the rest none."""
+
+
+@dataclass(slots=True)
+class _Track:
+    number: int
+    box: Detection
+    t_us: int
+
+
+class TrackIds(DetectorWrapper):
+    """A detector whose detections carry ids."""
+
+    def __init__(self, detector: Detector) -> None:
+        super().__init__(detector)
+        self._memories = PerSession(_Memory)
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        """What the other finds, with ids."""
+        return [one and self._named(one) for one in self.inner.detect(frames, deadline_us)]
+
+    def _named(self, result: DetectionResult) -> DetectionResult:
+        memory = self._memories.of(result.robot, result.session)
+        return replace(result, detections=memory.named(result.detections, result.t_us))
+
+
+class _Memory:
+    """The tracks of one robot's session."""
+
+    def __init__(self) -> None:
+        self._tracks: list[_Track] = []
+        self._given = 0
+
+    def named(self, found: Sequence[Detection], t_us: int) -> tuple[Detection, ...]:
+        """The best pair first, whichever it is."""
+        found, rest = found[:MAX_TRACKS], found[MAX_TRACKS:]
+        self._tracks = [one for one in self._tracks if t_us - one.t_us <= KEPT_US]
+        pairs = sorted(
+            ((share, index, track.number) for index, one in enumerate(found) for track in self._tracks
+             if (share := overlap(corners(one), corners(track.box))) >= LEAST_OVERLAP and one.label == track.box.label),
+            key=lambda pair: -pair[0],
+        )
+        numbers: dict[int, int] = {}
+        for _, index, number in pairs:
+            if index not in numbers and number not in numbers.values():
+                numbers[index] = number
+        return (*(self._keep(one, numbers.get(index), t_us) for index, one in enumerate(found)), *rest)
+
+    def _keep(self, one: Detection, number: int | None, t_us: int) -> Detection:
+        if number is None:
+            self._given += 1
+            number = self._given
+        self._tracks = [track for track in self._tracks if track.number != number][-(MAX_TRACKS - 1) :]
+        self._tracks.append(_Track(number, one, t_us))
+        return replace(one, track_id=number)

@@ -2,7 +2,11 @@
 
 from collections import OrderedDict
 from collections.abc import Callable
+from sightline.protocol.messages import FrameHeader
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.port import DetectFrame
 from typing import Final, Generic, TypeVar
+
 
 Memory = TypeVar("Memory")
 
@@ -26,3 +30,38 @@ class PerSession(Generic[Memory]):
         if len(self._kept) > MAX_ROBOTS:
             self._kept.popitem(last=False)
         return memory
+
+
+# Frames for who looks on a thread of its own: pixels of another's decoder may be replaced meanwhile. Pure.
+
+
+MAX_DECODERS: Final = 64
+"""Security limit: of decoders kept, one for each robot and place in a batch; the longest unused goes first.
+
+Pictures of 1920x1080, decoded at half scale, are 1.6 MB each: 100 MB at most. A robot whose decoder went gets another.
+"""
+
+
+class DecoderPool:
+    """Decoders of one thread."""
+
+    def __init__(self, max_pixels: int) -> None:
+        """Security limit: pictures of more than `max_pixels` are not decoded."""
+        self._max_pixels = max_pixels
+        self._decoders: OrderedDict[tuple[str, int], Decoder] = OrderedDict()
+
+    def again(self, frame: DetectFrame, place: int = 0) -> DetectFrame:
+        """The same frame, to be decoded here; valid until another of its robot and `place` is."""
+        return self.frame(frame.robot, frame.header, frame.jpeg, (frame.width_px, frame.height_px), place)
+
+    def frame(
+        self, robot: str, header: FrameHeader, jpeg: bytes, size_px: tuple[int, int], place: int = 0
+    ) -> DetectFrame:
+        """A frame whose size is known."""
+        decoder = self._decoders.pop((robot, place), None)
+        if decoder is None or decoder.size_px != size_px:
+            decoder = Decoder(*size_px, self._max_pixels)
+        self._decoders[robot, place] = decoder
+        if len(self._decoders) > MAX_DECODERS:
+            self._decoders.popitem(last=False)
+        return DetectFrame(robot, header, jpeg, decoder)

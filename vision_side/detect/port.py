@@ -1,18 +1,48 @@
-"""The detector port: `Detector`, the frames it is given and what it returns. Pure.
-
-"Saw nothing" is a `DetectionResult` without detections; "no answer" is None in its place. Only the first may start a
-search; the second goes the way of silence: the robot is not steered by it and holds.
-"""
-
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Final, Protocol
+"""What a label may be: one printable line, so that it can be shown, logged and sent as it is. Pure."""
 
 import numpy as np
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from numpy.typing import NDArray
-
+from pydantic import Field
 from sightline.protocol.messages import FrameHeader
 from sightline.vision_side.decode import Decoder, Picture
+from typing import Annotated, Final, Protocol
+
+
+LONGEST_LABEL: Final = 64
+"""As on the wire (`DetectedBox.label`), in characters."""
+Label = Annotated[str, Field(min_length=1, max_length=LONGEST_LABEL)]
+"""One that is configured."""
+
+
+COLOR_LABEL: Final = "target"
+"""What the colour detectors call what they find, whatever it is. It always counts: one of them may be the fallback."""
+_NO_TARGETS: Final = ("legs", "light")
+"""What other missions are for; a model that knows balls may know these too."""
+
+
+def is_followable(label: str, wanted: str) -> bool:
+    """Whether what is called `label` is followed: what is `wanted`, if anything is, and what has the target's colour;
+    else all but lights and legs."""
+    return label in (wanted, COLOR_LABEL) if wanted else not label.startswith(_NO_TARGETS)
+
+
+def is_label(text: str) -> bool:
+    """Whether it can be said as it is."""
+    return 0 < len(text) <= LONGEST_LABEL and text.isprintable()
+
+
+def clean_label(text: str) -> str:
+    """`text` as the wire allows it: one printable line, bounded; never empty."""
+    return "".join(letter for letter in text if letter.isprintable())[:LONGEST_LABEL] or "thing"
+
+
+# The detector port: `Detector`, the frames it is given and what it returns. Pure.
+#
+# "Saw nothing" is a `DetectionResult` without detections; "no answer" is None in its place. Only the first may start a
+# search; the second goes the way of silence: the robot is not steered by it and holds.
+
 
 NO_DEADLINE: Final = 2**63 - 1
 """For who has all the time there is: replays, judges, tests."""
@@ -148,3 +178,29 @@ def clipped(one: Detection, width_px: int, height_px: int) -> Detection | None:
     if (x1, y1, x2, y2) == (one.x1_px, one.y1_px, one.x2_px, one.y2_px):
         return one
     return replace(one, x1_px=x1, y1_px=y1, x2_px=x2, y2_px=y2)
+
+
+# How much two boxes have in common. Pure.
+
+
+Corners = tuple[float, float, float, float]
+"""x1, y1, x2, y2."""
+
+
+def corners(one: Detection) -> Corners:
+    """Of its box."""
+    return one.x1_px, one.y1_px, one.x2_px, one.y2_px
+
+
+def overlap(one: Corners, other: Corners) -> float:
+    """Intersection over union, 0 to 1."""
+    width = min(one[2], other[2]) - max(one[0], other[0])
+    height = min(one[3], other[3]) - max(one[1], other[1])
+    if width <= 0 or height <= 0:
+        return 0.0
+    common = width * height
+    return common / (_area(one) + _area(other) - common)
+
+
+def _area(box: Corners) -> float:
+    return (box[2] - box[0]) * (box[3] - box[1])

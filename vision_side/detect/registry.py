@@ -11,12 +11,12 @@ from typing import Any, Final
 
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.around import plugin_guard
-from sightline.vision_side.detect.colour_filter import ColorFilter
+from sightline.vision_side.detect.plugin_calls import plugin_guard
+from sightline.vision_side.detect.filters import ColorFilter
 from sightline.vision_side.detect.filters import LabelFilter
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.remote.client import EXAMPLES
-from sightline.vision_side.detect.tracked import TrackIds
+from sightline.vision_side.detect.filters import TrackIds
 from sightline.vision_side.missions.registry import check_missions, configured_mission
 from sightline.vision_side.plugins import PluginRegistry, config_model
 
@@ -27,12 +27,12 @@ BUILT_IN: Final = {
     "zenoh": "sightline.vision_side.detect.remote.zenoh_detector:ZenohDetector",
     "oip+http": "sightline.vision_side.detect.remote.oip_http:OipHttp",
     "oip+grpc": "sightline.vision_side.detect.remote.oip_grpc:OipGrpc",
-    "http+jpeg": "sightline.vision_side.detect.remote.http_jpeg:HttpJpeg",
+    "http+jpeg": "sightline.vision_side.detect.remote.http_client:HttpJpeg",
 }
 """Here and not as entry points, so that a checkout that nobody installed has them too."""
 GROUP: Final = "sightline.detectors"
 BOXES: Final = "boxes"
-"""No detector here: boxes that somebody else publishes, see vision_side/boxes_service.py."""
+"""No detector here: boxes that somebody else publishes, see vision_side/serving/service.py."""
 REGISTRY: Final = PluginRegistry("detector", BUILT_IN, GROUP)
 _FILLED: Final = ("robot", "connect", "listen", "secure", "max_frame_bytes", "max_pixels")
 _MOST_NAMED: Final = 12

@@ -1,26 +1,88 @@
-"""A second detector beside the driving one: it looks at the same frames and never steers, until it is promoted. Shell.
+"""Do two detectors see the same? Counted frame by frame, told in one line now and then. Pure.
 
-It has a thread and a decoder of its own and sees the newest frame only, so it delays no answer: only while a promotion
-takes effect may one frame wait for what it is looking at. Where each of the two drives some robots of a fleet, neither
-looks on.
+The clock is the frames' capture time. What counts is what would be steered by: the surest detection of each that the
+mission may go by.
 """
 
 import threading
-from collections import OrderedDict
-from collections.abc import Sequence
+from collections import OrderedDict, deque
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Final
-
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.transports.link import Link
-from sightline.vision_side.detect.agreement import Agreement, LabelTest
-from sightline.vision_side.detect.around import attach_detector, close_detector, notices_of
-from sightline.vision_side.detect.per_robot import MAX_ROBOTS
-from sightline.vision_side.detect.checking import validated
-from sightline.vision_side.detect.plugin_calls import Notices
-from sightline.vision_side.detect.own_decoders import DecoderPool
-from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
+from sightline.vision_side.detect.per_robot import DecoderPool, MAX_ROBOTS
+from sightline.vision_side.detect.plugin_calls import Notices, attach_detector, close_detector, notices_of, validated
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector, corners, overlap
+from typing import Final
+
+
+WINDOW: Final = 300
+"""Frames: ten seconds at 30 a second."""
+REPORT_EVERY_US: Final = 5_000_000
+"""Between two lines, however much the two disagree."""
+LEAST_OVERLAP: Final = 0.3
+"""Boxes of one thing by two detectors: one draws the ball, the other its shadow too."""
+LabelTest = Callable[[str], bool]
+"""Whether a mission may go by what has this label."""
+
+
+class Agreement:
+    """Of one robot's frames, in one session and one mission."""
+
+    def __init__(self) -> None:
+        self.compared = self.differed = 0
+        self._window: deque[bool] = deque(maxlen=WINDOW)
+        self._told_us: int | None = None
+
+    @property
+    def share(self) -> float:
+        """Of the newest frames, those in which both saw the same; 1 before there are any."""
+        return sum(self._window) / len(self._window) if self._window else 1.0
+
+    def add(self, driving: DetectionResult, shadow: DetectionResult, goes_by: LabelTest) -> str:
+        """One frame. Returns the line that tells how they differ, where it is time for one."""
+        what = disagreement(driving, shadow, goes_by)
+        self.compared += 1
+        self.differed += bool(what)
+        self._window.append(not what)
+        if not what or (self._told_us is not None and 0 <= driving.t_us - self._told_us < REPORT_EVERY_US):
+            return ""
+        self._told_us = driving.t_us
+        return (f"{what}; {shadow.detector} agreed with {driving.detector} in {self.share:.0%} of the last "
+                f"{len(self._window)} frames")
+
+
+def disagreement(driving: DetectionResult, shadow: DetectionResult, goes_by: LabelTest) -> str:
+    """What the surest detections of two results of one frame disagree on, of those that a mission may go by; empty if
+    on nothing. What else they are called does not count."""
+    mine, other = _surest(driving, goes_by), _surest(shadow, goes_by)
+    if mine is None and other is None:
+        return ""
+    if mine is None:
+        return f"{shadow.detector} sees {_where(other)}, {driving.detector} nothing"
+    if other is None:
+        return f"{driving.detector} sees {_where(mine)}, {shadow.detector} nothing"
+    if overlap(corners(mine), corners(other)) >= LEAST_OVERLAP:
+        return ""
+    return f"{driving.detector} sees {_where(mine)}, {shadow.detector} {_where(other)}"
+
+
+def _surest(result: DetectionResult, goes_by: LabelTest) -> Detection | None:
+    return next((one for one in result.detections if goes_by(one.label)), None)
+
+
+def _where(one: Detection | None) -> str:
+    if one is None:
+        return "nothing"
+    return f"{one.label} at ({(one.x1_px + one.x2_px) / 2:.0f}, {(one.y1_px + one.y2_px) / 2:.0f})"
+
+
+# A second detector beside the driving one: it looks at the same frames and never steers, until it is promoted. Shell.
+# It has a thread and a decoder of its own and sees the newest frame only, so it delays no answer: only while a
+# promotion takes effect may one frame wait for what it is looking at. Where each of the two drives some robots of a
+# fleet, neither looks on.
+
 
 _PATIENCE_US: Final = 1_000_000
 """The shadow's own deadline: it holds nobody up."""

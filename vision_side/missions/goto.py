@@ -1,27 +1,128 @@
-"""Mission `goto`: drive to waypoints, round what short-sighted range sensors find on the way, or say it cannot. Pure.
-
-Straight to the goal while nothing known is in between; else along the wall, at a clearance, the way that is shortest
-by all that was seen so far. Speed is bound by sight: whatever stands just beyond the sensors' reach must still leave
-the clearance. Waypoints are in the odometry frame, in metres.
-"""
+"""The robot's outline on the floor, and how fast it may go with what it knows about. Pure."""
 
 import math
-from typing import Annotated, ClassVar
-
 import numpy as np
 from pydantic import Field
-
 from sightline.protocol.config import Config
-from sightline.protocol.messages import STILL, CameraModel, Pose, Twist
+from sightline.protocol.messages import CameraModel, Pose, STILL, Twist
 from sightline.vision_side.config import LatencyConfig
-from sightline.vision_side.tracking.prediction import Motion, MotionPredictor
-from sightline.vision_side.missions.body import Footprint, braking_mps, clear_of
-from sightline.vision_side.missions.giving_up import ProgressChecker, ProgressCheckerConfig
-from sightline.vision_side.missions.planner import CELL_M, Costmap
+from sightline.vision_side.missions.planner import CELL_M, Costmap, Planner, Point
 from sightline.vision_side.missions.port import Plan, RangeScan, View
-from sightline.vision_side.missions.ranging import PoseMemory, about_robot, echoes, in_odometry
-from sightline.vision_side.missions.route import Planner, Point
+from sightline.vision_side.missions.ranges import Points, PoseMemory, about_robot, echoes, in_odometry
+from sightline.vision_side.tracking.prediction import Motion, MotionPredictor
 from sightline.vision_side.tracking.track import to_odometry
+from typing import Annotated, ClassVar
+
+
+_STILL_MPS = 1e-6
+
+
+class Footprint(Config):
+    """A rectangle about the axle's midpoint: the Thymio's, if nothing else is said."""
+
+    front_m: Annotated[float, Field(ge=0, le=2)] = 0.08
+    rear_m: Annotated[float, Field(ge=0, le=2)] = 0.03
+    half_width_m: Annotated[float, Field(gt=0.01, le=2)] = 0.056
+
+    @property
+    def radius_m(self) -> float:
+        """Of the circle about the axle that holds the robot however it turns."""
+        return math.hypot(max(self.front_m, self.rear_m), self.half_width_m)
+
+    def nearest(self, points: Points) -> Points:
+        """The place of the outline nearest to each of `points`, which are about the robot."""
+        return np.column_stack([np.clip(points[:, 0], -self.rear_m, self.front_m),
+                                np.clip(points[:, 1], -self.half_width_m, self.half_width_m)])
+
+
+def braking_mps(room_m: float, delay_s: float, brake_mps2: float) -> float:
+    """The highest speed from which the robot still stops within `room_m`, braking only after `delay_s`."""
+    if room_m <= 0:
+        return 0.0
+    lost = brake_mps2 * delay_s
+    return math.sqrt(lost * lost + 2 * brake_mps2 * room_m) - lost
+
+
+def clear_of(points: Points, body: Footprint, twist: tuple[float, float], keep_m: float, brake_mps2: float) -> float:
+    """The part (0..1) of `twist` that lets the robot come no nearer than `keep_m` to any of `points`.
+
+    Speed towards a point is what counts: along a wall and away from it the robot may go as it likes.
+    """
+    if not len(points):
+        return 1.0
+    spots = body.nearest(points)
+    away = points - spots
+    clearance = np.hypot(away[:, 0], away[:, 1])
+    normal = away / np.maximum(clearance, 1e-6)[:, None]
+    closing = normal[:, 0] * (twist[0] - twist[1] * spots[:, 1]) + normal[:, 1] * twist[1] * spots[:, 0]
+    allowed = np.sqrt(2 * brake_mps2 * np.maximum(clearance - keep_m, 0.0))
+    towards = closing > _STILL_MPS
+    return float(min(1.0, (allowed[towards] / closing[towards]).min(initial=1.0)))
+
+
+# When to say "cannot reach": every way seen is closed, or nothing was gained for too long. Pure.
+
+
+_GAIN_M = 0.1
+_DETOUR_M, _MAX_DETOURS = 0.3, 8
+_APPLIED = 1e-3
+
+
+class ProgressCheckerConfig(Config):
+    """How long to wait before giving up."""
+
+    closed_s: Annotated[float, Field(ge=0, le=60)] = 1.5
+    """With every way closed the robot stands still for this long: a ghost in a scan or somebody passing may go."""
+    stuck_s: Annotated[float, Field(gt=0, le=3600)] = 20.0
+    """Driving this long without coming nearer by the known way, and without anything new seen, is going round."""
+
+
+class ProgressChecker:
+    """Counts the time that brought nothing."""
+
+    def __init__(self, config: ProgressCheckerConfig) -> None:
+        self._config = config
+        self.start_again()
+
+    def start_again(self) -> None:
+        """There is a new goal."""
+        self._closed_s = self._stuck_s = 0.0
+        self._best_m = math.inf
+        self._discoveries = -1
+        self._detours = 0
+
+    def step(self, view: View, left_m: float | None, discoveries: int) -> str:
+        """Why to give up, or nothing. `left_m` is None where no way is left.
+
+        A robot that is held (disarmed, stopped) is not running out of time: only driving counts as being stuck.
+        """
+        if left_m is None:
+            self._closed_s += view.dt_s
+            return "every way that was seen is closed" if self._closed_s >= self._config.closed_s else ""
+        self._closed_s = 0.0
+        if discoveries != self._discoveries:
+            self._discoveries, self._best_m, self._stuck_s, self._detours = discoveries, left_m, 0.0, 0
+        elif left_m < self._best_m - _GAIN_M:
+            self._best_m, self._stuck_s = left_m, 0.0
+        else:
+            self._wait(view, left_m)
+        return f"no progress in {self._config.stuck_s:.0f} s" if self._stuck_s >= self._config.stuck_s else ""
+
+    def _wait(self, view: View, left_m: float) -> None:
+        """A plan that turned out longer has to be driven first: so a few of them are no standstill."""
+        if left_m > self._best_m + _DETOUR_M and self._detours < _MAX_DETOURS:
+            self._best_m = left_m
+            self._detours += 1
+        if max(map(abs, view.header.applied)) > _APPLIED:
+            self._stuck_s += view.dt_s
+
+
+# Mission `goto`: drive to waypoints, round what short-sighted range sensors find on the way, or say it cannot. Pure.
+#
+# Straight to the goal while nothing known is in between; else along the wall, at a clearance, the way that is shortest
+# by all that was seen so far. Speed is bound by sight: whatever stands just beyond the sensors' reach must still leave
+# the clearance. Waypoints are in the odometry frame, in metres.
+
 
 Metres = Annotated[float, Field(ge=-100, le=100)]
 

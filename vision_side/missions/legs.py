@@ -16,7 +16,7 @@ from sightline.vision_side.config import TrackConfig
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.follow import Follow
 from sightline.vision_side.missions.port import Plan, View
-from sightline.vision_side.missions.ranging import Points, PoseMemory, about_robot, echoes, in_odometry
+from sightline.vision_side.missions.ranges import Points, PoseMemory, about_robot, echoes, in_odometry
 from sightline.vision_side.tracking.locate import Sighting, points_ahead
 from sightline.vision_side.tracking.track import from_odometry
 

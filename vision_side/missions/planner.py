@@ -4,10 +4,12 @@ Sensors that reach 0.2 m see a wall only while they are beside it. What they saw
 given up again when rays pass where it was: after a drift of the odometry, or when the thing went away.
 """
 
+import cv2
+import math
 import numpy as np
 from numpy.typing import NDArray
+from sightline.vision_side.missions.ranges import Points
 
-from sightline.vision_side.missions.ranging import Points
 
 Cells = NDArray[np.int64]
 """(N, 2), whole numbers of cells."""
@@ -93,3 +95,170 @@ def _passed(sensor: Points, ends: Points) -> set[tuple[int, int]]:
     share = way_m / np.maximum(length_m, 1e-9)[:, None]
     points = sensor[:, None] + share[..., None] * along[:, None]
     return {(int(x), int(y)) for x, y in np.unique(cells_of(points[sure]), axis=0)}
+
+
+# The way to a goal over what is known of the floor; what is not known counts as free. Pure.  From the goal a wave
+# spreads over all cells that the robot's middle may enter; who steps against the wave gets there by a shortest way.
+# Where the wave does not reach the robot, no way is left: everything seen closes it, and what was not seen cannot open
+# it. Each new plan comes from something newly seen, so a robot that obeys them cannot go round for ever.
+
+
+Point = tuple[float, float]
+Cell = tuple[int, int]
+
+HORIZON_M = 6.0
+"""Half the width of the largest plan; a goal further off is aimed at over the plan's border."""
+_UNREACHED = np.int32(2**30)
+_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+_SQUARE = np.ones((3, 3), np.uint8)  # by turns with the cross: circles of the wave become octagons, 6 % off at most
+_TIGHT_STEPS = 3
+_AROUND = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
+_LOOK_AHEAD_CELLS = 48
+_NEAREST_CELLS = 6  # steering for a nearer point than this is weaving
+_TRIED_EVERY = 3  # of the way's cells, which are looked at for a straight line to them
+
+
+class Planner:
+    """One plan, good for any place of the robot until `ground` changes.
+
+    `keep_m`: how far from a filled cell's middle the robot's own middle has to stay; `roomy_m`: how far it does where
+    that is no long way round.
+    """
+
+    def __init__(self, filled: Cells, robot: Point, goal: Point, keep_m: float, roomy_m: float) -> None:
+        self.goal = goal
+        low, high = _window(filled, robot, goal, roomy_m)
+        self._low, size = low, high - low + 1
+        away_m = _away(filled - low, size)
+        self._blocked, self._tight = away_m < keep_m, away_m < roomy_m
+        self._steps = _flooded(self._blocked, self._tight, self._seeds(size))
+
+    def _seeds(self, size: NDArray[np.int64]) -> list[tuple[int, Cell]]:
+        """(when, where) the wave begins: at the goal, or on the border with what is left from there to the goal."""
+        i, j = self._cell(self.goal)
+        if 0 <= i < size[0] and 0 <= j < size[1]:
+            return [(0, (i, j))]
+        border = [(a, b) for a in range(int(size[0])) for b in (0, int(size[1]) - 1)]
+        border += [(a, b) for a in (0, int(size[0]) - 1) for b in range(int(size[1]))]
+        away = {one: round(math.hypot(one[0] - i, one[1] - j)) for one in border if not self._blocked[one]}
+        nearest = min(away.values(), default=0)
+        return [(steps - nearest, one) for one, steps in away.items()]
+
+    def _cell(self, point: Point) -> Cell:
+        i, j = cells_of(np.array([point]))[0] - self._low
+        return int(i), int(j)
+
+    def covers(self, point: Point) -> bool:
+        """Whether the plan says anything about `point`."""
+        i, j = self._cell(point)
+        return bool(0 <= i < self._steps.shape[0] and 0 <= j < self._steps.shape[1])
+
+    def middle(self, cell: Cell) -> Point:
+        """Where the middle of a cell of the plan is."""
+        return (float((cell[0] + self._low[0] + 0.5) * CELL_M), float((cell[1] + self._low[1] + 0.5) * CELL_M))
+
+    def entry(self, robot: Point, within_m: float) -> Cell | None:
+        """The robot's cell, or the nearest one from which a way leads to the goal; None if there is none so near."""
+        i, j = self._cell(robot)
+        if self.covers(robot) and self._steps[i, j] < _UNREACHED:
+            return i, j
+        reach = math.ceil(within_m / CELL_M)
+        a, b = max(0, i - reach), max(0, j - reach)
+        part = self._steps[a : max(0, i + reach + 1), b : max(0, j + reach + 1)]
+        cells = np.argwhere(part < _UNREACHED) + np.array([a, b])
+        if not len(cells):
+            return None
+        away = np.hypot(cells[:, 0] - i, cells[:, 1] - j)
+        nearest = int(np.argmin(away))
+        return (int(cells[nearest, 0]), int(cells[nearest, 1])) if away[nearest] <= reach else None
+
+    def left_m(self, entry: Cell) -> float:
+        """Length of the way from `entry`, about 6 % off; to the plan's border where the goal is beyond it."""
+        return float(self._steps[entry]) * CELL_M
+
+    def carrot(self, robot: Point, entry: Cell) -> Point:
+        """The farthest point of the way that lies straight ahead of the robot, unhidden by anything known."""
+        skip = 1.5 + math.dist(self.middle(entry), robot) / CELL_M
+        if self.sees(robot, self.goal, skip):
+            return self.goal
+        way = self._way(entry)
+        for cell in way[:_NEAREST_CELLS:-_TRIED_EVERY]:
+            point = self.middle(cell)
+            if self.sees(robot, point, skip):
+                return point
+        return self.middle(way[min(len(way) - 1, _NEAREST_CELLS)])
+
+    def left_from(self, point: Point) -> float:
+        """Length of the way from `point`; inf where none leads from there."""
+        steps = self._steps[self._cell(point)] if self.covers(point) else _UNREACHED
+        return float(steps) * CELL_M if steps < _UNREACHED else math.inf
+
+    def _way(self, entry: Cell) -> list[Cell]:
+        way = [entry]
+        while len(way) < _LOOK_AHEAD_CELLS and self._steps[way[-1]] > 0:
+            i, j = way[-1]
+            around = [(i + a, j + b) for a, b in _AROUND
+                      if 0 <= i + a < self._steps.shape[0] and 0 <= j + b < self._steps.shape[1]]
+            best = min(around, key=lambda one: (int(self._steps[one]), math.dist(self.middle(one), self.goal)))
+            if self._steps[best] >= self._steps[i, j]:
+                break
+            way.append(best)
+        return way
+
+    def sees(self, start: Point, end: Point, skip_cells: float = 1.5) -> bool:
+        """Whether a straight line meets no cell that is blocked or tight; the first `skip_cells` and what is off the
+        plan aside. One that begins in a tight place has to keep out of blocked cells only.
+        """
+        count = max(2, math.ceil(2 * math.dist(start, end) / CELL_M))
+        first = min(count, math.ceil(2 * skip_cells))
+        share = np.arange(first, count + 1)[:, None] / count
+        cells = cells_of(np.array([start]) * (1 - share) + np.array([end]) * share) - self._low
+        inside = ((cells >= 0) & (cells < self._steps.shape)).all(axis=1)
+        own = self._cell(start)
+        closed = self._blocked if self.covers(start) and self._tight[own] else self._tight
+        return not closed[tuple(cells[inside].T)].any()
+
+
+def _window(filled: Cells, robot: Point, goal: Point, keep_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The corner cells of the plan: robot, goal and all that is known, with room to go round; the horizon bounds it."""
+    own, margin = cells_of(np.array([robot]))[0], math.ceil(keep_m / CELL_M) + 4
+    horizon = round(HORIZON_M / CELL_M)
+    near = filled[(np.abs(filled - own) < horizon - margin).all(axis=1)]
+    ends = np.vstack([own, near, np.clip(cells_of(np.array([goal])), own - horizon, own + horizon)])
+    inside = (np.abs(cells_of(np.array([goal]))[0] - own) <= horizon).all()
+    low = np.maximum(ends.min(axis=0) - margin, own - horizon - (margin if inside else 0))
+    high = np.minimum(ends.max(axis=0) + margin, own + horizon + (margin if inside else 0))
+    return low, high
+
+
+def _away(filled: Cells, size: NDArray[np.int64]) -> NDArray[np.float32]:
+    """How far each cell's middle is from the nearest filled one's, in metres."""
+    room = np.ones(size, np.uint8)
+    inside = ((filled >= 0) & (filled < size)).all(axis=1)
+    room[tuple(filled[inside].T)] = 0
+    if room.all():
+        return np.full(size, np.inf, np.float32)
+    away: NDArray[np.float32] = cv2.distanceTransform(room, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * np.float32(CELL_M)
+    return away
+
+
+def _flooded(blocked: NDArray[np.bool_], tight: NDArray[np.bool_], seeds: list[tuple[int, Cell]]
+             ) -> NDArray[np.int32]:
+    """For each cell, how many steps of the wave it takes to get there. It enters tight cells every third step only."""
+    free, roomy = (~blocked).astype(np.uint8), (~(blocked | tight)).astype(np.uint8)
+    wave, waited = np.zeros_like(free), np.zeros(free.shape, np.int32)
+    pending = sorted((one for one in seeds if free[one[1]]), reverse=True)
+    step, counts = 0, [-1] * _TIGHT_STEPS
+    while True:
+        while pending and pending[-1][0] <= step:
+            wave[pending.pop()[1]] = 1
+        reached = cv2.countNonZero(wave)
+        if reached == counts[0] and not pending:
+            break
+        counts = [*counts[1:], reached]
+        waited += wave ^ 1
+        step += 1
+        grown = np.asarray(cv2.dilate(wave, _SQUARE if step % 2 else _CROSS), np.uint8)
+        wave |= grown & (free if step % _TIGHT_STEPS == 0 else roomy)
+    waited[wave == 0] = _UNREACHED
+    return waited

@@ -1,12 +1,13 @@
 """A range scan off the wire -> `RangeScan`, bounded; nothing that is no number gets any further. Pure."""
 
+import math
 import numpy as np
-
+from collections import deque
+from numpy.typing import NDArray
 from sightline.protocol.channels import SCAN
 from sightline.protocol.codec import check_sizes, decode
-from sightline.protocol.errors import WireError
-from sightline.protocol.messages import ScanHeader
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason, WireError
+from sightline.protocol.messages import FrameHeader, Pose, ScanHeader
 from sightline.vision_side.missions.port import RangeScan
 
 
@@ -25,3 +26,75 @@ def decode_scan(header: bytes, payload: bytes) -> tuple[ScanHeader, RangeScan]:
     scan = RangeScan(stamp.t_us, stamp.angle_min_rad, stamp.angle_increment_rad, stamp.range_min_m, stamp.range_max_m,
                      ranges_m)
     return stamp, scan
+
+
+# Where a scan's echoes are, at the pose of the scan's own time. Pure.
+#
+# A scan is older than the frame it comes with, by up to a turn of the sensor: what a turning robot saw 0.1 s ago is
+# elsewhere about it now. So echoes are laid out in the odometry frame from where the robot was when it met them.
+
+
+Points = NDArray[np.float64]
+"""(N, 2), metres."""
+
+_REMEMBERED = 64  # poses: two seconds at 30 fps, longer than any scan is believed
+_MAX_AHEAD_S = 0.2  # a scan newer than the newest pose is laid out by dead reckoning, no further than this
+
+
+class PoseMemory:
+    """Where the robot was during the last two seconds."""
+
+    def __init__(self) -> None:
+        self._poses: deque[tuple[int, Pose]] = deque(maxlen=_REMEMBERED)
+        self._moving = (0.0, 0.0)
+
+    def add(self, header: FrameHeader) -> None:
+        """One frame's odometry; frames come in order."""
+        self._poses.append((header.t_us, header.pose))
+        self._moving = header.moving
+
+    def at(self, t_us: int) -> Pose:
+        """The pose at `t_us`: between two known ones, or a little beyond the newest, or else the nearest in time."""
+        newest_us, newest = self._poses[-1]
+        if t_us >= newest_us:
+            return _moved(newest, self._moving, min((t_us - newest_us) / 1e6, _MAX_AHEAD_S))
+        later_us, later = newest_us, newest
+        for before_us, before in reversed(self._poses):
+            if before_us <= t_us:
+                share = (t_us - before_us) / max(1, later_us - before_us)
+                return _between(before, later, share)
+            later_us, later = before_us, before
+        return later
+
+
+def _moved(pose: Pose, moving: tuple[float, float], seconds: float) -> Pose:
+    middle = pose[2] + moving[1] * seconds / 2
+    way = moving[0] * seconds
+    return pose[0] + way * math.cos(middle), pose[1] + way * math.sin(middle), pose[2] + moving[1] * seconds
+
+
+def _between(one: Pose, other: Pose, share: float) -> Pose:
+    turn = math.remainder(other[2] - one[2], math.tau)
+    return one[0] + share * (other[0] - one[0]), one[1] + share * (other[1] - one[1]), one[2] + share * turn
+
+
+def echoes(scan: RangeScan, sensor_x_m: float) -> Points:
+    """Where the rays of `scan` met something, about the robot; the sensor is `sensor_x_m` ahead of the axle."""
+    ranges = scan.ranges_m.astype(np.float64)
+    met = np.flatnonzero((ranges >= scan.range_min_m) & (ranges <= scan.range_max_m))
+    angles = scan.angle_min_rad + met * scan.angle_increment_rad
+    return np.column_stack([sensor_x_m + ranges[met] * np.cos(angles), ranges[met] * np.sin(angles)])
+
+
+def in_odometry(points: Points, pose: Pose) -> Points:
+    """Points about the robot at `pose`, in the odometry frame."""
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    x, y = points[:, 0], points[:, 1]
+    return np.column_stack([pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y])
+
+
+def about_robot(points: Points, pose: Pose) -> Points:
+    """Points of the odometry frame, about the robot at `pose`."""
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    x, y = points[:, 0] - pose[0], points[:, 1] - pose[1]
+    return np.column_stack([cos * x + sin * y, cos * y - sin * x])

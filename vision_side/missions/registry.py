@@ -11,17 +11,17 @@ from typing import Any, Final
 
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import CameraModel
-from sightline.protocol.mission_messages import MissionRequest
+from sightline.protocol.messages import MissionRequest
 from sightline.vision_side.config import TargetConfig, VisionConfig
-from sightline.vision_side.detect.labels import is_followable
+from sightline.vision_side.detect.port import is_followable
 from sightline.vision_side.missions.port import Mission
 from sightline.vision_side.plugins import PluginRegistry, config_model
 
 BUILT_IN: Final = {
     "follow": "sightline.vision_side.missions.follow:Follow",
-    "band": "sightline.vision_side.missions.band:Band",
-    "pixel-pi": "sightline.vision_side.missions.pixel_pi:PixelPi",
-    "pixel-p": "sightline.vision_side.missions.pixel_p:PixelP",
+    "band": "sightline.evaluation.baselines.pixels:Band",
+    "pixel-pi": "sightline.evaluation.baselines.pixels:PixelPi",
+    "pixel-p": "sightline.evaluation.baselines.pixels:PixelP",
     "legs": "sightline.vision_side.missions.legs:Legs",
     "legs-baseline": "sightline.evaluation.baselines.legs:LegsBaseline",
     "traffic-light": "sightline.vision_side.missions.traffic_light:TrafficLight",

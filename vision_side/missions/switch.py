@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from sightline.protocol.messages import STILL, CameraModel
-from sightline.vision_side.detect.around import PLUGIN_ERRORS
+from sightline.vision_side.detect.plugin_calls import PLUGIN_ERRORS
 from sightline.vision_side.missions.registry import MissionSpec
 from sightline.vision_side.missions.port import Plan, View
 

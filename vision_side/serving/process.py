@@ -9,12 +9,12 @@ from types import FrameType
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.service import Observe
-from sightline.vision_side.detect.around import close_detector
+from sightline.vision_side.detect.plugin_calls import close_detector
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.missions.registry import configured_mission
 from sightline.vision_side.pipeline import SOURCE
-from sightline.vision_side.service import LogLine, endpoints_text, open_service
+from sightline.vision_side.serving.service import LogLine, endpoints_text, open_service
 
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 
@@ -43,7 +43,7 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
 
     Raises ConfigError for an endpoint or a mission that is none, LinkError if the link cannot be opened.
     """
-    from sightline.protocol.transports.zenoh_log import log_rejected_peers
+    from sightline.protocol.transports.zenoh.access_log import log_rejected_peers
 
     configured_mission(config)  # a mission that there is not is said before anything is opened
     ending, eyes = threading.Event(), configured_detector(config)
@@ -68,7 +68,7 @@ def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | N
 
 
 def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe | None, eyes: Detector | None) -> int:
-    from sightline.protocol.transports.zenoh_site import open_fleet
+    from sightline.protocol.transports.zenoh.link import open_fleet
     from sightline.vision_side.serving.fleet import Fleet
 
     opened = open_fleet(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,

@@ -1,7 +1,29 @@
 """What a vision service has done for one robot so far, for whoever measures it. Pure."""
 
+import secrets
+import threading
+import time
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MAX_HEADER_BYTES, TWIST
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import RejectReason, WireError
+from sightline.protocol.messages import CameraModel, FrameHeader, Stamp
+from sightline.protocol.text import format_twist
+from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.color.hsv import HsvDetector
+from sightline.vision_side.detect.plugin_calls import attach_detector
+from sightline.vision_side.detect.port import Detector
+from sightline.vision_side.detect.registry import configured_detector
+from sightline.vision_side.detect.timing import TimedDetector
+from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, encode_answer
+from sightline.vision_side.serving.mission_channel import MissionChannel, NO_FRAMES
+from sightline.vision_side.tracking.locate import BoxReader, REMEMBERED
+from sightline.vision_side.viewing import ViewPublisher
+from typing import Final, TypeVar
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,3 +48,358 @@ class Counts:
 CountsNow = Callable[[], list[Counts]]
 Observe = Callable[[CountsNow], None]
 """Told, once, how to look at the counts of every robot."""
+
+
+# Which session of a robot to steer by, when frames of more than one arrive. Pure.  A robot that starts anew begins a
+# session, and is met at once: the newest session is the one. Yet anybody on a plain network can send one frame of a
+# new session, and two robots may have one id. So an earlier session that goes on, while the newer one should be all
+# there is, is taken back: a robot that started anew cannot also be as it was before. From then on it is only replaced
+# when it has fallen silent.
+
+
+GOES_ON_US: Final = 300_000
+"""An earlier session is alive if frames of it were captured, and came, over this long: more than a late frame or two
+that the network held back, and as little as a robot without answers can show (it sends one every 120 to 500 ms)."""
+SILENT_US: Final = 1_000_000
+"""A session that is not heard for longer may be replaced: the slowest stream sends twice as often, and no robot starts
+anew so fast."""
+KEPT: Final = 8
+"""Earlier sessions remembered, those heard last. One that is forgotten counts as new."""
+
+
+@dataclass(slots=True)
+class _Earlier:
+    """A session that another replaced: since when it is heard again, by our clock and by its own, and when last."""
+
+    heard_us: int
+    again_us: int = 0
+    captured_us: int = 0
+
+    def goes_on(self, captured_us: int, now_us: int) -> bool:
+        """Whether, with this frame, it was heard for so long that it cannot be over."""
+        if not self.again_us or now_us - self.heard_us > SILENT_US:
+            self.again_us, self.captured_us = now_us, captured_us
+        self.heard_us = now_us
+        return min(now_us - self.again_us, captured_us - self.captured_us) >= GOES_ON_US
+
+
+class SessionSelector:
+    """Judges every frame by its session. Times are of this machine's clock, but for `captured_us`, the robot's."""
+
+    def __init__(self) -> None:
+        self.current = ""
+        self._heard_us = 0
+        self._proven = False
+        """Whether the current one was heard beside another: then another is no sign that it is over."""
+        self._earlier: dict[str, _Earlier] = {}
+
+    def admits(self, session: str, captured_us: int, now_us: int) -> bool:
+        """Whether a frame of `session` is of the robot that is steered; it may become so by this very frame."""
+        if session != self.current:
+            if not self._replaces(session, captured_us, now_us):
+                return False
+            self._follow(session)
+        self._heard_us = now_us
+        return True
+
+    def _replaces(self, session: str, captured_us: int, now_us: int) -> bool:
+        if self._proven and now_us - self._heard_us <= SILENT_US:
+            return False
+        earlier = self._earlier.get(session)
+        if earlier is not None and not earlier.goes_on(captured_us, now_us):
+            return False
+        self._proven = earlier is not None
+        return True
+
+    def _follow(self, session: str) -> None:
+        self._earlier.pop(session, None)
+        if self.current:
+            self._earlier[self.current] = _Earlier(self._heard_us)
+        if len(self._earlier) > KEPT:
+            del self._earlier[min(self._earlier, key=lambda name: self._earlier[name].heard_us)]
+        self.current = session
+
+
+# The vision service: newest frame in, twist or acknowledgement out, over a `Link`. Shell.
+#
+# One printed line per change of state, never one per frame. Ends within a second of SIGTERM or SIGINT.
+
+
+_SILENCE_S = 3.0
+_NO_FRAMES_S = 1.0  # twice what the slowest stream takes between two frames
+_CAMERA_PATIENCE_S = 1.5
+_TOLD_COUNTS = tuple(10**power for power in range(10))  # a camera gone bad is told at 1, 10, 100 ... pictures
+_TOLD_PHASES = {"searching": "target not in sight, searching", "lost": "target lost"}
+LogLine = Callable[[str], None]
+Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
+
+
+def open_service(config: VisionConfig, link: Link, say: LogLine, eyes: Detector | None = None) -> "Service":
+    """The service that fits the configured detector, for one robot. `eyes` are that detector, if it is built."""
+    if config.detector.kind == "boxes":
+
+        return BoxesService(config, link, say)
+    return Service(config, link, say, eyes)
+
+
+class Service:
+    """What is known of the robot on the other end, and the pipeline that fits it."""
+
+    def __init__(self, config: VisionConfig, link: Link, say: LogLine, eyes: Detector | None = None) -> None:
+        self._config, self._link, self._say = config, link, say
+        self._eyes = eyes or configured_detector(config)
+        self._plain = TimedDetector(HsvDetector(config.hsv))
+        attach_detector(self._eyes, link)
+        self._cameras: LatestSlot[Message] = link.latest(CAMERA)
+        self._frames = self._arrivals(link)
+        self._camera: CameraModel | None = None
+        self._pipeline: Pipeline | None = None
+        self._session = secrets.token_hex(4)
+        self._robot_session = ""
+        self._sessions = SessionSelector()
+        self._said: dict[str, str] = {}
+        self._counted: Counter[str] = Counter()
+        if config.camera is not None:
+            self._use(config.camera)
+        self._heard_s = time.monotonic()
+        self._blind_since_s = 0.0
+        self._newest: tuple[int, int | None] = (0, None)
+        self.answered = self.steered = 0
+        self.skipped: Counter[str] = Counter()
+        self._dispatch = MissionChannel(config, link, self._tell, self._refuse)
+        self._viewing = ViewPublisher(config, link, self._tell)
+
+    def _arrivals(self, link: Link) -> LatestSlot[Message]:
+        """Where what is to be answered arrives."""
+        return link.latest(FRAME)
+
+    def turn(self, wait_s: float) -> None:
+        """Wait up to `wait_s` for a frame and answer it."""
+        message = self._frames.take(wait_s)
+        started_ns = time.perf_counter_ns()
+        if message is not None and self._pipeline is not None:
+            self._frame(message, started_ns)
+            self._look_at_camera()  # afterwards: it says the same twice a second, and frames are in a hurry
+            return
+        self._look_at_camera()
+        if message is not None:
+            self._frame(message, started_ns)
+        else:
+            self._note_silence(time.monotonic())
+
+    def _note_silence(self, now_s: float) -> None:
+        if now_s - self._heard_s > _NO_FRAMES_S:
+            self._dispatch.after(now_s, self._pipeline, None, NO_FRAMES)
+        if now_s - self._heard_s > _SILENCE_S:
+            self._robot_session = ""
+            self._tell("link", f"no frames from robot {self._config.robot} at {endpoints_text(self._config)}; is "
+                               "`sightline robot` running there, with this robot id?")
+
+    def counts(self) -> Counts:
+        """What is done so far; from any thread."""
+        heard, (compute_us, latency_us) = time.monotonic() - self._heard_s <= _SILENCE_S, self._newest
+        return Counts(self._config.robot, heard and self.answered > 0, self.answered, self.steered,
+                      dict(self.skipped.copy()), self._frames.dropped, compute_us, latency_us)
+
+    def _look_at_camera(self) -> None:
+        """Take in the camera's model; a new one needs a new pipeline."""
+        message = self._cameras.take()
+        if message is None or self._decoded(Stamp, message.header, MAX_HEADER_BYTES) is None:
+            return
+        camera = self._decoded(CameraModel, message.payload, CAMERA.max_payload_bytes)
+        if camera is not None and camera != self._camera:
+            self._use(camera)
+
+    def _use(self, camera: CameraModel) -> None:
+        self._camera = camera
+        before = self._pipeline
+        self._pipeline = (before.with_camera(camera) if before
+                          else Pipeline(self._config, camera, self._plain, eyes=self._eyes))
+        self._counted.clear()
+        lens = "calibrated" if camera.calibrated else "not calibrated"
+        self._tell("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")
+
+    def _frame(self, message: Message, started_ns: int) -> None:
+        header = self._decoded(FrameHeader, message.header, MAX_HEADER_BYTES)
+        if header is None:
+            return
+        if not self._sessions.admits(header.session, header.t_us, monotonic_us()):
+            self.skipped["OTHER_SESSION"] += 1
+            self._tell("other", f"frames of session {header.session} are refused: robot {self._config.robot} is "
+                                f"steered in session {self._sessions.current}; two robots with this id? give each its "
+                                "own with --robot")
+            return
+        self._heard_s = time.monotonic()
+        if header.session != self._robot_session:
+            self._robot_session = header.session
+            self._tell("link", f"frames from robot {self._config.robot}, session {header.session}")
+        if self._pipeline is None:
+            self._wait_for_camera()
+            self._publish(header, PipelineAnswer(None, Observation("no picture", note="no camera model yet")), 0)
+            return
+        self._dispatch.before(self._pipeline, header)
+        deadline_us = monotonic_us() + round(self._config.detector.deadline_s * 1e6)
+        answer = self._pipeline.step(Frame(header, message.payload, deadline_us))
+        if answer.twist is None:
+            self._count_skipped(self._pipeline.skipped)
+        self._publish(header, answer, (time.perf_counter_ns() - started_ns) // 1000)
+        self._tell_phase(answer)
+        self._dispatch.after(time.monotonic(), self._pipeline, header, answer.seen)
+        self._viewing.show(header, answer, self._pipeline.mission.name, self._camera,
+                           started_ns=started_ns, jpeg=message.payload)
+
+    def _count_skipped(self, skipped: Counter[str]) -> None:
+        """Add what this pipeline has skipped since the last time to what earlier ones did."""
+        self.skipped.update(skipped - self._counted)
+        self._counted = skipped.copy()
+
+    def _wait_for_camera(self) -> None:
+        """The model comes twice a second; only a longer wait is worth a word."""
+        self._blind_since_s = self._blind_since_s or time.monotonic()
+        if time.monotonic() - self._blind_since_s > _CAMERA_PATIENCE_S:
+            self._tell("camera", "frames come, but no camera model; is the robot of another version?")
+
+    def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
+        self.answered += 1
+        self.steered += answer.twist is not None
+        self._newest = (compute_us, header.latency_us)
+        stamp = encode_answer(header, self._session, self.answered, compute_us, answer)
+        if answer.twist is None:
+            self._link.publish(ACK, stamp, b"")
+        else:
+            self._link.publish(TWIST, stamp, format_twist(answer.twist))
+
+    def _decoded(self, model: type[Model], data: bytes, max_bytes: int) -> Model | None:
+        try:
+            return decode(model, data, max_bytes)
+        except WireError as error:
+            self._refuse(error)
+            return None
+
+    def _refuse(self, error: WireError) -> None:
+        self.skipped[error.reason] += 1
+        if error.reason is RejectReason.UNSUPPORTED_VERSION:
+            self._tell("version", error.detail)
+
+    def _tell_phase(self, answer: PipelineAnswer) -> None:
+        seen = answer.seen
+        if answer.twist is None:
+            count = self.skipped.total()
+            if count in _TOLD_COUNTS:
+                self._say(f"vision: pictures skipped so far: {count}; this one: {seen.note}")
+        elif seen.phase in _TOLD_PHASES:
+            self._tell("phase", _TOLD_PHASES[seen.phase])
+        elif seen.phase == "tracking" and seen.distance_m is not None:
+            self._tell("phase", f"target seen at {seen.distance_m:.2f} m", "seen")
+        elif seen.phase != "coasting":
+            self._tell("phase", ": ".join(filter(None, (seen.phase, seen.note))), seen.phase)
+
+    def _tell(self, about: str, line: str, state: str = "") -> None:
+        """Print `line` if what it is about changed since it was last told."""
+        if self._said.get(about) != (state or line):
+            self._said[about] = state or line
+            self._say(f"vision: {line}")
+
+
+def endpoints_text(config: VisionConfig) -> str:
+    return ", ".join([*config.connect, *(f"{one} (listening)" for one in config.listen)]) or "nowhere"
+
+
+# The vision service without eyes of its own: it steers by boxes that somebody publishes. Shell.
+#
+# Every frame is acknowledged at once, since nothing here looks at it; boxes are answered with a twist that cites the
+# frame in which they were found, however old that is by now: the robot judges. No boxes, no twist: the robot holds.
+
+
+_BOXES_SILENCE_S = 2.0
+_NO_BOXES = Observation("no boxes")
+
+
+class BoxesInbox(LatestSlot[Message]):
+    """The newest frame and the newest boxes of one source; also the last frames' headers, which boxes may name."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__()
+        self._source = source
+        self._arrived = threading.Condition()
+        self._newest: dict[str, Message] = {}
+        self.headers: deque[bytes] = deque(maxlen=REMEMBERED)
+
+    def put(self, item: Message) -> None:
+        """Replace what is there of that channel; never blocks."""
+        if item.channel is DETECTIONS and item.source != self._source:
+            return
+        with self._arrived:
+            if item.channel is FRAME:
+                self.headers.append(item.header)
+            self.dropped += item.channel.name in self._newest
+            self._newest[item.channel.name] = item
+            self._arrived.notify()
+
+    def take(self, timeout_s: float = 0.0) -> Message | None:
+        """A frame, of which credit bounds the number, before boxes; None if neither comes within `timeout_s`."""
+        with self._arrived:
+            self._arrived.wait_for(lambda: self._newest, timeout_s)
+            return self._newest.pop(FRAME.name, None) or self._newest.pop(DETECTIONS.name, None)
+
+
+class BoxesService(Service):
+    """A `Service` whose detector is elsewhere."""
+
+    def __init__(self, config: VisionConfig, link: Link, say: LogLine) -> None:
+        self._inbox = BoxesInbox(config.boxes.source)
+        self._reader = BoxReader(config.boxes)
+        self._boxes_heard_s = time.monotonic()
+        super().__init__(config, link, say)
+
+    def _arrivals(self, link: Link) -> LatestSlot[Message]:
+        for channel in (FRAME, DETECTIONS):
+            link.subscribe(channel, self._inbox.put)
+        return self._inbox
+
+    def _frame(self, message: Message, started_ns: int) -> None:
+        """A frame is acknowledged, boxes are answered."""
+        if message.channel is DETECTIONS:
+            self._boxes(message, started_ns)
+            return
+        header = self._decoded(FrameHeader, message.header, MAX_HEADER_BYTES)
+        if header is None:
+            return
+        self._heard_s = time.monotonic()
+        self._tell("link", f"frames from robot {self._config.robot}, session {header.session}")
+        self._publish(header, PipelineAnswer(None, Observation("no picture", note="somebody else looks")), 0)
+        self._viewing.keep(header, message.payload)
+        if self._pipeline is None:
+            self._wait_for_camera()
+        elif time.monotonic() - self._boxes_heard_s > _BOXES_SILENCE_S:
+            self._dispatch.after(time.monotonic(), self._pipeline, header, _NO_BOXES)
+            self._tell("boxes", f"frames come, but no boxes from {self._config.boxes.source}; does its detector run?")
+
+    def _boxes(self, message: Message, started_ns: int) -> None:
+        self._remember_frames()
+        self._boxes_heard_s = time.monotonic()
+        if self._pipeline is None or self._camera is None:
+            return
+        try:
+            frame, found = self._reader.read(message.header, message.payload, self._camera)
+        except WireError as error:
+            self.skipped[error.reason] += 1
+            self._tell("boxes", f"boxes are refused: {error.detail}", f"refused {error.reason}")
+            return
+        self._tell("boxes", f"boxes from {self._config.boxes.source}")
+        self._dispatch.before(self._pipeline, frame)
+        answer = self._pipeline.follow(frame, found)
+        if answer.twist is None:
+            self.skipped["OUT_OF_ORDER"] += 1
+            return
+        self._publish(frame, answer, (time.perf_counter_ns() - started_ns) // 1000)
+        self._tell_phase(answer)
+        self._dispatch.after(time.monotonic(), self._pipeline, frame, answer.seen)
+        self._viewing.show(frame, answer, self._pipeline.mission.name, self._camera, started_ns=started_ns)
+
+    def _remember_frames(self) -> None:
+        """Also those that newer ones replaced before they were taken up."""
+        while self._inbox.headers:
+            header = self._decoded(FrameHeader, self._inbox.headers.popleft(), MAX_HEADER_BYTES)
+            if header is not None:
+                self._reader.remember(header)

@@ -10,14 +10,14 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES
-from sightline.protocol.transports.websocket_access import bearer_header
-from sightline.protocol.transports.websocket_dialects import PeerError
-from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint
+from sightline.protocol.transports.security import bearer_header
+from sightline.protocol.transports.websocket.framing import PeerError
+from sightline.protocol.transports.endpoints import WebSocketEndpoint
 from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL
-from sightline.protocol.transports.websocket_keys import own_token
-from sightline.protocol.transports.websocket_peer import OPEN_S, PROTOCOL_OPTIONS
-from sightline.protocol.transports.websocket_tls import client_tls_context, tls_handshake
-from sightline.protocol.transports.websocket_wire import Connection
+from sightline.protocol.transports.security import own_token
+from sightline.protocol.transports.websocket.peer import OPEN_S, PROTOCOL_OPTIONS
+from sightline.protocol.transports.security import client_tls_context, tls_handshake
+from sightline.protocol.transports.websocket.connection import Connection
 
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed

@@ -3,7 +3,28 @@
 They all are the same `guest` to the robot, which so cannot tell two that contradict each other from one.
 """
 
-from typing import Final
+from collections.abc import Callable, Hashable
+from sightline.protocol.channels import ACK, Channel, DETECTIONS, FRAME, KEY_PREFIX, TWIST, key_for
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import RejectReason, WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader
+from sightline.protocol.text import (
+    MAX_BOXES_BYTES,
+    decode_picture,
+    detections_from_boxes,
+    encode_picture,
+    format_twist,
+    parse_boxes,
+    parse_dashed,
+    parse_twist,
+    text_bound,
+)
+from sightline.protocol.transports.endpoints import LegacyOptions
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.websocket.framing import BAD_FRAMING, IncomingMessage, PeerError
+from typing import Final, NamedTuple
+
 
 DRIVER_SLOT_US: Final = 1_000_000
 """A driver that has said nothing valid for so long has left its seat; as long as the robot's own lease."""
@@ -26,3 +47,171 @@ class DriverSlot:
         """`who` is gone."""
         if who == self._driver:
             self._driver, self._until_us = "", 0
+
+
+# The older text dialect from either end of a WebSocket; who speaks it has no header, token or session. Pure.
+
+
+GUEST: Final = "guest"
+GUEST_SESSION: Final = "00000000"
+"""The session of everybody who speaks without headers."""
+MAX_COMMAND_TEXT_BYTES: Final = 256
+"""Security limit: a text towards a robot; a twist over its own 64 bytes is still counted, not a reason to hang up."""
+
+
+class LegacyClient(NamedTuple):
+    """Who speaks the older dialect with a robot, the seat it shares with others, and where lines for the log go."""
+
+    who: str
+    seat: DriverSlot
+    tell: Callable[[str], None]
+
+
+class LegacyToVision:
+    """The robot's end of the older dialect: pictures out as base64, `linear|angular` in, as source `guest`.
+
+    Such a peer cannot acknowledge. Each of its answers is also taken as the answer to the newest picture it was sent,
+    so that it gets pictures at the rate of its own answers.
+    """
+
+    text = True
+    wants: tuple[str, ...] = ()
+
+    def __init__(self, robot: str, options: LegacyOptions, now_us: Callable[[], int], client: LegacyClient) -> None:
+        """`now_us` reads a monotonic clock."""
+        self._robot, self._options, self._now_us = robot, options, now_us
+        self._who, self._seat, self._tell = client
+        self._told = ""
+        self._sent: tuple[bytes, int] | None = None
+        self._looked_at: tuple[bytes, bytes] | None = None
+        self._answers = 0
+
+    @property
+    def form(self) -> Hashable:
+        return self._options
+
+    def hears(self, channel: Channel) -> bool:
+        return channel is FRAME
+
+    def write(self, message: Message) -> tuple[bytes, ...]:
+        return (encode_picture(message.payload, self._options.newlines),)
+
+    def note_sent(self, message: Message) -> None:
+        self._sent = message.header, self._now_us()
+        if self._looked_at is None:  # of several it may have looked at, the oldest: never younger than the truth
+            self._looked_at = message.header, message.payload
+
+    def read(self, message: str | bytes) -> list[IncomingMessage]:
+        if isinstance(message, bytes):
+            raise PeerError(BAD_FRAMING, 1003, "binary message; this port speaks text: linear|angular")
+        text = message.encode("utf-8", "surrogatepass")
+        if self._options.boxes and (b"," in text or not text):
+            return [self._detections(text), *self._acknowledgement()]
+        return [self._twist(text), *self._acknowledgement()]
+
+    def bound(self, _wanted_bytes: int, /) -> int:
+        return MAX_BOXES_BYTES if self._options.boxes else MAX_COMMAND_TEXT_BYTES
+
+    def note_gone(self) -> None:
+        """The client is gone: another may drive."""
+        self._seat.leave(self._who)
+
+    def _twist(self, text: bytes) -> IncomingMessage:
+        """What is no twist stays as it is: the robot refuses it, and says why in `status`."""
+        try:
+            twist = parse_dashed(text, self._options.swapped) if self._options.dashed else parse_twist(text)
+        except WireError:
+            return IncomingMessage(key_for(self._robot, TWIST, GUEST), b"", text)
+        self._take_seat()
+        barred = format_twist(twist) if self._options.dashed else text
+        return IncomingMessage(key_for(self._robot, TWIST, GUEST), b"", barred)
+
+    def _take_seat(self) -> None:
+        """Raise WireError, told once for each driver, if another client drives."""
+        driver = self._seat.claim(self._who, self._now_us())
+        if driver != self._told:
+            self._told = driver
+            self._tell(f"{self._who} drives" if driver == self._who else f"{self._who} only watches: {driver} drives")
+        if driver != self._who:
+            raise WireError(RejectReason.NOT_HOLDER, f"{driver} drives")
+
+    def _detections(self, text: bytes) -> IncomingMessage:
+        looked_at, self._looked_at = self._looked_at, None
+        if looked_at is None:
+            raise WireError(RejectReason.UNKNOWN_FRAME, "boxes without a picture to look at")
+        found = detections_from_boxes(parse_boxes(text), read_jpeg_size(looked_at[1]))
+        self._answers += 1
+        echo = _echo(looked_at[0])
+        header = DetectionsHeader(source=GUEST, session=GUEST_SESSION, seq=self._answers, echo=echo)
+        return IncomingMessage(key_for(self._robot, DETECTIONS, GUEST), encode(header), encode(found))
+
+    def _acknowledgement(self) -> list[IncomingMessage]:
+        sent, self._sent, self._looked_at = self._sent, None, None
+        echo = _echo(sent[0]) if sent else None
+        if sent is None or echo is None:  # there is no credit to return
+            return []
+        self._answers += 1
+        # How much of the time was computing is unknown; called computing, none of it widens the window.
+        spent_us = max(0, self._now_us() - sent[1])
+        answer = AnswerHeader(source=GUEST, session=GUEST_SESSION, seq=self._answers, echo=echo, compute_us=spent_us)
+        return [IncomingMessage(key_for(self._robot, ACK, GUEST), encode(answer), b"")]
+
+
+def _echo(header: bytes) -> Echo | None:
+    """Names the frame of `header`; None for one published without."""
+    try:
+        frame = decode(FrameHeader, header)
+    except WireError:
+        return None
+    return Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
+
+
+class LegacyToRobot:
+    """Vision's end of the older dialect: base64 text in as frames, twists out as bare text.
+
+    The header of a frame is made up here: the session stands for this connection, `t_us` is the time of arrival on
+    this machine's clock, and what the robot did is not known.
+    """
+
+    text = True
+    wants: tuple[str, ...] = ()
+
+    def __init__(
+        self, robot: str, options: LegacyOptions, now_us: Callable[[], int], session: str, max_frame_bytes: int
+    ) -> None:
+        """`session` is 8 hex digits, new for each connection; `now_us` reads a monotonic clock."""
+        self._robot, self._options, self._now_us = robot, options, now_us
+        self._session, self._max_frame_bytes = session, max_frame_bytes
+        self._seq = 0
+        self._last_us = -1
+
+    @property
+    def form(self) -> Hashable:
+        return self._options
+
+    def hears(self, channel: Channel) -> bool:
+        return channel is TWIST
+
+    def write(self, message: Message) -> tuple[bytes, ...]:
+        linear, bar, angular = message.payload.partition(b"|")
+        if not bar or not self._options.dashed:
+            return (message.payload,)
+        return (angular, b"-", linear) if self._options.swapped else (linear, b"-", angular)
+
+    def note_sent(self, message: Message) -> None:
+        pass
+
+    def note_gone(self) -> None:
+        pass
+
+    def read(self, message: str | bytes) -> list[IncomingMessage]:
+        if isinstance(message, bytes):
+            raise PeerError(BAD_FRAMING, 1003, "binary message; the older dialect is text: base64 pictures")
+        jpeg = decode_picture(message.encode("utf-8", "surrogatepass"), self._max_frame_bytes)
+        self._seq += 1
+        self._last_us = max(self._now_us(), self._last_us + 1)
+        header = FrameHeader(session=self._session, seq=self._seq, t_us=self._last_us)
+        return [IncomingMessage(f"{KEY_PREFIX}/{self._robot}/{FRAME.name}", encode(header), jpeg)]
+
+    def bound(self, _wanted_bytes: int, /) -> int:
+        return text_bound(self._max_frame_bytes)

@@ -1,10 +1,6 @@
-"""WebSocket as a `Link`: `sightline.v1`, or the older text dialect, with threads; newest-only per peer. Shell.
+"""What one end of WebSocket connections wants to hear, and who is called with it. Pure.
 
-    with open_websocket("r1", listen="ws://127.0.0.1:9090") as link:
-        link.publish(STATUS, header, payload)
-
-Only what the table of channels calls passed on goes from peer to peer: who listens speaks with each who connects, and
-they do not hear one another.
+That is what it subscribed to; and where all connect, what is said only while watched, as long as one of them watches.
 """
 
 from __future__ import annotations
@@ -15,27 +11,92 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from types import TracebackType
-from typing import Final, Self
-
-from sightline.protocol.channels import FRAME, TWIST, Channel, parse_key
+from sightline.protocol.channels import CHANNELS, Channel, FRAME, TWIST, parse_key
 from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.log import log_line
-from sightline.protocol.transports.link import LatestSlot, Message
-from sightline.protocol.transports.link_rules import INEXACT_KEY, LinkRules
+from sightline.protocol.log import BurstLimiter, log_line
+from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_websocket_endpoint
+from sightline.protocol.transports.link import INEXACT_KEY, LatestSlot, LinkRules, Message
 from sightline.protocol.transports.websocket.client import Client as Dialer
-from sightline.protocol.transports.websocket_dialects import PeerCodec, SightlineV1
-from sightline.protocol.transports.websocket_doorlog import BurstLimiter
-from sightline.protocol.transports.websocket_endpoints import WebSocketEndpoint, parse_websocket_endpoint
-from sightline.protocol.transports.websocket.framing import IncomingMessage
-from sightline.protocol.transports.websocket_legacy import LegacyClient, LegacyToRobot, LegacyToVision
-from sightline.protocol.transports.websocket_listen import KeyFolder, Server
-from sightline.protocol.transports.websocket.peer import Publication
-from sightline.protocol.transports.websocket_peer import Peer, Promote, exchange_hellos
-from sightline.protocol.transports.websocket.legacy import DriverSlot
-from sightline.protocol.transports.websocket_wants import Subscriptions
-from sightline.protocol.transports.websocket_wire import Connection
+from sightline.protocol.transports.websocket.connection import Connection
+from sightline.protocol.transports.websocket.framing import Hello, IncomingMessage, PeerCodec, SightlineV1
+from sightline.protocol.transports.websocket.legacy import DriverSlot, LegacyClient, LegacyToRobot, LegacyToVision
+from sightline.protocol.transports.websocket.peer import Peer, Promote, Publication, exchange_hellos
+from sightline.protocol.transports.websocket.server import KeyFolder, Server
+from types import TracebackType
+from typing import Final, Protocol, Self
+
+
+Callback = Callable[[Message], None]
+_WATCHED = tuple(one for one in CHANNELS.values() if one.while_watched)
+
+
+class Subscriber(Protocol):
+    """Another end."""
+
+    def hears(self, channel: Channel) -> bool:
+        """Whether it wants `channel`."""
+        ...
+
+    def limit(self, wanted_bytes: int) -> None:
+        """Accept no larger messages than what is wanted makes necessary."""
+        ...
+
+    def tell(self, hello: str) -> None:
+        """Say it who this end is and what it wants."""
+        ...
+
+
+class Subscriptions:
+    """The wants of one link. `told` is what its peers know of them."""
+
+    def __init__(self, rules: LinkRules, session: str) -> None:
+        self._rules, self._session = rules, session
+        self._callbacks: dict[str, list[Callback]] = {}
+        self.told: tuple[str, ...] = ()
+
+    def add(self, channel: Channel, callback: Callback) -> None:
+        """One more that is called for `channel`."""
+        self._callbacks.setdefault(channel.name, []).append(callback)
+
+    def drop(self, channel: Channel) -> None:
+        """Nobody is called for `channel` any more."""
+        self._callbacks.pop(channel.name, None)
+
+    def of(self, channel: Channel) -> tuple[Callback, ...]:
+        """Who is called for `channel`."""
+        return tuple(self._callbacks.get(channel.name, ()))
+
+    def hello(self) -> str:
+        """The hello that says what was told last."""
+        about = Hello(robot=self._rules.robot, role=self._rules.role, session=self._session, wants=self.told)
+        return encode(about).decode("utf-8")
+
+    def bound(self) -> int:
+        """The largest payload of what was told last, in bytes."""
+        return max((self._rules.payload_bound(CHANNELS[name]) for name in self.told), default=0)
+
+    def tell(self, peer: Subscriber) -> None:
+        """Tell one peer what the others were told."""
+        peer.limit(self.bound())
+        peer.tell(self.hello())
+
+    def retell(self, peers: Sequence[Subscriber], passing_on: bool) -> None:
+        """Tell all `peers` what is wanted now, if it changed. `passing_on`: what one says is for the others too."""
+        watched = (one.name for one in _WATCHED if passing_on and any(peer.hears(one) for peer in peers))
+        names = tuple(dict.fromkeys((*self._callbacks, *watched)))
+        if names != self.told:
+            self.told = names
+            for peer in peers:
+                self.tell(peer)
+
+
+# WebSocket as a `Link`: `sightline.v1`, or the older text dialect, with threads; newest-only per peer. Shell.
+# with open_websocket("r1", listen="ws://127.0.0.1:9090") as link:         link.publish(STATUS, header, payload)  Only
+# what the table of channels calls passed on goes from peer to peer: who listens speaks with each who connects, and
+# they do not hear one another.
+
 
 CLOSE_S: Final = 1.5
 """A close that takes longer is left to daemon threads, so that no process hangs on a dead peer."""
@@ -53,7 +114,7 @@ def open_websocket(
 ) -> WebSocketLink:
     """Open a link to `robot`; use it in a `with`.
 
-    Endpoints are `ws://host:port`, `wss://` and `ws-legacy://` (`sightline.protocol.transports.websocket_endpoints`). Who listens
+    Endpoints are `ws://host:port`, `wss://` and `ws-legacy://` (`sightline.protocol.transports.endpoints`). Who listens
     reaches `connect` in the background; a lost connection is made again by itself. `role` is the default source of what
     is published towards the robot. `secure` is a folder of tokens and certificates (`websocket_keys`, `websocket_tls`).
     Raises ConfigError for a robot id, endpoint, limit or folder that is none, for an endpoint open to anybody, and for
@@ -105,7 +166,7 @@ class WebSocketLink:
 
     @property
     def refused(self) -> Counter[str]:
-        """Messages and peers turned away, by reason (`sightline.protocol.transports.link_rules`, `websocket_*`)."""
+        """Messages and peers turned away, by reason (`sightline.protocol.transports.link`, `websocket_*`)."""
         return self._rules.refused
 
     @property

@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 import threading
+import time
 from collections import Counter
-from collections.abc import Hashable
-from typing import Final, Protocol
-
-from sightline.protocol.channels import CHANNELS, REQUEST, Channel, Priority
+from collections.abc import Callable, Hashable, Sequence
+from sightline.protocol.channels import ACK, CHANNELS, Channel, Priority, REQUEST
+from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import WireError
+from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.messages import Request
-from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.link import Message, OVERSIZE
 from sightline.protocol.transports.security import KNOWN_SOURCES
+from sightline.protocol.transports.websocket.connection import CLOSE_S, Connection, Keepalive
+from sightline.protocol.transports.websocket.framing import (
+    BAD_FRAMING,
+    BAD_HELLO,
+    IncomingMessage,
+    PeerCodec,
+    PeerError,
+    SightlineV1,
+)
+from typing import Any, Final, Protocol, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from websockets.exceptions import ConnectionClosed
+
 
 MAX_UNKNOWN_SOURCES: Final = 16
 """Security limit: places of one channel for sources that are no role's."""
@@ -116,3 +132,175 @@ def _rank(place: tuple[str, str, str]) -> int:
     if not name:
         return _HELLO_RANK
     return _STOP_RANK if verb == _STOP else _RANKS[CHANNELS[name].priority]
+
+
+# One WebSocket peer: what waits for it is sent by whoever has something new; a thread of its own reads. Shell.
+
+
+OPEN_S: Final = 2.0
+"""Security limit: for connecting and the handshake, and once more for the hello."""
+PROTOCOL_OPTIONS: Final[dict[str, Any]] = {"extensions": None, "logger": logging.getLogger("sightline.websocket")}
+"""No compression: pictures do not shrink, and trying costs three times the CPU."""
+SILENT: Final = "SILENT"
+"""Counted for a peer that left a ping unanswered, or took nothing for long."""
+
+NOT_GRANTED: Final = "NOT_GRANTED"
+"""Counted for a message that the role of the sender's token may not publish."""
+
+Promote = Callable[[str], None]
+"""Gives a client of that role a place; raises PeerError if there is none."""
+
+logging.getLogger("sightline.websocket").addHandler(logging.NullHandler())  # else Python prints to the terminal
+
+_TICK_US: Final = 250_000  # how late a ping may be, and silence be noticed
+_COUNTED_FOR_CODE: Final = {1002: BAD_FRAMING, 1007: BAD_FRAMING, 1009: OVERSIZE}
+
+
+class Peer:
+    """An open connection whose other end is known, and the dialect that it speaks."""
+
+    def __init__(self, wire: Connection, dialect: PeerCodec, heed: Callable[[], None] = lambda: None) -> None:
+        """`heed` is called on the reading thread when the peer says that it wants something else."""
+        self.outbox = Outbox()
+        self._heed = heed
+        self._wire, self._dialect = wire, dialect
+        self._reader = threading.current_thread()
+        self._gone = threading.Event()
+        self._forbidden = RepeatLimiter()
+        self._look_us = 0
+
+    def hears(self, channel: Channel) -> bool:
+        """Whether the peer wants `channel`."""
+        return self._dialect.hears(channel)
+
+    def admits(self, key: str, refuse: Callable[[str], None], tell: Callable[[str], None]) -> bool:
+        """Whether its token lets it publish on `key`; if not, that is counted and, ever more seldom, told."""
+        said = tuple(key.split("/")[2:])
+        if self._wire.granted is None or said in self._wire.granted:
+            return True
+        refuse(NOT_GRANTED)
+        what = "/".join(said)
+        times = 0 if said[0] == ACK.name else self._forbidden.is_due(what, monotonic_us())  # a viewer that acknowledges
+        if times:
+            often = f" ({times} times)" if times > 1 else ""
+            who = self._wire.address[0] or "a client"
+            tell(f"refused {what} from {who}{often}: the role of its token may not say that (docs/security.md)")
+        return False
+
+    def offer(self, post: Publication) -> None:
+        """Send it if the peer wants it, now or when there is room and nothing newer; never blocks."""
+        if self._dialect.hears(post.message.channel):
+            self.outbox.put(post)
+            self._send()
+
+    def tell(self, hello: str) -> None:
+        """Say who this end is and what it wants now, in a dialect that has words for it."""
+        if isinstance(self._dialect, SightlineV1):
+            self.outbox.put_hello(hello)
+            self._send()
+
+    def limit(self, wanted_bytes: int) -> None:
+        """Accept no larger messages than what this end wants makes necessary."""
+        with self._wire.lock:
+            self._wire.protocol.max_message_size = self._dialect.bound(wanted_bytes)
+        self._send()  # whoever found the lock taken left it to this thread
+
+    def run(self, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]) -> None:
+        """Read until the connection ends; a peer that breaks the rules is dropped and told why."""
+        from websockets.exceptions import ConnectionClosed
+
+        life = Keepalive(monotonic_us())
+        try:
+            while self._turn(life, deliver, refuse):
+                self._wire.wait(_TICK_US / 1e6)
+            refuse(SILENT)
+            self._wire.close(1011, "silent for too long")
+        except PeerError as refusal:
+            refuse(refusal.counted)
+            self._wire.close(refusal.code, str(refusal))
+            self._wire.linger()
+        except ConnectionClosed as closed:
+            count_close(closed, refuse)
+        finally:
+            self._wire.shut()
+            self._gone.set()
+
+    def _turn(self, life: Keepalive, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]) -> bool:
+        """Read what there is, and send; False if the other end is to be given up."""
+        now_us = monotonic_us()  # before reading: however long this end stood still, what came meanwhile counts
+        for message in self._wire.receive():
+            self._read(message, deliver, refuse)
+        if now_us < self._look_us:  # whoever was given a message waits for this thread to rest
+            self._send()
+            return True
+        self._look_us = now_us + _TICK_US
+        life.hear(self._wire.heard_us)
+        if life.is_ping_due(now_us):
+            self._wire.ping()
+        self._send()
+        return not life.is_over(now_us, self._wire.way_out)
+
+    def _read(self, message: Any, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]) -> None:
+        before = self._dialect.wants
+        try:
+            packets = self._dialect.read(message)
+        except WireError as error:
+            refuse(error.reason)
+            return
+        if self._dialect.wants != before:
+            self._heed()
+        for packet in packets:
+            deliver(self, packet)
+
+    def close(self, reason: str) -> None:
+        """Begin to say goodbye."""
+        self._wire.close(1001, reason)
+
+    def wait_gone(self, timeout_s: float = CLOSE_S) -> None:
+        """Until the peer is gone, but not for the thread that is about to see to that."""
+        if threading.current_thread() is not self._reader:
+            self._gone.wait(timeout_s)
+
+    def _send(self) -> None:
+        """Send while there is room. Who finds another thread at it leaves the rest to that one."""
+        lock = self._wire.lock
+        while self.outbox.waiting and lock.acquire(blocking=False):
+            try:
+                has_room = self._wire.fill(self._take)
+            finally:
+                lock.release()
+            if not has_room:
+                return
+
+    def _take(self) -> tuple[Sequence[bytes], bool] | None:
+        item = self.outbox.take()
+        if item is None:
+            return None
+        if isinstance(item, str):
+            return (item.encode("utf-8"),), True
+        pieces = item.written(self._dialect)
+        self._dialect.note_sent(item.message)
+        return pieces, self._dialect.text
+
+
+def exchange_hellos(wire: Connection, dialect: SightlineV1, hello: str, settle: Promote | None) -> None:
+    """Exchange hellos; who connects, and so gives no place, speaks first."""
+    if settle is None:
+        wire.say(hello)
+    try:
+        answer = wire.receive_one(time.monotonic() + OPEN_S)
+    except TimeoutError:
+        raise PeerError(BAD_HELLO, 1008, f"no hello within {OPEN_S:g} s") from None
+    if not isinstance(answer, str):
+        raise PeerError(BAD_HELLO, 1003, "the first message must be a hello, as text")
+    dialect.accept(answer)
+    if settle is not None:
+        settle(dialect.peer_role)
+        wire.say(hello)
+
+
+def count_close(closed: ConnectionClosed, refuse: Callable[[str], None]) -> None:
+    """Count a connection that this end closed because the peer broke a rule; one that the peer ended is no fault."""
+    counted = _COUNTED_FOR_CODE.get(closed.sent.code) if closed.sent and not closed.rcvd_then_sent else None
+    if counted is not None:
+        refuse(counted)

@@ -15,12 +15,12 @@ from sightline.protocol.channels import KEY_PREFIX, STATUS, parse_key
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints, parse_zenoh_endpoint
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.link_rules import LinkRules
+from sightline.protocol.transports.link import LinkRules
 from sightline.protocol.transports.zenoh.presence import MAX_PEERS, QUERY_ROUNDS, PeerInfo, best_round_trips
 from sightline.protocol.transports.security import RoleKeys, load_role_keys
 from sightline.protocol.transports.zenoh.session import multicast_address
-from sightline.protocol.transports.zenoh_presence import REPLY_TIMEOUT_S, query_presence
-from sightline.protocol.transports.zenoh_session import open_session
+from sightline.protocol.transports.zenoh.presence import REPLY_TIMEOUT_S, query_presence
+from sightline.protocol.transports.zenoh.session import open_session
 
 if TYPE_CHECKING:
     import zenoh

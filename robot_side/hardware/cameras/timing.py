@@ -4,7 +4,12 @@ A stamp taken when the picture is read makes one that lay in the driver's queue 
 monotonic clock, some with the clock of the day or with the time since boot; some do not stamp at all.
 """
 
+import time
 from dataclasses import dataclass
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.transports.link import LatestSlot
+from sightline.robot_side.ports import Picture
+
 
 _OLDEST_US = 2_000_000  # until its clock is known, what seems older than this was stamped by another
 
@@ -37,3 +42,63 @@ class CaptureClock:
             self._known = next((at for at, age_us in enumerate(ages_us) if 0 <= age_us <= _OLDEST_US), self._known)
         age_us = -1 if self._known is None else ages_us[self._known]
         return now.monotonic_us - (age_us if age_us >= 0 else self._delay_us)
+
+
+# The robot's clocks, and a rhythm for sources that have none of their own, such as files. Shell (clocks).
+
+
+class FrameTimer:
+    """Ticks `fps` times a second. Ticks that nobody waited for are not made up for, and who is late shifts none."""
+
+    def __init__(self, fps: float) -> None:
+        self._interval_s = 1 / fps
+        self._next_s = time.monotonic()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for the next tick; False if it is not due within `timeout_s`."""
+        now_s = time.monotonic()
+        due_s = self._next_s + self._interval_s
+        if due_s - now_s > timeout_s:
+            time.sleep(timeout_s)
+            return False
+        time.sleep(max(0.0, due_s - now_s))
+        self._next_s = due_s if now_s - due_s < self._interval_s / 2 else now_s
+        return True
+
+
+def read_clocks() -> Clocks:
+    """Every clock that a driver may stamp with, now."""
+    boot_us = time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000
+    return Clocks(monotonic_us(), boot_us, time.time_ns() // 1000)
+
+
+# The newest picture of a camera that captures by itself. Shell (a lock and a clock).
+
+
+_JUST_NOW_S = 0.008
+"""A picture that arrived this long ago may still be handed over. Longer, and it is better to wait for the next: a
+stored picture is old sight. Shorter, and a reader late by a hair would get every second picture only."""
+
+
+class LatestPicture:
+    """One place: the reader thread puts, `take` waits."""
+
+    def __init__(self) -> None:
+        self._slot: LatestSlot[tuple[float, Picture]] = LatestSlot()
+
+    @property
+    def dropped(self) -> int:
+        """Pictures replaced before anybody took them."""
+        return self._slot.dropped
+
+    def put(self, picture: Picture) -> None:
+        """Replace whatever is there; never blocks."""
+        self._slot.put((time.monotonic(), picture))
+
+    def take(self, timeout_s: float) -> Picture | None:
+        """A picture that has just arrived, else the next one; None if none arrives within `timeout_s`."""
+        stored = self._slot.take()
+        if stored is not None and time.monotonic() - stored[0] <= _JUST_NOW_S:
+            return stored[1]
+        fresh = self._slot.take(timeout_s)
+        return fresh[1] if fresh else None

@@ -1,12 +1,23 @@
 """Why a V4L2 device cannot be used, in one line with the fix. Shell (looks at /dev and /proc; Linux)."""
 
+from __future__ import annotations
+
 import errno
 import grp
 import os
 import stat
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
-
-from sightline.protocol.errors import HardwareError
+from pydantic import Field
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.jpeg import JpegSize
+from sightline.protocol.messages import CameraModel
+from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
+from sightline.robot_side.hardware.cameras.timing import CaptureClock, LatestPicture, read_clocks
+from sightline.robot_side.ports import Picture, scaled_quality, scaled_size
+from typing import Annotated, Any, Literal
 
 
 def check_device(path: Path) -> None:
@@ -89,3 +100,268 @@ def _name(process: Path) -> str:
         return (process / "comm").read_text("utf-8", "replace").strip()
     except OSError:
         return "a process"
+
+
+# An open V4L2 device, through OpenCV: its format pinned, its JPEGs undecoded, its buffers' times. Shell.
+#
+# OpenCV is imported when a device is opened; the robot's base install has none.
+
+
+_SELECT_TIMEOUT_S = 2  # OpenCV waits this long for a picture; its own default of 10 would hide a frozen camera
+_SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
+
+
+class V4l2CameraConfig(LensConfig):
+    """`device` may also be a stable name, /dev/v4l/by-id/...; `quality` and the copy it costs are for YUYV only."""
+
+    device: Path = Path("/dev/video0")
+    format: Literal["MJPG", "YUYV"] = "MJPG"
+    """MJPG: the camera's own JPEG, passed through. YUYV: encoded here, some milliseconds of CPU a picture."""
+    width_px: Annotated[int, Field(ge=16, le=8192)] = 640
+    height_px: Annotated[int, Field(ge=16, le=8192)] = 480
+    fps: Annotated[float, Field(gt=0, le=240)] = 30.0
+    quality: Annotated[int, Field(ge=10, le=100)] = 80
+    delay_ms: Annotated[float, Field(ge=0, le=1000)] = 30.0
+    """Age of a picture when it is read, for drivers that write no usable time on it."""
+    frozen_after_s: Annotated[float, Field(ge=0.2, le=60)] = 2.0
+    """Without a picture for this long the camera is said to be frozen."""
+
+
+Capture = Any
+"""Shaped like `cv2.VideoCapture`: isOpened, set, get, grab, retrieve, release."""
+
+
+def open_capture(path: Path) -> Capture:
+    """A `cv2.VideoCapture` of a V4L2 device.
+
+    Raises HardwareError that says why not; ConfigError without OpenCV.
+    """
+    check_device(path)
+    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(_SELECT_TIMEOUT_S))
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # its warnings say less than the errors here
+    cv2 = _opencv()
+    capture = cv2.VideoCapture(str(path), cv2.CAP_V4L2)
+    if not capture.isOpened():
+        raise open_error(path)
+    return capture
+
+
+def _opencv() -> Any:
+    try:
+        import cv2
+    except ImportError:
+        raise ConfigError("camera v4l2 needs OpenCV: pip install 'sightline[camera]'") from None
+    return cv2
+
+
+class V4l2Device:
+    """One opening of a device; raises HardwareError when it does not give what was asked for, or is gone."""
+
+    def __init__(self, config: V4l2CameraConfig, opening: Callable[[Path], Capture]) -> None:
+        self._config = config
+        self.wish = (100, 100)
+        """Shares of the configured quality and side lengths; for YUYV, whose pictures are encoded here."""
+        self._stamps = CaptureClock(round(config.delay_ms * 1000))
+        self._capture = opening(config.device)
+        try:
+            self._pin_format()
+        except HardwareError:
+            self.close()
+            raise
+
+    def _pin_format(self) -> None:
+        """The format first: the driver chooses size and rate among what it has in that format."""
+        cv2, config = _opencv(), self._config
+        for name, value in (
+            (cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.format)),
+            (cv2.CAP_PROP_FRAME_WIDTH, config.width_px),
+            (cv2.CAP_PROP_FRAME_HEIGHT, config.height_px),
+            (cv2.CAP_PROP_FPS, config.fps),
+            (cv2.CAP_PROP_CONVERT_RGB, 0),
+        ):
+            self._capture.set(name, value)
+        self._check_format(_fourcc_text(int(self._capture.get(cv2.CAP_PROP_FOURCC))))
+        width, height = (int(self._capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if (width, height) != (config.width_px, config.height_px):
+            raise self._error(
+                f"gives {width}x{height}, not {config.width_px}x{config.height_px}; set camera.options.width_px and "
+                "height_px to a size it has (`v4l2-ctl --list-formats-ext`)"
+            )
+        self.size = JpegSize(width, height, 3)
+
+    def _check_format(self, given: str) -> None:
+        if given == self._config.format:
+            return
+        if given == "YUYV":
+            raise self._error(
+                'gives YUYV, not MJPG: set camera.options.format = "YUYV" to have it encoded here, which costs CPU'
+            )
+        raise self._error(f"gives {given}, not {self._config.format}; set camera.options.format to MJPG or YUYV")
+
+    def wait(self) -> None:
+        """Wait for the next capture and take it from the driver; microseconds of CPU."""
+        if not self._capture.grab():
+            if not self._config.device.exists():
+                raise self._error("was unplugged; plug it in again")
+            raise self._error("gives no picture; unplug it and plug it in again, or check its cable and power")
+
+    def picture(self) -> Picture | None:
+        """The capture last waited for; None if it was damaged on its way."""
+        cv2 = _opencv()
+        t_us = self._stamps.captured_us(round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1000), read_clocks())
+        done, data = self._capture.retrieve()
+        if not done:
+            return None
+        if self._config.format == "YUYV":
+            return self._encoded(data, t_us)
+        jpeg = whole_jpeg(data.tobytes())
+        return Picture(jpeg, t_us) if jpeg else None
+
+    def _encoded(self, yuyv: Any, t_us: int) -> Picture:
+        import simplejpeg
+
+        cv2 = _opencv()
+        quality_percent, scale_percent = self.wish
+        full = self.size
+        bgr = cv2.cvtColor(yuyv.reshape(full.height_px, full.width_px, 2), cv2.COLOR_YUV2BGR_YUYV)
+        if scale_percent != 100:
+            size = scaled_size(full.width_px, full.height_px, scale_percent)
+            bgr = cv2.resize(bgr, (size.width_px, size.height_px), interpolation=cv2.INTER_AREA)
+        jpeg: bytes = simplejpeg.encode_jpeg(
+            bgr, quality=scaled_quality(self._config.quality, quality_percent), colorspace="BGR", colorsubsampling="422",
+            fastdct=True,
+        )
+        return Picture(jpeg, t_us, scale_percent)
+
+    def close(self) -> None:
+        """Idempotent."""
+        self._capture.release()
+
+    def _error(self, what: str) -> HardwareError:
+        return HardwareError(f"camera {self._config.device} {what}")
+
+
+def whole_jpeg(data: bytes) -> bytes | None:
+    """`data` less the padding that some cameras add; None if its beginning or end is missing."""
+    end = data.rfind(_EOI)
+    if end < 0 or data[:2] != _SOI:
+        return None
+    return data[: end + 2]
+
+
+def _fourcc_text(code: int) -> str:
+    text = "".join(chr(code >> shift & 0xFF) for shift in (0, 8, 16, 24))
+    return text if text.isalnum() else f"format {code:#x}"
+
+
+# A USB or built-in camera through V4L2: its own JPEGs and times, its own thread, unplugged and plugged in. Shell.  The
+# thread takes every capture from the driver, so that nothing old waits there, but copies it only while somebody asks.
+
+
+_RETRY_S = 0.5
+_INTEREST_S = 1.0  # after the last `read`, captures are copied for this long
+_FIRST_PICTURE_S = 5.0  # some cameras take seconds to start
+_CLOSING_S = 2.5
+
+
+class V4l2Camera:
+    """`open_capture` is the one seam: whatever it returns is taken for a `cv2.VideoCapture`."""
+
+    Config = V4l2CameraConfig
+    live = True
+
+    def __init__(
+        self, config: V4l2CameraConfig, opening: Callable[[Path], Capture] = open_capture
+    ) -> None:
+        self._config, self._opening = config, opening
+        self._newest = LatestPicture()
+        self._wish = (100, 100)
+        self._fault: HardwareError | None = None
+        self._ending = threading.Event()
+        self._asked_s = self._heard_s = time.monotonic()
+        self._device: V4l2Device | None = V4l2Device(config, opening)
+        self.model: CameraModel = self._model(self._device)
+        self._thread = threading.Thread(target=self._run, name="v4l2 camera", daemon=True)
+        self._thread.start()
+        self._await_first()
+
+    def _model(self, device: V4l2Device) -> CameraModel:
+        try:
+            return camera_model(self._config, device.size)
+        except Exception:
+            device.close()
+            raise
+
+    def _await_first(self) -> None:
+        deadline_s = time.monotonic() + _FIRST_PICTURE_S
+        while time.monotonic() < deadline_s and self._fault is None:
+            self._asked_s = time.monotonic()
+            if self._newest.take(0.1):
+                return
+        self.close()
+        raise self._fault or self._frozen()
+
+    def read(self, timeout_s: float) -> Picture | None:
+        """The next capture; None if none came in time. Raises HardwareError while the camera is gone or frozen."""
+        self._asked_s = time.monotonic()
+        picture = self._newest.take(timeout_s)
+        if picture is None and self._fault is not None:
+            raise self._fault
+        if picture is None and time.monotonic() - self._heard_s > self._config.frozen_after_s:
+            raise self._frozen()
+        return picture
+
+    def adjust(self, quality_percent: int, scale_percent: int) -> bool:
+        """As `Adjustable` says: with YUYV, which is encoded here; MJPG is the camera's own and stays as it is."""
+        self._wish = (quality_percent, scale_percent)
+        return self._config.format == "YUYV"
+
+    def missed_captures(self) -> int:
+        """Pictures that nobody took before the next one came."""
+        return self._newest.dropped
+
+    def close(self) -> None:
+        """Idempotent; the device is released by its thread, which a frozen driver can hold up."""
+        self._ending.set()
+        self._thread.join(_CLOSING_S)
+
+    # --- the thread ----------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._ending.is_set():
+            try:
+                self._capture_one()
+            except HardwareError as error:
+                self._fail(error)
+            except Exception as error:  # OpenCV raises its own for what a broken driver hands over
+                self._fail(HardwareError(f"camera {self._config.device} failed: {' '.join(str(error).split())}"))
+        self._release()
+
+    def _fail(self, fault: HardwareError) -> None:
+        self._fault = fault
+        self._release()
+        self._ending.wait(_RETRY_S)
+
+    def _capture_one(self) -> None:
+        if self._device is None:
+            self._device = V4l2Device(self._config, self._opening)
+        self._device.wish = self._wish
+        self._device.wait()
+        asked = time.monotonic() - self._asked_s < _INTEREST_S
+        picture = self._device.picture() if asked else None
+        if picture is not None:
+            self._newest.put(picture)
+        if picture is not None or not asked:
+            self._heard_s = time.monotonic()
+            self._fault = None
+
+    def _release(self) -> None:
+        if self._device is not None:
+            self._device.close()
+            self._device = None
+
+    def _frozen(self) -> HardwareError:
+        return HardwareError(
+            f"camera {self._config.device} has given no usable picture for {self._config.frozen_after_s:g} s; unplug "
+            "it and plug it in again, or check its cable and power"
+        )

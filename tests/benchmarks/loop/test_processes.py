@@ -19,10 +19,10 @@ from sightline.benchmarks.loop.vision import PipelineVision
 from sightline.benchmarks.loop.counters import children_of
 from sightline.benchmarks.loop.pictures import COUNT, camera_of, write_pictures
 from sightline.benchmarks.loop.figures import FLOOR, OUR_DETECTOR, OURS, PEERS, TCP, WITH_OUR_DETECTOR, LoopSetting
-from sightline.benchmarks.loop_sockets import carried_between, carried_bytes
+from sightline.benchmarks.loop.counters import carried_between, carried_bytes
 from sightline.benchmarks.peers.classic_detector import ClassicVision
-from sightline.benchmarks.watchers import measure_watchers
-from sightline.operator_side.cli_bench_loop import register_loop_benches
+from sightline.benchmarks.loop.viewers import measure_watchers
+from sightline.operator_side.cli.bench import register_loop_benches
 from sightline.protocol.errors import HardwareError
 from sightline.robot_side.hardware.cameras.files import FolderCamera, FolderCameraConfig
 from tests.fixtures.links import until
@@ -115,7 +115,7 @@ def test_viewers_come_and_stall_and_the_loop_goes_on():
 def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkeypatch):
     app = typer.Typer()
     register_loop_benches(app)
-    monkeypatch.setattr("sightline.benchmarks.loop_sample.TAKEN_BOUND_PERCENT", 100.0)
+    monkeypatch.setattr("sightline.benchmarks.loop.race.TAKEN_BOUND_PERCENT", 100.0)
     asked = ["--size", "160x120", "--seconds", "2", "--peers", "none", "--out", str(tmp_path / "new"), "--json"]
     code = app(["loop", *asked], standalone_mode=False)
     printed = json.loads(capsys.readouterr().out)
@@ -148,7 +148,7 @@ run_race(LoopSetting(Path(), 160, 120, seconds=60.0, peers=(), tries=1), print)
 
 
 def test_a_process_that_cannot_start_is_said_in_its_own_words(monkeypatch):
-    monkeypatch.setattr("sightline.benchmarks.loop_sample._MODULE", "benchmarks.no_such_module")
+    monkeypatch.setattr("sightline.benchmarks.loop.race._MODULE", "benchmarks.no_such_module")
     with pytest.raises(HardwareError, match="No module named"):
         run_race(replace(SMALL, peers=()), lambda _: None)
 

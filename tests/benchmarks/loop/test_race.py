@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sightline.benchmarks.loop.race import run_race
-from sightline.benchmarks.loop_course import Course, Sample, course_of_headers, course_of_tally, joined
-from sightline.benchmarks.loop_figures import figures_of, loop_checks, percentile
+from sightline.benchmarks.loop.figures import Course, Sample, course_of_headers, course_of_tally, joined
+from sightline.benchmarks.loop.figures import figures_of, loop_checks, percentile
 from sightline.benchmarks.loop.counters import Reading, taken_percent
-from sightline.benchmarks.loop_overload import overloaded, with_overload
+from sightline.benchmarks.loop.vision import overloaded, with_overload
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.figures import (
     FLOOR,

@@ -7,9 +7,9 @@ import sys
 
 import pytest
 
-from sightline.benchmarks.loop_figures import LoopCheck, at_most
+from sightline.benchmarks.loop.figures import LoopCheck, at_most
 from sightline.benchmarks.network.run import SCENES, write_film
-from sightline.benchmarks.network_figures import Stretch, figures_of, network_checks, sent_between, worst_of_seeds
+from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks, sent_between, worst_of_seeds
 from sightline.benchmarks.network.cases import CASES, Case, chosen, spans_s
 from sightline.benchmarks.network.stage import NetworkSetting
 from sightline.protocol.errors import ConfigError

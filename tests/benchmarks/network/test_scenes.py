@@ -6,10 +6,10 @@ import sys
 
 import pytest
 
-from sightline.benchmarks.network_fleet import ROBOTS, fleet_checks
+from sightline.benchmarks.network.scenes import ROBOTS, fleet_checks
 from sightline.benchmarks.network.figures import moves_again_s, on_old_sight, read_wheel_commands
 from sightline.evaluation.faults.evidence import MotorRow
-from sightline.operator_side.network_medium import reached_ms, reported_check, stop_checks_of
+from sightline.benchmarks.network.scenes import reached_ms, reported_check, stop_checks_of
 from sightline.sim.tun_emulator import why_impossible
 
 TICK_US = 20_000

@@ -18,7 +18,7 @@ import time
 from sightline.protocol.channels import CHANNELS, Direction, key_for
 from sightline.conformance.raw_peers import xor
 from sightline.protocol.errors import WireError
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.memory import MemoryNetwork
 from tests.conformance.robot.reference import ReferenceRobot
 

@@ -5,7 +5,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from sightline.protocol.conformance.bench import KEPT_MESSAGES
+from sightline.conformance.case import KEPT_MESSAGES
 from sightline.conformance.case import GROUPS, Case, Level, Suite
 from sightline.conformance.robot.cases import CASES, prepare
 from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_cases

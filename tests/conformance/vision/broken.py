@@ -5,7 +5,7 @@ and no other. The steps that a broken one may change, in the order of a frame's 
 """
 
 from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST, key_for
-from sightline.protocol.conformance.vision_pictures import HALF_CAMERA
+from sightline.conformance.vision.drawing import HALF_CAMERA
 from sightline.protocol.spec.message_cases import packed
 from sightline.protocol.messages import STILL, FrameHeader
 from sightline.protocol.transports.link import Message

@@ -1,7 +1,7 @@
 """Broken visions: wrong headers, wrong twists, wrong echoes, wrong counts. Pure."""
 
 from sightline.protocol.channels import REQUEST, key_for
-from sightline.protocol.conformance.vision_pictures import picture
+from sightline.conformance.vision.drawing import picture
 from sightline.protocol.spec.message_cases import packed
 from sightline.protocol.messages import Stamp
 from tests.conformance.vision.broken import STANDING, BrokenVision, breaks, frame_header

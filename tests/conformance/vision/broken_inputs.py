@@ -4,8 +4,8 @@ import json
 from contextlib import suppress
 
 from sightline.conformance.vision.hostile import CAMERAS
-from sightline.protocol.conformance.vision_limits import DOUBTED, READ, REFUSED
-from sightline.protocol.conformance.vision_pictures import CAMERA, picture
+from sightline.conformance.vision.hostile import DOUBTED, READ, REFUSED
+from sightline.conformance.vision.drawing import CAMERA, picture
 from tests.conformance.vision.broken import STANDING, BrokenVision, breaks, frame_header, header_of
 
 

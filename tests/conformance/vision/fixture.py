@@ -5,16 +5,16 @@ What a picture holds is computed once per picture and process: the pictures of t
 
 from functools import cache
 
-from sightline.protocol.conformance.bench import Bench
-from sightline.protocol.conformance.virtual import TO_ROBOT, VirtualBench
+from sightline.conformance.case import Bench
+from sightline.conformance.benches import TO_ROBOT, VirtualBench
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import CameraModel, FrameHeader
 from sightline.protocol.transports.memory import MemoryLink, MemoryNetwork
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.pipeline import Pipeline, PipelineAnswer
-from sightline.vision_side.service import Service
+from sightline.vision_side.serving.service import Service
 
 COMPUTE_US = 2_000
 """What it says a frame took; virtual answers take a step of 5 ms."""

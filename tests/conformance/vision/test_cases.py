@@ -3,7 +3,7 @@
 import pytest
 
 from sightline.conformance.case import Level
-from sightline.protocol.conformance.codec import CASES as CODEC_CASES
+from sightline.conformance.codec import CASES as CODEC_CASES
 from sightline.conformance.robot.cases import CASES as ROBOT_CASES
 from sightline.conformance.runner import Outcome, run_case
 from sightline.conformance.vision.cases import CASES, prepare
@@ -26,7 +26,7 @@ def result_of(case, vision):
 
 
 def or_pending(case):
-    mark = pytest.mark.xfail(strict=True, reason="vision_side/service.py")
+    mark = pytest.mark.xfail(strict=True, reason="vision_side/serving/service.py")
     return pytest.param(case, marks=mark if case.id in PENDING else (), id=case.id)
 
 

@@ -7,9 +7,9 @@ import simplejpeg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sightline.protocol.conformance import vision_pictures
+from sightline.conformance.vision import drawing as vision_pictures
 from sightline.conformance.vision.drawing import encode_jpeg
-from sightline.protocol.conformance.vision_pictures import (
+from sightline.conformance.vision.drawing import (
     CAMERA,
     DRAWINGS,
     HALF_CAMERA,

@@ -8,10 +8,10 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from sightline.protocol.conformance.bench import Access
+from sightline.conformance.case import Access
 from sightline.conformance.benches import LiveBench
 from sightline.conformance.runner import Outcome, run_case
-from sightline.protocol.conformance.virtual import TO_ROBOT
+from sightline.conformance.benches import TO_ROBOT
 from sightline.conformance.vision.cases import CASES
 from sightline.conformance.vision.websocket import _take
 from sightline.protocol.transports.open import open_link

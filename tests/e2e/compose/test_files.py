@@ -12,8 +12,8 @@ from packaging.requirements import Requirement
 from typer.main import get_command
 
 from sightline.operator_side.cli.app import app
-from sightline.operator_side.service_settings import load_service
-from sightline.robot_side.child import _END_S
+from sightline.operator_side.config.loading import load_service
+from sightline.robot_side.pipe import _END_S
 from sightline.robot_side.driver.process import _SHUTDOWN_US
 from tests.e2e.compose.fixture import COMPOSE, DEFAULT, HEAVY, PROFILES, ROOT, SERVICES, ask
 from tests.fixtures.links import free_endpoint

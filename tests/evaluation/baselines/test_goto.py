@@ -9,7 +9,7 @@ import pytest
 from sightline.protocol.messages import FrameHeader, Pose
 from tests.fixtures.vision.course import Course, Drive, Row
 from tests.fixtures.vision.vision import camera
-from sightline.vision_side.missions.body import Footprint
+from sightline.vision_side.missions.goto import Footprint
 from sightline.evaluation.baselines.goto import GotoBaseline
 from sightline.vision_side.missions.port import Plan, RangeScan, View
 

@@ -11,11 +11,11 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.operator_side import cli_faults
+from sightline.operator_side.cli import evaluate as cli_faults
 from sightline.evaluation.checks import Check, at_most
 from sightline.evaluation.faults import camera
-from sightline.operator_side.faults.attacks import ATTACKS, MALFORMED, OVERSIZED
-from sightline.operator_side.faults.bench import run_case, watched_us
+from sightline.evaluation.faults.peer import ATTACKS, MALFORMED, OVERSIZED
+from sightline.evaluation.faults.runner import run_case, watched_us
 from sightline.evaluation.faults.evidence import (
     Blind,
     MotorRow,
@@ -27,11 +27,11 @@ from sightline.evaluation.faults.evidence import (
     read_motors,
     stop_checks,
 )
-from sightline.operator_side.faults.ledger import GOOD, INJECTED, EventLog, read_events
+from sightline.evaluation.faults.evidence import GOOD, INJECTED, EventLog, read_events
 from sightline.evaluation.faults.report import describe_machine
-from sightline.operator_side.faults.report import markdown, passed, run_line, to_dict, worst_checks
+from sightline.evaluation.faults.report import markdown, passed, run_line, to_dict, worst_checks
 from sightline.evaluation.faults.runner import Outcome
-from sightline.operator_side.faults.rows import CASES, chosen
+from sightline.evaluation.faults.cases import CASES, chosen
 from sightline.evaluation.faults.sampler import read_holes, stalled_us
 from sightline.protocol.channels import TWIST
 from sightline.protocol.errors import ConfigError, WireError

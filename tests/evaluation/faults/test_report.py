@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 import typer
 
-from sightline.operator_side import cli_faults
+from sightline.operator_side.cli import evaluate as cli_faults
 from sightline.evaluation.faults.evidence import MotorRow
-from sightline.operator_side.faults.report import with_rows_of
-from sightline.operator_side.faults.rows_crowd import _tick_checks, permille_us, undisturbed_gaps_us
+from sightline.evaluation.faults.report import with_rows_of
+from sightline.evaluation.faults.cases import _tick_checks, permille_us, undisturbed_gaps_us
 from sightline.evaluation.faults.sampler import Hole
-from sightline.operator_side.faults.worst import page_with_summary
+from sightline.evaluation.faults.report import page_with_summary
 
 DOCS = Path(__file__).parent.parent.parent.parent / "docs"
 PAGE = "before\n<!-- worst values: x -->\nold\n<!-- /worst values -->\nafter\n"
@@ -109,7 +109,7 @@ def test_the_page_of_promises_shows_the_report_that_is_committed():
 
 
 def test_the_command_writes_both_pages(tmp_path, monkeypatch):
-    from sightline.operator_side.faults import parallel
+    from sightline.evaluation.faults import runner as parallel
 
     (tmp_path / "safety.md").write_text(PAGE)
     monkeypatch.setattr(parallel, "run_cases", lambda rows, *_: [[_measured(row)] for row in rows])

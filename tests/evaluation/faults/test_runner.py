@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from sightline.evaluation.checks import Check
-from sightline.operator_side.faults import parallel
-from sightline.operator_side.faults.parallel import run_cases
-from sightline.operator_side.faults.report import progress_line
-from sightline.operator_side.faults.rig import Setup
+from sightline.evaluation.faults import runner as parallel
+from sightline.evaluation.faults.runner import run_cases
+from sightline.evaluation.faults.report import progress_line
+from sightline.evaluation.faults.fixture import Setup
 from sightline.evaluation.faults.runner import Case, Outcome
 
 GOOD = (Check("zero", 1.0, "ms", 2.0, True),)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from sightline.evaluation.score.figures import median_and_worst, score
-from sightline.operator_side.score_bounds import BOUNDS, UNITS, checks_of
-from sightline.operator_side.score_course import figures_of, goal_figures, legs_figures, light_figures
+from sightline.evaluation.score.figures import BOUNDS, UNITS, checks_of
+from sightline.evaluation.score.figures import figures_of, goal_figures, legs_figures, light_figures
 from sightline.sim.scenario import load_scenario, scenario_names
 from tests.evaluation.score.test_figures import samples, truth
 

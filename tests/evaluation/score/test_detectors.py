@@ -11,15 +11,15 @@ pytest.importorskip("pybullet")
 import cv2
 
 from sightline.operator_side.cli import app as cli
-from sightline.operator_side import cli_score_detectors
+from sightline.operator_side.cli import evaluate as cli_score_detectors
 from sightline.evaluation.score.detectors import FrameResult, LabelMatches, figures, frame_result, precisions
-from sightline.operator_side.score_detectors_text import markdown, text
+from sightline.evaluation.score.detector_report import markdown, text
 from sightline.evaluation.score.detector_report import score_scenes, subjects
-from sightline.operator_side.score_sheet import Sheet
+from sightline.evaluation.score.detector_report import Sheet
 from sightline.training.shipping import ball_threshold, label_threshold
 from sightline.sim.scenes.plan import plan_scene
 from sightline.sim.scenes.model import COLUMNS, JUDGED_FROM, LabelledBox, Scene
-from sightline.vision_side.detect.overlap import overlap
+from sightline.vision_side.detect.port import overlap
 from sightline.vision_side.detect.port import Circle, Detection
 
 BALL = LabelledBox("ball", (100.0, 100.0, 140.0, 140.0), 1.0, (100.0, 100.0, 140.0, 140.0))

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from sightline.evaluation.score.figures import median_and_worst, score
-from sightline.operator_side.score_bounds import checks_of
+from sightline.evaluation.score.figures import checks_of
 from sightline.sim.truth import Truth
 
 

@@ -8,7 +8,7 @@ import pytest
 from sightline.operator_side.cli import app as cli
 from sightline.evaluation.score.figures import Score
 from sightline.evaluation.score.runs import Case, ScoreReport, cases, run_case, run_cases, scored_figures
-from sightline.operator_side.score_table import score_text
+from sightline.evaluation.score.runs import score_text
 from sightline.protocol.errors import ConfigError
 
 GOOD = Score(

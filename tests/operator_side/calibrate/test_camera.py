@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import typer
 
-from sightline.operator_side import cli_calibrate
+from sightline.operator_side.cli import calibrate as cli_calibrate
 from sightline.operator_side.calibrate.camera import (
     Ball,
     Board,
@@ -20,11 +20,11 @@ from sightline.operator_side.calibrate.camera import (
     from_boards,
     is_new_view,
 )
-from sightline.operator_side.calibrate_pictures import collect
+from sightline.operator_side.calibrate.camera import collect
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.jpeg import JpegSize
 from sightline.robot_side.hardware.cameras.lens import guessed_model, read_model
-from sightline.robot_side.hardware.still_camera import StillCamera
+from sightline.robot_side.hardware.cameras.files import StillCamera
 from tests.operator_side.calibrate.board import BOARD, TRUTH, draw_board, rays, tilted_views, turned
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess

@@ -22,7 +22,7 @@ from sightline.protocol.errors import ConfigError
 from tests.fixtures.vision.vision import camera, scene
 from sightline.vision_side.config import HsvConfig, HsvRange
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.color.hsv import HsvDetector
 
 MODEL = camera()
 

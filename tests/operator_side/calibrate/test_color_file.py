@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from sightline.operator_side.cli.app import run
-from sightline.operator_side.film import Film
-from sightline.operator_side.pick_color_file import check_config, write_ranges
+from sightline.operator_side.recording.film import Film
+from sightline.operator_side.calibrate.color_file import check_config, write_ranges
 from sightline.operator_side.calibrate.color_file import ranges_toml, with_ranges
-from sightline.operator_side.service_settings import load_service
+from sightline.operator_side.config.loading import load_service
 from sightline.protocol.errors import ConfigError
 from tests.operator_side.calibrate.test_color import ball_picture
 from sightline.vision_side.config import HsvRange

@@ -15,7 +15,7 @@ from sightline.robot_side.driver.supervision import EXIT_SIGNALS
 from tests.fixtures.links import until
 from tests.fixtures.terminal import Terminal
 
-GPIO = PluginChoice(kind="sightline.robot_side.hardware.gpio_drive:GpioDrive", options={"wheel_radius_m": 0.0325})
+GPIO = PluginChoice(kind="sightline.robot_side.hardware.gpio:GpioDrive", options={"wheel_radius_m": 0.0325})
 
 
 class Person:

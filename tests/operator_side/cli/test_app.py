@@ -160,7 +160,7 @@ def test_a_fault_of_the_program_is_one_line_and_a_traceback_only_on_request(caps
     def broken(*_arguments: object, **_options: object) -> None:
         raise ZeroDivisionError("two\nlines")
 
-    monkeypatch.setattr("sightline.operator_side.cli_config.load_service", broken)
+    monkeypatch.setattr("sightline.operator_side.cli.services.load_service", broken)
     code, out, err = run(capsys, "config", "check", "robot")
     assert (code, out) == (1, "")
     assert err.count("\n") == 1

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from sightline.operator_side.cli import app as cli
-from sightline.operator_side import cli_detector
+from sightline.operator_side.cli import detector as cli_detector
 from tests.fixtures.vision.onnx import brightness_model, without_gpu
-from sightline.vision_side import detector_service
+from sightline.vision_side.serving import detector_service
 from sightline.vision_side.detect.onnx import detector as onnx_detector
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.remote import oip_grpc

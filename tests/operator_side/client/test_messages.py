@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.operator_side.channel_text import message_line, message_object
+from sightline.operator_side.client.messages import message_line, message_object
 from sightline.protocol.channels import CHANNELS, SCAN, STATUS, TWIST
 from sightline.protocol.spec.message_cases import USUAL, packed
-from sightline.protocol.golden_cases import CASES
+from sightline.protocol.spec.message_cases import CASES
 from sightline.protocol.transports.link import Message
 
 

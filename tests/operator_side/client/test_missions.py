@@ -3,11 +3,11 @@
 import pytest
 
 from sightline.operator_side.cli.options import options_of
-from sightline.operator_side.mission_asking import request_of
-from sightline.operator_side.mission_text import cannot, mission_line, mission_lines
+from sightline.operator_side.client.missions import request_of
+from sightline.operator_side.client.missions import cannot, mission_line, mission_lines
 from sightline.operator_side.client.missions import waypoints_of, waypoints_of_file
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.mission_messages import MissionReport
+from sightline.protocol.messages import MissionReport
 
 
 def test_waypoints_are_pairs_of_metres():

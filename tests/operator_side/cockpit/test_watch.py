@@ -14,7 +14,7 @@ import cv2
 import pytest
 
 from sightline.operator_side.cli.app import run
-from sightline.operator_side.film import Film
+from sightline.operator_side.recording.film import Film
 from tests.javascript_browser import Browser, chromium
 from tests.fixtures.links import free_endpoint, until
 from tests.e2e.javascript.test_browser import LEVELS, PATIENCE_S, Started

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.operator_side.service_settings import load_service
+from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.config.loading import ENV_PREFIX, SERVICES, load, model_of
 from sightline.operator_side.config.errors import is_known, known_keys
 from sightline.operator_side.config.toml_text import toml_text

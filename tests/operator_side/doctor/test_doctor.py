@@ -10,7 +10,7 @@ import pytest
 
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.setup import keys
-from sightline.operator_side.doctor import network as between, cameras, machine
+from sightline.operator_side.doctor import network as between, machine as cameras, machine
 from sightline.operator_side.doctor.finding import Finding, as_object, histogram
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.zenoh.link import open_zenoh

@@ -3,7 +3,7 @@
 import random
 
 from sightline.operator_side.teleop.control import Teleop
-from sightline.operator_side.teleop_speed import Speeds
+from sightline.operator_side.teleop.control import Speeds
 from sightline.protocol.channels import ACK, FRAME, REPLY, REQUEST, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Request

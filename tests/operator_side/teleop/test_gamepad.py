@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from sightline.operator_side.teleop_evdev import Gamepad
+from sightline.operator_side.teleop.gamepad import Gamepad
 from sightline.operator_side.teleop.gamepad import (
     ABS_X,
     ABS_Y,

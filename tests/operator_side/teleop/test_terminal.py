@@ -10,7 +10,7 @@ import pytest
 
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.messages import State
-from sightline.protocol.transports.zenoh_session import open_session
+from sightline.protocol.transports.zenoh.session import open_session
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess, Vision
 from tests.fixtures.terminal import Terminal

@@ -13,9 +13,9 @@ from sightline.protocol.spec import golden, generate as schema
 from sightline.protocol.channels import CHANNELS
 from sightline.protocol.spec.field_docs import doc_of, unit_of
 from sightline.protocol.spec.message_cases import MessageCase
-from sightline.protocol.golden_cases import CASES
+from sightline.protocol.spec.message_cases import CASES
 from sightline.protocol.spec.framing_cases import FRAMING_CASES, READERS
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.text import MAX_TWIST_BYTES
 
 VECTORS = Path(schema.__file__).parent.parent / "vectors"

@@ -8,10 +8,10 @@ import math
 import pytest
 
 from sightline.protocol.spec.golden import INEXACT_KEY, outcome
-from sightline.protocol.golden_cases import CASES
+from sightline.protocol.spec.message_cases import CASES
 from sightline.protocol.spec.framing_cases import FRAMING_CASES, framing_outcome
 from sightline.protocol.messages import MAX_INTEGER
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 
 ACCEPTED = [case for case in CASES if case.refuse is None]
 WIRED = [case for case in FRAMING_CASES if case.refuse is None]

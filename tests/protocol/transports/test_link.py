@@ -10,7 +10,7 @@ import pytest
 
 from sightline.protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.link_rules import INEXACT_KEY, OVERSIZE, LinkRules
+from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE, LinkRules
 from tests.fixtures.links import RIGS, MemoryRig
 
 

@@ -13,7 +13,7 @@ from sightline.operator_side.setup import keys
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.websocket.link import open_websocket
-from sightline.protocol.transports.websocket_listen import NO_TLS
+from sightline.protocol.transports.websocket.server import NO_TLS
 from tests.fixtures.links import until
 from tests.fixtures.websocket import V1, address_of, free_ws
 

@@ -29,10 +29,10 @@ from sightline.protocol.transports.security import (
     may_publish,
     may_subscribe,
 )
-from sightline.protocol.transports.websocket_keys import read_tokens
+from sightline.protocol.transports.security import read_tokens
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.discovery import list_robots
-from sightline.protocol.transports.zenoh_session import MAX_MESSAGE_BYTES, open_session
+from sightline.protocol.transports.zenoh.session import MAX_MESSAGE_BYTES, open_session
 from tests.fixtures.links import free_endpoint, until
 
 SAID = (TWIST, ACK, REQUEST, MISSION, REPORT)

@@ -17,7 +17,7 @@ from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNAL
 from sightline.robot_side.driver.persistence import StopLatch
 from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.ports import WheelAngles
-from sightline.robot_side.scribe import BackgroundWriter
+from sightline.robot_side.driver.persistence import BackgroundWriter
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 

@@ -6,8 +6,8 @@ import pytest
 
 from sightline.protocol.channels import ACK, TWIST, key_for
 from sightline.protocol.messages import LastRejection
-from sightline.protocol.transports.zenoh_session import open_session
-from sightline.robot_side.refusal_log import RejectionLog
+from sightline.protocol.transports.zenoh.session import open_session
+from sightline.robot_side.driver.process import RejectionLog
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision
 

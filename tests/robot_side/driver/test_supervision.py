@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.process import zero_motors
-from sightline.robot_side.supervision import SystemdNotifier
+from sightline.robot_side.driver.supervision import SystemdNotifier
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 

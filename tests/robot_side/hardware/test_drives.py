@@ -5,7 +5,7 @@ import time
 import pytest
 
 from examples.my_drive import MyDrive
-from sightline.operator_side.processes import Processes
+from sightline.evaluation.processes import Processes
 from sightline.robot_side.hardware.log_drive import LogDrive
 from sightline.robot_side.ports import WheelAngles
 from tests.contracts.drives import check_drive

@@ -12,10 +12,10 @@ pytest.importorskip("gpiozero")
 from gpiozero import Device
 from gpiozero.pins.mock import MockFactory
 
-from sightline.operator_side.service_settings import load_service
+from sightline.operator_side.config.loading import load_service
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import Twist
-from sightline.robot_side.hardware.gpio_drive import GpioDrive
+from sightline.robot_side.hardware.gpio import GpioDrive
 from sightline.robot_side.hardware.gpio import DutyTable, table_of, table_text
 from sightline.robot_side.kinematics import DiffDriveConfig, wheel_speeds
 from sightline.robot_side.plugins import load_device
@@ -265,7 +265,7 @@ def test_the_end_is_low_before_the_pins_are_given_back_whoever_gives_them():
 
 def test_the_expected_wheels_turn_as_the_table_says(drive, monkeypatch):
     clock = SimpleNamespace(us=1_000_000)
-    monkeypatch.setattr("sightline.robot_side.hardware.gpio_drive.monotonic_us", lambda: clock.us)
+    monkeypatch.setattr("sightline.robot_side.hardware.gpio.monotonic_us", lambda: clock.us)
     drive.set(0.0, 0.0)
     start = drive.wheels()
     drive.set(0.05 / 0.0325, -1.0)  # less than the least duty gives: it turns at that

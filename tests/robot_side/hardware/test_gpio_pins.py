@@ -12,10 +12,10 @@ pytest.importorskip("gpiozero")
 from gpiozero import Device
 from gpiozero.pins.mock import MockFactory
 
-from sightline.operator_side.service_settings import load_service
+from sightline.operator_side.config.loading import load_service
 from sightline.protocol.errors import ConfigError, HardwareError
-from sightline.robot_side.hardware import gpio_low, gpio_pins
-from sightline.robot_side.hardware.gpio_drive import GpioDrive
+from sightline.robot_side.hardware import gpio_low, gpio as gpio_pins
+from sightline.robot_side.hardware.gpio import GpioDrive
 from sightline.robot_side.plugins import load_device
 from tests.fixtures.gpio import NotingPin, config
 

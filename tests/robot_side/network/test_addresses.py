@@ -4,8 +4,8 @@ import socket
 
 import pytest
 
-from sightline.robot_side import addresses
-from sightline.robot_side.addresses import own_addresses, reachable_endpoints
+from sightline.robot_side.network import process as addresses
+from sightline.robot_side.network.process import own_addresses, reachable_endpoints
 
 
 @pytest.mark.parametrize(("endpoints", "said"), [

@@ -13,7 +13,7 @@ from sightline.protocol.messages import MAX_CHANNELS_SHOWN, CameraModel, FrameHe
 from sightline.robot_side.network.core import CameraAdaptation
 from sightline.robot_side.network.bitrate_control import EncodingTarget
 from sightline.robot_side.ports import Picture, scaled_model, scaled_size
-from sightline.robot_side.sending import NetworkCore
+from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.network.stream import StreamConfig
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.pipeline import Frame, Pipeline

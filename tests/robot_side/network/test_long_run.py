@@ -12,7 +12,7 @@ from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.core import DriverCore
 from sightline.robot_side.safety.limits import STOP_TIME_BOUND_US, SafetyConfig
 from sightline.robot_side.ports import Picture, WheelAngles
-from sightline.robot_side.sending import NetworkCore
+from sightline.robot_side.network.core import NetworkCore
 
 TICK_US, FRAME_US = 20_000, 33_333
 OUTAGE_US = (300_000_000, 302_000_000)

@@ -4,7 +4,7 @@ import pytest
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import STILL, Echo, Request, RequestHeader, State, Twist, Verb
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.limits import (
     SafetyConfig,
     age_factor,

@@ -6,7 +6,7 @@ import pytest
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import STILL, Echo, LastRejection, State, Twist, Verb
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.gate import Decision, SafetyGate
 from sightline.robot_side.safety.states import TRANSITIONS, Event, is_armed, next_state

@@ -4,7 +4,7 @@ import pytest
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import STILL, AnswerHeader, Echo, Holder, Request, RequestHeader, Verb
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.gate import Decision, SafetyGate
 from tests.gate_rig import HUMAN_HOLDER, VISION_HOLDER, A, D, H, driving, refused

@@ -6,7 +6,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import STILL, State, Verb
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety import gate as safety
 from sightline.robot_side.safety.states import TRANSITIONS
 from tests.fixtures.safety import HUMAN, MS, OTHER, VISION, Rig

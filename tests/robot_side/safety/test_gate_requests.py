@@ -4,7 +4,7 @@ import pytest
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import STILL, Echo, Request, RequestHeader, Verb
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.gate import SafetyGate
 from tests.gate_rig import A, D, F, H, S, driving, refused

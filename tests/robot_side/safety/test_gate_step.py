@@ -6,7 +6,7 @@ import math
 import pytest
 
 from sightline.protocol.messages import STILL, Verb
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.guard import GuardConfig, RangeGuard
 from sightline.robot_side.safety.limits import AxisRamp
 from sightline.robot_side.ports import Ranges

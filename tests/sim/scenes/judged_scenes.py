@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import simplejpeg
 
-from sightline.sim.scene_defects import as_seen
-from sightline.sim.scene_render import SceneRenderer
+from sightline.sim.scenes.plan import as_seen
+from sightline.sim.scenes.render import SceneRenderer
 from sightline.sim.scenes.model import COLUMNS, HEIGHT_PX, JUDGED_FROM, THINGS, WIDTH_PX
 
 FILE = Path(__file__).parent.parent.parent / "judged_scenes.json"

@@ -11,11 +11,11 @@ pytest.importorskip("pybullet")
 import simplejpeg
 
 from sightline.sim.scenes import render as scene_backdrop
-from sightline.sim.scene_defects import as_seen, streak, with_defects
+from sightline.sim.scenes.plan import as_seen, streak, with_defects
 from sightline.sim.scenes.plan import plan_scene
-from sightline.sim.scene_render import SceneRenderer
+from sightline.sim.scenes.render import SceneRenderer
 from sightline.sim.scenes.textures import SIDE
-from sightline.sim.scene_textures import FAMILIES, JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED, texture
+from sightline.sim.scenes.textures import FAMILIES, JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED, texture
 from sightline.sim.scenes.model import (
     BALL_PX,
     COLUMNS,

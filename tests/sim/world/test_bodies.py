@@ -13,12 +13,12 @@ import numpy as np
 import simplejpeg
 
 from sightline.protocol.errors import ConfigError
-from sightline.sim.light import LIT, Light, Phase, color_of
+from sightline.sim.scenario import LIT, Light, Phase, color_of
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
 from sightline.sim.world.start import goals_seen
-from sightline.sim.target import PathMover
-from sightline.sim.things import Legs
+from sightline.sim.world.bodies import PathMover
+from sightline.sim.scenario import Legs
 from sightline.sim.toml_file import laid_over
 from sightline.sim.world.world import World
 from tests.fixtures.sim import robot_with
@@ -170,7 +170,7 @@ def test_waypoints_are_told_as_the_robot_counts(seed):
 
 @pytest.mark.parametrize(("look", "least", "most"), [("plain", 0.8, 1.0), ("desaturated", 0.3, 0.6)])
 def test_a_desaturated_picture_is_paler(look, least, most):
-    from sightline.sim.look import look_named
+    from sightline.sim.scenario import look_named
 
     with World(load_scenario("ball").model_copy(update={"look": look_named(look)}), robot_with(), 3) as world:
         rgb = simplejpeg.decode_jpeg(world.render(), "RGB").astype(float)

@@ -11,9 +11,9 @@ from tests.fixtures.vision.detector import Told, box
 from tests.fixtures.vision.vision import YELLOW_BGR, jpeg_of
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.colour_filter import ColorFilter
+from sightline.vision_side.detect.filters import ColorFilter
 from sightline.vision_side.detect.filters import LabelFilter
-from sightline.vision_side.detect.overlap import corners, overlap
+from sightline.vision_side.detect.port import corners, overlap
 from sightline.vision_side.detect.port import (
     NO_DEADLINE,
     Circle,
@@ -22,7 +22,7 @@ from sightline.vision_side.detect.port import (
     DetectionResult,
     clipped,
 )
-from sightline.vision_side.detect.tracked import KEPT_US, MAX_TRACKS, TrackIds
+from sightline.vision_side.detect.filters import KEPT_US, MAX_TRACKS, TrackIds
 
 GREY = np.full((240, 320, 3), 140, np.uint8)
 

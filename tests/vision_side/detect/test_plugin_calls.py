@@ -6,7 +6,7 @@ from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect import registry as choice
-from sightline.vision_side.detect.around import attach_detector, close_detector, notices_of
+from sightline.vision_side.detect.plugin_calls import attach_detector, close_detector, notices_of
 
 
 class Failing:

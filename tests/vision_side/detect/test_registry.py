@@ -23,13 +23,13 @@ from sightline.vision_side.detect.registry import (
     is_plain,
     split_kind,
 )
-from sightline.vision_side.detect.colour_filter import ColorFilter
+from sightline.vision_side.detect.filters import ColorFilter
 from sightline.vision_side.detect.filters import LabelFilter
 from sightline.vision_side.detect.color.detectors import Adaptive, Hsv
 from sightline.vision_side.detect.onnx.detector import OnnxDetector
 from sightline.vision_side.detect.port import DetectFrame, result_of
 from sightline.vision_side.detect.shadow import ShadowDetector
-from sightline.vision_side.detect.tracked import TrackIds
+from sightline.vision_side.detect.filters import TrackIds
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,7 @@ from tests.fixtures.vision.detector import BALL, Bench
 from tests.fixtures.links import until
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.agreement import REPORT_EVERY_US, Agreement, disagreement
+from sightline.vision_side.detect.shadow import REPORT_EVERY_US, Agreement, disagreement
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Maker, result_of
 from sightline.vision_side.detect.shadow import ShadowDetector

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from tests.fixtures.vision.course import Course, Drive, Eyes, Lidar, Row, Segment
 from tests.fixtures.vision.vision import camera
-from sightline.vision_side.missions.body import Footprint
+from sightline.vision_side.missions.goto import Footprint
 from sightline.vision_side.missions.goto import Goto
 from sightline.vision_side.missions.port import Plan
 

@@ -11,7 +11,7 @@ from sightline.protocol.messages import FrameHeader
 from tests.fixtures.vision.course import Course, Drive, Lidar, Row
 from tests.fixtures.vision.vision import camera
 from sightline.vision_side.detect.port import Detection
-from sightline.vision_side.missions.body import Footprint
+from sightline.vision_side.missions.goto import Footprint
 from sightline.vision_side.missions.legs import Legs, nearest_legs
 from sightline.evaluation.baselines.legs import LegsBaseline
 from sightline.vision_side.missions.port import RangeScan, View

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from sightline.protocol.messages import FrameHeader
 from tests.fixtures.vision.vision import camera
-from sightline.vision_side.missions.body import Footprint, braking_mps, clear_of
-from sightline.vision_side.missions.giving_up import ProgressChecker, ProgressCheckerConfig
+from sightline.vision_side.missions.goto import Footprint, braking_mps, clear_of
+from sightline.vision_side.missions.goto import ProgressChecker, ProgressCheckerConfig
 from sightline.vision_side.missions.planner import CELL_M, Costmap, cells_of
 from sightline.vision_side.missions.port import RangeScan, View
-from sightline.vision_side.missions.ranging import PoseMemory, about_robot, echoes, in_odometry
-from sightline.vision_side.missions.route import HORIZON_M, Planner
+from sightline.vision_side.missions.ranges import PoseMemory, about_robot, echoes, in_odometry
+from sightline.vision_side.missions.planner import HORIZON_M, Planner
 
 LENGTH = st.floats(-5, 5)
 ANGLE = st.floats(-9, 9)

@@ -10,7 +10,7 @@ import pytest
 
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, CameraModel, FrameHeader
-from sightline.protocol.mission_messages import MissionRequest
+from sightline.protocol.messages import MissionRequest
 from tests.contracts.missions import CAMERA, check_mission
 from sightline.vision_side import plugins as plugin_choice
 from sightline.vision_side.config import VisionConfig

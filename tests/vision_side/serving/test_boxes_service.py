@@ -25,9 +25,9 @@ from sightline.protocol.text import parse_twist
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import Rig, acquired_at, ball_about_lens, camera, circle, errors_after, still
-from sightline.vision_side.boxes_service import BoxesService
+from sightline.vision_side.serving.service import BoxesService
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.boxes import REMEMBERED, locate_box
+from sightline.vision_side.tracking.locate import REMEMBERED, locate_box
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.serving.process import serve
 

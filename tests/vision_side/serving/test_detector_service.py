@@ -14,7 +14,7 @@ from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.detect.filters import LabelFilter
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.port import Circle, Detection, Maker, result_of
-from sightline.vision_side.detector_service import DetectorService, ServingOptions
+from sightline.vision_side.serving.detector_service import DetectorService, ServingOptions
 
 HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
 GOOD = Detection(10.0, 10.0, 50.0, 50.0, 0.9, "ball")

@@ -12,7 +12,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import AnswerHeader, FrameHeader, Stamp, State, Status
 from sightline.protocol.transports.link import LatestSlot
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from sightline.protocol.transports.zenoh_site import open_fleet
+from sightline.protocol.transports.zenoh.link import open_fleet
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import JPEG
 from sightline.vision_side.config import VisionConfig

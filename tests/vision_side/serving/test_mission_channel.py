@@ -17,14 +17,14 @@ from sightline.protocol.messages import (
     ScanHeader,
     Stamp,
 )
-from sightline.protocol.mission_messages import MissionReport, MissionRequest
+from sightline.protocol.messages import MissionReport, MissionRequest
 from sightline.protocol.transports.memory import MemoryNetwork
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.serving.dry_run import AckingService
 from sightline.vision_side.pipeline import Observation
-from sightline.vision_side.reporting import LEAST_GAP_S, PERIOD_S, Reporter
-from sightline.vision_side.service import Service
+from sightline.vision_side.serving.mission_channel import LEAST_GAP_S, PERIOD_S, Reporter
+from sightline.vision_side.serving.service import Service
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))

@@ -18,7 +18,7 @@ from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.protocol.text import parse_twist
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.service import Service
+from sightline.vision_side.serving.service import Service
 from sightline.vision_side.serving.process import serve
 
 MODEL = camera()
@@ -165,7 +165,7 @@ def test_serve_ends_when_asked(bench: Bench) -> None:
 def test_frames_that_come_again_after_a_silence_are_told_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.camera()
     bench.frame(BALL, 1)
-    monkeypatch.setattr("sightline.vision_side.service._SILENCE_S", -1.0)
+    monkeypatch.setattr("sightline.vision_side.serving.service._SILENCE_S", -1.0)
     bench.turn()
     bench.frame(BALL, 2)
     bench.frame(BALL, 3)
@@ -202,7 +202,7 @@ def test_frames_of_a_session_that_is_over_are_left_out_and_said_once(bench):
 
 def test_of_two_robots_with_one_id_the_second_is_refused_and_that_is_said(bench, monkeypatch):
     """Where they cannot meet, nobody but vision can see that they are two."""
-    monkeypatch.setattr("sightline.vision_side.service.monotonic_us", lambda: bench.now_us)
+    monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", lambda: bench.now_us)
     bench.camera()
     answers = {"0000abcd": 0, "0000beef": 0}
     for seq in range(1, 10):

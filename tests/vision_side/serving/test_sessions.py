@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from sightline.vision_side.sessions import GOES_ON_US, KEPT, SILENT_US, SessionSelector
+from sightline.vision_side.serving.service import GOES_ON_US, KEPT, SILENT_US, SessionSelector
 
 A, B, C = "0000aaaa", "0000bbbb", "0000cccc"
 FRAME_US = 33_333

@@ -10,7 +10,7 @@ from sightline.protocol.messages import Pose, Twist
 from sightline.vision_side.config import LatencyConfig, SearchConfig, SteerConfig, TrackConfig
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.tracking.prediction import MotionPredictor
-from sightline.vision_side.search import Search
+from sightline.vision_side.tracking.steering import Search
 from sightline.vision_side.tracking.locate import Sighting
 from sightline.vision_side.tracking.steering import Aim, Steer
 from sightline.vision_side.tracking.track import Track, from_odometry, to_odometry

@@ -3,14 +3,17 @@
 The table is over BGR565, so any number of ranges, and a hue range through red, cost the same.
 """
 
+import cv2
+import math
+import numpy as np
+from collections.abc import Sequence
 from dataclasses import dataclass
+from numpy.typing import NDArray
+from sightline.vision_side.config import HsvConfig, HsvRange
+from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.port import Circle, Detection
 from typing import Any
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
-from sightline.vision_side.config import HsvRange
 
 COARSE = 4
 """Where to look is decided on every fourth pixel of every fourth row, which no disc worth measuring slips between."""
@@ -70,3 +73,225 @@ def color_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
         inside |= (turn & (saturation >= one.saturation_low) & (saturation <= one.saturation_high)
                    & (value >= one.value_low) & (value <= one.value_high))
     return np.where(inside, 255, 0).astype(np.uint8)
+
+
+# Where exactly the edge of a coloured blob is: half-way between its own colour and what is around it. Pure.  A colour
+# range says which blob it is; its bounds lie anywhere between the two colours, which would make the same ball look 7 %
+# smaller in cold light and larger in warm. Brightness is left out, so neither shade nor a dark floor moves it.
+
+
+_MARGIN_PX = 4
+_AROUND = np.ones((3, 5), np.uint8)  # two pixels each way, where every second row is left out
+_MIN_CONTRAST = 200.0  # squared steps of colour; below it, noise would draw the edge
+
+Box = Sequence[int]
+
+
+def sharp_outline(bgr: NDArray[np.uint8], mask: NDArray[Any], box: Box) -> NDArray[Any] | None:
+    """The outermost pixels (N, 1, 2) of the blob of `mask` in `box` (x, y, width, height).
+
+    None when the blob's colour differs too little from its surroundings to tell.
+    """
+    x1, y1 = max(0, box[0] - _MARGIN_PX), max(0, box[1] - _MARGIN_PX)
+    rows, columns = slice(y1, box[1] + box[3] + _MARGIN_PX), slice(x1, box[0] + box[2] + _MARGIN_PX)
+    blob = _blob(bgr[rows, columns], mask[rows, columns])
+    if blob is None:
+        return None
+    outlines, _ = cv2.findContours(blob, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(x1, y1))
+    return max(outlines, key=len) if outlines else None
+
+
+def _blob(bgr: NDArray[np.uint8], inside: NDArray[Any]) -> NDArray[Any] | None:
+    """Not zero where a pixel is more like the colour inside the mask than like the one outside, brightness left out."""
+    inside = inside[::2]  # every second row tells a mean as well as every row
+    return blob_between(bgr, bgr[::2], inside, cv2.bitwise_not(cv2.dilate(inside, _AROUND)))
+
+
+def blob_between(
+    bgr: NDArray[np.uint8], rows: NDArray[np.uint8], inside: NDArray[Any], outside: NDArray[Any]
+) -> NDArray[Any] | None:
+    """Not zero where a pixel of `bgr` is more like those of `rows` that are `inside` than like those `outside`.
+
+    None where the two differ too little.
+    """
+    blue, green, red, _ = cv2.mean(rows, inside)
+    other_blue, other_green, other_red, _ = cv2.mean(rows, outside)
+    blue, green, red = blue - other_blue, green - other_green, red - other_red
+    brighter = (blue + green + red) / 3
+    blue, green, red = blue - brighter, green - brighter, red - brighter
+    contrast = blue * blue + green * green + red * red
+    if contrast < _MIN_CONTRAST:
+        return None
+    half_way = blue * other_blue + green * other_green + red * other_red + contrast / 2
+    return cv2.transform(bgr, np.array(((blue, green, red, -half_way),)))  # what is below zero saturates to zero
+
+
+# Is an outline round, and which part of it is? Circle fits through outline points. Pure.
+
+
+Outline = NDArray[np.float64]
+"""Points (N, 2) in pixels."""
+Fit = tuple[float, float, float]
+"""Circle: cx, cy, radius."""
+Terms = NDArray[np.float64]
+"""Of each point, the columns (4, N) that a circle is linear in: x, y, x^2 + y^2, 1."""
+
+MIN_POINTS = 8
+_OVAL = 0.1  # a ball at the side of a wide picture is drawn oval; its outline leaves the circle by this part of it
+_TRIMS = 4  # each leaves out what the fit before shows to be off the circle, and so bends the next fit less
+_STAIRS_PX = 1.5  # no pixel of a clean disc's outline is further from its circle
+_CLEAN = 0.25  # RMS, by the limit for a single point: so few points off it bend no circle, and none is looked for
+
+
+def fit_circle(points: Outline) -> Fit:
+    """Least-squares circle through `points` (Kåsa's linear form); radius 0 for a straight line or fewer than three."""
+    return _fit(_terms(points))[0]
+
+
+def fit_round_part(outline: NDArray[Any], min_radius_px: float, max_roughness: float) -> tuple[Fit, Outline] | None:
+    """The circle of `outline` and the points on it, less what something in front cut off; None if it is not round.
+
+    `max_roughness` bounds the RMS distance from the circle, in radii.
+    """
+    terms = _terms(outline)
+    circle, rough_px = _fit(terms)
+    for _ in range(_TRIMS):
+        limit_px = max(_STAIRS_PX, _OVAL * circle[2])
+        if rough_px <= _CLEAN * limit_px or terms.shape[1] < MIN_POINTS:
+            break
+        off = _off(terms, circle)
+        if off.max() <= limit_px:
+            break
+        terms = terms[:, off <= max(limit_px, 2.0 * float(np.median(off)))]
+        circle, rough_px = _fit(terms)
+    if terms.shape[1] < MIN_POINTS or circle[2] < min_radius_px:
+        return None
+    # Half a pixel of stair-steps is no roughness: without this allowance, distant discs would be refused.
+    return (circle, terms[:2].T) if rough_px <= max_roughness * circle[2] + 0.5 else None
+
+
+def _terms(points: NDArray[Any]) -> Terms:
+    terms = np.empty((4, len(points)))
+    x, y, square, one = terms
+    terms[:2] = points.T
+    np.add(x * x, y * y, out=square)
+    one.fill(1.0)
+    return terms
+
+
+def _fit(terms: Terms) -> tuple[Fit, float]:
+    """The circle, and the RMS distance of the points from it, to first order.
+
+    One product of matrices holds every sum; the rest is plain numbers: normal equations about the points' middle.
+    """
+    count = terms.shape[1]
+    if count < 3:
+        return (0.0, 0.0, 0.0), math.inf
+    (xx, xy, xs, x), (_, yy, ys, y), (_, _, ss, square), _ = (terms @ terms.T).tolist()
+    mx, my, mean = x / count, y / count, square / count
+    xx, xy, yy = xx - x * mx, xy - x * my, yy - y * my
+    bx, by = (xs - x * mean) / 2, (ys - y * mean) / 2
+    determinant = xx * yy - xy * xy
+    if determinant <= 1e-9 * (xx + yy) ** 2:
+        return (mx, my, 0.0), math.inf
+    cx, cy = (bx * yy - by * xy) / determinant, (by * xx - bx * xy) / determinant
+    radius = math.sqrt(max(0.0, mean - 2 * (cx * mx + cy * my) + cx * cx + cy * cy))
+    left = max(0.0, ss - square * mean - 4 * (cx * bx + cy * by))  # squares of d^2 - r^2, which is 2r (d - r)
+    return (cx, cy, radius), math.sqrt(left / count) / (2 * radius) if radius else math.inf
+
+
+def _off(terms: Terms, circle: Fit) -> Outline:
+    """Distance of each point from the circle."""
+    cx, cy, radius = circle
+    square = np.array((-2 * cx, -2 * cy, 1.0, cx * cx + cy * cy)) @ terms
+    away: Outline = np.abs(np.sqrt(np.maximum(square, 0.0)) - radius)
+    return away
+
+
+# Detector of things of one colour, round ones unless told otherwise: mask, outlines, sharp edge, circle fit. Pure.
+
+
+Pixels = NDArray[Any]
+"""Outline as OpenCV gives it: (N, 1, 2), integers."""
+
+_EDGE_PX = 0.45  # the true edge lies this far outside the centre of an outermost pixel, on average over directions
+
+
+class HsvDetector:
+    """Finds discs of the configured colours, or anything that has them."""
+
+    def __init__(self, config: HsvConfig, label: str = "target") -> None:
+        self._config = config
+        self._label = label
+        self._mask = ColorMask(config.ranges)
+
+    def detect(self, picture: Picture) -> tuple[Detection, ...]:
+        """What has the colour, and the shape if one is asked for, largest first."""
+        region = self._mask.region(picture.bgr)
+        return () if region is None else self.measure(picture, region)
+
+    def measure(self, picture: Picture, region: Region) -> tuple[Detection, ...]:
+        """What is in `region` of `picture`, whoever marked it, and has the shape; largest first."""
+        outlines, _ = cv2.findContours(region.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        longest = sorted(outlines, key=len, reverse=True)[: self._config.max_contours]
+        look = self._disc if self._config.shape == "disc" else self._thing
+        found = [look(picture, region, outline) for outline in longest]
+        return tuple(sorted((one for one in found if one), key=_radius, reverse=True))
+
+    def _thing(self, picture: Picture, region: Region, outline: Pixels) -> Detection | None:
+        """The box around whatever it is; None if it is too small."""
+        box = cv2.boundingRect(outline)
+        if min(box[2], box[3]) < 2 * self._config.min_radius_px:
+            return None
+        sharp = sharp_outline(region.bgr, region.mask, box)
+        x, y, width, height = box if sharp is None else cv2.boundingRect(sharp)
+        left, top, scale = region.origin_px[0] + x, region.origin_px[1] + y, picture.scale
+        right, bottom = left + width, top + height
+        return Detection(left * scale, top * scale, right * scale, bottom * scale, 1.0, self._label)
+
+    def _disc(self, picture: Picture, region: Region, outline: Pixels) -> Detection | None:
+        """The disc that `outline` encloses, or None if it is too small or not round."""
+        box = cv2.boundingRect(outline)
+        if max(box[2], box[3]) < 2 * self._config.min_radius_px:
+            return None
+        sharp = sharp_outline(region.bgr, region.mask, box)
+        if sharp is not None:
+            outline, box = sharp, cv2.boundingRect(sharp)
+        edge = own_edge(outline, box, region.origin_px, picture.bgr.shape)
+        fit = fit_round_part(edge, self._config.min_radius_px, self._config.max_roughness)
+        if fit is None or len(fit[1]) < self._config.min_outline_kept * len(edge):
+            return None
+        whose = (len(fit[1]) / len(outline), self._label)
+        return disc_detection((box, *fit), whose, region.origin_px, picture.scale)
+
+
+def disc_detection(shape: tuple[Box, Fit, Outline], whose: tuple[float, str], origin_px: tuple[int, int],
+                   scale: int) -> Detection:
+    """In pixels of the encoded picture. The shape's circle and edge go by the centres of the region's pixels."""
+    box, circle, edge = shape
+    x, y = origin_px[0] + box[0], origin_px[1] + box[1]
+    cx, cy = origin_px[0] + 0.5 + circle[0], origin_px[1] + 0.5 + circle[1]
+    radius = circle[2] + _EDGE_PX
+    outwards = radius / circle[2]
+    ring = edge.T * (outwards * scale)
+    ring[0] += (cx - outwards * circle[0]) * scale
+    ring[1] += (cy - outwards * circle[1]) * scale
+    return Detection(x * scale, y * scale, (x + box[2]) * scale, (y + box[3]) * scale, *whose,
+                     Circle(cx * scale, cy * scale, radius * scale), ring.T)
+
+
+def own_edge(pixels: Pixels, box: Box, origin_px: tuple[int, int], shape: tuple[int, ...]) -> Pixels:
+    """The outline's pixels (N, 2), less those that the picture's border made."""
+    flat = pixels[:, 0]
+    left, top = -origin_px[0], -origin_px[1]  # where the picture begins, in the region's pixels
+    right, bottom = left + shape[1] - 1, top + shape[0] - 1
+    x, y, width, height = box
+    if x <= left or y <= top or x + width > right or y + height > bottom:
+        xs, ys = flat.T
+        flat = flat[(xs > left) & (ys > top) & (xs < right) & (ys < bottom)]
+    return flat
+
+
+def _radius(detection: Detection) -> float:
+    """Of its circle; of what has none, half its height."""
+    return detection.circle.radius_px if detection.circle else (detection.y2_px - detection.y1_px) / 2

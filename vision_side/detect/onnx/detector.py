@@ -19,7 +19,7 @@ from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.vision_side.config import Device
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
-from sightline.vision_side.detect.onnx_engine import Engine, open_engine
+from sightline.vision_side.detect.onnx.engine import Engine, open_engine
 from sightline.vision_side.detect.onnx.engine import OnnxHeader, read_onnx_header
 from sightline.vision_side.detect.onnx.tensors import (
     ModelFormat,

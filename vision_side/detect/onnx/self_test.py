@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sightline.vision_side.detect.overlap import corners, overlap
+from sightline.vision_side.detect.port import corners, overlap
 from sightline.vision_side.detect.port import Detection
 
 KEY: Final = "golden"

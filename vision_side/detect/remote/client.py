@@ -1,10 +1,30 @@
 """`oip+http://HOST[:PORT]/MODEL` and its like: the parts of a remote detector's name. Pure."""
 
+import numpy as np
 import re
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from enum import StrEnum
+from numpy.typing import NDArray
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError, WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.messages import DetectedBox, MAX_DETECTED_BOXES
+from sightline.vision_side.detect.plugin_calls import Notices
+from sightline.vision_side.detect.port import (
+    Circle,
+    DetectFrame,
+    Detection,
+    DetectionResult,
+    Maker,
+    clean_label,
+    clipped,
+    result_of,
+)
+from typing import Any, Final, Protocol
 
-from sightline.protocol.errors import ConfigError
 
 DEFAULT_PORTS: Final = {"oip+http": 8000, "oip+grpc": 8001, "http+jpeg": 80}
 """Those of Triton, and of HTTP."""
@@ -51,3 +71,239 @@ def parse_address(kind: str) -> Address:
     if named is None:
         raise ConfigError(f"detector {kind!r} names no model: write {example}, or .../MODEL/VERSION")
     return Address(scheme, host, port, path, named[1], named[2] or "")
+
+
+# Why a remote detector gave no answer that counts: one list, one exception, one tally. Pure.
+
+
+_LONGEST: Final = 160
+_TOLD_AT: Final = frozenset(10**power for power in range(10))
+"""A server gone bad is told at the 1st, 10th, 100th ... refusal of a kind, when it is good again, and when it is bad
+again."""
+_IN_A_ROW: Final = 10
+"""Of answers that were good before, or of refusals: from so many on it is bad again. Fewer come and go, as where one
+robot of several is not answered; a line for each of them would be one for each frame."""
+
+
+class NoAnswerReason(StrEnum):
+    """What is counted. All of them mean "no answer": none of them moves the robot."""
+
+    LATE = "LATE"  # not there by the deadline
+    UNREACHABLE = "UNREACHABLE"  # nobody there, or gone in the middle of it
+    REFUSED = "REFUSED"  # it answered with an error of its own
+    TOO_LARGE = "TOO_LARGE"  # more bytes than any answer needs
+    ENCODED = "ENCODED"  # compressed, which was not asked for; never unpacked
+    MALFORMED = "MALFORMED"  # not the protocol: grammar, type, shape
+    NOT_FINITE = "NOT_FINITE"  # a box or score that is no number
+    TOO_MANY = "TOO_MANY"  # more boxes than any scene has
+    OTHER_FRAME = "OTHER_FRAME"  # it names another frame than the one it was asked about
+    OTHER_SIZE = "OTHER_SIZE"  # it looked at a picture of another size
+    UNFIT = "UNFIT"  # its model takes or gives what this end does not speak
+    BAD_PICTURE = "BAD_PICTURE"  # the robot's own frame is none: nobody was asked
+
+
+class NoAnswerError(Exception):
+    """There is no answer that counts; `detail` is one line for a person."""
+
+    def __init__(self, reason: NoAnswerReason, detail: str) -> None:
+        self.reason = reason
+        self.detail = " ".join(detail.split())[:_LONGEST]
+        super().__init__(f"{reason}: {self.detail}")
+
+
+class ErrorCounters:
+    """Counts what was refused of one remote, and says so where that is news."""
+
+    def __init__(self, name: str) -> None:
+        self.refused: Counter[str] = Counter()
+        self.news = Notices()
+        self._name = name
+        self._said = ""
+        self._good = self._bad = 0
+        """In a row."""
+
+    def refuse(self, error: NoAnswerError) -> None:
+        """Count it."""
+        self.refused[error.reason] += 1
+        count, good_before = self.refused[error.reason], self._good
+        self._good, self._bad = 0, self._bad + 1
+        again = self._said == "good" and (good_before >= _IN_A_ROW or self._bad == _IN_A_ROW)
+        if again or count in _TOLD_AT:
+            self._said = error.reason
+            self.news.add(f"detector {self._name}: no answer: {error.reason}: {error.detail} ({count} so far)")
+
+    def good(self) -> None:
+        """An answer that counts."""
+        self._good, self._bad = self._good + 1, 0
+        if self._said != "good":
+            before, self._said = self._said, "good"
+            self.news.add(f"detector {self._name} answers" + (" again" if before else ""))
+
+
+# Columns of numbers from somebody else -> detections, nothing taken on trust. Pure.
+
+
+MAX_ROWS: Final = 1024
+"""Security limit: a model with a fixed number of rows fills up with scores of 0; more than this is no detector's."""
+MIN_SCORE: Final = 0.25
+"""As for boxes on the wire: less sure than this is no box, unless configured otherwise."""
+_HASH: Final = re.compile("[0-9a-fA-F]{8,64}")
+Numbers = NDArray[Any]
+
+
+def read_columns(
+    boxes: Numbers, scores: Numbers, labels: Sequence[str], *, stretch: tuple[float, float], size_px: tuple[int, int],
+    min_score: float,
+) -> tuple[Detection, ...]:
+    """Boxes (K, 4) xyxy, scores (K,) and labels (K) as detections, best first, at most as many as the wire allows.
+
+    `stretch` turns the boxes' pixels into those of the encoded picture. Rows below `min_score` are no boxes and may
+    hold anything finite. Raises NoAnswerError for a wrong shape or order, too many rows, and what is not finite.
+    """
+    _check_shapes(boxes, scores, labels)
+    if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
+        raise NoAnswerError(NoAnswerReason.NOT_FINITE, "a box or score is nan or infinite")
+    order = [int(row) for row in np.argsort(-scores, kind="stable") if scores[row] >= min_score]
+    found = [_detection(boxes[row], float(scores[row]), labels[row], stretch, size_px) for row in order]
+    return tuple(one for one in found if one)[:MAX_DETECTED_BOXES]
+
+
+def _check_shapes(boxes: Numbers, scores: Numbers, labels: Sequence[str]) -> None:
+    rows = len(scores) if scores.ndim == 1 else -1
+    if boxes.ndim != 2 or boxes.shape[1] != 4 or boxes.shape[0] != rows or len(labels) != rows:
+        got = f"boxes {boxes.shape}, scores {scores.shape}, {len(labels)} labels"
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{got}; expected (K, 4), (K,) and K")
+    if rows > MAX_ROWS:
+        raise NoAnswerError(NoAnswerReason.TOO_MANY, f"{rows} boxes, at most {MAX_ROWS}")
+
+
+def _detection(
+    box: Numbers, score: float, label: str, stretch: tuple[float, float], size_px: tuple[int, int]
+) -> Detection | None:
+    """The part in the picture; None if there is none."""
+    across, down = stretch
+    x1, y1, x2, y2 = (float(value) for value in box)
+    if x2 < x1 or y2 < y1 or score > 1:
+        corners = f"{x1:g} {y1:g} {x2:g} {y2:g}"
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"a box inside out or a score over 1: {corners}, {score:g}")
+    one = Detection(x1 * across, y1 * down, x2 * across, y2 * down, score, clean_label(label))
+    return clipped(one, *size_px)
+
+
+def read_boxes(boxes: Sequence[DetectedBox], size_px: tuple[int, int], min_score: float) -> tuple[Detection, ...]:
+    """Boxes of the wire, which checked each by itself, as detections in the picture, best first."""
+    found = [clipped(_of_wire(box), *size_px) for box in boxes if box.score >= min_score]
+    return tuple(sorted((one for one in found if one), key=lambda one: one.score, reverse=True))
+
+
+def _of_wire(box: DetectedBox) -> Detection:
+    ring = box.circle
+    circle = Circle(ring.cx_px, ring.cy_px, ring.radius_px) if ring else None
+    label = clean_label(box.label)
+    return Detection(box.x1_px, box.y1_px, box.x2_px, box.y2_px, box.score, label, circle, track_id=box.track)
+
+
+def hash_of(text: str) -> str:
+    """A model's hash as results carry it: 16 digits; empty for what is none."""
+    return text[:16].lower() if _HASH.fullmatch(text) else ""
+
+
+# A detector that asks a server about one frame after the other. Shell (the clock, for how long it took).
+
+
+REMOTE: Final = "remote"
+"""What a result was made on, where the server does not say."""
+LONGEST_WAIT_S: Final = 2.0
+"""For an answer, whatever the deadline: twice the longest that can be configured."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServerAnswer:
+    """What a server said of one frame, checked, and who said it."""
+
+    detections: tuple[Detection, ...]
+    maker: Maker
+
+
+class Server(Protocol):
+    """How one kind of server is asked."""
+
+    def ask(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
+        """Its answer; blocks until about `until_us`. Raises NoAnswerError for everything else."""
+        ...
+
+    def close(self) -> None:
+        """Let go of its connection."""
+        ...
+
+
+class FrameByFrame(ABC):
+    """A `Detector` that asks elsewhere about one frame after the other, and counts what it refused."""
+
+    def __init__(self, name: str) -> None:
+        self._tally = ErrorCounters(name)
+
+    @property
+    def refused(self) -> Counter[str]:
+        """What was refused so far, by reason."""
+        return self._tally.refused
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        """As the port says."""
+        return [self._one(frame, deadline_us) for frame in frames]
+
+    def _one(self, frame: DetectFrame, deadline_us: int) -> DetectionResult | None:
+        try:
+            result = self._ask(frame, deadline_us)
+        except NoAnswerError as error:
+            self._tally.refuse(error)
+            return None
+        self._tally.good()
+        return result
+
+    @abstractmethod
+    def _ask(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
+        """What is seen in `frame`. Raises NoAnswerError."""
+
+    def news(self) -> list[str]:
+        """What a person may want to know, since the last time."""
+        return self._tally.news.take()
+
+
+class ServerDetector(FrameByFrame):
+    """Over one server. It may block for longer than the deadline: see `ByDeadline` for who must not."""
+
+    def __init__(self, name: str, server: Server) -> None:
+        super().__init__(name)
+        self._server = server
+
+    def close(self) -> None:
+        """Let go of the server."""
+        self._server.close()
+
+    def _ask(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
+        began_us = monotonic_us()
+        _check_picture(frame)
+        try:
+            answer = self._server.ask(frame, deadline_us)
+        except WireError as error:  # of pixels that were asked for
+            raise NoAnswerError(NoAnswerReason.BAD_PICTURE, error.detail) from None
+        ended_us = monotonic_us()
+        if ended_us > deadline_us:
+            raise NoAnswerError(NoAnswerReason.LATE, f"{(ended_us - deadline_us) / 1000:.0f} ms after the deadline")
+        return result_of(frame, answer.detections, answer.maker, ended_us - began_us)
+
+
+def _check_picture(frame: DetectFrame) -> None:
+    """Bytes go on undecoded, so that they are a picture of the right size is seen from their head alone."""
+    try:
+        size = read_jpeg_size(frame.jpeg, frame.width_px * frame.height_px)
+    except WireError as error:
+        raise NoAnswerError(NoAnswerReason.BAD_PICTURE, error.detail) from None
+    if (size.width_px, size.height_px) != (frame.width_px, frame.height_px):
+        raise NoAnswerError(NoAnswerReason.BAD_PICTURE, f"the frame is {size.width_px}x{size.height_px}")
+
+
+def seconds_left(until_us: int) -> float:
+    """What is left until then, 0 if nothing is; bounded for who has no deadline."""
+    return min(max(0, until_us - monotonic_us()) / 1e6, LONGEST_WAIT_S)

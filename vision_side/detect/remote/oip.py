@@ -5,18 +5,20 @@ model that can be used here takes one input, a JPEG (datatype BYTES) or its pixe
 `boxes` (K, 4) xyxy in pixels of what it was given, `scores` (K) and, if it knows several things, `labels` (K).
 """
 
+import cv2
 import math
+import numpy as np
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
-
-import cv2
-import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
+from sightline.protocol.config import Config as Settings
+from sightline.vision_side.config import Fraction
+from sightline.vision_side.detect.port import DetectFrame, Detection, Label
+from sightline.vision_side.detect.remote.client import MIN_SCORE, NoAnswerError, NoAnswerReason, read_columns
+from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, PixelBound
+from typing import Annotated, Any, Final, Literal
 
-from sightline.vision_side.detect.port import DetectFrame, Detection
-from sightline.vision_side.detect.remote.boxes_read import MIN_SCORE, read_columns
-from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
 
 NUMBERS: Final = {"FP16": "<f2", "FP32": "<f4", "FP64": "<f8", "UINT8": "u1", "INT8": "i1", "INT16": "<i2",
                   "UINT16": "<u2", "INT32": "<i4", "UINT32": "<u4", "INT64": "<i8", "UINT64": "<u8", "BOOL": "?"}
@@ -224,3 +226,22 @@ def _labels(found: NDArray[Any] | list[str] | None, rows: int, names: tuple[str,
         raise NoAnswerError(NoAnswerReason.MALFORMED, f"labels of shape {numbers.shape} and type {numbers.dtype}; they are "
                                               "text or whole numbers")
     return [names[number] if 0 <= number < len(names) else str(number) for number in numbers.tolist()]
+
+
+# What is configured of a model that is asked by the Open Inference Protocol, over HTTP and gRPC alike. Pure.
+
+
+class OipSettings(Settings):
+    """The detectors `oip+http` and `oip+grpc`."""
+
+    address: str
+    labels: Annotated[tuple[Label, ...], Field(max_length=1024)] = ()
+    """Names of labels that the model gives as numbers, from 0 on."""
+    min_score: Fraction = MIN_SCORE
+    order: Literal["bgr", "rgb"] = "bgr"
+    """Of the colours, where the model takes pixels."""
+    max_pixels: PixelBound = MAX_PIXELS
+
+    def looking(self) -> OutputOptions:
+        """How its answers are read."""
+        return OutputOptions(self.labels, self.min_score, self.order == "rgb")

@@ -1,14 +1,156 @@
-"""`oip+http://HOST/MODEL`: a model of an inference server (Triton, OpenVINO Model Server) over HTTP. Shell."""
+"""The Open Inference Protocol as JSON over HTTP, with the binary tensor data extension: requests, answers. Pure."""
 
+import json
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sightline.vision_side.detect.port import DetectFrame, Maker
-from sightline.vision_side.detect.remote.client import Address, parse_address
-from sightline.vision_side.detect.remote.asking import REMOTE, ServerAnswer, ServerDetector
+from sightline.vision_side.detect.remote.client import (
+    Address,
+    NoAnswerError,
+    NoAnswerReason,
+    REMOTE,
+    ServerAnswer,
+    ServerDetector,
+    parse_address,
+)
 from sightline.vision_side.detect.remote.deadline import DeadlineDetector
 from sightline.vision_side.detect.remote.http_client import HttpExchange
-from sightline.vision_side.detect.remote.oip import OipModel, OutputOptions, detections_of, tensor_of
-from sightline.vision_side.detect.remote.oip_json import HEADER_LENGTH, infer_body, read_infer, read_metadata
-from sightline.vision_side.detect.remote.oip_settings import OipSettings
-from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.remote.oip import (
+    Inferred,
+    MAX_DIMENSIONS,
+    MAX_TENSORS,
+    NUMBERS,
+    OipModel,
+    OipSettings,
+    OutputOptions,
+    Slot,
+    Tensor,
+    detections_of,
+    elements_of,
+    model_of,
+    read_number_tensor,
+    read_text_tensor,
+    tensor_of,
+)
+from typing import Annotated, Any, Final, TypeVar
+
+
+HEADER_LENGTH: Final = "Inference-Header-Content-Length"
+"""How many bytes of a body are JSON; tensors follow."""
+_Name = Annotated[str, Field(max_length=256)]
+_Shape = Annotated[tuple[int, ...], Field(max_length=MAX_DIMENSIONS)]
+
+
+class _Said(BaseModel):
+    """What a server says; what is not asked for here is left alone."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+Said = TypeVar("Said", bound=_Said)
+
+
+class _Slot(_Said):
+    name: _Name
+    datatype: _Name
+    shape: _Shape
+
+
+class _Metadata(_Said):
+    name: _Name
+    versions: Annotated[tuple[_Name, ...], Field(max_length=1024)] = ()
+    inputs: Annotated[tuple[_Slot, ...], Field(max_length=MAX_TENSORS)]
+    outputs: Annotated[tuple[_Slot, ...], Field(max_length=MAX_TENSORS)]
+
+
+class _Parameters(_Said):
+    binary_data_size: Annotated[int | None, Field(ge=0)] = None
+
+
+class _Output(_Slot):
+    parameters: _Parameters = _Parameters()
+    data: Any = None
+
+
+class _Answer(_Said):
+    id: str | None = None
+    model_version: _Name = ""
+    outputs: Annotated[tuple[_Output, ...], Field(max_length=MAX_TENSORS)]
+
+
+def read_metadata(body: bytes) -> OipModel:
+    """The model that `GET v2/models/NAME` describes. Raises NoAnswerError."""
+    said = _validated(_Metadata, body)
+    slots = [[Slot(one.name, one.datatype, one.shape) for one in of] for of in (said.inputs, said.outputs)]
+    return model_of(said.name, said.versions[-1] if said.versions else "", *slots)
+
+
+def infer_body(model: OipModel, tensor: Tensor, number: str) -> tuple[int, bytes]:
+    """The body of `POST v2/models/NAME/infer`, and how much of it is JSON; `number` comes back as the answer's id."""
+    head = json.dumps({
+        "id": number,
+        "inputs": [{"name": tensor.name, "shape": tensor.shape, "datatype": tensor.datatype,
+                    "parameters": {"binary_data_size": len(tensor.data)}}],
+        "outputs": [{"name": name, "parameters": {"binary_data": True}} for name in model.outputs],
+    }, separators=(",", ":")).encode()
+    return len(head), head + tensor.data
+
+
+def read_infer(body: bytes, json_length: str | None, number: str) -> Inferred:
+    """An answer. Raises NoAnswerError, also if it is the answer to something else."""
+    length = _json_length(json_length, len(body))
+    said = _validated(_Answer, body[:length])
+    if said.id not in (None, "", number):
+        raise NoAnswerError(NoAnswerReason.OTHER_FRAME, f"the answer's id is {said.id[:40]!r}, asked was {number!r}")
+    tensors, at = {}, length
+    for one in said.outputs:
+        size = one.parameters.binary_data_size
+        if size is None:
+            tensors[one.name] = _from_list(one)
+            continue
+        if at + size > len(body):
+            raise NoAnswerError(NoAnswerReason.MALFORMED, f"output {one.name[:40]!r} ends behind the end of the answer")
+        tensors[one.name] = _from_bytes(one, body[at : at + size])
+        at += size
+    return Inferred(tensors, said.model_version)
+
+
+def _json_length(text: str | None, whole: int) -> int:
+    if text is None:
+        return whole
+    if not (text.isascii() and text.isdecimal() and len(text) < 10 and int(text) <= whole):
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{HEADER_LENGTH} {text[:20]!r} of an answer of {whole} bytes")
+    return int(text)
+
+
+def _from_bytes(one: _Output, data: bytes) -> NDArray[Any] | list[str]:
+    if one.datatype == "BYTES":
+        return read_text_tensor(one.shape, data)
+    return read_number_tensor(one.datatype, one.shape, data)
+
+
+def _from_list(one: _Output) -> NDArray[Any] | list[str]:
+    """Servers without the extension write numbers as JSON, flat or nested."""
+    try:
+        values = np.asarray(one.data, dtype=object if one.datatype == "BYTES" else NUMBERS[one.datatype]).reshape(-1)
+    except (ValueError, TypeError, OverflowError, KeyError) as error:
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"output {one.name[:40]!r}: {error}") from None
+    if values.size != elements_of(one.shape):
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{values.size} values for a tensor of shape {list(one.shape)}")
+    return [str(value) for value in values] if one.datatype == "BYTES" else values.reshape(one.shape)
+
+
+def _validated(model: type[Said], data: bytes) -> Said:
+    try:
+        return model.model_validate_json(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        where = ".".join(str(part) for part in first["loc"]) or "answer"
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{where}: {first['msg']}") from None
+
+
+# `oip+http://HOST/MODEL`: a model of an inference server (Triton, OpenVINO Model Server) over HTTP. Shell.
 
 
 class HttpServer:

@@ -16,11 +16,11 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.messages import Detections, DetectionsHeader, Source
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 from sightline.vision_side.config import Fraction
-from sightline.vision_side.detect.labels import clean_label
+from sightline.vision_side.detect.port import clean_label
 from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Maker, result_of
-from sightline.vision_side.detect.remote.asking import REMOTE, FrameByFrame, seconds_left
-from sightline.vision_side.detect.remote.boxes_read import MIN_SCORE, hash_of, read_boxes
-from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.remote.client import REMOTE, FrameByFrame, seconds_left
+from sightline.vision_side.detect.remote.client import MIN_SCORE, hash_of, read_boxes
+from sightline.vision_side.detect.remote.client import NoAnswerError, NoAnswerReason
 
 ROLE: Final = "detector"
 """The source under which a detector service speaks."""

@@ -2,7 +2,7 @@
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import State, Twist, Verb
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.validation import AcceptedCommand, CommandResult
 from sightline.robot_side.safety.lease import RANKS
 from tests.conformance.robot.broken.breaking import breaks, wrap

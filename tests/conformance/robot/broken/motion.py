@@ -2,7 +2,7 @@
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import State, Twist
-from sightline.protocol.refusals import CLAMPED, RejectReason
+from sightline.protocol.errors import CLAMPED, RejectReason
 from sightline.robot_side.safety.validation import AcceptedCommand
 from tests.conformance.robot.broken.breaking import bend_out, breaks, fields_of, wrap
 from tests.conformance.robot.broken.lease import who_sends

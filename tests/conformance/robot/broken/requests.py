@@ -2,7 +2,7 @@
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import Verb
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.link import Message
 from tests.conformance.robot.broken.breaking import as_json, bend_out, bend_requests, breaks, fields_of, wrap
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, TWIST, key_for
 from sightline.protocol.errors import WireError
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, IncomingMessage, pack, parse_hello, unpack
 
 ROLES = st.from_regex(r"[a-z][a-z0-9_]{0,15}", fullmatch=True)

@@ -13,12 +13,12 @@ from websockets.sync.client import connect
 from sightline.protocol.channels import ACK, DETECTIONS, FRAME, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Detections, DetectionsHeader, FrameHeader
-from sightline.protocol.refusals import RejectReason
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.link_rules import OVERSIZE
+from sightline.protocol.transports.link import OVERSIZE
 from sightline.protocol.transports.websocket.link import open_websocket
-from sightline.protocol.transports.websocket_dialects import BAD_FRAMING
-from sightline.protocol.transports.websocket_listen import CROSS_SITE
+from sightline.protocol.transports.websocket.framing import BAD_FRAMING
+from sightline.protocol.transports.websocket.server import CROSS_SITE
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import JPEG as SMALL_JPEG
 from tests.fixtures.websocket import address_of, received, upgrade

@@ -17,7 +17,7 @@ from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.websocket.link import open_websocket
-from sightline.protocol.transports.websocket_dialects import OTHER_ROBOT
+from sightline.protocol.transports.websocket.framing import OTHER_ROBOT
 from tests.fixtures.links import until
 from tests.fixtures.websocket import Robot, free_ws
 

@@ -13,9 +13,9 @@ from sightline.protocol.channels import ACK, FRAME, SCAN, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import FrameHeader
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.link_rules import OVERSIZE
+from sightline.protocol.transports.link import OVERSIZE
 from sightline.protocol.transports.websocket.link import open_websocket
-from sightline.protocol.transports.websocket_dialects import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
+from sightline.protocol.transports.websocket.framing import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
 from tests.fixtures.links import claim, hail, until
 from tests.fixtures.websocket import HELLO, TWIST_KEY, V1, Robot, bare_client, closed_with, received
 

@@ -16,8 +16,8 @@ from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import Request
 from sightline.protocol.transports.security import ROLES
 from sightline.protocol.transports.websocket.link import open_websocket
-from sightline.protocol.transports.websocket_access import grants_of_role
-from sightline.protocol.transports.websocket_listen import TOO_MANY_CLIENTS
+from sightline.protocol.transports.security import grants_of_role
+from sightline.protocol.transports.websocket.server import TOO_MANY_CLIENTS
 from sightline.protocol.transports.websocket.server import (
     MAX_CLIENTS,
     MAX_HANDSHAKES,

@@ -8,9 +8,9 @@ from contextlib import suppress
 import pytest
 
 from sightline.protocol.channels import FRAME, STATUS
-from sightline.protocol.transports.link_rules import OVERSIZE
+from sightline.protocol.transports.link import OVERSIZE
 from sightline.protocol.transports.websocket.link import open_websocket
-from sightline.protocol.transports.websocket_peer import SILENT
+from sightline.protocol.transports.websocket.peer import SILENT
 from tests.fixtures.links import claim, until
 from tests.fixtures.websocket import Robot, bare_client, free_ws, never_reads, pause_until, resident_kib
 

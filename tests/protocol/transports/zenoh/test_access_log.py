@@ -8,9 +8,9 @@ import sys
 import pytest
 
 from sightline.protocol.log import RepeatLimiter
-from sightline.protocol.transports import tcp_table
-from sightline.protocol.transports.denied import Certificates
-from sightline.protocol.transports.tcp_table import Visitors
+from sightline.protocol.transports.zenoh import access_log as tcp_table
+from sightline.protocol.transports.zenoh.access_log import Certificates
+from sightline.protocol.transports.zenoh.access_log import Visitors
 from sightline.protocol.transports.zenoh.access_log import refusal_cause
 from tests.fixtures.links import free_endpoint, until
 

@@ -16,12 +16,12 @@ from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.messages import FrameHeader
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
-from sightline.protocol.transports.link_rules import NOT_A_PUT
+from sightline.protocol.transports.link import NOT_A_PUT
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.zenoh.link import MAX_KEPT_PUBLISHERS, ZenohLink, open_zenoh
 from sightline.protocol.transports.zenoh.discovery import list_robots
-from sightline.protocol.transports.zenoh_session import open_session
-from sightline.protocol.transports.zenoh_site import open_fleet
+from sightline.protocol.transports.zenoh.session import open_session
+from sightline.protocol.transports.zenoh.link import open_fleet
 from tests.fixtures.links import free_endpoint, until
 
 NO_ENDPOINTS = (

@@ -24,8 +24,8 @@ from sightline.protocol.transports.zenoh.presence import (
 from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.discovery import discover, peers_at
-from sightline.protocol.transports.zenoh_session import open_session
-from sightline.protocol.transports.zenoh_site import open_fleet
+from sightline.protocol.transports.zenoh.session import open_session
+from sightline.protocol.transports.zenoh.link import open_fleet
 from tests.fixtures.links import free_endpoint
 
 ROBOT = Presence(role="robot", robot="r1", session="0000abcd", software="sightline 9", host="shed", up_us=5_000_000)
@@ -167,8 +167,8 @@ def test_a_robot_of_another_id_and_its_own_restarted_self_are_welcome(router):
 
 def test_a_robot_that_ends_while_its_successor_looks_is_no_namesake(router, monkeypatch):
     first = open_zenoh("r1", connect=[router], role="robot")
-    monkeypatch.setattr("sightline.protocol.transports.zenoh_presence._SECOND_LOOK_S", 0.0)
-    monkeypatch.setattr("sightline.protocol.transports.zenoh_presence.time.sleep", lambda _seconds: first.close())
+    monkeypatch.setattr("sightline.protocol.transports.zenoh.presence._SECOND_LOOK_S", 0.0)
+    monkeypatch.setattr("sightline.protocol.transports.zenoh.presence.time.sleep", lambda _seconds: first.close())
     with open_zenoh("r1", connect=[router], role="robot") as second:
         assert second.connected
 

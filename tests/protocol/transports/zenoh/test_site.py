@@ -16,7 +16,7 @@ from sightline.operator_side.setup import keys
 from sightline.protocol.channels import ACK, FRAME, REQUEST, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from sightline.protocol.transports.zenoh_site import open_fleet
+from sightline.protocol.transports.zenoh.link import open_fleet
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 

@@ -5,7 +5,7 @@ import pytest
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice
 from sightline.robot_side.hardware.cameras.picamera import PiCamera
-from sightline.robot_side.hardware.v4l2_camera import V4l2Camera
+from sightline.robot_side.hardware.cameras.v4l2 import V4l2Camera
 from sightline.robot_side.plugins import build_device
 from tests.contracts.cameras import check_camera
 from tests.fixtures.cameras import FakeDevice, install_fake_picamera2, jpeg, video

@@ -6,10 +6,10 @@ import pytest
 
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.adaptive import AdaptiveConfig, AdaptiveTracker
+from sightline.vision_side.detect.color.adaptive import AdaptiveConfig, AdaptiveTracker
 from sightline.vision_side.detect.color.adaptive import ColorModel
-from sightline.vision_side.detect.hsv import HsvDetector
-from sightline.vision_side.detect.pixel_track import PixelTrack
+from sightline.vision_side.detect.color.hsv import HsvDetector
+from sightline.vision_side.detect.color.adaptive import PixelTrack
 from sightline.vision_side.detect.port import Circle
 
 YELLOW = (13, 199, 242)

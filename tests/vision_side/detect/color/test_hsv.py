@@ -13,8 +13,8 @@ from tests.fixtures.vision.vision import ball_about_lens, camera, draw_ball, jpe
 from sightline.vision_side.config import HsvConfig, HsvRange
 from sightline.vision_side.decode import Decoder, Picture
 from sightline.vision_side.detect.color.hsv import color_table
-from sightline.vision_side.detect.disc import fit_circle, fit_round_part
-from sightline.vision_side.detect.hsv import HsvDetector
+from sightline.vision_side.detect.color.hsv import fit_circle, fit_round_part
+from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.tracking.locate import locate_sphere
 

@@ -17,7 +17,7 @@ from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from sightline.vision_side.decode import Decoder, Picture
 from sightline.vision_side.detect.onnx.self_test import difference, golden_picture, golden_text, read_golden
 from sightline.vision_side.detect.onnx.detector import OnnxDetector
-from sightline.vision_side.detect.onnx_engine import open_engine
+from sightline.vision_side.detect.onnx.engine import open_engine
 from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor, read_onnx_header
 from sightline.vision_side.detect.onnx.tensors import Letterbox, ModelFormat, fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection

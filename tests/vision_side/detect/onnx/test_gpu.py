@@ -17,7 +17,7 @@ from sightline.vision_side.decode import Decoder, Picture
 from sightline.vision_side.detect.registry import build_detector
 from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
 from sightline.vision_side.detect.onnx.detector import SHIPPED
-from sightline.vision_side.detect.onnx_engine import open_engine
+from sightline.vision_side.detect.onnx.engine import open_engine
 from sightline.vision_side.detect.onnx.engine import read_onnx_header
 from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame

@@ -9,7 +9,7 @@ from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.zenoh_site import MAX_ROBOTS as MOST_AT_A_SITE
+from sightline.protocol.transports.zenoh.link import MAX_ROBOTS as MOST_AT_A_SITE
 from tests.fixtures.vision.remote import frame, within
 from tests.vision_side.detect.remote.test_deadline import FakeRemote, Held, _who
 from sightline.vision_side.detect.per_robot import MAX_ROBOTS, PerSession

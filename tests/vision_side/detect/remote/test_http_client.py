@@ -12,9 +12,9 @@ from sightline.protocol.errors import ConfigError
 from tests.fixtures.links import until
 from tests.fixtures.vision.remote import BALL_JPEG, GREY_JPEG, Server, box, frame, http_reply, said, within
 from sightline.vision_side.detect.remote.client import parse_address
-from sightline.vision_side.detect.remote.asking import ServerDetector
+from sightline.vision_side.detect.remote.client import ServerDetector
 from sightline.vision_side.detect.remote.http_client import MAX_ANSWER_BYTES, RETRY_US
-from sightline.vision_side.detect.remote.http_jpeg import HttpJpeg, JpegServer
+from sightline.vision_side.detect.remote.http_client import HttpJpeg, JpegServer
 
 GOOD = http_reply(said(box()))
 

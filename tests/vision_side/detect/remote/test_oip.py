@@ -20,11 +20,11 @@ from sightline.vision_side.detect.remote.oip import (
     model_of,
     tensor_of,
 )
-from sightline.vision_side.detect.remote.oip_json import read_infer, read_metadata
-from sightline.vision_side.detect.remote.oip_messages import infer_request, metadata_request
-from sightline.vision_side.detect.remote.oip_messages import read_infer as read_grpc
-from sightline.vision_side.detect.remote.oip_messages import read_metadata as read_grpc_metadata
-from sightline.vision_side.detect.remote.refusing import NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.remote.oip_http import read_infer, read_metadata
+from sightline.vision_side.detect.remote.oip_grpc import infer_request, metadata_request
+from sightline.vision_side.detect.remote.oip_grpc import read_infer as read_grpc
+from sightline.vision_side.detect.remote.oip_grpc import read_metadata as read_grpc_metadata
+from sightline.vision_side.detect.remote.client import NoAnswerError, NoAnswerReason
 
 PIXELS = Slot("image", "UINT8", (-1, 240, 320, 3))
 SIZE = (320, 240)

@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-from sightline.benchmarks.detector_streams import DEADLINE_MS, measure_streams
+from sightline.benchmarks.detector import DEADLINE_MS, measure_streams
 from sightline.operator_side.cli import app as cli
-from sightline.operator_side.processes import Processes
+from sightline.evaluation.processes import Processes
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.vision.remote import within

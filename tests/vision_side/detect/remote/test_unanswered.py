@@ -9,10 +9,10 @@ import pytest
 
 from tests.fixtures.vision.remote import COLUMNS, JPEG_INPUT, OUTPUTS, Server, frame, http_reply, within
 from sightline.vision_side.detect.remote.client import parse_address
-from sightline.vision_side.detect.remote.asking import ServerDetector
+from sightline.vision_side.detect.remote.client import ServerDetector
 from sightline.vision_side.detect.remote.oip import Inferred, OutputOptions, detections_of
 from sightline.vision_side.detect.remote.oip_http import HttpServer
-from sightline.vision_side.detect.remote.refusing import ErrorCounters, NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.remote.client import ErrorCounters, NoAnswerError, NoAnswerReason
 
 
 def _refuse(tally, count):

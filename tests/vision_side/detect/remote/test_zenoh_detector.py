@@ -24,7 +24,7 @@ from sightline.protocol.messages import (
 )
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.discovery import peers_at
-from sightline.protocol.transports.zenoh_site import open_fleet
+from sightline.protocol.transports.zenoh.link import open_fleet
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.vision.remote import BALL_JPEG, GREY_JPEG, frame, within
 from tests.fixtures.vision.vision import jpeg_of
@@ -33,7 +33,7 @@ from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.port import DetectFrame
 from sightline.vision_side.detect.remote.zenoh_detector import ZenohDetector
-from sightline.vision_side.detector_service import ROLE, DetectorService, ServingOptions
+from sightline.vision_side.serving.detector_service import ROLE, DetectorService, ServingOptions
 
 CORNERS = ("x1_px", "y1_px", "x2_px", "y2_px")
 DEADLINE_S = DetectorConfig().deadline_s
