@@ -1,4 +1,4 @@
-"""What encoding and decoding of the small messages costs: `sightline bench codec`. Shell (reads the clock)."""
+"""What encoding a message and judging a command cost. Shell (a clock)."""
 
 import statistics
 import time

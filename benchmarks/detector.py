@@ -1,4 +1,4 @@
-"""A detector that takes a given time for each frame, as a busy GPU does, and always sees the same. Shell (sleeps)."""
+"""What a detector elsewhere costs, and one service for many streams; with a detector that is slow on purpose. Shell."""
 
 import subprocess
 import sys

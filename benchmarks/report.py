@@ -1,4 +1,4 @@
-"""What the performance page shows: each section's command, and why it is there. Pure."""
+"""Writes docs/performance.md section by section from the commands that it names. Shell (processes)."""
 
 import json
 import os

@@ -1,1 +1,1 @@
-"""The conformance kit: cases that test any peer over the network, point by point against `protocol/README.md`."""
+"""A conformance kit for any peer: numbered cases against protocol/README.md."""

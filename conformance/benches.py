@@ -1,4 +1,4 @@
-"""A bench in real time: the peer is somebody at an endpoint. Shell (a lock, a clock, a link's threads)."""
+"""The bench in real time over a link, and in virtual time over a network in memory. Shell (threads, a clock)."""
 
 import threading
 from collections import Counter, deque

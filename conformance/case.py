@@ -1,4 +1,4 @@
-"""What a case is: numbered, MUST or SHOULD, of one clause, a plain function of a `Bench`. Pure.
+"""A case and the bench that it runs on: messages, time, expectations. Pure.
 
     SUITE = Suite("R")
 

@@ -1,4 +1,4 @@
-"""The line protocol between the kit and any codec: questions out, answers in, each one line of JSON. Pure.
+"""The codec suite: golden vectors sent to any program over a line protocol. Shell (a process).
 
     {"id", "kind": "message", "key", "header", "payload"}      header and payload in base64
     {"id", "kind": "hello" | "websocket" | "older_...", fields}  a vector of that folder, in its own words

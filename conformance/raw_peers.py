@@ -1,4 +1,4 @@
-"""A WebSocket client of bytes, for what a well-behaved library would never send. Shell (a socket).
+"""Clients that send what no library would: raw WebSocket bytes, any Zenoh key. Shell (sockets).
 
     with RawWebSocket("ws://127.0.0.1:9090") as raw:
         raw.send(TEXT, hello)

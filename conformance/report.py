@@ -1,4 +1,4 @@
-"""What a run of the kit leaves for machines: JSON, JUnit XML, and the Markdown page of several runs. Pure."""
+"""Results as JSON, JUnit XML, a Markdown page and one HTML file. Pure."""
 
 import xml.etree.ElementTree as ET
 from collections import Counter

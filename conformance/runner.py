@@ -1,4 +1,4 @@
-"""Runs cases one after another and keeps what came out. Pure: the bench brings time and network."""
+"""Runs cases one after another and collects their results. Pure."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

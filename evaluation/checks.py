@@ -1,4 +1,4 @@
-"""Checks and figures as text. Pure."""
+"""A check: name, value, unit, bound, verdict; how checks are made, printed and returned as an exit code. Pure."""
 
 from dataclasses import dataclass
 from typing import Final

@@ -1,4 +1,4 @@
-"""The simulation's labels as the boxes that a detector elsewhere would publish. Pure."""
+"""The simulation's labels published as detections, as a detector service would. Shell (a link)."""
 
 import secrets
 from collections import OrderedDict

@@ -1,4 +1,4 @@
-"""The whole line in virtual time: the services' own pure logic, a simulated world, a network in memory. Pure.
+"""The whole loop in virtual time: the services' own logic, a simulated world, a network in memory. Pure.
 
 Nothing here decides anything: robot, driver, stream and vision are the classes the real processes run. Every delay and
 loss is drawn from the seed, so a run repeats bit for bit, about twenty times faster than real.

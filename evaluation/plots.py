@@ -1,4 +1,4 @@
-"""trajectory.png: where robot and target went, and what the scenario is about over time. Shell (writes a file)."""
+"""The path of a run and its figures over time as a picture. Shell (writes a file)."""
 
 import math
 from collections.abc import Sequence

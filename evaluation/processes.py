@@ -1,4 +1,4 @@
-"""SIGTERM as Ctrl-C, for whoever has processes of its own to end. Shell (a signal handler)."""
+"""Processes and worker pools that end together whatever happens, each process with its log. Shell."""
 
 import multiprocessing
 import os

@@ -1,4 +1,4 @@
-"""What a person would configure for a scenario and its robot: robot.toml and vision.toml. Pure.
+"""The robot's and vision's configuration for a simulated scenario. Pure.
 
 Nothing here is told to the services behind anybody's back: `sightline demo` leaves both files in its run folder.
 """

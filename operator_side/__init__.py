@@ -1,1 +1,1 @@
-"""What people touch: the command line, the demo, lockstep, the score. The composition root."""
+"""What an operator uses: a client of robots, teleop, calibration, recording, pages, and the command line."""

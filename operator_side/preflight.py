@@ -1,4 +1,6 @@
-"""A package that is not installed, said as the command that installs it. Pure."""
+"""What a command checks before its work: the extra that it needs is installed, its result can be written. Shell
+(files).
+"""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""The contract: what is on the wire, and the ways to carry it. Imports nothing of ours."""
+"""The wire contract: channels, messages, codecs and the transports that carry them. Imports nothing of ours."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""This machine's monotonic clock, that of deadlines, ages and stamps: one for all its processes. Shell."""
+"""The monotonic clock of this machine, and the age of stamps of a robot whose clock is another. Shell (a clock)."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""Why a message was not obeyed. One list, used by the gate, the codec and `status`. Pure."""
+"""Reasons for rejecting a message, and every exception that Sightline raises on purpose. Pure."""
 
 from enum import StrEnum
 

@@ -1,4 +1,5 @@
-"""The lines that a service says, as text or as JSON: one object a line, for what collects logs. Shell (streams).
+"""Log lines as text or JSON, written by a thread that never blocks its caller, and limits on how many there are.
+Shell (streams).
 
     sightline robot --log json        {"time":"2026-03-01T10:00:00.123Z","level":"info","service":"robot","message":...}
 

@@ -1,4 +1,4 @@
-"""What is said on the wire: frozen, strict, bounded models. Pure.
+"""Every message on the wire as a frozen, strict, bounded pydantic model. Pure.
 
 Headers travel beside the payload (Zenoh attachment); payloads of JSON channels are the other models. Units are in the
 names; signs as in REP 103: x forward, y left, counter-clockwise positive. Times are the robot's monotonic clock.

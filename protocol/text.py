@@ -1,4 +1,4 @@
-"""The twist text `linear|angular`: a strict ASCII grammar both ways. Pure.
+"""Payloads that are text: the twist `linear|angular`, and pictures, twists and boxes of the legacy protocol. Pure.
 
 `float()` takes nan, inf, `1_0`, blanks and digits of other scripts; none of these may reach a wheel.
 Grammar: NUMBER "|" NUMBER, NUMBER = [+-] (DIGITS [. DIGITS*] | . DIGITS) [(e|E) [+-] 1*3DIGIT].

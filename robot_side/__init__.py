@@ -1,1 +1,3 @@
-"""What runs on the robot: gate, motors, camera, link. Needs no NumPy, OpenCV or PyBullet."""
+"""The robot service: a driver process with motors and safety gate, a network process with camera and link. Needs no
+NumPy, OpenCV or PyBullet.
+"""

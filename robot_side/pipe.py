@@ -1,4 +1,4 @@
-"""What the driver process and its network child say to each other, one SOCK_SEQPACKET packet each. Pure.
+"""The pipe between driver and network process: packets, pending requests, and both ends. Shell.
 
     network -> driver   RAW     bytes of a twist or request as they came: channel, source, header, payload
                         STREAM  stream counters, JSON

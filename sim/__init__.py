@@ -1,1 +1,1 @@
-"""A PyBullet world that stands in for hardware, behind the robot's own ports."""
+"""A PyBullet simulation behind the robot's ports."""

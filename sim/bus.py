@@ -1,4 +1,4 @@
-"""The robot's plug-ins that reach into a running simulation, and `TruthReader` for scores. Shell (sockets).
+"""The sockets between robot and simulation: device plug-ins, truth, labels. Shell (sockets).
 
 Imported on the robot: no NumPy, no PyBullet. Each port has its own local SOCK_SEQPACKET socket, so that a slow picture
 never delays a motor. Formats, all little-endian:

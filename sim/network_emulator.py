@@ -1,4 +1,4 @@
-"""A bad network, one direction at a time: delay, jitter, loss, bursts, rate, copies, reorder, corrupt, cut. Pure.
+"""A bad network, one direction at a time: delay, jitter, loss, bursts, rate, reordering. Pure.
 
 Packets in and out in the time it is told, chance from a seed. `sim/tun_emulator.py` carries real packets through it.
 """

@@ -1,4 +1,4 @@
-"""Says when something periodic is due. Pure."""
+"""The simulation as a real-time process: sockets, motor latch, loop. Shell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a simulated robot is made of: the models behind `robots/*.toml`. Pure.
+"""Simulated robots: models of `robots/*.toml`, and their URDF. Pure.
 
 Lengths are metres from the axle's midpoint on the floor: x forward, y left, z up. The body is either written in the
 TOML (`chassis`, `caster`) or drawn in a URDF that it names, whose wheels and sensors it then only names too.

@@ -1,4 +1,4 @@
-"""A closed path of straights and arcs, by arc length: where a moving target is. Pure."""
+"""Scenarios: paths, things, traffic lights and camera looks, as models of `scenarios/*.toml`. Pure."""
 
 import difflib
 import math

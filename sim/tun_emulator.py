@@ -1,4 +1,4 @@
-"""`sim/network_emulator.py` between two network namespaces: a TUN device in each, a leg each way. Shell; needs root.
+"""The network emulator between two network namespaces. Shell; needs root.
 
 For kernels without netem. Shapes are JSON lines on stdin (`{"ab": {...}, "ba": {...}}`); each is answered by a line of
 counts on stdout once it is in force.

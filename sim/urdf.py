@@ -1,4 +1,4 @@
-"""Frames of reference without NumPy: a rotation and where it is, chained as a URDF chains its joints. Pure."""
+"""Reads and checks a URDF or xacro file. Pure (reads files)."""
 
 import difflib
 import math

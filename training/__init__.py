@@ -1,1 +1,1 @@
-"""Modules of training."""
+"""Trains the detector that ships: scenes, network, loop, export, model card."""

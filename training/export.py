@@ -1,4 +1,4 @@
-"""Trained weights -> ONNX, opset 17: uint8 BGR in; boxes, scores and labels out, suppressed and decoded. Pure (ONNX).
+"""Trained weights as an ONNX file: uint8 BGR in, boxes, scores and labels out. Pure (ONNX).
 
 Written node by node, so that nothing but the table and the weights decides what is in the file.
 """

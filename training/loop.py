@@ -1,5 +1,4 @@
-"""The network's table as a PyTorch module, and its weights as arrays with the normalisation folded in. Pure (PyTorch).
-"""
+"""The network in PyTorch and the training loop: batches, checkpoints, averaged weights. Shell (threads, files)."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""The learned detector's network as one table, from which both PyTorch's module and the ONNX graph are made. Pure.
+"""The network as one table, from which the PyTorch module and the ONNX graph are made. Pure.
 
 A heat map of where the middles of things are, one for each label, and for each cell how far off the middle is and how
 large the thing. Depthwise layers carry the width; 240 rows halve evenly four times, so no layer pads.

@@ -1,4 +1,4 @@
-"""The scenes that a training run learns from, drawn once into a folder by as many processes as asked. Shell (files)."""
+"""Training scenes drawn to disk, and samples cut from them with their heat maps. Shell (files, processes)."""
 
 import hashlib
 import json

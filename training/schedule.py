@@ -1,4 +1,4 @@
-"""What decides a training's outcome, and what changes as it goes: learning rate, scenes, cut-outs. Pure."""
+"""What decides the outcome of a training: learning rate, scenes and crops by step. Pure."""
 
 import math
 from dataclasses import dataclass

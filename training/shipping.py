@@ -1,4 +1,4 @@
-"""From which score on a detection counts, chosen on scenes that are neither trained on nor judged. Pure."""
+"""Thresholds, golden outputs, final report and model card of the file that ships. Shell (files, processes)."""
 
 import numpy as np
 from collections.abc import Callable, Mapping, Sequence

@@ -1,1 +1,1 @@
-"""What runs on the strong machine: a frame in, a command out."""
+"""The vision service: a frame in, a command out."""

@@ -1,4 +1,4 @@
-"""Finds a plug-in by its name and checks what it is configured with: missions and detectors alike. Shell (imports).
+"""Loads a plug-in by name and validates its configuration; for missions and detectors. Shell (imports).
 
 Names are those of a built-in table, those of a group of entry points, or, from a configuration or a command line only,
 `package.module:Name`. A plug-in's `Config` that has a section of vision's configuration by name and type (`target`,

@@ -1,4 +1,4 @@
-"""Lets through no more than so many a second of what comes at a rate of its own. Pure."""
+"""Publishes `overlay` and `preview` while a client subscribes to them. Shell (a thread)."""
 
 import numpy as np
 import os

@@ -1,1 +1,1 @@
-"""Modules of sightline.benchmarks.loop."""
+"""`sightline bench loop`: capture to the driver's verdict, against a floor and other designs."""

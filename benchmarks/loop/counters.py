@@ -1,4 +1,4 @@
-"""What the kernel counted: time and memory of processes, time taken by others. Shell (/proc)."""
+"""The kernel's counters: CPU time, memory, bytes of each TCP connection. Shell (/proc, netlink)."""
 
 import os
 import socket

@@ -1,4 +1,4 @@
-"""What `bench loop` is asked to do. Pure."""
+"""Settings, samples, figures and bounds of a race. Pure."""
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""One sample of one contestant: start it, let it settle, read the kernel's counters around its time, end it. Shell.
+"""One race: each contestant is started, sampled with the kernel's counters, and ended. Shell (processes).
 
 A sample during which others had the machine's time is marked and taken again, as often as the setting allows.
 """

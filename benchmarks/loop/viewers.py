@@ -1,4 +1,4 @@
-"""Viewers of the robot's pictures, for `bench watchers`: `python -m sightline.benchmarks.loop.viewers ENDPOINT COUNT NAP_S`. Shell.
+"""What viewers cost the driver of a robot: the bench, and the viewers' process. Shell (processes).
 
 Opens COUNT links, each with its own connection, and takes every frame; with NAP_S it sleeps so long over each one, on
 the transport's thread, so that its connection is read no faster than that.

@@ -1,4 +1,4 @@
-"""Sightline's own eyes for contestants of `bench loop`: one `Pipeline`, with a detector as slow as was asked. Shell."""
+"""The vision service with a tap, and a pipeline whose detector is as slow as requested. Shell."""
 
 import json
 import signal

@@ -1,1 +1,1 @@
-"""Modules of sightline.benchmarks.network."""
+"""`sightline bench network`: robot and vision in two network namespaces with a shaped wire between."""

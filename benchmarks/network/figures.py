@@ -1,4 +1,4 @@
-"""What a robot's wheels were told, as its log drive notes it, held against when something was harmed. Pure."""
+"""Figures and bounds of a network case, and of what its wheels were told. Pure."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Rows of `bench network`: the driving vision, the router and the robot's address change. Shell (processes).
+"""Cases with a course of their own: takeover, uplink, twenty robots, STOP through a full medium. Shell (processes).
 
 Judged from what the wheels were told: they stop, and turn again.
 """

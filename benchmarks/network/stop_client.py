@@ -1,4 +1,4 @@
-"""A person who says STOP again and again, for `bench network`: once it drives STOP, then reset and arm. Shell.
+"""A process that sends STOP, reset and arm again and again. Shell.
 
     python -m sightline.benchmarks.network.stop_client ENDPOINT ROBOT LEDGER SECONDS SEED
 """

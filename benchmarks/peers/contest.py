@@ -1,4 +1,4 @@
-"""What every peer's vision is handed: something that answers pictures. Pure."""
+"""What every rival is given: a camera, a vision to call, a tally. Shell (a clock)."""
 
 import json
 import time

@@ -1,1 +1,1 @@
-"""Modules of sightline.conformance.robot."""
+"""Cases for robots, by chapter of the specification."""

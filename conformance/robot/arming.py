@@ -1,4 +1,4 @@
-"""Cases on arming and disarming: what lets a robot move. Pure."""
+"""Cases on arming, disarming, STOP and reset. Pure."""
 
 from sightline.conformance.case import Bench, Suite
 from sightline.conformance.robot.fixture import CRAWL, GOOD, Robot, Sender, arm, armed

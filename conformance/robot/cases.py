@@ -1,4 +1,4 @@
-"""All cases for robots, in the order of the report, and what prepares a robot for each. Shell (some have sockets)."""
+"""All cases for robots in the order of the report, and the state in which each begins. Pure."""
 
 from typing import Final
 

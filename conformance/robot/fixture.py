@@ -1,4 +1,4 @@
-"""The kit at a robot: who it hears (`Robot`) and who it plays (`Sender`). Pure.
+"""The kit as a peer of a robot: what it receives and what it sends. Pure.
 
 Headers towards the robot are made of plain dicts, so that a case can also send what no model would let it say.
 """

@@ -1,4 +1,4 @@
-"""Cases on what a robot publishes: frames, their headers, camera model, status and odometry, at their rates. Pure."""
+"""Cases on what a robot publishes and on credit: frames, status, odometry, rates. Pure."""
 
 from collections.abc import Callable
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Cases on the port of the older text dialect: base64 pictures out, `linear|angular` in. Shell (raw sockets)."""
+"""Cases on the port of the legacy text protocol. Shell (sockets)."""
 
 import binascii
 import time

@@ -1,4 +1,4 @@
-"""Cases on requests and their replies, and on what `status` lets a person see. Pure."""
+"""Cases on requests, replies and counters. Pure."""
 
 from sightline.conformance.case import Bench, Suite
 from sightline.conformance.robot.fixture import GOOD, Robot, Sender, armed, as_json

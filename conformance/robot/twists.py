@@ -1,4 +1,4 @@
-"""Cases on single twists: header fields, the grammar, and what a twist cites. Each is a row of a table. Pure.
+"""Cases on single twists: header, grammar, what they cite, their order. Pure.
 
 A robot that is not armed judges every command all the same and counts a good one as DISARMED, so no wheel turns here.
 """

@@ -1,4 +1,4 @@
-"""Cases that need sockets of their own: the handshake, hello and framing of `sightline.v1`. Shell (raw sockets)."""
+"""Cases on `sightline.v1` with sockets of their own: handshake, hello, framing, tokens. Shell (sockets)."""
 
 import socket
 import time

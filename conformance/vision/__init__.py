@@ -1,1 +1,1 @@
-"""Modules of sightline.conformance.vision."""
+"""Cases for visions, by chapter of the specification."""

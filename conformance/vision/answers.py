@@ -1,4 +1,4 @@
-"""Cases about a vision's answers: framing, headers, grammar. Pure."""
+"""Cases on a vision's answers: framing, headers, grammar, and where it steers. Pure."""
 
 import json
 import math

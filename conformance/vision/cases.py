@@ -1,4 +1,4 @@
-"""Every case for a vision, in the order of the report, and how each begins. Shell (some cases have sockets)."""
+"""All cases for visions in the order of the report, and the state in which each begins. Pure."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""Pixels -> JPEG with integers alone, so that the kit's pictures come out the same on every machine. Pure.
+"""The kit's pictures: how they are drawn with integers alone, and what is no picture. Pure.
 
 Baseline or progressive (spectral selection), every component at full size, 8 bits: ITU-T T.81. The Huffman tables give
 all symbols codes of one length: legal, a little larger than the usual ones, and nothing to look up.

@@ -1,4 +1,4 @@
-"""The robot that the kit plays for a vision, and what the vision answered, read leniently. Pure.
+"""The robot that the kit plays for a vision, and the vision's answers. Pure.
 
     robot = RobotPlayed(bench).met()
     sent = robot.frame("left")

@@ -1,4 +1,4 @@
-"""Cases about credit, silence, and what a robot says of itself: flow, silence, status. Pure."""
+"""Cases on credit, silence, status and a robot that reconnects. Pure."""
 
 from collections.abc import Callable
 from sightline.conformance.case import Bench, Case, Level, Suite

@@ -1,4 +1,4 @@
-"""Cases about what is not the protocol: broken headers, broken cameras, noise, strangers' keys. Pure."""
+"""Cases on invalid headers, cameras, keys and pictures. Pure."""
 
 from collections.abc import Callable
 from random import Random

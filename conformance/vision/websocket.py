@@ -1,4 +1,4 @@
-"""A WebSocket server of a few lines that can do what no good one does: for cases about the connection. Shell.
+"""Cases on a vision's WebSocket, with a server that can misbehave. Shell (sockets).
 
 It knows just enough of RFC 6455 to accept one client at a time, and leaves everything else to who uses it.
 """

@@ -1,1 +1,1 @@
-"""Modules of sightline.evaluation.baselines."""
+"""Control laws of older systems, only for comparison."""

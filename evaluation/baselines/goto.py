@@ -1,4 +1,4 @@
-"""Mission `goto-baseline`: the write-up's go-to-goal and wall following as they were, for comparison. Pure.
+"""Go-to-goal with wall following. Pure.
 
 Two PD laws, never both at once, and a machine of three states (to the goal, left contour, right contour) at 10 Hz.
 What is wrong in it stays: differences per step instead of per second, an angle that wraps wrongly near half a turn, a

@@ -1,4 +1,4 @@
-"""Mission `legs-baseline`: the write-up's leg follower with its own numbers, for comparison. Pure.
+"""The older leg follower. Pure.
 
 It takes 70 of a lidar's rays, one a degree, from 39 degrees left to 30 right, and indexes them with the box's edges as
 shares of the picture. The middle of the picture is ray 35, straight ahead is ray 39, and the law steers for ray 30: the

@@ -1,4 +1,4 @@
-"""What the laws of the older write-ups go by: the largest detection as centre, radius and area in pixels. Pure."""
+"""Band, P and PI steering in pixels. Pure."""
 
 import math
 from collections import deque

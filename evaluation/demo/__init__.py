@@ -1,1 +1,1 @@
-"""Modules of sightline.evaluation.demo."""
+"""One run in real time: simulation, robot and vision as processes, then scored and filmed."""

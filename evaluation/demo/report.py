@@ -1,4 +1,4 @@
-"""What a demo leaves and says when it is over: score.json, trajectory.png, run.mp4, a table. Shell (writes files)."""
+"""Scores a demo and writes score.json, trajectory.png, run.mp4 and a summary. Shell (files)."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""One block on the terminal that shows how a demo goes; one line a second where there is no terminal. Shell."""
+"""Starts, arms, watches and ends the three processes of a demo. Shell."""
 
 import math
 import os

@@ -1,4 +1,4 @@
-"""A worse network than the real one: delay and seeded loss on each leg of any `Link`. Shell (one thread, a lock).
+"""The vision service behind a link with added latency and seeded loss. Shell (a thread).
 
 `DelayLine` is the pure part: a bounded queue in the time it is told. `ShapedLink` puts one on each leg and releases
 what is due on a thread of its own. What it did is counted, so that a run in which nothing was injected shows.

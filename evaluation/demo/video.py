@@ -1,4 +1,4 @@
-"""The world from above as a picture, drawn from truth: walls, the ways so far, robot and target. Pure."""
+"""run.mp4: the robot's view beside the world from above. Shell (files)."""
 
 import cv2
 import math

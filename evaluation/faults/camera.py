@@ -1,4 +1,4 @@
-"""The simulated camera, made to fail: a camera plug-in that does what the file `mode` in its folder names. Shell.
+"""A camera plug-in that fails on command. Shell (files).
 
 Every picture that was spoiled is noted in `camera.ledger` beside it.
 """

@@ -1,4 +1,4 @@
-"""Rows: vision dies, hangs or slows; the network process does; the driver process is starved or ended. Shell."""
+"""Every case of the fault bench: processes, network, commands, clients, operators. Shell."""
 
 import itertools
 import signal

@@ -1,4 +1,4 @@
-"""What the motors' own log says of a stop, held against what was demanded. Pure.
+"""What the motor log and the event logs say of a stop, compared with the demanded bounds. Pure but for the logs.
 
 Nothing here believes the software under test: the motors' log is stamped by the simulation, the ledger by whoever sent.
 """

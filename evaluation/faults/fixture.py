@@ -1,4 +1,4 @@
-"""The bench's processes: as `Processes`, and started in namespaces, signalled, killed and looked into. Shell."""
+"""One robot at speed, ready to be harmed: its processes, network namespaces and logs. Shell."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""A hundred viewers by WebSocket of whom one never reads, or five hundred handshakes begun and left. Shell.
+"""Many WebSocket viewers, or handshakes that are begun and abandoned. Shell.
 
     python -m sightline.evaluation.faults.load_clients viewers|handshakes ENDPOINT LEDGER
 

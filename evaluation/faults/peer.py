@@ -1,4 +1,4 @@
-"""A process of the bench that speaks to the robot: vision itself, a driver by script, or a person. Shell.
+"""A process that speaks to the robot: the vision service, a scripted driver with its attacks, or an operator. Shell.
 
     python -m sightline.evaluation.faults.peer OPTIONS_AS_JSON
 

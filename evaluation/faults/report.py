@@ -1,4 +1,4 @@
-"""What a measurement ran on, in words that name no host. Shell (reads the system)."""
+"""The fault report: a line per run, JSON, the table of docs/faults.md and the worst values of docs/safety.md. Pure."""
 
 import os
 import platform

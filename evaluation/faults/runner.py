@@ -1,4 +1,4 @@
-"""One row of the fault bench: what is injected and what is demanded. Pure."""
+"""A fault case, how it is run and judged, and many of them side by side. Shell (processes)."""
 
 import multiprocessing
 import shutil

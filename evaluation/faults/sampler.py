@@ -1,4 +1,4 @@
-"""Notes when this machine did not run what should run: the stamps of such a moment cannot be trusted. Shell.
+"""Records when this machine did not run what should run, so that stamps of that time are not trusted. Shell.
 
     python -m sightline.evaluation.faults.sampler FILE
 

@@ -1,4 +1,4 @@
-"""What stands on docs/behaviours.md, in its order: scenarios, their laws, the light they are seen in. Pure."""
+"""docs/behaviours.md: every scenario with its baseline, in figures and pictures. Shell (processes, files)."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, as_completed

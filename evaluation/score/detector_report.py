@@ -1,4 +1,4 @@
-"""Shows labelled scenes to detectors and counts what they answer. Shell (draws scenes, runs detectors).
+"""Detectors on labelled scenes: runs, bounds, tables and a sheet of pictures. Shell (draws scenes).
 
 Every detector gets the same JPEGs through the port that vision uses; each scene is a session of its own. What it says
 is checked as vision checks it: whatever a plug-in does, it is an answer that a robot could get, or none.

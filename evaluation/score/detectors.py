@@ -1,4 +1,4 @@
-"""How good a detector's answers are: each frame's verdict, and the figures over many. Pure.
+"""Hits, misses, localisation and average precision of a detector. Pure.
 
 A frame's answer is what somebody who follows a ball would steer by: the surest detection that is called a ball.
 Going for another object is the unsafe failure, and is counted by itself.

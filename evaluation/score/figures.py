@@ -1,4 +1,4 @@
-"""The score of a run, from world truth alone: never from what the software says of itself. Pure."""
+"""The figures of a run from world truth, and the bounds of each scenario. Pure."""
 
 import itertools
 import math

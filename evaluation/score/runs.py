@@ -1,4 +1,4 @@
-"""`sightline score`: lockstep runs over scenarios, seeds, latencies and losses, judged. Shell (processes).
+"""`sightline score`: many lockstep runs, scored and compared with their bounds. Shell (processes, a terminal).
 
 Each run is a process's own, so that they share the machine's cores; a run itself repeats bit for bit.
 """

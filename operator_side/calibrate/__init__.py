@@ -1,1 +1,1 @@
-"""Modules of sightline.operator_side.calibrate."""
+"""Measures what a robot is made of: camera, target colour, wheels."""

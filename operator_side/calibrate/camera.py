@@ -1,4 +1,4 @@
-"""A camera's model from pictures of a chessboard, or of a ball of known size at a known distance. Pure.
+"""A camera's model from pictures of a chessboard or a ball, and where the pictures come from. Shell (files, a link).
 
 OpenCV counts pixels from the middle of the top-left one, `CameraModel` from its corner: half a pixel is added.
 """

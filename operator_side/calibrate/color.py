@@ -1,4 +1,4 @@
-"""A place in a picture -> the colour range of what is there, tried on pictures, in words and as a mask. Pure.
+"""A color range from a place in a picture, and how well it separates. Pure.
 
 One range, or two for a colour on both sides of red. Margins are for what changes by itself: shade moves the value by a
 factor, haze and warm light take saturation, JPEG and noise blur the hue.

@@ -1,4 +1,4 @@
-"""Puts colour ranges into the text of a vision configuration; every comment and all else stays as it was. Pure.
+"""Writes color ranges into a vision configuration and leaves everything else as it was. Shell (files).
 
 The text is cut into statements by a small scanner; what comes out is read again by Python's TOML reader and must say
 what was meant, or nothing is changed.

@@ -1,4 +1,4 @@
-"""Pictures to pick a colour from: of a file, of a video, of a robot. Shell (reads files, waits)."""
+"""The page of `sightline pick-color`, and the pictures that it shows. Shell (threads, files)."""
 
 import cv2
 import json

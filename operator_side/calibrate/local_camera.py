@@ -1,4 +1,4 @@
-"""A camera plug-in opened by the command line, without a robot around it. Shell (opens a device).
+"""Opens a camera plug-in of this machine without a robot. Shell (a device).
 
     --camera v4l2 --camera-set device=/dev/video2 --camera-set width_px=1280
 """

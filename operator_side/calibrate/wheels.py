@@ -1,4 +1,4 @@
-"""`sightline robot test-wheels`: one wheel at a time, off the ground, judged by a person's eyes. Shell.
+"""Turns one wheel at a time, off the ground, and asks the operator what was seen. Shell.
 
 It goes round the gate, as nothing else does: no network and no camera is needed, and nothing turns before a person, who
 stands beside the robot, has said that its wheels are off the ground.

@@ -1,1 +1,1 @@
-"""Modules of sightline.operator_side.cli."""
+"""The command line, one file per group of commands. It composes every other package; nothing imports it."""

@@ -1,4 +1,4 @@
-"""`sightline keys`: certificates for `--secure`. Shell."""
+"""Commands that set up a machine: keys, install, doctor. Shell."""
 
 import getpass
 import json

@@ -1,4 +1,4 @@
-"""The command line: `sightline COMMAND`. Shell; heavy imports are inside the commands.
+"""The `sightline` command: registers the command groups and turns every error into one line and an exit code. Shell.
 
 Whatever goes wrong is one line on stderr that says what, where and how to fix it, and the exit code of the design:
 0 ok, 2 bad usage or configuration, 3 hardware, 4 cannot connect, 5 a check failed.

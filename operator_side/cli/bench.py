@@ -1,4 +1,4 @@
-"""`sightline bench`: what things cost on this machine. Shell. Exit code 5 when a check is outside its bound."""
+"""Commands that measure performance: bench codec, gate, pipeline, loop, network, detector and others. Shell."""
 
 import json
 import tempfile

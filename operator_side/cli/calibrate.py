@@ -1,4 +1,4 @@
-"""`sightline robot test-wheels` and `sightline calibrate drive`: tools of who builds a robot. Shell."""
+"""Commands that measure a robot: calibrate camera, calibrate drive, robot test-wheels, pick-color. Shell."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""What `sightline conform` shows at a peer's door: tokens by role, and a folder of keys. Shell (reads files)."""
+"""Commands that test a peer against the protocol: conform robot, vision, codec, page. Shell."""
 
 import json
 import ssl

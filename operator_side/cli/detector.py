@@ -1,4 +1,4 @@
-"""`sightline detector --serve NAME`: one detector for many robots. Shell; heavy imports inside the command."""
+"""Commands about detectors: list, check, promote, and a detector served to many robots. Shell."""
 
 import json
 import math

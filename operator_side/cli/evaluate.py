@@ -1,4 +1,4 @@
-"""Commands that judge: `demo`, `score`. Shell. Exit code 5 when a check is outside its bound."""
+"""Commands that evaluate: demo, score, score detectors, faults, train. Shell."""
 
 import hashlib
 import json

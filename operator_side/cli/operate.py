@@ -1,4 +1,4 @@
-"""Commands of a person at a robot: `robots`, `status`, `arm`, `disarm`, `stop`, `reset`. Shell."""
+"""Commands for a running robot: robots, status, arm, disarm, stop, reset, mission, goto, teleop. Shell."""
 
 import json
 import secrets

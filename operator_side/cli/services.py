@@ -1,4 +1,4 @@
-"""Commands that run a service: `sim`, `robot`, `vision`. Shell."""
+"""Commands that run or configure a service: sim, robot, vision, router, labels, scenarios, config, metrics. Shell."""
 
 import json
 import os

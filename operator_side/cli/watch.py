@@ -1,4 +1,4 @@
-"""The command `watch`: a robot's view on a page, its state in the terminal, or any channel as text. Shell."""
+"""Commands that show what a robot sees: watch, capture. Shell."""
 
 import json
 import sys

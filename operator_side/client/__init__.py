@@ -1,1 +1,1 @@
-"""Modules of sightline.operator_side.client."""
+"""A robot and its vision as an operator reaches them, over any link."""

@@ -1,4 +1,4 @@
-"""Who is there, in words and as an object: `sightline robots`. Pure."""
+"""Which robots and visions are online: at given endpoints, on this machine, or by multicast. Shell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said on one channel, for who prints it: words in order, of pictures the newest. Shell (a queue)."""
+"""The messages of one channel as lines of text or JSON objects. Shell (a queue)."""
 
 import math
 import queue

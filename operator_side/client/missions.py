@@ -1,4 +1,4 @@
-"""Waypoints as a person writes them, `X Y X Y ...` or a file of lines, checked one by one. Pure.
+"""Requests to a vision for a mission, its reports, and the waypoints of `goto`. Shell (waits).
 
 A file has one waypoint a line, its numbers separated by blanks or a comma; what follows a `#` is a remark.
 """

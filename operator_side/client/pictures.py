@@ -1,4 +1,4 @@
-"""What a viewer says to a frame: seen. It returns credit and drives nothing. Shell (publishes)."""
+"""A robot's pictures for a viewer: the overlay of its vision, or acknowledged frames. Shell (waits)."""
 
 import secrets
 import threading

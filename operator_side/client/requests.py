@@ -1,4 +1,4 @@
-"""What an operator asks of a robot, and the robot's answer, over any `Link`. Shell (waits, threads).
+"""Requests to a robot (arm, stop, reset ...), repeated until the robot answers. Shell (waits, threads).
 
     with open_link("r1", connect=[...], role="operator") as link:
         Operator(link).arm()

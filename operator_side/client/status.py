@@ -1,4 +1,4 @@
-"""A robot's status in words. Pure."""
+"""A robot's status as text. Pure."""
 
 from collections.abc import Iterator
 

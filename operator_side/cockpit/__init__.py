@@ -1,1 +1,1 @@
-"""Modules of sightline.operator_side.cockpit."""
+"""Pages for the operator and metrics for Prometheus, over HTTP on this machine."""

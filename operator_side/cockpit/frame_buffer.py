@@ -1,4 +1,4 @@
-"""The last pictures of a robot, numbered, for a page that asks for them: none is fetched that nobody asks for. Shell.
+"""The last pictures of a robot, numbered, fetched only while a page asks for them. Shell (a thread).
 
 A page asks for the next one when it has drawn the last: so a slow page gets fewer pictures, never older ones.
 """

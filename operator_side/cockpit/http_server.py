@@ -1,4 +1,4 @@
-"""A thread for each connection, while there is a place: what serves beside a robot stays small. Shell (threads)."""
+"""A bounded HTTP server on loopback: routes, pages, JSON answers. Shell (threads)."""
 
 import json
 import threading

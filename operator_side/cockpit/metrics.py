@@ -1,4 +1,4 @@
-"""`/metrics` in Prometheus' own words and `/health`, over plain HTTP. Shell (an HTTP server).
+"""A robot's status as Prometheus metrics, served at /metrics and /health. Shell (HTTP, a link).
 
 `prometheus_client` writes the format: it is the one that Prometheus itself maintains.
 """

@@ -1,4 +1,4 @@
-"""What a vision service does, for Prometheus: `sightline vision --metrics PORT`. Shell (an HTTP server)."""
+"""The counters of a vision service as Prometheus metrics. Shell (HTTP)."""
 
 from __future__ import annotations
 

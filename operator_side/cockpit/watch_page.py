@@ -1,4 +1,4 @@
-"""The page of `sightline watch`: what vision sees, and what the robot does and why. Shell (threads)."""
+"""The page of `sightline watch`: the view, the robot's state and its reasons. Shell (threads)."""
 
 import threading
 from collections.abc import Iterator

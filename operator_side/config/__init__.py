@@ -1,1 +1,1 @@
-"""Modules of sightline.operator_side.config."""
+"""The configuration of a service: read, checked, explained and written."""

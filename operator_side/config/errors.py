@@ -1,4 +1,4 @@
-"""Which keys a configuration model has, and what each allows. Pure."""
+"""Configuration errors as one line with the nearest valid name. Pure."""
 
 import difflib
 import types

@@ -1,4 +1,4 @@
-"""A service's configuration from all its sources: defaults < profile < file < environment < --set < options. Shell.
+"""A service's configuration: defaults < profile < file < environment < --set < options. Shell (files).
 
     loaded = load("robot", file="robot.toml", sets=["safety.max_linear_mps=0.3"], environ=os.environ)
     loaded.config, loaded.origin("safety.max_linear_mps")

@@ -1,4 +1,4 @@
-"""A configuration as TOML text, with the origin of each value as a comment if wanted. Pure."""
+"""A configuration as TOML text, with the origin of each value as a comment. Pure."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping

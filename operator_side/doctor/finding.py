@@ -1,4 +1,4 @@
-"""One finding of the doctor. Pure."""
+"""One finding of the doctor, with the command that fixes it. Pure."""
 
 from __future__ import annotations
 

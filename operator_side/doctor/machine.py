@@ -1,4 +1,4 @@
-"""What the doctor finds on this machine. Shell (reads /sys and /proc, asks the system's own tools; Linux)."""
+"""What is wrong on this machine: Python, packages, clock, ports, keys, cameras. Shell (reads the system; Linux)."""
 
 from __future__ import annotations
 

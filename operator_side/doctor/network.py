@@ -1,4 +1,4 @@
-"""What the doctor finds between this machine and a robot or router. Shell (sockets, a link)."""
+"""What is wrong between this machine and a robot or router. Shell (sockets, a link)."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Modules of sightline.operator_side.recording."""
+"""Runs and pictures on disk: recorded, replayed, filmed."""

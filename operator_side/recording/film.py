@@ -1,4 +1,4 @@
-"""JPEG from a robot -> all of its pixels, bounded as vision bounds it. Pure."""
+"""Snapshots and H.264 films of what a robot sees. Shell (waits, writes files)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run on disk: `Recorder` writes what is on the wire to MCAP, `read_recording` gives it back. Shell.
+"""Writes the messages of a link to MCAP and reads them back. Shell (threads, files).
 
 One MCAP channel per Sightline channel (and source: `twist/vision`), encoding `sightline.v1`: message data = header
 length (uint16, big-endian), header, payload, exactly as they came. `log_time` is when this end received it, for the

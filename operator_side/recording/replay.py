@@ -1,4 +1,4 @@
-"""A recording through a fresh pipeline: what went in must give the same twists again, byte for byte. Shell.
+"""Replays a recording through a fresh pipeline; the twists must be the same, byte for byte. Shell (reads files).
 
 Frames that were answered go in again in the order they were answered, one pipeline per vision session; with each go the
 scan and the mission that its answer cites.

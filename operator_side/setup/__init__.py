@@ -1,1 +1,1 @@
-"""Modules of sightline.operator_side.setup."""
+"""What is set up once: keys, services that start with the machine, a router."""

@@ -1,4 +1,4 @@
-"""`sightline install`: a service that begins with the machine. Shell.
+"""Writes systemd units for a robot or a vision service. Shell (files).
 
 The units are files that a person can read (`robot_side/systemd`, `vision_side/systemd`); paths, user and pins change.
 """

@@ -1,4 +1,4 @@
-"""A private authority, a certificate and a token for each role, for `--secure DIR`: made, added, looked at. Shell.
+"""A private authority with a certificate and a token for each role. Shell (files).
 
 Written with `cryptography`, which is what Python's own packaging relies on; elliptic-curve keys (P-256) keep the TLS
 handshake short on a small robot. Only `ca.pem` and the files of its own role belong on a machine, and all tokens on a

@@ -1,4 +1,4 @@
-"""`sightline router`: where robots, visions and people meet; each frame crosses a robot's radio once. Shell.
+"""Runs a Zenoh router that robots, visions and operators of one site connect to. Shell.
 
 It is a Zenoh router and nothing else: a stock `zenohd` does as well, without the access rules of `--secure`.
 """

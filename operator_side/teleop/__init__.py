@@ -1,1 +1,1 @@
-"""Modules of sightline.operator_side.teleop."""
+"""Driving by hand: keys or a gamepad to leased twists."""

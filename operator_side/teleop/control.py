@@ -1,4 +1,4 @@
-"""How fast teleop drives: speeds that keys change, and a ramp for speeding up. Pure."""
+"""Teleop's logic: keys held, speeds, hand-over to vision; messages for the robot out. Pure."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What a gamepad means to `sightline teleop`: sticks to shares of the speeds, a dead man's button. Pure.
+"""A gamepad as shares of the speeds with a dead man's button, read from Linux's input devices. Shell.
 
 Codes are those of the Linux input layer (linux/input-event-codes.h), which pads of all makers follow.
 """

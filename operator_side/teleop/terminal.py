@@ -1,4 +1,4 @@
-"""What `sightline teleop` shows: the keys once, and one line that follows the robot. Pure."""
+"""Teleop in a terminal: raw keys, one status line, an end that stops the robot. Shell."""
 
 import os
 import select

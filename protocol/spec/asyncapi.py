@@ -1,4 +1,4 @@
-"""The channels as an AsyncAPI 3.0 document, seen from the robot: what it sends is what others receive. Pure."""
+"""The channels as an AsyncAPI 3.0 document. Pure."""
 
 from typing import Any, Final
 

@@ -1,4 +1,4 @@
-"""What each field on the wire means and in which unit it is, for the specification's tables. Pure.
+"""Meaning and unit of each field on the wire, for the tables of the specification. Pure.
 
 One table by field name; `Model.field` where a name means something else there. The unit follows from the name's ending.
 """

@@ -1,4 +1,4 @@
-"""Golden cases of what carries messages: WebSocket framing and hellos, and the older dialects' texts. Pure.
+"""Golden cases of WebSocket framing, of hellos, and of the texts of the legacy protocol. Pure.
 
 Folder of a case -> what its `given` is and what reading it makes of it:
 

@@ -1,4 +1,4 @@
-"""Writes, or verifies, what is generated from the models: README tables, schemas, golden vectors. Shell.
+"""Writes or verifies the generated parts of the specification. Shell.
 
     python -m sightline.protocol.spec.generate --verify    exit code 5 and the names of what differs, if anything does
     python -m sightline.protocol.spec.generate --write

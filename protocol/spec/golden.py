@@ -1,4 +1,4 @@
-"""Golden vectors: what a message must be read as, or why it must be refused, for peers in any language. Pure.
+"""Builds the golden vectors and checks that the decoders agree with each of them. Pure.
 
 `golden_cases.py` and `golden_wires.py` state each case and its outcome by hand; a file is made only if the decoders
 agree. A message lies in `vectors/<channel>/<case>.json`:

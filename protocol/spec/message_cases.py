@@ -1,4 +1,4 @@
-"""What a golden case is, and each channel's usual message, from which the cases differ. Pure."""
+"""Golden cases of every channel: header, payload, and the reason for rejecting it, if any. Pure."""
 
 import json
 import struct

@@ -1,1 +1,1 @@
-"""Ways to carry messages. Only this package imports zenoh or websockets."""
+"""A `Link` over Zenoh, WebSocket or memory. Only zenoh/ imports zenoh, only websocket/ imports websockets."""

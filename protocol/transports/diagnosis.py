@@ -1,4 +1,4 @@
-"""Which process listens on a TCP port, for the error text of a port in use. Shell (reads /proc; Linux only)."""
+"""Explains why an endpoint cannot be opened: which process holds the port, what is wrong with TLS. Shell."""
 
 from __future__ import annotations
 

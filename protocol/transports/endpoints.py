@@ -1,4 +1,4 @@
-"""Endpoints as people write them, `tcp/<host>:<port>`: the check, and the transport options added to them. Pure."""
+"""Parses Zenoh endpoints (`tcp/host:port`) and WebSocket endpoints (`ws://host:port`). Pure."""
 
 import ipaddress
 import re

@@ -1,4 +1,4 @@
-"""The seam between services and transports: `Link`, `Message`, `LatestSlot`. Shell (locks).
+"""The transport interface: `Link`, `Message`, `LatestSlot`, and the rules that every link enforces. Shell (locks).
 
 A `Link` belongs to one robot id. It promises what `tests/protocol/transports/test_link.py` checks on every transport: newest wins,
 memory is bounded, both ends may restart, nothing raised in a callback ends anything, `close` does not hang.

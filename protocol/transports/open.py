@@ -1,4 +1,4 @@
-"""Opens a link by what its endpoints say: `tcp/host:port` is Zenoh, `ws://` and `ws-legacy://` are WebSocket. Shell.
+"""Opens a link on a set of endpoints, joins several links into one, and relays between them. Shell.
 
 A robot may listen on several at once; then its link is all of them, and what any peer says is heard alike.
 """

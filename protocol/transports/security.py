@@ -1,4 +1,4 @@
-"""Who may say and hear what on a secured link: mutual TLS, access rules from the channel table. Shell (seeks files).
+"""Certificates, tokens and access rules: which role may publish and subscribe to what. Shell (reads files).
 
 A role is the common name of a certificate. Zenoh judges by inclusion and at every hop, and says nothing to who is
 denied: whoever listens denies all that is not listed here.

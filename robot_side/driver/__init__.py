@@ -1,1 +1,1 @@
-"""Modules of sightline.robot_side.driver."""
+"""The driver process: owns motors, gate and STOP latch; has no network."""

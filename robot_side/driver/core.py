@@ -1,4 +1,4 @@
-"""The driver process's own logic: messages in, wheel speeds and messages out. Pure; `driver.py` is its shell."""
+"""Logic of the driver process: messages in, wheel speeds and messages out. Pure."""
 
 from collections import Counter
 from collections.abc import Iterator

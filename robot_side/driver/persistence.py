@@ -1,4 +1,4 @@
-"""The STOP state on disk, so that a restart cannot clear it. Shell (a file)."""
+"""The STOP latch on disk, and the threads that write latch and log lines without blocking the loop. Shell."""
 
 import errno
 import os

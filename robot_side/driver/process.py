@@ -1,4 +1,4 @@
-"""Refusals in words for the robot's log, so that neither a flood nor a vision left running fills it. Pure."""
+"""The control loop of the driver process, and its log of rejected commands. Shell."""
 
 import secrets
 import select

@@ -1,4 +1,4 @@
-"""Which signals end the driver. Pure, and light: the robot's tools need no driver for it."""
+"""Real-time scheduling, systemd watchdog, and the signals that end the driver. Shell."""
 
 import ctypes
 import gc

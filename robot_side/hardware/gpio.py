@@ -1,4 +1,4 @@
-"""Duty <-> speed at a wheel's rim, by a calibration table, and the table's file. Pure.
+"""Two motors on an H-bridge at the pins of a Raspberry Pi: drive, pins, duty table. Shell.
 
 `sightline calibrate drive` writes the file; `drive.options.table_file` of the drive `gpio` names it.
 """

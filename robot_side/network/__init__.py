@@ -1,1 +1,1 @@
-"""Modules of sightline.robot_side.network."""
+"""The network process: owns camera and link."""

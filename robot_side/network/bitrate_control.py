@@ -1,4 +1,4 @@
-"""How pictures are to be encoded so that they pass in time: a budget of bytes, then quality, then size. Pure.
+"""Quality and size of the pictures, so that each passes the link in time. Pure.
 
 Down by a factor when the link shows that it is full, up by a little while it is calm. Only cameras that encode
 themselves can follow (`sightline.robot_side.ports.Adjustable`); for the others the wish is no more than that.

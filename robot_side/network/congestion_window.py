@@ -1,4 +1,4 @@
-"""How many frames may be in flight, from delays alone: enough for a long link, one for a thin or a slow one. Pure.
+"""How many frames may be in flight, estimated from delays alone. Pure.
 
 A frame sent while nothing is in flight shows the link's own delay. One sent behind another shows the same where the
 link is long, and waits where the link is thin or the peer slow. So the window grows while nobody waits, and what gets

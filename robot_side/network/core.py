@@ -1,4 +1,4 @@
-"""A camera as the stream sees it: told how to encode, and with which model its last picture was taken. Pure."""
+"""Logic of the network process: pictures in, frames out, credit, camera adaptation. Pure."""
 
 from collections.abc import Mapping
 from sightline.protocol.channels import CAMERA, FRAME

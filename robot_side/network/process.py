@@ -1,4 +1,4 @@
-"""Where others reach a robot that listens on every address of its machine, for the line at its start. Shell (Linux)."""
+"""The camera loop of the network process and its threads. Shell."""
 
 import fcntl
 import os

@@ -1,4 +1,4 @@
-"""What to send, when and how much: credit, its timeout, the window, the rate, the encoding. Pure.
+"""When to send a frame: credit, timeouts, rate. Pure.
 
 A frame is captured only while there is credit, so it is young when it leaves and nothing queues behind it. An answer (a
 twist accepted or refused, or an ack) returns credit. The window starts at one frame in flight and widens only for the

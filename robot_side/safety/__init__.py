@@ -1,1 +1,1 @@
-"""Modules of sightline.robot_side.safety."""
+"""The safety gate: the only path from a command to the wheels."""

@@ -1,4 +1,4 @@
-"""The SafetyGate: the only road to the wheels. Pure.
+"""`SafetyGate`: accepts or rejects commands, and decides at every tick what the wheels do. Pure.
 
 `offer` judges a command once, on arrival; `step` decides, each tick and with the age judged again, what the wheels do.
 Liveness is the accepted command: refused commands, acks and open connections refresh nothing.

@@ -1,4 +1,4 @@
-"""Limits speed towards what the range sensor sees: held state, last before the wheels. Pure.
+"""Limits speed towards obstacles that the range sensor sees, and checks its blind zone. Pure.
 
 Each near point of a scan becomes one inequality on the twist. With n the direction from the robot's outline to the
 point, the robot closes in on it at `linear * forward + angular * turning`, which may be at most

@@ -1,4 +1,4 @@
-"""States of the gate and the one table of their transitions. Pure.
+"""States of the gate and the table of their transitions. Pure.
 
     state      wheels                         left by
     DISARMED   zero; commands are judged      arm

@@ -1,4 +1,4 @@
-"""Judges what a command cites, by the robot's own record and clock alone. Pure.
+"""Validates what a command cites against the robot's own record of issued frames. Pure.
 
 Nothing here trusts a sender: a frame is known because this robot issued it, and as old as the robot's clock says.
 """

@@ -1,1 +1,1 @@
-"""Modules of sightline.sim.scenes."""
+"""Labelled scenes to train and evaluate detectors on."""

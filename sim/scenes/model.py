@@ -1,4 +1,4 @@
-"""Labelled scenes to train and to judge detectors on: what is in one, drawn from its seed alone. Pure.
+"""What a labelled scene consists of, drawn from its seed. Pure.
 
 A column says what is hard about a scene. Who judges never shows what was trained on: other seeds, other families of
 textures, light from heights in between.

@@ -1,4 +1,4 @@
-"""What stands where in a labelled scene: a seed and a column in, a plan out. Pure."""
+"""Places the things of a scene, and the defects of its picture. Pure."""
 
 import cv2
 import math

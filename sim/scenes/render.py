@@ -1,4 +1,4 @@
-"""The room of a scene, painted by rays: a textured floor that ends at a textured wall. Pure (NumPy, OpenCV)."""
+"""Renders a scene with boxes from the segmentation mask. Shell (PyBullet)."""
 
 import cv2
 import math

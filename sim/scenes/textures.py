@@ -1,4 +1,4 @@
-"""What families of textures are made of: colours, mixing, smooth noise. Pure (NumPy, OpenCV)."""
+"""Tileable textures of floors and walls. Pure."""
 
 import cv2
 import numpy as np

@@ -1,1 +1,1 @@
-"""Modules of sightline.sim.world."""
+"""The simulated world on PyBullet."""

@@ -1,4 +1,4 @@
-"""Balls, boxes, cylinders and legs as bodies of one PyBullet client. Shell (PyBullet); reads no clock."""
+"""Things, traffic lights and movers as bodies of PyBullet. Shell (PyBullet)."""
 
 import math
 import numpy as np

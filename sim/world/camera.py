@@ -1,4 +1,4 @@
-"""Paints walls as flat quads with their own depth, which costs a third of TinyRenderer's pixels. Pure (NumPy, OpenCV).
+"""The simulated camera: renderer, painted floor and walls, defects. Shell (PyBullet).
 
 One over depth is linear across the picture of a plane, so each face needs one plane equation and one comparison.
 """

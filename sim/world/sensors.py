@@ -1,4 +1,4 @@
-"""A lidar, or several small sensors merged into one scan: rays to whatever is not the robot. Shell (PyBullet).
+"""Lidar and perfect labels by ray casts. Shell (PyBullet).
 
 Reads no clock. Rays are level with the floor; one that starts in a body would hit nothing, so the robot is masked out.
 """

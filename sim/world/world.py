@@ -1,4 +1,4 @@
-"""A wheel's motor and encoder: acceleration limit, lag, slip, steps. Pure."""
+"""`World`: robot, motors, things and sensors on one clock. Shell (PyBullet)."""
 
 import math
 from random import Random

@@ -1,1 +1,1 @@
-"""Detectors: a picture in, detections out."""
+"""Detectors behind one port, and the wrappers around them."""

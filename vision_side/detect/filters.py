@@ -1,4 +1,4 @@
-"""Combinator: only detections with certain labels count. Pure."""
+"""Detector wrappers: filter by label, filter by color, add track ids. Pure."""
 
 import cv2
 import numpy as np

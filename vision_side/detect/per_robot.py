@@ -1,4 +1,4 @@
-"""What a detector remembers of each robot, begun anew with each of its sessions. Pure."""
+"""State per robot: memory that is reset by a new session, and a pool of decoders. Pure."""
 
 from collections import OrderedDict
 from collections.abc import Callable

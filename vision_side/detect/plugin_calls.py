@@ -1,4 +1,4 @@
-"""Lines for a person, kept until somebody asks for them. Pure."""
+"""Calls a detector plug-in safely: optional methods, notices, validated results. Pure."""
 
 import math
 from collections import deque

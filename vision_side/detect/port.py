@@ -1,4 +1,4 @@
-"""What a label may be: one printable line, so that it can be shown, logged and sent as it is. Pure."""
+"""The detector port: `Detector`, frames, results, labels, overlap of boxes. Pure."""
 
 import numpy as np
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Finds a detector by its name and builds it with its own `Config`. Shell (imports plug-ins).
+"""Finds a detector by name and builds it with its wrappers. Shell (imports plug-ins).
 
 Names are those below, those of the entry points `sightline.detectors`, or, from a configuration or a command line only,
 `package.module:Name`. What stands after the name is the option `address`: `onnx:ball.onnx` gives "ball.onnx",

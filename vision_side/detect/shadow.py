@@ -1,4 +1,4 @@
-"""Do two detectors see the same? Counted frame by frame, told in one line now and then. Pure.
+"""A second detector that runs beside the first one, and how often they agree. Shell (a thread).
 
 The clock is the frames' capture time. What counts is what would be steered by: the surest detection of each that the
 mission may go by.

@@ -1,4 +1,4 @@
-"""How long a detector of decoded pictures takes: results with the time that they took. Shell (a clock)."""
+"""Results of picture detectors with the time that they took. Shell (a clock)."""
 
 import time
 from collections.abc import Callable, Sequence

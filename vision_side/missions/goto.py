@@ -1,4 +1,4 @@
-"""The robot's outline on the floor, and how fast it may go with what it knows about. Pure."""
+"""Mission `goto`: footprint, progress checker, and driving to waypoints. Pure."""
 
 import math
 import numpy as np

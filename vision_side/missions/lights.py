@@ -1,4 +1,4 @@
-"""Reads traffic lights in a picture: which lamp of a housing is lit, or which colour a whole box has. Pure.
+"""Reads traffic lights in a picture. Pure.
 
 A lamp counts when place and colour agree: the brightest of three places in a dark upright housing, and the hue that
 belongs there. The ranges are two-sided and do not touch, so that light of another tint makes no other colour of it.

@@ -1,4 +1,4 @@
-"""What range sensors told of the floor: a bounded memory of cells that something stands in. Pure.
+"""Costmap of what the range sensors saw, and the path over it. Pure.
 
 Sensors that reach 0.2 m see a wall only while they are beside it. What they saw is kept in the odometry frame, and
 given up again when rays pass where it was: after a drift of the odometry, or when the thing went away.

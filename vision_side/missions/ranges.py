@@ -1,4 +1,4 @@
-"""A range scan off the wire -> `RangeScan`, bounded; nothing that is no number gets any further. Pure."""
+"""Range scans: decoding, and echoes in the odometry frame. Pure."""
 
 import math
 import numpy as np

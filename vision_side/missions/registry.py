@@ -1,4 +1,4 @@
-"""Finds a mission by its name and builds it with its own `Config`. Shell (imports plug-ins).
+"""Finds a mission by name and builds it with its configuration. Shell (imports plug-ins).
 
 Names are those below, those of the entry points `sightline.missions`, or, from a configuration or a command line only,
 `package.module:Name`. A mission whose `Config` has a section of vision's configuration by name and type (`target`,

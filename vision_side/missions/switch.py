@@ -1,4 +1,4 @@
-"""The mission in force, and the safe way to the next: a new one begins with wheels that stand still. Pure.
+"""The active mission, and the switch to the next one by way of standing still. Pure.
 
 A mission is somebody's plug-in: one that raises, or asks for what no robot does, is over, and the robot stands still.
 """

@@ -1,4 +1,4 @@
-"""Whether to stop before a traffic light's line: on red, on what cannot be read, and on yellow where it can. Pure."""
+"""Missions `traffic-light` and `traffic-light-boxes`: follow a lane and stop at its lights. Pure."""
 
 import math
 from pydantic import Field

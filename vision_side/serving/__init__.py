@@ -1,1 +1,1 @@
-"""Modules of sightline.vision_side.serving."""
+"""Services around the pipeline: one robot, a fleet, a detector for others, a dry run."""

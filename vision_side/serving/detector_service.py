@@ -1,4 +1,4 @@
-"""Whose frame a detector looks at next: the newest of each robot, in fair turns, and none that is too old. Pure."""
+"""Serves one detector to many robots: a fair queue of newest frames in, boxes out. Shell."""
 
 import secrets
 import threading

@@ -1,4 +1,4 @@
-"""Looks and tells, and drives nothing: a robot's pictures, or a camera of this machine without any robot. Shell.
+"""Runs the pipeline on a robot's frames or a local camera and only prints. Shell.
 
 A robot's frames are acknowledged, so that it goes on sending; no twist is ever published.
 """

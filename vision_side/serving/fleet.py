@@ -1,4 +1,4 @@
-"""Several robots, one vision: a pipeline for each, newest frames only, in fair turns. Shell.
+"""`Fleet`: one service for each robot of a fleet, in fair turns. Shell.
 
     sightline vision --robot 'r*' --listen tcp/0.0.0.0:7447
 """

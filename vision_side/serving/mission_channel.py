@@ -1,4 +1,4 @@
-"""Missions that people ask for: who may, whether it was asked just now, and why one is not taken up. Pure.
+"""Mission requests, scans and reports of one robot. Shell (slots).
 
 Times are the robot's: what was asked must cite a status not much older than the frame at hand, so that a message that
 a network kept back does not start anything.

@@ -1,4 +1,4 @@
-"""What a vision service has done for one robot so far, for whoever measures it. Pure."""
+"""`Service`: answers the frames of one robot, by its own detector or by boxes that are published. Shell."""
 
 import secrets
 import threading

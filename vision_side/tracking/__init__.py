@@ -1,1 +1,1 @@
-"""Modules of sightline.vision_side.tracking."""
+"""From detections to twists: locate, track, predict, steer."""

@@ -1,4 +1,4 @@
-"""A sphere's outline in pixels -> where its centre is, in metres about the robot. Pure.
+"""Position over the floor of a detection: a sphere by its outline, a box by its size. Pure.
 
 A sphere projects to an ellipse, not to a circle about its centre. Its outline rays do form a circular cone: for every
 unit ray u, u . c = cos(alpha) with c towards the centre, and the centre is at radius / sin(alpha). So u . w = 1, or

@@ -1,4 +1,4 @@
-"""How late a command acts, and where the commands under way will have taken the robot by then. Pure.
+"""Latency estimate and Smith predictor: where the robot will be when a command acts. Pure.
 
 A command computed now meets a robot that has meanwhile obeyed the commands sent before it. Steering from the picture
 alone corrects the same error several times over; steering from where the robot will be does not.

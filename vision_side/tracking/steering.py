@@ -1,4 +1,4 @@
-"""Bearing in radians and distance in metres -> twist. Pure.
+"""Bearing and distance to a twist (feed-forward and PI), and the search turn. Pure.
 
 Each axis is feed-forward (what the target's and the robot's motion ask for) plus PI on what is left. dt comes from
 capture times, gains shrink as latency grows, and integrals give way to whatever the robot did not carry out.

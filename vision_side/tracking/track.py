@@ -1,4 +1,4 @@
-"""Memory of one target in the odometry frame: smooth, coast, give up; lost is lost. Pure.
+"""Tracks one target in the odometry frame with a Kalman filter. Pure.
 
 There the robot's own motion drops out, and what is left is the target's position and velocity. Both axes share one
 2x2 covariance, since nothing prefers one of them. The clock is the frames' capture time.

@@ -1,1 +1,1 @@
-"""Modules of sightline.protocol.transports.websocket."""
+"""WebSocket as a `Link`: the sub-protocol `sightline.v1` and the legacy protocol."""

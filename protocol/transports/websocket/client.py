@@ -1,4 +1,4 @@
-"""The connecting end of WebSocket: reaches one endpoint, and again whenever it is lost. Shell."""
+"""The connecting end: reaches one endpoint and reconnects when it is lost. Shell."""
 
 from __future__ import annotations
 

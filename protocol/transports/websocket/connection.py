@@ -1,4 +1,4 @@
-"""Whether the other end of a connection still lives: it is heard, or it is slow but takes what it is sent. Pure.
+"""One WebSocket connection on a socket that never blocks: messages, keepalive, send path. Shell.
 
 A pong waits behind what its reader has not read yet. So silence alone ends only a connection whose way out is clear;
 while it is full, the reader is slow, and stays as long as it goes on taking.

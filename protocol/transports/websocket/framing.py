@@ -1,4 +1,4 @@
-"""The sub-protocol `sightline.v1`: `hello`, and channel messages as one binary message each. Pure.
+"""The sub-protocol `sightline.v1`: hello, framing of channel messages, and the codec of one peer. Pure.
 
     uint16 BE length of the header block | header block | payload
 

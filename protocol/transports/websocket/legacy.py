@@ -1,4 +1,4 @@
-"""Which of several clients of the older dialect drives: the first with a valid twist; the rest are viewers. Pure.
+"""The legacy text protocol as a peer codec, at either end, and the one slot of its driver. Pure.
 
 They all are the same `guest` to the robot, which so cannot tell two that contradict each other from one.
 """

@@ -1,4 +1,4 @@
-"""What one end of WebSocket connections wants to hear, and who is called with it. Pure.
+"""`WebSocketLink`: subscriptions and peers behind the `Link` interface. Shell.
 
 That is what it subscribed to; and where all connect, what is said only while watched, as long as one of them watches.
 """

@@ -1,4 +1,4 @@
-"""What waits for one WebSocket peer: the newest message of each channel and source; STOP before all. Shell (a lock)."""
+"""One connected peer: its outbox of newest messages, STOP first, and the thread that reads. Shell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The places of one WebSocket endpoint: a few for strangers, and apart from them those of clients. Shell (a lock).
+"""The listening end: connection limits, access checks, handshake. Shell.
 
 A stranger is who has not yet said what it is. None takes the places of another address, and nobody who only watches
 takes the last ones of who may say STOP.

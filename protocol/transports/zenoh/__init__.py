@@ -1,1 +1,1 @@
-"""Modules of sightline.protocol.transports.zenoh."""
+"""Zenoh as a `Link`."""

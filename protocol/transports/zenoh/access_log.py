@@ -1,4 +1,4 @@
-"""Who was turned away at a TLS endpoint and why, from Zenoh's own log, in words and in few lines. Pure.
+"""Reports TLS clients and messages that Zenoh rejected, read from Zenoh's own log. Shell.
 
 Zenoh tells the peer by a TLS alert, and its own side only by a line of its log. The causes are those of rustls.
 """

@@ -1,4 +1,4 @@
-"""Who is heard at an endpoint: robots by their status, everybody by presence; and where robots listen. Shell."""
+"""Finds listeners by multicast, and robots and peers behind an endpoint. Shell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Zenoh as a `Link`: payload as it is, header as attachment, exact keys; who listens is the router. Shell.
+"""`ZenohLink` for one robot, and `ZenohFleet` for many robots over one session. Shell.
 
     with open_zenoh("r1", listen=["tcp/127.0.0.1:7447"]) as link:
         link.publish(STATUS, header, payload)

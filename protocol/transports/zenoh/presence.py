@@ -1,4 +1,4 @@
-"""Who is where, told to whoever asks: what a peer says of itself, and what is made of the answers. Pure.
+"""Presence: each peer answers a query with its role, robot, host and version. Shell.
 
 For people: `sightline robots`, the doctor, and a robot's check that nobody else has its id. No frame, no command and no
 judgement of either depends on it.

@@ -1,4 +1,4 @@
-"""Being found and finding, by multicast: a comfort for people, never a way that a service relies on. Shell.
+"""Opens a Zenoh session with our settings and turns its errors into `LinkError`. Shell.
 
 Who listens beyond loopback answers on a group and port of Sightline's own, so that other Zenoh programs on the network
 neither find it nor are found; it connects to nobody by itself. Explicit endpoints need none of this.

@@ -1,1 +1,1 @@
-"""Modules of sightline.robot_side.hardware.cameras."""
+"""Camera plug-ins."""

@@ -1,4 +1,4 @@
-"""A camera that plays a folder of JPEGs in name order, looped and paced. Shell (files and a clock)."""
+"""Cameras that play one JPEG, a folder of JPEGs, or a video file. Shell."""
 
 import math
 import time

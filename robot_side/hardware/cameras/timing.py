@@ -1,4 +1,4 @@
-"""When a picture was captured, from the time a driver wrote on its buffer. Pure.
+"""Capture times from driver stamps, a frame timer for files, and the slot of the latest picture. Shell (clocks).
 
 A stamp taken when the picture is read makes one that lay in the driver's queue look young. Drivers stamp with the
 monotonic clock, some with the clock of the day or with the time since boot; some do not stamp at all.

@@ -1,4 +1,4 @@
-"""Why a V4L2 device cannot be used, in one line with the fix. Shell (looks at /dev and /proc; Linux)."""
+"""A V4L2 camera through OpenCV: JPEGs passed through, capture times, reconnection, diagnosis. Shell."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Modules of sightline.vision_side.detect.color."""
+"""Detectors by color."""

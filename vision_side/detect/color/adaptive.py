@@ -1,4 +1,4 @@
-"""What colour a thing has just now, as a cloud in the plane of chromaticity, and which pixels share it. Pure.
+"""Follows one target while its color changes with the light: color model, Kalman filter, gate. Pure.
 
 Chromaticity is red and green as shares of the whole, so that neither shade nor exposure moves it; warm or cold light
 does, slowly, and the cloud goes along.

@@ -1,4 +1,4 @@
-"""Detectors of one decoded picture, behind the port: who made the result, and how long it took. Shell (a clock)."""
+"""The detectors `hsv` and `adaptive` behind the port. Shell (a clock)."""
 
 from collections.abc import Sequence
 from typing import Final

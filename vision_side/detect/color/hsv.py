@@ -1,4 +1,4 @@
-"""Which pixels have the target's colour: one table look-up per pixel, then an opening. Pure.
+"""Finds discs and blobs of configured colors: mask, sharp edge, circle fit. Pure.
 
 The table is over BGR565, so any number of ranges, and a hue range through red, cost the same.
 """

@@ -1,4 +1,4 @@
-"""Where exactly a ball is that a model drew a box around: its edge, by its own colour, and a circle through it. Pure.
+"""Finds the exact edge of a ball inside a model's box. Pure.
 
 A model's box is a pixel or two off, which is 5 % of a ball's distance; the edge in the picture is not.
 """

@@ -1,1 +1,1 @@
-"""Modules of sightline.vision_side.detect.onnx."""
+"""Detectors that are ONNX models."""

@@ -1,4 +1,4 @@
-"""The detector `onnx:PATH`: any model that gives boxes, on the CPU or a GPU of this machine. Shell (files, a clock).
+"""The detector `onnx:PATH`. Shell.
 
 Without a path it is the model that comes with Sightline. Before the first frame it has run warm, and shown on a known
 picture that it gives here what it should.

@@ -1,4 +1,4 @@
-"""What an ONNX file says of itself: input, outputs, metadata. Pure; no package, since engines differ in what they tell.
+"""Runs an ONNX model with ONNX Runtime or OpenCV, and reads the inputs, outputs and metadata of its file. Shell.
 
 An ONNX file is a protocol buffer; the few fields that matter are read, all else is stepped over.
 """

@@ -1,4 +1,4 @@
-"""A picture whose answer is known: does the model give on this device what it gave where it was made? Pure.
+"""A picture with a known answer: checks a model on this device. Pure.
 
 The picture is drawn with integers only, so that it is the same everywhere. A model may carry its answer to it in its
 metadata, as `golden`; one that does not is compared with itself on the CPU.

@@ -1,4 +1,4 @@
-"""Pixels into the form that a model takes, and what it gives out into detections. Pure.
+"""Pictures to input tensors, output tensors to detections. Pure.
 
 Inputs: uint8 rows of pixels (1, H, W, 3), BGR unless told otherwise, or float (1, 3, H, W), RGB as 0..1. Outputs:
 `boxes` (K, 4), `scores` (K), `labels` (K), as Sightline's own; one (N, 6) of x1, y1, x2, y2, score, class; or one

@@ -1,1 +1,1 @@
-"""Detectors that are elsewhere: a service on the robot's own link, or a server that is asked frame by frame."""
+"""Detectors on another machine: a service on the robot's link, or a server that is queried frame by frame."""

@@ -1,4 +1,6 @@
-"""`oip+http://HOST[:PORT]/MODEL` and its like: the parts of a remote detector's name. Pure."""
+"""What all remote detectors share: addresses, reasons for no answer, reading boxes, one request for each frame.
+Shell (a clock).
+"""
 
 import numpy as np
 import re

@@ -1,4 +1,4 @@
-"""Newest only, by the deadline: any detector asked on a thread of its own, and not waited for any longer. Shell.
+"""Runs any detector on a thread of its own and waits for it until the deadline. Shell.
 
 Whatever hangs in there (a name server, a socket, a model) hangs alone. While it is busy, newer frames replace each
 other in one place; an answer that comes too late is nobody's.

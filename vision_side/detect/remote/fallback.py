@@ -1,4 +1,4 @@
-"""Remote eyes while they answer, own ones while they do not: late or silent once, and the own ones drive. Shell.
+"""A local detector that takes over while the remote one is late. Shell.
 
 While they drive, the remote is asked beside them, and drives again after ten good answers in a row. Each robot for
 itself: one whose frames are not answered changes nothing for the others.

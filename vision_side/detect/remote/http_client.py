@@ -1,4 +1,4 @@
-"""HTTP/1.1 to one server over one kept connection: bounded in time and bytes. Shell.
+"""HTTP/1.1 with one deadline for the whole exchange, and the detector `http+jpeg`. Shell.
 
 Nothing is unpacked, nothing is followed: a redirect, a compressed body and a body over the limit are refused. The
 standard library's own client waits anew for every byte that drips in; here one deadline holds for the whole exchange.

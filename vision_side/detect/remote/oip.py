@@ -1,4 +1,4 @@
-"""The Open Inference Protocol, version 2, without a network: models, tensors, and what is made of an answer. Pure.
+"""The Open Inference Protocol v2: models, tensors, configuration. Pure.
 
 Specification: https://github.com/kserve/open-inference-protocol (JSON over HTTP, gRPC), with Triton's binary tensors. A
 model that can be used here takes one input, a JPEG (datatype BYTES) or its pixels (UINT8, three channels), and gives

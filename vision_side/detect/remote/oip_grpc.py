@@ -1,4 +1,4 @@
-"""The Open Inference Protocol's gRPC messages: the four that are spoken here. Pure.
+"""The detector `oip+grpc`. Shell.
 
 Numbers of fields: grpc_service.proto of https://github.com/kserve/open-inference-protocol (service
 `inference.GRPCInferenceService`).

@@ -1,4 +1,4 @@
-"""The Open Inference Protocol as JSON over HTTP, with the binary tensor data extension: requests, answers. Pure."""
+"""The detector `oip+http`: JSON with binary tensors. Shell."""
 
 import json
 import numpy as np
