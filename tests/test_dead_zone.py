@@ -18,16 +18,16 @@ from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 
 # Binary fractions: front 0.5, rear 1, half as wide 0.25, so that "just" is just.
-BOX = {"front_m": 0.5, "rear_m": 1.0, "half_width_m": 0.25, "sensor_x_m": 0.0, "stop_m": 0.25}
+BLIND_BOX = {"front_m": 0.5, "rear_m": 1.0, "half_width_m": 0.25, "sensor_x_m": 0.0, "stop_m": 0.25}
 
 
-def scan(least_m, first_rad=0.0, each_rad=0.0, rays=1):
+def blind_scan(least_m, first_rad=0.0, each_rad=0.0, rays=1):
     return Ranges(0, first_rad, each_rad, least_m, 8.0, array.array("f", [math.inf] * rays))
 
 
 def is_refused(sees, **guard):
     try:
-        check_blind_zone(GuardConfig(**{**BOX, **guard}), sees)
+        check_blind_zone(GuardConfig(**{**BLIND_BOX, **guard}), sees)
     except BlindZoneError:
         return True
     return False
@@ -37,21 +37,21 @@ def is_refused(sees, **guard):
     (0.0, 0.5 + 0.25), (math.pi, 1.0 + 0.25), (math.pi / 2, 0.25 + 0.25), (-math.pi / 2, 0.25 + 0.25),
 ])  # fmt: skip
 def test_in_each_direction_the_dead_zone_ends_within_the_stop_zone(looks_rad, edge_m):
-    assert not is_refused(scan(edge_m - 1e-6, looks_rad))
-    assert is_refused(scan(edge_m + 1e-6, looks_rad))
+    assert not is_refused(blind_scan(edge_m - 1e-6, looks_rad))
+    assert is_refused(blind_scan(edge_m + 1e-6, looks_rad))
 
 
 def test_as_far_as_the_stop_zone_is_too_far():
-    assert is_refused(scan(0.75)) and not is_refused(scan(0.75), stop_m=0.25001)
+    assert is_refused(blind_scan(0.75)) and not is_refused(blind_scan(0.75), stop_m=0.25001)
 
 
 @pytest.mark.parametrize(("sensor_x_m", "refused"), [(-0.2, False), (0.2, True)])
 def test_where_the_sensor_sits_counts(sensor_x_m, refused):
-    assert is_refused(scan(0.6), sensor_x_m=sensor_x_m) == refused
+    assert is_refused(blind_scan(0.6), sensor_x_m=sensor_x_m) == refused
 
 
 def test_what_is_between_the_robot_and_a_sensor_ahead_of_it_is_not_seen_either():
-    assert is_refused(scan(0.0), sensor_x_m=0.76) and not is_refused(scan(0.0), sensor_x_m=0.74)
+    assert is_refused(blind_scan(0.0), sensor_x_m=0.76) and not is_refused(blind_scan(0.0), sensor_x_m=0.74)
 
 
 @pytest.mark.parametrize(("first_rad", "each_rad", "refused"), [
@@ -59,19 +59,19 @@ def test_what_is_between_the_robot_and_a_sensor_ahead_of_it_is_not_seen_either()
 ])  # fmt: skip
 def test_it_is_judged_only_where_the_sensor_looks(first_rad, each_rad, refused):
     """0.6 is too much to the sides, not ahead and behind."""
-    assert is_refused(scan(0.6, first_rad, each_rad, rays=2), stop_m=0.3) == refused
+    assert is_refused(blind_scan(0.6, first_rad, each_rad, rays=2), stop_m=0.3) == refused
 
 
 @pytest.mark.parametrize("least_m", [math.nan, math.inf])
 def test_a_minimum_that_is_no_number_is_a_bad_reading(least_m):
     with pytest.raises(ValueError, match="no numbers") as caught:
-        check_blind_zone(GuardConfig(**BOX), scan(least_m))
+        check_blind_zone(GuardConfig(**BLIND_BOX), blind_scan(least_m))
     assert not isinstance(caught.value, BlindZoneError)
 
 
 def test_the_words_say_what_to_set():
     with pytest.raises(BlindZoneError, match=r"guard.stop_m = 0.25: .* nearer than 1 m, .* 0.500 m beyond .* outline"):
-        check_blind_zone(GuardConfig(**BOX), scan(1.0))
+        check_blind_zone(GuardConfig(**BLIND_BOX), blind_scan(1.0))
 
 
 def test_a_simulated_robot_is_refused_with_its_name():

@@ -10,7 +10,7 @@ from sightline.robot_side.kinematics import DiffDriveConfig, Odometer, twist_of,
 from sightline.robot_side.ports import WheelAngles
 
 # In binary fractions, so that every expected value is exact.
-DRIVE = DiffDriveConfig(wheel_radius_m=0.125, track_width_m=0.5, max_wheel_rad_s=8.0)
+EXACT_DRIVE = DiffDriveConfig(wheel_radius_m=0.125, track_width_m=0.5, max_wheel_rad_s=8.0)
 
 
 def twist(linear_mps, angular_rad_s):
@@ -53,12 +53,12 @@ def test_each_field_is_bounded(field, lower, upper):
     ],
 )
 def test_a_twist_turns_the_wheels_within_their_limit(asked, wheels):
-    assert wheel_speeds(DRIVE, twist(*asked)) == pytest.approx(wheels, rel=1e-14)
+    assert wheel_speeds(EXACT_DRIVE, twist(*asked)) == pytest.approx(wheels, rel=1e-14)
 
 
 def test_just_over_the_limit_is_cut_to_it():
-    assert max(wheel_speeds(DRIVE, twist(0.999, 0.0))) == pytest.approx(7.992)
-    assert max(wheel_speeds(DRIVE, twist(1.001, 0.0))) == pytest.approx(8.0, rel=1e-14)
+    assert max(wheel_speeds(EXACT_DRIVE, twist(0.999, 0.0))) == pytest.approx(7.992)
+    assert max(wheel_speeds(EXACT_DRIVE, twist(1.001, 0.0))) == pytest.approx(8.0, rel=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -66,14 +66,14 @@ def test_just_over_the_limit_is_cut_to_it():
     [((4.0, 4.0), (0.5, 0.0)), ((-2.0, 2.0), (0.0, 1.0)), ((2.0, 6.0), (0.5, 1.0)), ((80.0, 0.0), (5.0, -20.0))],
 )
 def test_and_back_without_a_limit(wheels, got):
-    assert twist_of(DRIVE, *wheels) == twist(*got)
+    assert twist_of(EXACT_DRIVE, *wheels) == twist(*got)
 
 
 # --- odometry ----------------------------------------------------------------------------------------------------
 
 
 def odometer(*readings):
-    reckoned = Odometer(DRIVE)
+    reckoned = Odometer(EXACT_DRIVE)
     for reading in readings:
         reckoned.update(WheelAngles(*reading))
     return reckoned

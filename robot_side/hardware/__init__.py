@@ -1,1 +1,1 @@
-"""Camera and drive plug-ins behind the ports of `robot_side.ports`."""
+"""Camera and drive plug-ins behind the ports of `sightline.robot_side.ports`."""
