@@ -30,7 +30,7 @@ UNTESTED = {
     "18.4 Report": "as 18.1",
     "19.1 Overlay and preview": "of a vision that draws for people, which none must; tests/vision_side/test_viewing.py",
     "19.2 Only while watched": "as 19.1",
-    "19.3 Passing on": "a robot may leave it out; tests/test_passing_pictures.py",
+    "19.3 Passing on": "a robot may leave it out; tests/e2e/test_relay.py",
 }
 """Clauses without a case of their own, and why; a test demands that all others have one."""
 

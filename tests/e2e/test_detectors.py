@@ -1,17 +1,26 @@
 """Detectors in real processes: `sightline vision` drives a real robot by one, another looks on and is promoted live."""
 
 import json
+import numpy as np
+import os
+import pytest
 import signal
 import subprocess
 import sys
+import time
+from contextlib import contextmanager
 from pathlib import Path
-
-import pytest
-
+from sightline.evaluation.processes import Processes
+from sightline.vision_side.config import HsvConfig
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.color.hsv import HsvDetector
+from sightline.vision_side.detect.protobuf import fields
 from tests.fixtures.links import until
-from tests.fixtures.vision.onnx import brightness_model
 from tests.fixtures.robot_process import RobotProcess
+from tests.fixtures.vision.onnx import brightness_model
+from tests.fixtures.vision.remote import Server, box, grpc_answer, grpc_started, http_reply, said
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
+
 
 pytestmark = pytest.mark.slow
 RIGHT = [[250.0, 100.0, 300.0, 150.0]]
@@ -91,3 +100,128 @@ def test_without_a_shadow_nobody_is_promoted(tmp_path: Path) -> None:
         refused = sightline("detector", "promote", "r1", "--connect", robot.endpoint)
         assert refused.returncode == 5 and "--shadow NAME" in refused.stderr
         assert len(refused.stderr.splitlines()) == 1
+
+
+# A real robot, steered by a real vision whose eyes are elsewhere; the eyes are killed while it drives.
+
+
+FAR_BALL = jpeg_of(scene(camera(), 2.2, 0.0))
+ZERO_US = 700_000
+"""From the last valid command, DESIGN.md; the detector's own deadline comes before it."""
+DEADLINE_US = 100_000
+
+
+def _corners():
+    """What a good detector says of the picture."""
+    one = HsvDetector(HsvConfig()).detect(Decoder(320, 240, 320 * 240).decode(FAR_BALL))[0]
+    return one.x1_px, one.y1_px, one.x2_px, one.y2_px
+
+
+def _answer(_request):
+    return http_reply(said(box(*_corners())))
+
+
+def _infer(request, _context):
+    """The same over gRPC, under the id that was asked with."""
+    asked = bytes(dict(fields(request))[3]).decode()
+    columns = {"boxes": np.float32([_corners()]), "scores": np.float32([0.9]), "labels": np.int64([0])}
+    return grpc_answer(columns, asked)
+
+
+@contextmanager
+def _driving(tmp_path, detector, *options, beside=None):
+    """The robot and what vision says, once the wheels turn; `beside(endpoint)` starts what else there is."""
+    robot = RobotProcess(tmp_path)
+    (tmp_path / "pictures" / "0.jpg").write_bytes(FAR_BALL)
+    log = tmp_path / "vision.log"
+    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli.app", "vision", "--connect", robot.endpoint, "--detector",
+               detector, "--set", "boxes.height_m=0.2", *options]
+    with robot, log.open("wb") as out:
+        assert until(lambda: "on" in robot.output(), 10)
+        if beside is not None:
+            beside(robot.endpoint)
+        vision = subprocess.Popen(command, stdout=out, stderr=out)
+        try:
+            assert until(lambda: robot.drive_log.exists() and robot.speed() > 0.5, 20), log.read_text()
+            yield robot, log
+        finally:
+            vision.terminate()
+            vision.wait(5)
+
+
+def _at(server):
+    return f"http+jpeg://127.0.0.1:{server.port}/"
+
+
+def _wheels_us(robot, since_us):
+    """When the wheels were first at zero after `since_us`; None if they were not."""
+    return next((t_us for t_us, left, right in robot.motor_rows() if t_us > since_us and left == right == 0), None)
+
+
+def test_a_killed_detector_is_silence_the_robot_holds_and_drives_again_within_three_seconds(tmp_path):
+    with Server(_answer) as server, _driving(tmp_path, _at(server)) as (robot, log):
+        port, killed_us = server.port, time.monotonic_ns() // 1000
+        server.kill()
+        assert until(lambda: _wheels_us(robot, killed_us), 3)
+        assert _wheels_us(robot, killed_us) - killed_us <= ZERO_US + DEADLINE_US
+        assert "searching" not in log.read_text(), "no answer is not saw nothing"
+        server.start(port)
+        assert until(lambda: robot.speed() > 0.5, 3.0), log.read_text()
+        assert "answers again" in log.read_text()
+
+
+def test_with_own_eyes_to_fall_back_on_it_drives_on_without_a_stop_and_goes_back(tmp_path):
+    with Server(_answer) as server, _driving(tmp_path, _at(server), "--set", "detector.fallback=hsv") as (robot, log):
+        port, killed_us = server.port, time.monotonic_ns() // 1000
+        server.kill()
+        assert until(lambda: "own eyes drive on" in log.read_text(), 2)
+        assert not until(lambda: _wheels_us(robot, killed_us), 1.5), "the wheels never stopped"
+        server.start(port)
+        assert until(lambda: "drives again" in log.read_text(), 3.0)
+        asked = len(server.requests)
+        assert until(lambda: len(server.requests) > asked + 10, 2) and not _wheels_us(robot, killed_us)
+        assert robot.speed() > 0.5
+
+
+@pytest.mark.parametrize("hostile", [b"<html>", b"\0" * 100_000, None])
+def test_hostile_answers_do_not_move_the_robot(tmp_path, hostile):
+    with Server(_answer) as server, _driving(tmp_path, _at(server)) as (robot, log):
+        turned_us = time.monotonic_ns() // 1000
+        server.answer = lambda request: None if hostile is None else http_reply(hostile)
+        assert until(lambda: _wheels_us(robot, turned_us), 3)
+        still_us = _wheels_us(robot, turned_us)
+        time.sleep(0.5)
+        assert not [row for row in robot.motor_rows() if row[0] > still_us and (row[1] or row[2])]
+        assert "no answer" in log.read_text()
+
+
+def test_a_grpc_server_that_is_gone_is_the_same(tmp_path):
+    server, port = grpc_started(_infer)
+    labels = "detector.options.labels=['ball']"
+    try:
+        with _driving(tmp_path, f"oip+grpc://127.0.0.1:{port}/ball", "--set", labels) as (robot, log):
+            gone_us = time.monotonic_ns() // 1000
+            server.stop(0).wait()
+            assert until(lambda: _wheels_us(robot, gone_us), 3)
+            assert _wheels_us(robot, gone_us) - gone_us <= ZERO_US + DEADLINE_US
+            server, _ = grpc_started(_infer, port)
+            assert until(lambda: robot.speed() > 0.5, 3.0), log.read_text()
+            assert "searching" not in log.read_text() and "answers again" in log.read_text()
+    finally:
+        server.stop(0)
+
+
+def test_a_killed_detector_service_is_the_same_over_zenoh(tmp_path):
+    with Processes(tmp_path) as processes:
+        def serve(endpoint):
+            processes.start("detector", ["detector", "--serve", "hsv", "--connect", endpoint])
+
+        with _driving(tmp_path, "zenoh", beside=serve) as (robot, log):
+            killed_us = time.monotonic_ns() // 1000
+            os.kill(processes.pid("detector"), signal.SIGKILL)
+            assert until(lambda: _wheels_us(robot, killed_us), 3)
+            assert _wheels_us(robot, killed_us) - killed_us <= ZERO_US + DEADLINE_US
+            serve(robot.endpoint)
+            processes.wait_line("detector", "looks at the pictures", 15)
+            assert until(lambda: robot.speed() > 0.5, 3.0), log.read_text()
+            assert "searching" not in log.read_text()

@@ -1,14 +1,13 @@
 """Differential drive and odometry: exact on arcs, the curve kept under saturation."""
 
 import math
-
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
+from hypothesis import given, strategies as st
+from pydantic import ValidationError
 from sightline.protocol.messages import Twist
 from sightline.robot_side.kinematics import DiffDriveConfig, Odometer, twist_of, wheel_speeds
 from sightline.robot_side.ports import WheelAngles
+
 
 DRIVE = DiffDriveConfig()
 
@@ -52,3 +51,141 @@ def test_readings_that_are_not_newer_are_ignored_and_the_rate_is_measured():
     linear, angular = odometer.moving
     assert linear == pytest.approx(10 * DRIVE.wheel_radius_m) and angular == 0
     assert odometer.pose[0] == pytest.approx(1.9 * DRIVE.wheel_radius_m)
+
+
+# Every number of the wheels' arithmetic, worked out by hand.
+
+
+# In binary fractions, so that every expected value is exact.
+EXACT_DRIVE = DiffDriveConfig(wheel_radius_m=0.125, track_width_m=0.5, max_wheel_rad_s=8.0)
+
+
+def twist(linear_mps, angular_rad_s):
+    return Twist(linear_mps=linear_mps, angular_rad_s=angular_rad_s)
+
+
+def test_the_defaults_are_the_raspberry_pi_class_robot():
+    assert DiffDriveConfig().model_dump() == {"wheel_radius_m": 0.035, "track_width_m": 0.174, "max_wheel_rad_s": 22.0}
+
+
+@pytest.mark.parametrize(
+    ("field", "lower", "upper"),
+    [("wheel_radius_m", 0.005, 1.0), ("track_width_m", 0.02, 3.0), ("max_wheel_rad_s", 0.1, 500.0)],
+)
+def test_each_field_is_bounded(field, lower, upper):
+    inside, outside = (lower + 1e-6, upper - 1e-6), (lower - 1e-6, lower, upper, upper + 1e-6)
+    for value in inside:
+        assert getattr(DiffDriveConfig(**{field: value}), field) == value
+    for value in outside:
+        with pytest.raises(ValidationError):
+            DiffDriveConfig(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("asked", "wheels"),
+    [
+        ((0.0, 0.0), (0.0, 0.0)),
+        ((0.5, 0.0), (4.0, 4.0)),
+        ((0.0, 1.0), (-2.0, 2.0)),
+        ((0.5, 1.0), (2.0, 6.0)),
+        ((-0.25, 0.5), (-3.0, -1.0)),
+        ((1.0, 0.0), (8.0, 8.0)),
+        ((0.75, 1.0), (4.0, 8.0)),
+        ((1.0, 2.0), (8.0 / 3, 8.0)),
+        ((2.0, 0.0), (8.0, 8.0)),
+        ((-2.0, 4.0), (-8.0, -8.0 / 3)),
+        ((0.0, 8.0), (-8.0, 8.0)),
+        ((0.0, -8.0), (8.0, -8.0)),
+        ((-2.0, -4.0), (-8.0 / 3, -8.0)),
+    ],
+)
+def test_a_twist_turns_the_wheels_within_their_limit(asked, wheels):
+    assert wheel_speeds(EXACT_DRIVE, twist(*asked)) == pytest.approx(wheels, rel=1e-14)
+
+
+def test_just_over_the_limit_is_cut_to_it():
+    assert max(wheel_speeds(EXACT_DRIVE, twist(0.999, 0.0))) == pytest.approx(7.992)
+    assert max(wheel_speeds(EXACT_DRIVE, twist(1.001, 0.0))) == pytest.approx(8.0, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("wheels", "got"),
+    [((4.0, 4.0), (0.5, 0.0)), ((-2.0, 2.0), (0.0, 1.0)), ((2.0, 6.0), (0.5, 1.0)), ((80.0, 0.0), (5.0, -20.0))],
+)
+def test_and_back_without_a_limit(wheels, got):
+    assert twist_of(EXACT_DRIVE, *wheels) == twist(*got)
+
+
+# --- odometry ----------------------------------------------------------------------------------------------------
+
+
+def odometer(*readings):
+    reckoned = Odometer(EXACT_DRIVE)
+    for reading in readings:
+        reckoned.update(WheelAngles(*reading))
+    return reckoned
+
+
+def test_nothing_is_known_before_the_second_reading():
+    assert odometer().pose == (0.0, 0.0, 0.0) and odometer().moving == (0.0, 0.0)
+    one = odometer((5.0, 9.0, 0))
+    assert one.pose == (0.0, 0.0, 0.0) and one.moving == (0.0, 0.0)
+
+
+def test_straight_on():
+    assert odometer((0.0, 0.0, 0), (2.0, 2.0, 10)).pose == (0.25, 0.0, 0.0)
+    assert odometer((1.0, 1.0, 0), (-1.0, -1.0, 10)).pose == (-0.25, 0.0, 0.0)
+
+
+def test_on_the_spot():
+    assert odometer((0.0, 0.0, 0), (-2.0, 2.0, 10)).pose == (0.0, 0.0, 1.0)
+
+
+def test_an_arc_ends_on_its_circle():
+    # Left wheel still, right one 8 rad: 1 m of arc at 0.5 m track, so 2 rad about a centre 0.25 m to the left.
+    x_m, y_m, yaw_rad = odometer((0.0, 0.0, 0), (0.0, 8.0, 10)).pose
+    assert (x_m, y_m) == pytest.approx((0.25 * math.sin(2), 0.25 * (1 - math.cos(2))), rel=1e-12)
+    assert yaw_rad == 2.0
+
+
+def test_two_arcs_follow_each_other():
+    x_m, y_m, yaw_rad = odometer((0.0, 0.0, 0), (0.0, 4.0, 10), (2.0, 8.0, 20)).pose
+    first = (0.25 * math.sin(1), 0.25 * (1 - math.cos(1)))
+    # Then 0.375 m of arc over 0.5 rad: radius 0.75, from heading 1 to 1.5.
+    second = (0.75 * (math.sin(1.5) - math.sin(1)), 0.75 * (math.cos(1) - math.cos(1.5)))
+    assert (x_m, y_m) == pytest.approx((first[0] + second[0], first[1] + second[1]), rel=1e-12)
+    assert yaw_rad == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize(
+    ("turned", "yaw"), [(3.125, 3.125), (3.25, 3.25 - math.tau), (-3.25, math.tau - 3.25), (6.25, 6.25 - math.tau)]
+)
+def test_yaw_stays_within_half_a_turn(turned, yaw):
+    assert odometer((0.0, 0.0, 0), (-2 * turned, 2 * turned, 10)).pose[2] == pytest.approx(yaw, rel=1e-12)
+
+
+@pytest.mark.parametrize(("t_us", "taken"), [(99, False), (100, False), (101, True)])
+def test_only_newer_readings_count(t_us, taken):
+    reckoned = odometer((0.0, 0.0, 100), (2.0, 2.0, t_us))
+    assert (reckoned.pose[0] == 0.25) == taken
+    reckoned.update(WheelAngles(4.0, 4.0, 102))
+    assert reckoned.pose[0] == 0.5
+    again = odometer((0.0, 0.0, 100), (2.0, 2.0, 200), (6.0, 6.0, 100 + t_us))
+    assert (again.pose[0] == 0.75) == taken
+
+
+@pytest.mark.parametrize(("window_us", "known"), [(39_999, False), (40_000, True), (40_001, True)])
+def test_the_rate_is_taken_over_40_ms_at_least(window_us, known):
+    reckoned = odometer((0.0, 0.0, 1_000), (0.25, 0.75, 1_000 + window_us // 2), (0.5, 1.5, 1_000 + window_us))
+    seconds = window_us / 1e6
+    expected = (0.125 / seconds, 0.25 / seconds) if known else (0.0, 0.0)
+    assert reckoned.moving == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_next_rate_is_taken_from_where_the_last_ended():
+    reckoned = odometer((0.0, 0.0, 0), (1.0, 3.0, 50_000), (2.0, 5.0, 100_000))
+    # 1 and 2 rad in 50 ms: 20 and 40 rad/s; at 0.125 m 2.5 and 5 m/s.
+    assert reckoned.moving == pytest.approx((3.75, 5.0), rel=1e-12)
+    reckoned.update(WheelAngles(9.0, 9.0, 120_000))
+    assert reckoned.moving == pytest.approx((3.75, 5.0), rel=1e-12), "20 ms are too short"
+    assert odometer((0.0, 0.0, 0), (1.0, 1.0, 50_000), (1.0, 1.0, 100_000)).moving == (0.0, 0.0)

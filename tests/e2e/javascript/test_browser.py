@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.javascript_browser import Browser, chromium
+from tests.fixtures.javascript import Browser, chromium
 from tests.fixtures.javascript import JsProcess, JsRobot, free_port, node
 from tests.fixtures.links import until
 

@@ -2,17 +2,14 @@
 
 import json
 import math
-import struct
-
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
-from sightline.operator_side.client.messages import message_line, message_object
-from sightline.protocol.channels import CHANNELS, SCAN, STATUS, TWIST
-from sightline.protocol.spec.message_cases import USUAL, packed
-from sightline.protocol.spec.message_cases import CASES
+import struct
+from hypothesis import given, strategies as st
+from sightline.operator_side.client.messages import ChannelInbox, MAX_WAITING, message_line, message_object
+from sightline.protocol.channels import CHANNELS, JPEG, SCAN, STATUS, TWIST
+from sightline.protocol.spec.message_cases import CASES, USUAL, packed
 from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.memory import MemoryNetwork
 
 
 def usual(name, **changed):
@@ -81,3 +78,31 @@ def test_any_bytes_give_a_line(channel, header, payload):
 
 def test_ranges_in_scans_that_are_none_are_refused():
     assert "NOT_FINITE" in message_line(usual(SCAN.name, payload=struct.pack("<f", math.nan)))
+
+
+# What waits to be printed: of pictures the newest alone, of words some, and never more than a bound.
+
+
+PICTURES = [name for name, one in CHANNELS.items() if one.encoding == JPEG]
+
+
+def heard(name, count):
+    """An inbox in which `count` messages of a channel arrived, told apart by their payloads' last byte."""
+    network = MemoryNetwork(seed=1)
+    inbox = ChannelInbox(network.link("r1", role="operator"), "operator", CHANNELS[name])
+    messages = [usual(name, payload=usual(name).payload + bytes([number])) for number in range(count)]
+    for message in messages:
+        inbox._put(message)
+    return inbox, messages
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_only_the_newest_picture_waits(name):
+    inbox, messages = heard(name, 5)
+    assert inbox.take(0.0) == messages[-1] and inbox.take(0.0) is None and inbox.dropped == 4
+
+
+def test_words_wait_in_order_up_to_a_bound():
+    inbox, messages = heard("status", MAX_WAITING + 3)
+    assert [inbox.take(0.0) for _ in range(MAX_WAITING)] == messages[:MAX_WAITING]
+    assert inbox.take(0.0) is None and inbox.dropped == 3

@@ -10,7 +10,7 @@ from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.gate import Decision, SafetyGate
 from sightline.robot_side.safety.states import TRANSITIONS, Event, is_armed, next_state
-from tests.gate_rig import GUEST, VISION_HOLDER, A, D, F, G, H, S, driving, guest, guest_driving
+from tests.fixtures.safety import GUEST, VISION_HOLDER, A, D, F, G, H, S, driving, guest, guest_driving
 from tests.fixtures.safety import HUMAN, OTHER, ROBOT, VISION, Rig
 
 # --- the table of states -----------------------------------------------------------------------------------------

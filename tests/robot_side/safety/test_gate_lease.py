@@ -7,7 +7,7 @@ from sightline.protocol.messages import STILL, AnswerHeader, Echo, Holder, Reque
 from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.gate import Decision, SafetyGate
-from tests.gate_rig import HUMAN_HOLDER, VISION_HOLDER, A, D, H, driving, refused
+from tests.fixtures.safety import HUMAN_HOLDER, VISION_HOLDER, A, D, H, driving, refused
 from tests.fixtures.safety import HUMAN, OTHER, ROBOT, VISION, Rig
 
 # --- lease: acquire, release, losing a human ---------------------------------------------------------------------

@@ -7,7 +7,7 @@ from sightline.protocol.messages import STILL, Echo, Request, RequestHeader, Ver
 from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.gate import SafetyGate
-from tests.gate_rig import A, D, F, H, S, driving, refused
+from tests.fixtures.safety import A, D, F, H, S, driving, refused
 from tests.fixtures.safety import HUMAN, OTHER, ROBOT, Rig
 
 # --- requests ----------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from sightline.robot_side.safety.guard import GuardConfig, RangeGuard
 from sightline.robot_side.safety.limits import AxisRamp
 from sightline.robot_side.ports import Ranges
 from sightline.robot_side.safety.gate import Decision
-from tests.gate_rig import (
+from tests.fixtures.safety import (
     A,
     D,
     G,
