@@ -16,19 +16,23 @@ ENTRYPOINT ["sightline"]
 FROM python:3.11-slim-bookworm AS build
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_CONSTRAINT=/src/constraints.txt
 WORKDIR /src
-COPY requirements.lock pyproject.toml README.md LICENSE ./
+COPY requirements.lock pyproject.toml setup.py README.md LICENSE ./
 # The lock's versions as constraints: an extra of a local package cannot be installed by hash.
 RUN sed -n 's/^\([[:alnum:]].*[^ \\]\) *\\*$/\1/p' requirements.lock > constraints.txt
 # A wheel of the same name and extras without any code: what depends on it is built anew only when the lock changes.
-RUN mkdir protocol robot_side vision_side sim operator_side benchmarks \
+RUN mkdir sightline protocol robot_side vision_side sim conformance operator_side evaluation training benchmarks \
  && pip wheel --no-deps --wheel-dir /empty .
 
 FROM build AS wheel
+COPY sightline sightline
 COPY protocol protocol
 COPY robot_side robot_side
 COPY vision_side vision_side
 COPY sim sim
+COPY conformance conformance
 COPY operator_side operator_side
+COPY evaluation evaluation
+COPY training training
 COPY benchmarks benchmarks
 RUN pip wheel --no-deps --wheel-dir /dist .
 

@@ -1,8 +1,8 @@
 """`sightline bench camera`: what passing a camera's own JPEGs through costs the network process. Shell (processes).
 
-`python -m sightline.benchmarks.camera SECONDS` is the measured process: the V4L2 plug-in with its thread, and the network
-process's own logic from a capture to a frame that is ready for the link, and back to its credit. The device is a
-stand-in behind the plug-in's own seam, paced and filled as a real one; what it takes itself is left out.
+`python -m sightline.benchmarks.camera SECONDS` is the measured process: the V4L2 plug-in with its thread, and the
+network process's own logic from a capture to a frame that is ready for the link, and back to its credit. The device is
+a stand-in behind the plug-in's own seam, paced and filled as a real one; what it takes itself is left out.
 """
 
 import json
@@ -20,11 +20,10 @@ from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import Holder
-from sightline.robot_side.hardware.cameras.v4l2 import V4l2Camera
-from sightline.robot_side.hardware.cameras.v4l2 import V4l2CameraConfig
-from sightline.robot_side.pipe import CommandAck
+from sightline.robot_side.hardware.cameras.v4l2 import V4l2Camera, V4l2CameraConfig
 from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.network.stream import StreamConfig
+from sightline.robot_side.pipe import CommandAck
 
 BOUND_MS: Final = 0.1
 MISSED_BOUND: Final = 3
@@ -51,7 +50,7 @@ class PassThrough:
 
 def measure_camera(seconds: float) -> PassThrough:
     """Run the measured process. Raises HardwareError with its last words if it fails."""
-    command = [sys.executable, "-m", "sightline.benchmarks.camera", f"{seconds:g}"]
+    command = [sys.executable, "-P", "-m", "sightline.benchmarks.camera", f"{seconds:g}"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise HardwareError(f"the measured process ended ({done.returncode}): {done.stderr.strip()[-300:]}")

@@ -4,14 +4,14 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from statistics import median
+from typing import Final
+
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
 from sightline.protocol.text import format_twist, parse_twist
 from sightline.robot_side.safety.gate import SafetyGate
 from sightline.robot_side.safety.limits import SafetyConfig
-from statistics import median
-from typing import Final
-
 
 CODEC_BOUND_US: Final = 10.0
 _ROUNDS: Final = 200

@@ -9,7 +9,11 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
+from statistics import median
+from typing import Annotated, Final
+
 from pydantic import Field
+
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.protocol.channels import DETECTIONS, FRAME, STATUS
 from sightline.protocol.clock import monotonic_us
@@ -22,8 +26,6 @@ from sightline.protocol.transports.zenoh.link import ZenohLink
 from sightline.protocol.transports.zenoh.session import open_session
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector, Maker, result_of
-from statistics import median
-from typing import Annotated, Final
 
 
 class SlowDetector:
@@ -206,8 +208,20 @@ def measure_streams(endpoint: str, folder: Path, streams: int = 40, seconds: flo
 
 
 def _service(endpoint: str, each_us: int, log: Path) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli.app", "detector", "--serve", "sightline.benchmarks.detector:SlowDetector",
-               "--connect", endpoint, "--set", f"detector.options.each_us={each_us}"]
+    command = [
+        sys.executable,
+        "-u",
+        "-P",
+        "-m",
+        "sightline.operator_side.cli.app",
+        "detector",
+        "--serve",
+        "sightline.benchmarks.detector:SlowDetector",
+        "--connect",
+        endpoint,
+        "--set",
+        f"detector.options.each_us={each_us}",
+    ]
     with log.open("wb") as out:
         return subprocess.Popen(command, stdout=out, stderr=out)
 
@@ -224,14 +238,14 @@ def _wait_ready(robots: _Streams, log: Path, streams: int, service: "subprocess.
 def _offer(robots: _Streams, streams: int, seconds: float, pid: int) -> None:
     """Frames of one stream after the other, evenly spaced; the newest of each, as robots send them."""
     began_s = time.monotonic()
-    for count in range(round(seconds * streams * _FPS)):
-        due_s = began_s + count / (streams * _FPS)
+    for index in range(round(seconds * streams * _FPS)):
+        due_s = began_s + index / (streams * _FPS)
         left_s = due_s - time.monotonic()
         if left_s > 0:
             time.sleep(left_s)
-        if count % (streams * _FPS) == 0:
+        if index % (streams * _FPS) == 0:
             robots.load.memory_mb.append(_memory_mb(pid))
-        robots.frame(count % streams)
+        robots.frame(index % streams)
 
 
 def _memory_mb(pid: int) -> float:

@@ -1,7 +1,7 @@
 """The robot side alone in a bare environment: what it installs, how it drives, what it needs. Shell (processes).
 
-A new virtual environment gets `sightline[zenoh]` and nothing else; in it runs the robot service, beside a simulation
-and a vision of this environment. Memory is the kernel's own high-water mark of each process.
+A new virtual environment gets `sightline-robot[zenoh]` and nothing else; in it runs the robot service, beside a
+simulation and a vision of this environment. Memory is the kernel's own high-water mark of each process.
 """
 
 import signal
@@ -89,7 +89,7 @@ def _service(python: str, arguments: list[str], folder: Path, ready: str) -> Ite
     log = folder / f"{arguments[0]}.log"
     with log.open("wb") as out:
         # Not from the checkout, so that a bare environment finds nothing but what it has installed.
-        command = [python, "-m", "sightline.operator_side.cli.app", *arguments]
+        command = [python, "-P", "-m", "sightline.operator_side.cli.app", *arguments]
         process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, cwd=folder)
     try:
         _wait_for(log, ready, process)

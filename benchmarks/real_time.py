@@ -55,7 +55,7 @@ def _demo(scenario: str, seed: int, seconds: float | None) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="sightline-demo-") as folder:
         lasting = [] if seconds is None else ["--seconds", f"{seconds:g}"]
         arguments = ["demo", "--scenario", scenario, "--seed", str(seed), *lasting, "--out", folder, "--json"]
-        command = [sys.executable, "-m", "sightline.operator_side.cli.app", *arguments]
+        command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode not in _JUDGED:
         raise RuntimeError(f"demo {scenario} seed {seed}: {done.stderr.strip()}")

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from sightline.protocol.errors import ConfigError
 from typing import Any, Final
+
+from sightline.protocol.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +172,7 @@ SECTIONS: Final = (
     Section(
         "robot",
         "A robot without NumPy, OpenCV and PyBullet",
-        "`sightline[zenoh]` in a new environment, driving in the simulation; memory is the kernel's high-water mark.",
+        "`sightline-robot[zenoh]` in a new environment, driving in the simulation; memory: the kernel's peak.",
         ("bench", "robot", "--seconds", "60"),
     ),
 )
@@ -239,7 +240,7 @@ def _measured(section: Section, pictures: Path) -> dict[str, Any]:
 
 def _run(arguments: Sequence[str]) -> dict[str, Any]:
     """The command's JSON object. Raises RuntimeError with its error line if it printed none."""
-    command = [sys.executable, "-m", "sightline.operator_side.cli.app", *arguments, "--json"]
+    command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments, "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode not in (0, CHECK_FAILED):
         raise RuntimeError(f"{' '.join(arguments)}: {done.stderr.strip()}")

@@ -3,15 +3,15 @@
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Final, Protocol, Self
+
 from sightline.conformance.case import Access, Bench, NotApplicableError
 from sightline.protocol.channels import CHANNELS, Channel, Direction
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.memory import MemoryLink, MemoryNetwork
 from sightline.protocol.transports.security import certificate_role
-from types import TracebackType
-from typing import Final, Protocol, Self
-
 
 _WAITING: Final = 1024  # messages that a case has not yet looked at; it looks every few milliseconds
 _NAP_S: Final = 0.005

@@ -21,14 +21,14 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Final, TypeVar
+
 from sightline.protocol.channels import Channel
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import WireModel
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
-from typing import Final, TYPE_CHECKING, TypeVar
-
 
 GROUPS: Final = {
     "FRAM": "framing",
@@ -232,7 +232,9 @@ class Bench(ABC):
 
     # --- messages ------------------------------------------------------------------------------------------------
 
-    def publish(self, channel: Channel, header: WireModel | bytes, payload: WireModel | bytes = b"", source: str = "") -> None:
+    def publish(
+        self, channel: Channel, header: WireModel | bytes, payload: WireModel | bytes = b"", source: str = ""
+    ) -> None:
         """Send a message; `source` is the role in the key, for channels towards the robot."""
         self.send(channel, _bytes(header), _bytes(payload), source)
 

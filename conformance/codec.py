@@ -20,13 +20,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Final, Self
+
 from sightline.conformance.case import Bench, Case, Level, NotApplicableError, Suite
 from sightline.conformance.runner import Outcome, Result
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.spec.golden import outcome
-from types import TracebackType
-from typing import Any, Final, IO, Self
-
 
 MAX_ANSWER_BYTES: Final = 1_048_576
 """Security limit: a longer line is no answer."""

@@ -12,13 +12,13 @@ import time
 from base64 import b64encode
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from types import TracebackType
+from typing import Final, NamedTuple, Self
+
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.security import load_role_keys
 from sightline.protocol.transports.websocket.framing import SUBPROTOCOL
 from sightline.protocol.transports.zenoh.session import open_session
-from types import TracebackType
-from typing import Final, NamedTuple, Self
-
 
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 CONTINUED: Final = 0

@@ -5,10 +5,10 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import groupby
-from sightline.conformance.case import Level
-from sightline.conformance.runner import Outcome, Result, passed, printable
 from typing import Any, Final
 
+from sightline.conformance.case import Level
+from sightline.conformance.runner import Outcome, Result, passed, printable
 
 _MARKS: Final = {Outcome.PASSED: "ok", Outcome.FAILED: "FAIL", Outcome.SKIPPED: "n/a"}
 

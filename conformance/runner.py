@@ -4,8 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from sightline.conformance.case import Bench
-from sightline.conformance.case import GROUPS, Case, ConformanceError, Level, NotApplicableError
+from sightline.conformance.case import GROUPS, Bench, Case, ConformanceError, Level, NotApplicableError
 from sightline.protocol.errors import ConfigError, LinkError
 
 

@@ -3,6 +3,8 @@
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
+from typing import Any
+
 from sightline.protocol.channels import DETECTIONS, FRAME
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import WireError
@@ -14,8 +16,6 @@ from sightline.sim.bus import KEPT, LabelReader
 from sightline.vision_side.config import BoxesConfig
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.tracking.locate import BoxReader
-from typing import Any
-
 
 SOURCE = "guest"
 """Whose boxes they are: somebody's who looks at frames and drives nothing."""

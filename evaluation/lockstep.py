@@ -14,14 +14,14 @@ from sightline.evaluation.scenario_config import robot_config, vision_config
 from sightline.protocol.channels import ACK, FRAME, SCAN, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import FrameHeader, State
+from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import LatestSlot, Message
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.protocol.text import format_twist
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.core import DriverCore
-from sightline.robot_side.safety.limits import TICK_US
-from sightline.robot_side.ports import Picture
 from sightline.robot_side.network.core import NetworkCore
+from sightline.robot_side.ports import Picture
+from sightline.robot_side.safety.limits import TICK_US
 from sightline.sim.process import PeriodicTimer
 from sightline.sim.robot import RobotModel
 from sightline.sim.scenario import Scenario
@@ -30,8 +30,8 @@ from sightline.sim.world.world import World
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector, notices_of
 from sightline.vision_side.detect.registry import configured_detector
-from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
 from sightline.vision_side.missions.ranges import decode_scan
+from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
 
 COMPUTE_US = 4_000
 """What one frame costs the vision side in virtual time: one step of the world, above what it takes in truth."""

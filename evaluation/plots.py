@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sightline.operator_side.preflight import needs
-from sightline.sim.scenario import Scenario, Wall
-from sightline.sim.scenario import Static
+from sightline.sim.scenario import Scenario, Static, Wall
 from sightline.sim.truth import Truth
 
 if TYPE_CHECKING:

@@ -11,10 +11,11 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
-from sightline.protocol.errors import HardwareError, SightlineError
-from sightline.protocol.log import LOG_FORMATS, LOG_FORMAT_VARIABLE
 from types import FrameType, TracebackType
 from typing import Final, Self
+
+from sightline.protocol.errors import HardwareError, SightlineError
+from sightline.protocol.log import LOG_FORMAT_VARIABLE, LOG_FORMATS
 
 
 @contextmanager
@@ -58,7 +59,7 @@ class Processes:
 
     def start(self, name: str, arguments: Sequence[str]) -> None:
         """Run `sightline ARGUMENTS`, its output going to `<name>.log`, as text: who starts them reads it."""
-        command = [sys.executable, "-u", "-m", "sightline.operator_side.cli.app", *arguments]
+        command = [sys.executable, "-u", "-P", "-m", "sightline.operator_side.cli.app", *arguments]
         with self.log(name).open("wb") as log:
             self._running[name] = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,

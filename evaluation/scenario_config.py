@@ -12,13 +12,12 @@ from pydantic import BaseModel, ValidationError
 
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
 from sightline.robot_side.ports import Ranges
-from sightline.sim.robot import outline
-from sightline.sim.robot import RobotModel, load_robot
+from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
+from sightline.sim.robot import RobotModel, load_robot, outline
 from sightline.sim.scenario import Scenario
-from sightline.sim.world.start import goals_seen
 from sightline.sim.toml_file import laid_over
+from sightline.sim.world.start import goals_seen
 from sightline.vision_side.config import VisionConfig
 
 Table = dict[str, Any]

@@ -9,9 +9,9 @@ import json
 import sys
 from typing import Any
 
-from sightline.protocol.spec.golden import outcome
-from sightline.protocol.spec.framing_cases import READERS, framing_outcome
 from sightline.protocol.messages import Twist
+from sightline.protocol.spec.framing_cases import READERS, framing_outcome
+from sightline.protocol.spec.golden import outcome
 from sightline.protocol.text import format_twist
 
 

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from sightline.protocol.channels import DETECTIONS, FRAME
 from sightline.protocol.codec import decode, encode
-from sightline.protocol.errors import SightlineError, WireError
+from sightline.protocol.errors import RejectReason, SightlineError, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader
-from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.open import open_link
 

@@ -7,21 +7,20 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
 from sightline.protocol.errors import ConfigError
 
-
-_OURS = ("protocol", "robot_side", "vision_side", "sim", "operator_side", "benchmarks")
 _PYBULLET_UP_TO = (3, 11)
 
 
 @contextmanager
 def needs(extra: str, version: tuple[int, int] = sys.version_info[:2]) -> Iterator[None]:
-    """Imports inside that fail become a ConfigError naming `sightline[extra]`; ours are faults and stay as they are."""
+    """Imports inside that fail become a ConfigError that names the extra; ours are faults and stay as they are."""
     try:
         yield
     except ImportError as error:
         package = (error.name or "").partition(".")[0]
-        if not package or package in _OURS:
+        if not package or package == "sightline":
             raise
         raise ConfigError(_advice(package, extra, version)) from None
 
@@ -30,9 +29,9 @@ def _advice(package: str, extra: str, version: tuple[int, int]) -> str:
     if package == "pybullet" and version > _PYBULLET_UP_TO:
         return (
             f"PyBullet has no ready-made package for Python {version[0]}.{version[1]}: use Python 3.11, or "
-            "`docker compose up`, or let pip compile it (minutes): pip install 'sightline[sim]'"
+            "`docker compose up`, or let pip compile it (minutes): pip install 'sightline-robot[sim]'"
         )
-    return f"{package} is not installed: pip install 'sightline[{extra}]'"
+    return f"{package} is not installed: pip install 'sightline-robot[{extra}]'"
 
 
 # Whether a result can be written where it is to go, looked at before the work that makes it. Shell.

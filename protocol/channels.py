@@ -16,6 +16,8 @@ from sightline.protocol.messages import (
     Detections,
     DetectionsHeader,
     FrameHeader,
+    MissionReport,
+    MissionRequest,
     Odometry,
     Reply,
     Request,
@@ -25,7 +27,6 @@ from sightline.protocol.messages import (
     Status,
     WireModel,
 )
-from sightline.protocol.messages import MissionReport, MissionRequest
 from sightline.protocol.text import MAX_TWIST_BYTES
 
 MAX_HEADER_BYTES = 512

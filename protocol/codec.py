@@ -11,9 +11,8 @@ from pydantic import ValidationError
 
 from sightline.protocol import VERSION
 from sightline.protocol.channels import MAX_HEADER_BYTES, SCAN, Channel
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import WireModel
-from sightline.protocol.errors import RejectReason
 
 Model = TypeVar("Model", bound=WireModel)
 
@@ -45,10 +44,13 @@ def _wire_error(name: str, error: ValidationError) -> WireError:
 def check_sizes(channel: Channel, header: bytes, payload: bytes) -> None:
     """Raise WireError MALFORMED unless both parts are within the channel's bounds."""
     if len(header) > MAX_HEADER_BYTES:
-        raise WireError(RejectReason.MALFORMED, f"{channel.name} header is {len(header)} bytes, at most {MAX_HEADER_BYTES}")
+        raise WireError(
+            RejectReason.MALFORMED, f"{channel.name} header is {len(header)} bytes, at most {MAX_HEADER_BYTES}"
+        )
     if len(payload) > channel.max_payload_bytes:
         raise WireError(
-            RejectReason.MALFORMED, f"{channel.name} payload is {len(payload)} bytes, at most {channel.max_payload_bytes}"
+            RejectReason.MALFORMED,
+            f"{channel.name} payload is {len(payload)} bytes, at most {channel.max_payload_bytes}",
         )
 
 

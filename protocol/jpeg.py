@@ -6,8 +6,7 @@ Marker layout: ITU-T T.81, annex B.
 
 from dataclasses import dataclass
 
-from sightline.protocol.errors import WireError
-from sightline.protocol.errors import RejectReason
+from sightline.protocol.errors import RejectReason, WireError
 
 MAX_SEGMENTS = 64
 _SOF_BASELINE_AND_PROGRESSIVE = (0xC0, 0xC1, 0xC2)

@@ -16,9 +16,9 @@ import sys
 import threading
 from contextlib import suppress
 from datetime import UTC, datetime
-from sightline.protocol.errors import ConfigError
 from typing import Final, TextIO
 
+from sightline.protocol.errors import ConfigError
 
 LOG_FORMAT_VARIABLE: Final = "SIGHTLINE_LOG"
 LOG_FORMATS: Final = ("text", "json")

@@ -5,10 +5,11 @@ names; signs as in REP 103: x forward, y left, counter-clockwise positive. Times
 """
 
 from enum import StrEnum
-from pydantic import BaseModel, ConfigDict, Field, model_validator
-from sightline.protocol import VERSION
 from typing import Annotated, Final, Literal, Self
 
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from sightline.protocol import VERSION
 
 MAX_INTEGER = 2**53 - 1  # the largest integer that every JSON reader holds exactly
 MAX_CHANNELS_SHOWN = 16
@@ -322,7 +323,7 @@ class MissionRequest(WireModel):
     name: MissionName
     waypoints: Annotated[tuple[tuple[Metres, Metres], ...], Field(max_length=MAX_WAYPOINTS)] = ()
     """(x_m, y_m) in the odometry frame."""
-    options: Annotated[dict[OptionName, OptionValue], Field(max_length=MAX_OPTIONS)] = {}  # noqa: RUF012
+    options: Annotated[dict[OptionName, OptionValue], Field(max_length=MAX_OPTIONS)] = {}
     """For the mission's own configuration; a dot reaches into its tables."""
 
 

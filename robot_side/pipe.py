@@ -25,6 +25,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Final
+
 from sightline.protocol.channels import CHANNELS, REQUEST
 from sightline.protocol.codec import decode
 from sightline.protocol.config import Config
@@ -32,8 +34,6 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.messages import Holder, Planar, Pose, Request, SessionId, Verb
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import RobotConfig
-from typing import Final
-
 
 MAX_PACKET_BYTES = 65_536
 _ISSUED = struct.Struct("<BQQI")
@@ -274,7 +274,8 @@ _WEDGED_US = 2_000_000
 _STARTS_WITHIN_US = 30_000_000  # a first start reads its packages from a slow card
 _END_S = 1.0
 _CHILD: Final = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from sightline.robot_side.network.process import main; main()"
+    "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); "
+    "from sightline.robot_side.network.process import main; main()"
 )
 """It looks for modules where the driver does: neither first in the folder that it starts in, where a file of the user's
 may be called as one of Python's, nor in another copy of this package than the driver's."""

@@ -25,15 +25,16 @@ import time
 from collections import OrderedDict
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
 from pydantic import Field
+
 from sightline.protocol.codec import decode
 from sightline.protocol.config import Config
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import CameraModel
 from sightline.robot_side.ports import Picture, Ranges, WheelAngles
 from sightline.sim.truth import Truth
-from typing import Annotated, Any, NamedTuple
-
 
 MOTION, RANGE, CAMERA, TRUTH = "motion.sock", "range.sock", "camera.sock", "truth.sock"
 MOTION_SET = struct.Struct("<dd")

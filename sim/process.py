@@ -14,7 +14,11 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated
+
 from pydantic import Field
+
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, HardwareError
@@ -27,15 +31,13 @@ from sightline.sim.bus import (
     PICTURE_REQUEST,
     RANGE,
     RANGE_HEAD,
+    TRUTH,
     SimSocketConfig,
     SimulationInfo,
-    TRUTH,
     to_json,
 )
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
-from types import FrameType
-from typing import Annotated, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sightline.sim.world.world import World
@@ -400,5 +402,7 @@ def _world_class() -> type[World]:
     try:
         from sightline.sim.world.world import World
     except ImportError as error:
-        raise ConfigError(f"the simulation needs {error.name}; install it with: pip install 'sightline[sim]'") from None
+        raise ConfigError(
+            f"the simulation needs {error.name}; install it with: pip install 'sightline-robot[sim]'"
+        ) from None
     return World

@@ -7,14 +7,15 @@ TOML (`chassis`, `caster`) or drawn in a URDF that it names, whose wheels and se
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any, Self
+
 from pydantic import Field, model_validator
+
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import CameraModel
 from sightline.sim.toml_file import check, find, names_in, read_table
 from sightline.sim.urdf import Front, Outline, Transform, Urdf, urdf_text
-from typing import Annotated, Any, Self
-
 
 ROBOTS = Path(__file__).parent / "robots"
 

@@ -3,11 +3,13 @@
 import difflib
 import math
 from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, Self
+
 from pydantic import AfterValidator, Field, model_validator
+
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
 from sightline.sim.toml_file import check, find, names_in, read_table
-from typing import Annotated, Any, Literal, NamedTuple, Self
 
 __all__ = ["Forced", "OnPath", "Pushed", "Scenario", "Start", "Static", "Wall", "load_scenario", "scenario_names"]
 

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from itertools import product
 from pathlib import Path
-from sightline.protocol.errors import ConfigError
 from typing import Literal, NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+from sightline.protocol.errors import ConfigError
 
 Vector = tuple[float, float, float]
 Rotation = tuple[Vector, Vector, Vector]
@@ -372,7 +372,7 @@ def _expanded(path: Path) -> str:
     try:
         from xacrodoc import XacroDoc
     except ImportError:
-        raise ConfigError(f"{path}: a xacro file needs xacrodoc; install it with: pip install 'sightline[xacro]'"
+        raise ConfigError(f"{path}: a xacro file needs xacrodoc; install it with: pip install 'sightline-robot[xacro]'"
                           ) from None
     try:
         return str(XacroDoc.from_file(str(path)).to_urdf_string())

@@ -12,6 +12,7 @@ import onnx
 from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
 
+from sightline.sim.scenes.model import HEIGHT_PX, LABELS, WIDTH_PX
 from sightline.training.network import (
     BRIGHTNESS,
     COLOURS,
@@ -25,7 +26,6 @@ from sightline.training.network import (
     Weights,
     network,
 )
-from sightline.sim.scenes.model import HEIGHT_PX, LABELS, WIDTH_PX
 
 OPSET: Final = 17
 IR_VERSION: Final = 8

@@ -2,11 +2,9 @@
 
 import hashlib
 import json
-import numpy as np
 import os
 import signal
 import sys
-import torch
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,6 +13,12 @@ from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import nn
+
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.sim.scenes.model import LABELS
 from sightline.training.export import shifted
@@ -24,18 +28,15 @@ from sightline.training.network import (
     COLOURS,
     DARKEST,
     LOOKED_AT,
-    Layer,
     OUTPUTS,
     TAUGHT,
+    Layer,
     Weights,
     network,
 )
-from sightline.training.scenes import CUT_PX, DrawnScenes, Sample, WHOLE_PX, drawn_scenes, sample
+from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes, Sample, drawn_scenes, sample
 from sightline.training.schedule import Training
 from sightline.training.shipping import Card, Progress, card_text, chosen_thresholds, final_report, written
-from torch import nn
-from typing import Any, Final
-
 
 _RARE = -4.6  # bias of the heat maps at the beginning: a hundredth of the cells
 

@@ -3,36 +3,37 @@
 import hashlib
 import json
 import math
-import numpy as np
-import numpy.typing as npt
-import simplejpeg
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import simplejpeg
+
 from sightline.evaluation.processes import worker_pool
 from sightline.protocol.errors import ConfigError
 from sightline.sim.scenes.model import (
-    Box,
-    Column,
     DEFECTS,
     HARDER_FROM,
     HEIGHT_PX,
     LABELS,
     LATER_FROM,
-    LabelledBox,
-    Random,
     TRAINED,
     VALIDATED_FROM,
     WIDTH_PX,
+    Box,
+    Column,
+    LabelledBox,
+    Random,
     trained_column,
 )
 from sightline.sim.scenes.plan import with_defects
 from sightline.sim.scenes.render import SceneRenderer
 from sightline.training.network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
 from sightline.training.schedule import SceneRange
-from typing import Any, Final
-
 
 _SLICE: Final = 100
 """Scenes that one process draws before it says so."""

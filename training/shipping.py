@@ -1,11 +1,14 @@
 """Thresholds, golden outputs, final report and model card of the file that ships. Shell (files, processes)."""
 
-import numpy as np
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
+
+import numpy as np
+
 from sightline.evaluation.processes import worker_pool
 from sightline.evaluation.score.detector_report import (
     LABELLED,
@@ -23,7 +26,6 @@ from sightline.evaluation.score.detector_report import (
 from sightline.evaluation.score.detectors import FrameResult, LabelMatches
 from sightline.sim.scenes.model import (
     COLUMNS,
-    Column,
     HARDER_FROM,
     HEIGHT_PX,
     LABELS,
@@ -31,19 +33,18 @@ from sightline.sim.scenes.model import (
     THINGS,
     VALIDATED_FROM,
     WIDTH_PX,
+    Column,
 )
 from sightline.sim.scenes.textures import JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED
 from sightline.training.export import MOST_BOXES, OPSET, onnx_bytes
 from sightline.training.network import Weights
-from sightline.training.schedule import LEAST_SHARE, Training, WHOLE_FROM
+from sightline.training.schedule import LEAST_SHARE, WHOLE_FROM, Training
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.detect.onnx.engine import open_engine, read_onnx_header
 from sightline.vision_side.detect.onnx.self_test import KEY, golden_picture, golden_text
 from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.registry import build_detector
-from typing import Final
-
 
 MOST_FALSE: Final = 0.02
 """Of false alarms and of wrong objects, in every column. A judge allows 5 of a hundred frames without a ball: what is

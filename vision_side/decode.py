@@ -7,9 +7,8 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import MAX_SEGMENTS, read_jpeg_size
-from sightline.protocol.errors import RejectReason
 
 cv2.setNumThreads(1)  # one stream, one thread: pictures this small only lose by being split
 

@@ -8,8 +8,8 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, RequestId, ScanHeader, Twist
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder, Picture
-from sightline.vision_side.detect.plugin_calls import checked_results
 from sightline.vision_side.detect.color.hsv import HsvDetector
+from sightline.vision_side.detect.plugin_calls import checked_results
 from sightline.vision_side.detect.port import (
     NO_DEADLINE,
     DetectFrame,
@@ -18,10 +18,10 @@ from sightline.vision_side.detect.port import (
     Detector,
     PictureDetector,
 )
-from sightline.vision_side.tracking.prediction import LatencyEstimator
+from sightline.vision_side.missions.port import Plan, RangeScan, View
 from sightline.vision_side.missions.registry import MissionSpec, configured_mission
 from sightline.vision_side.missions.switch import MissionSwitch
-from sightline.vision_side.missions.port import Plan, RangeScan, View
+from sightline.vision_side.tracking.prediction import LatencyEstimator
 
 Detections = tuple[Detection, ...]
 SOURCE = "vision"
@@ -213,7 +213,9 @@ def answer_header(
                         mission=mission)
 
 
-def encode_answer(frame: FrameHeader, session: str, seq: int, compute_us: int, answer: PipelineAnswer | None = None) -> bytes:
+def encode_answer(
+    frame: FrameHeader, session: str, seq: int, compute_us: int, answer: PipelineAnswer | None = None
+) -> bytes:
     """`encode(answer_header(...))` byte for byte, without the models: every part of it was checked when it came in."""
     scan, mission = (answer.scan, answer.mission) if answer else (None, None)
     by_scan = "" if scan is None else f',"scan":{scan}'

@@ -1,17 +1,20 @@
 """Publishes `overlay` and `preview` while a client subscribes to them. Shell (a thread)."""
 
-import numpy as np
 import os
 import secrets
-import simplejpeg
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import simplejpeg
 from numpy.typing import NDArray
-from sightline.protocol.channels import Channel, OVERLAY, PREVIEW
+
+from sightline.protocol.channels import OVERLAY, PREVIEW, Channel
 from sightline.protocol.clock import RobotClock, monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import CameraModel, DetectionsHeader, Echo, FrameHeader
@@ -19,9 +22,7 @@ from sightline.protocol.transports.link import LatestSlot, Link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.overlay import OverlayData, draw_overlay, draw_preview
-from sightline.vision_side.pipeline import PipelineAnswer, SOURCE
-from typing import Final
-
+from sightline.vision_side.pipeline import SOURCE, PipelineAnswer
 
 _EARLY: Final = 0.25
 """Share of a period that one may come early: else every second of 30 frames a second would often be a third."""

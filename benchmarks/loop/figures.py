@@ -4,10 +4,10 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from sightline.protocol.errors import ConfigError
 from statistics import median
 from typing import Final
 
+from sightline.protocol.errors import ConfigError
 
 OURS: Final = "sightline"
 FLOOR: Final = "floor"

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from sightline.benchmarks.loop.figures import Accepted, Course, course_of_headers
-from sightline.benchmarks.loop.processes import BenchProcesses, free_port
 from sightline.benchmarks.loop.counters import children_of
-from sightline.benchmarks.loop.figures import LoopSetting
+from sightline.benchmarks.loop.figures import Accepted, Course, LoopSetting, course_of_headers
+from sightline.benchmarks.loop.processes import BenchProcesses, free_port
 from sightline.protocol.channels import STATUS
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import ConfigError
@@ -55,7 +54,9 @@ def running_services(setting: LoopSetting, folder: Path, crew: BenchProcesses) -
     """Robot and vision, seen working. Raises HardwareError with a service's own words if one does not start."""
     port = free_port()
     endpoint = endpoint_of(setting.transport, port)
-    driver = crew.start("robot", "sightline.operator_side.cli.app", "robot", "--config", str(_robot_toml(setting, folder, endpoint)))
+    driver = crew.start(
+        "robot", "sightline.operator_side.cli.app", "robot", "--config", str(_robot_toml(setting, folder, endpoint))
+    )
     crew.wait_line("robot", f"robot {ROBOT}: on")
     with open_link(ROBOT, connect=[endpoint], role="operator") as link:
         tally = folder / "headers.json"

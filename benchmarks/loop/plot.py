@@ -8,8 +8,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from sightline.benchmarks.loop.race import Race
 from sightline.benchmarks.loop.figures import FLOOR, OUR_DETECTOR, OURS, TCP, LoopSetting
+from sightline.benchmarks.loop.race import Race
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -30,7 +30,7 @@ class BenchProcesses:
         In a network `namespace` if one is named.
         """
         entering = ["ip", "netns", "exec", namespace] if namespace else []
-        command = [*entering, sys.executable, "-u", "-m", module, *arguments]
+        command = [*entering, sys.executable, "-P", "-u", "-m", module, *arguments]
         with self._log(name).open("wb") as log:
             process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True

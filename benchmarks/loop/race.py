@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final, Protocol
+
 from sightline.benchmarks.loop.counters import (
     carried_between,
     carried_bytes,
@@ -19,16 +21,16 @@ from sightline.benchmarks.loop.counters import (
     taken_percent,
 )
 from sightline.benchmarks.loop.figures import (
-    Course,
     FLOOR,
+    OUR_DETECTOR,
+    OURS,
+    OWN_DETECTOR,
+    TAKEN_BOUND_PERCENT,
+    Course,
     Figures,
     LoopCheck,
     LoopSetting,
-    OURS,
-    OUR_DETECTOR,
-    OWN_DETECTOR,
     Sample,
-    TAKEN_BOUND_PERCENT,
     course_of_tally,
     figures_of,
     joined,
@@ -40,8 +42,6 @@ from sightline.benchmarks.loop.processes import BenchProcesses, free_port
 from sightline.benchmarks.loop.vision import overloaded
 from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.protocol.clock import monotonic_us
-from typing import Final, Protocol
-
 
 _SETTLE_S: Final = 1.5
 _DRAIN_S: Final = 0.3

@@ -14,24 +14,25 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
+
 from sightline.benchmarks.loop.counters import high_water_mb, read_machine, taken_percent
 from sightline.benchmarks.loop.figures import (
     ANSWERED_PERCENT,
+    TAKEN_BOUND_PERCENT,
     Course,
     LoopCheck,
     LoopSetting,
-    TAKEN_BOUND_PERCENT,
     at_most,
     percentile,
 )
-from sightline.benchmarks.loop.ours import Ours, ROBOT, running_services
+from sightline.benchmarks.loop.ours import ROBOT, Ours, running_services
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.protocol.channels import FRAME
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.open import open_link
-from typing import Final
 
 
 def main(endpoint: str, count: int, nap_s: float) -> None:

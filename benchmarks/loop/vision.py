@@ -8,7 +8,10 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from sightline.benchmarks.loop.figures import LoopSetting, MAX_FPS
+from statistics import median
+from typing import Final
+
+from sightline.benchmarks.loop.figures import MAX_FPS, LoopSetting
 from sightline.benchmarks.loop.pictures import camera_of
 from sightline.protocol.channels import MAX_HEADER_BYTES
 from sightline.protocol.codec import decode
@@ -20,10 +23,8 @@ from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.port import Detection, PictureDetector
-from sightline.vision_side.pipeline import Frame, Pipeline, SOURCE
+from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline
 from sightline.vision_side.serving.service import Service
-from statistics import median
-from typing import Final
 
 
 class SlowDetector:

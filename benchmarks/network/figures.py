@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from sightline.benchmarks.loop.figures import LoopCheck, at_most, percentile
-from sightline.benchmarks.network.cases import Case, HOLD_AGE_MS
-from sightline.benchmarks.network.watch import NOTED
-from sightline.robot_side.safety.limits import SafetyConfig, TICK_US, stop_bound
 from typing import Any, Final, NamedTuple
 
+from sightline.benchmarks.loop.figures import LoopCheck, at_most, percentile
+from sightline.benchmarks.network.cases import HOLD_AGE_MS, Case
+from sightline.benchmarks.network.watch import NOTED
+from sightline.robot_side.safety.limits import TICK_US, SafetyConfig, stop_bound
 
 _LATE_US: Final = 2 * TICK_US
 """A decision holds for a tick; who notes a twist may hear it a little after the robot."""

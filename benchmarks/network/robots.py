@@ -26,10 +26,10 @@ from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import AnswerHeader, Holder, Stamp, State, Status
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
-from sightline.robot_side.pipe import CommandAck
-from sightline.robot_side.ports import Picture
 from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.network.stream import StreamConfig
+from sightline.robot_side.pipe import CommandAck
+from sightline.robot_side.ports import Picture
 
 _STATUS_US = 100_000
 _CONNECT_S = 15.0

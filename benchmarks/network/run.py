@@ -14,13 +14,12 @@ from typing import Final
 import cv2
 import numpy as np
 
-from sightline.evaluation.processes import terminated_like_interrupted
-from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.loop.figures import LoopCheck, at_most
 from sightline.benchmarks.loop.pictures import write_pictures
-from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks
-from sightline.benchmarks.network.scenes import fleet
+from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.network.cases import Case, spans_s
+from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks, on_old_sight, read_wheel_commands
+from sightline.benchmarks.network.scenes import fleet, moved, router, standby, uplink
 from sightline.benchmarks.network.stage import (
     BenchWire,
     NetworkRun,
@@ -31,9 +30,7 @@ from sightline.benchmarks.network.stage import (
     start_robot,
     start_vision,
 )
-from sightline.benchmarks.network.scenes import moved, router, standby
-from sightline.benchmarks.network.scenes import uplink
-from sightline.benchmarks.network.figures import on_old_sight, read_wheel_commands
+from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.sim.network_emulator import LinkShapes
@@ -117,7 +114,9 @@ def _course(row: Case, stage: Stage) -> NetworkRun:
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
     figures = tuple(figures_of(notes, stretch) for stretch in stretches)
     harmed = LoopCheck("injected", float(injected), "", 1.0, injected >= 1)
-    return NetworkRun(row, stage.seed, injected, figures, (harmed, *network_checks(row, figures), *_wheel_checks(stage, notes)))
+    return NetworkRun(
+        row, stage.seed, injected, figures, (harmed, *network_checks(row, figures), *_wheel_checks(stage, notes))
+    )
 
 
 def _wheel_checks(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[LoopCheck]:
@@ -130,7 +129,12 @@ def _wheel_checks(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) ->
 def _start(row: Case, wire: BenchWire, crew: BenchProcesses, stage: Stage) -> None:
     """Robot and watcher on one side, vision on the other, seen driving over the wire as it is."""
     start_robot(stage, crew, wire.robot_side, passes_through=row.passes_through)
-    crew.start("watch", "sightline.benchmarks.network.watch", stage.form.format("127.0.0.1"), str(stage.folder / "notes.json"),
-               namespace=wire.robot_side)
+    crew.start(
+        "watch",
+        "sightline.benchmarks.network.watch",
+        stage.form.format("127.0.0.1"),
+        str(stage.folder / "notes.json"),
+        namespace=wire.robot_side,
+    )
     crew.wait_line("watch", "watching")
     start_vision(stage, crew, wire.far_side, stage.form.format(ADDRESS_A))

@@ -9,22 +9,22 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from typing import Any, Final
+
 from sightline.benchmarks.loop.figures import LoopCheck, at_most, percentile
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.network.cases import Case
 from sightline.benchmarks.network.figures import WheelCommand, moves_again_s, read_wheel_commands, sent_between
 from sightline.benchmarks.network.robots import Settings
-from sightline.benchmarks.network.stage import BenchWire, EVERYWHERE, NetworkRun, Stage, start_robot, start_vision
+from sightline.benchmarks.network.stage import EVERYWHERE, BenchWire, NetworkRun, Stage, start_robot, start_vision
 from sightline.benchmarks.network.stop_client import RESET, STOPPED
-from sightline.evaluation.faults.evidence import MotorRow, REQUESTED, measure_stop, moved_on_old_sight, wheel_mps
+from sightline.evaluation.faults.evidence import REQUESTED, MotorRow, measure_stop, moved_on_old_sight, wheel_mps
 from sightline.evaluation.faults.fixture import ROBOT, RobotFixture, Setup
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import HardwareError, SightlineError
 from sightline.sim.network_emulator import LinkShapes
 from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B, move_address
-from typing import Any, Final
-
 
 TAKES_OVER_S: Final = 1.5
 BACK_S: Final = 3.0
@@ -185,7 +185,9 @@ def uplink(row: Case, stage: Stage) -> NetworkRun:
         _start_notes(crews["site"], wire, stage)
         alone = _stretch(wire, shapes, stage.setting.seconds / 2)
         start_vision(stage, crews["standby"], wire.far_side, _AT_ROUTER)
-        crews["site"].start("watcher", "sightline.benchmarks.loop.viewers", _AT_ROUTER, str(READERS), "0", namespace=wire.far_side)
+        crews["site"].start(
+            "watcher", "sightline.benchmarks.loop.viewers", _AT_ROUTER, str(READERS), "0", namespace=wire.far_side
+        )
         crews["site"].wait_line("watcher", "watching")
         crowded = _stretch(wire, shapes, stage.setting.seconds / 2)
         for crew in crews.values():
@@ -249,10 +251,20 @@ def fleet(row: Case, stage: Stage) -> NetworkRun:
                         notes=stage.folder / "notes.json", seed=stage.seed)
     with stage.wire() as wire, stage.crew("crew") as crew:
         before = wire.shape(stage.seeded(row.phases[0].shapes))
-        crew.start("vision", "sightline.operator_side.cli.app", "vision", "--robot", "r*", "--listen", f"tcp/{EVERYWHERE}:7447",
-                   namespace=wire.far_side)
+        crew.start(
+            "vision",
+            "sightline.operator_side.cli.app",
+            "vision",
+            "--robot",
+            "r*",
+            "--listen",
+            f"tcp/{EVERYWHERE}:7447",
+            namespace=wire.far_side,
+        )
         crew.wait_line("vision", "looking for robots")
-        crew.start("robots", "sightline.benchmarks.network.robots", settings.model_dump_json(), namespace=wire.robot_side)
+        crew.start(
+            "robots", "sightline.benchmarks.network.robots", settings.model_dump_json(), namespace=wire.robot_side
+        )
         crew.wait_line("robots", f"playing {ROBOTS} robots")
         time.sleep(_FLEET_SETTLE_S)
         begin_us = monotonic_us()

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.loop.figures import LoopCheck
 from sightline.benchmarks.loop.ours import ROBOT
-from sightline.benchmarks.network.figures import NetworkFigures
+from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.network.cases import WEBSOCKET, ZENOH, Case
+from sightline.benchmarks.network.figures import NetworkFigures
 from sightline.protocol.errors import ConfigError
 from sightline.sim.network_emulator import LinkShapes
 
@@ -106,7 +106,9 @@ class Stage:
 Scene = Callable[[Case, Stage], NetworkRun]
 
 
-def start_robot(stage: Stage, crew: BenchProcesses, namespace: str, *, connect: str = "", passes_through: bool = False) -> int:
+def start_robot(
+    stage: Stage, crew: BenchProcesses, namespace: str, *, connect: str = "", passes_through: bool = False
+) -> int:
     """A robot that listens, or connects where a router is; returns its process id once it is on."""
     config = _robot_toml(stage, connect, passes_through)
     pid = crew.start("robot", "sightline.operator_side.cli.app", "robot", "--config", str(config), namespace=namespace)
@@ -117,8 +119,17 @@ def start_robot(stage: Stage, crew: BenchProcesses, namespace: str, *, connect: 
 def start_vision(stage: Stage, crew: BenchProcesses, namespace: str, endpoint: str) -> int:
     """A vision, seen working; returns its process id."""
     secure = ("--secure", str(stage.folder)) if stage.setting.transport in _TOKENED else ()
-    pid = crew.start("vision", "sightline.operator_side.cli.app", "vision", "--robot", ROBOT, "--connect", endpoint, *secure,
-                     namespace=namespace)
+    pid = crew.start(
+        "vision",
+        "sightline.operator_side.cli.app",
+        "vision",
+        "--robot",
+        ROBOT,
+        "--connect",
+        endpoint,
+        *secure,
+        namespace=namespace,
+    )
     crew.wait_line("vision", "target seen")
     return pid
 

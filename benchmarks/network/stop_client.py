@@ -12,8 +12,8 @@ from typing import Final
 
 from sightline.evaluation.faults.evidence import REQUESTED, EventLog
 from sightline.operator_side.client.requests import SOURCE, Operator
-from sightline.protocol.messages import Reply, State, Status, Verb
 from sightline.protocol.errors import RejectReason
+from sightline.protocol.messages import Reply, State, Status, Verb
 from sightline.protocol.transports.zenoh.link import open_zenoh
 
 STOPPED: Final = "stopped"

@@ -15,9 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from sightline.benchmarks.peers.contest import Tally
-from sightline.benchmarks.peers.contest import Vision
-from sightline.benchmarks.peers.contest import Film
+from sightline.benchmarks.peers.contest import Film, Tally, Vision
 
 _RETRY_S: Final = 0.1
 

@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Tally
-    from sightline.benchmarks.peers.contest import Vision
-    from sightline.benchmarks.peers.contest import Film
+    from sightline.benchmarks.peers.contest import Film, Tally, Vision
 
 STAMP: Final = struct.Struct("<Q")
 

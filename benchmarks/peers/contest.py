@@ -3,8 +3,9 @@
 import json
 import time
 from pathlib import Path
-from sightline.protocol.clock import monotonic_us
 from typing import Protocol
+
+from sightline.protocol.clock import monotonic_us
 
 
 class Vision(Protocol):

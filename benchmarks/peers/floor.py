@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Final
 from sightline.protocol.text import parse_twist
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Tally
-    from sightline.benchmarks.peers.contest import Vision
-    from sightline.benchmarks.peers.contest import Film
+    from sightline.benchmarks.peers.contest import Film, Tally, Vision
 
 _HOT_STEPS: Final = 150
 

@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING
 import zmq
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Tally
-    from sightline.benchmarks.peers.contest import Vision
-    from sightline.benchmarks.peers.contest import Film
+    from sightline.benchmarks.peers.contest import Film, Tally, Vision
 
 Socket = zmq.Socket[bytes]
 

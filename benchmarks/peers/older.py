@@ -16,9 +16,7 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.sync.client import ClientConnection, connect
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Tally
-    from sightline.benchmarks.peers.contest import Vision
-    from sightline.benchmarks.peers.contest import Film
+    from sightline.benchmarks.peers.contest import Film, Tally, Vision
 
 COMMAND_PERIOD_S: Final = 0.0551
 

@@ -14,9 +14,7 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.sync.client import connect
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Tally
-    from sightline.benchmarks.peers.contest import Vision
-    from sightline.benchmarks.peers.contest import Film
+    from sightline.benchmarks.peers.contest import Film, Tally, Vision
 
 STAMP: Final = struct.Struct("<Q")
 ANSWER: Final = struct.Struct("<Qdd")

@@ -12,9 +12,7 @@ import time
 from typing import IO, TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Tally
-    from sightline.benchmarks.peers.contest import Vision
-    from sightline.benchmarks.peers.contest import Film
+    from sightline.benchmarks.peers.contest import Film, Tally, Vision
 
 HEAD: Final = struct.Struct("<IQ")
 """Bytes of JPEG, and the capture time in microseconds, by which the answer is told apart in measuring."""

@@ -1,10 +1,10 @@
 """Cases on arming, disarming, STOP and reset. Pure."""
 
+from typing import Final
+
 from sightline.conformance.case import Bench, Suite
 from sightline.conformance.robot.fixture import CRAWL, GOOD, Robot, Sender, arm, armed
 from sightline.protocol.messages import State, Status
-from typing import Final
-
 
 SUITE: Final = Suite("R")
 

@@ -2,59 +2,30 @@
 
 from typing import Final
 
-from sightline.protocol.channels import STATUS
+from sightline.conformance.case import GROUPS, Bench, Case, ConformanceError
 from sightline.conformance.robot import (
-    arming as robot_arming,
-    requests as robot_asking,
-    twists as robot_commands,
-    frames as robot_framing,
-    hostile as robot_hostile,
-    lease as robot_lease,
-    motion as robot_motion,
-    legacy as robot_older,
-    websocket as robot_sockets,
+    arming,
+    frames,
+    hostile,
+    lease,
+    legacy,
+    motion,
+    requests,
+    twists,
+    websocket,
 )
-from sightline.conformance.robot import (
-    frames as robot_credit,
-    websocket as robot_doors,
-    frames as robot_flow,
-    websocket as robot_messages,
-    twists as robot_order,
-    requests as robot_requests,
-    arming as robot_stop,
-    websocket as robot_tokens,
-)
-from sightline.conformance.case import Bench
-from sightline.conformance.case import GROUPS, Case, ConformanceError
 from sightline.conformance.robot.fixture import Robot, Sender
+from sightline.protocol.channels import STATUS
 from sightline.protocol.messages import State, Status
 
-_SUITES: Final = (
-    robot_framing.SUITE,
-    robot_commands.SUITE,
-    robot_lease.SUITE,
-    robot_arming.SUITE,
-    robot_stop.SUITE,
-    robot_motion.SUITE,
-    robot_asking.SUITE,
-    robot_flow.SUITE,
-    robot_hostile.SUITE,
-    robot_older.SUITE,
-    robot_sockets.SUITE,
-    robot_messages.SUITE,
-    robot_tokens.SUITE,
-    robot_order.SUITE,
-    robot_requests.SUITE,
-    robot_doors.SUITE,
-    robot_credit.SUITE,
-)
+_PARTS: Final = (arming, frames, hostile, lease, legacy, motion, requests, twists, websocket)
 _SETTLES_US: Final = 6_000_000
 _FIRST_US: Final = 5_000_000
 _ORDER: Final = tuple(GROUPS)
 
 CASES: Final[tuple[Case, ...]] = tuple(
     sorted(
-        (case for suite in _SUITES for case in suite.cases),
+        (case for part in _PARTS for case in part.SUITE.cases),
         key=lambda case: (_ORDER.index(case.id.split("-")[1]), case.id),
     )
 )

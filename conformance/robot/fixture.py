@@ -9,10 +9,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
-from sightline.protocol.channels import ACK, CAMERA, FRAME, REPLY, REQUEST, STATUS, TWIST
 from sightline.conformance.case import Bench, Heard
-from sightline.protocol.messages import CameraModel, FrameHeader, Reply, Stamp, State, Status
+from sightline.protocol.channels import ACK, CAMERA, FRAME, REPLY, REQUEST, STATUS, TWIST
 from sightline.protocol.errors import CLAMPED, RejectReason
+from sightline.protocol.messages import CameraModel, FrameHeader, Reply, Stamp, State, Status
 
 GOOD: Final = "GOOD"
 """The verdict on a command that the robot judged good: obeyed, or counted as DISARMED."""

@@ -2,26 +2,26 @@
 
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Final
+
 from sightline.conformance.case import Bench, Heard, Suite
 from sightline.conformance.robot.fixture import Robot, Sender, armed
 from sightline.protocol.channels import (
     CAMERA,
     CHANNELS,
-    Direction,
     FRAME,
     KEY_PREFIX,
     MAX_HEADER_BYTES,
     ODOMETRY,
     SCAN,
     STATUS,
+    Direction,
 )
 from sightline.protocol.codec import decode_ranges
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import CameraModel, FrameHeader, Odometry, ScanHeader, Stamp, Status
 from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE
-from typing import Final
-
 
 SUITE: Final = Suite("R")
 _WATCHED_US: Final = 2_000_000

@@ -2,10 +2,9 @@
 
 from typing import Final
 
-from sightline.protocol.channels import FRAME, REQUEST, STATUS, TWIST, key_for
-from sightline.conformance.case import Bench
-from sightline.conformance.case import Suite
+from sightline.conformance.case import Bench, Suite
 from sightline.conformance.robot.fixture import CRAWL, GOOD, Robot, Sender, arm, armed, as_json
+from sightline.protocol.channels import FRAME, REQUEST, STATUS, TWIST, key_for
 from sightline.protocol.messages import Holder, Stamp, State
 
 SUITE: Final = Suite("R")

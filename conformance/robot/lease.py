@@ -2,8 +2,7 @@
 
 from typing import Final
 
-from sightline.conformance.case import Bench
-from sightline.conformance.case import Suite
+from sightline.conformance.case import Bench, Suite
 from sightline.conformance.robot.fixture import GOOD, Robot, Sender, armed
 from sightline.protocol.messages import Holder, State
 

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from sightline.conformance.case import Bench
-from sightline.conformance.case import Suite
+from sightline.conformance.case import Bench, Suite
 from sightline.conformance.raw_peers import BINARY, TEXT, RawWebSocket, split_url
 from sightline.conformance.robot.fixture import GOOD, Robot, Sender
 from sightline.protocol.errors import WireError

@@ -6,12 +6,11 @@ How long a stop takes is the time between two arrivals at the kit, so that the l
 import math
 from typing import Final
 
-from sightline.protocol.channels import STATUS
-from sightline.conformance.case import Bench
-from sightline.conformance.case import Suite
+from sightline.conformance.case import Bench, Suite
 from sightline.conformance.robot.fixture import CRAWL, Robot, Sender, armed
-from sightline.protocol.messages import FrameHeader, Planar, State, Status
+from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import CLAMPED
+from sightline.protocol.messages import FrameHeader, Planar, State, Status
 
 SUITE: Final = Suite("R")
 _STOPS_WITHIN_US: Final = 700_000

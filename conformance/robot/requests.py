@@ -1,11 +1,11 @@
 """Cases on requests, replies and counters. Pure."""
 
+from typing import Final
+
 from sightline.conformance.case import Bench, Suite
 from sightline.conformance.robot.fixture import GOOD, Robot, Sender, armed, as_json
 from sightline.protocol.channels import ACK, REPLY, REQUEST
 from sightline.protocol.messages import Reply, Stamp, State
-from typing import Final
-
 
 SUITE: Final = Suite("R")
 

@@ -4,12 +4,12 @@ A robot that is not armed judges every command all the same and counts a good on
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any, Final
+
 from sightline.conformance.case import Bench, Case, Level, Suite
 from sightline.conformance.robot.fixture import CRAWL, GOOD, Robot, Sender, as_json
 from sightline.protocol.channels import MAX_HEADER_BYTES, TWIST
-from sightline.protocol.messages import FrameHeader, MAX_INTEGER, Status
-from typing import Any, Final
-
+from sightline.protocol.messages import MAX_INTEGER, FrameHeader, Status
 
 SUITE: Final = Suite("R")
 

@@ -4,21 +4,21 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any, Final
+
 from sightline.conformance.case import Bench, NotApplicableError, Suite
-from sightline.conformance.raw_peers import BINARY, CONTINUED, Frame, PING, PONG, RawWebSocket, TEXT, split_url
+from sightline.conformance.raw_peers import BINARY, CONTINUED, PING, PONG, TEXT, Frame, RawWebSocket, split_url
 from sightline.conformance.robot.fixture import GOOD, Robot, Sender, as_json
 from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, REPLY, STATUS
 from sightline.protocol.errors import WireError
 from sightline.protocol.transports.websocket.framing import (
-    IncomingMessage,
     MAX_BLOCK_BYTES,
     MAX_HELLO_BYTES,
     SUBPROTOCOL,
+    IncomingMessage,
     parse_hello,
     unpack,
 )
-from typing import Any, Final
-
 
 SUITE: Final = Suite("R")
 SWITCHED: Final = 101
@@ -495,7 +495,9 @@ def block_without_header(bench: Bench) -> None:
     """A block of channel and source alone is a message without header: a guest's twist, or UNKNOWN_SOURCE."""
     bench.need(not bench.access.is_guarded, "where keys are asked for no guest gets in")
     with spoken(bench, role="guest") as raw:
-        verdict = _reason_given(bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","source":"guest"}', b"0.1|0")))[0]
+        verdict = _reason_given(
+            bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","source":"guest"}', b"0.1|0"))
+        )[0]
         bench.expect(verdict in (GOOD, "UNKNOWN_SOURCE"), f"it was {verdict or 'not counted'}")
 
 
@@ -540,7 +542,11 @@ def no_token(bench: Bench) -> None:
 def wrong_token(bench: Bench) -> None:
     """A token that is nobody's, or a part of the right one, is refused with 401."""
     token = _token(bench)
-    for what, wrong in (("nobody's token", _WRONG_TOKENS), ("all but its last letter", token[:-1]), ("an empty one", "")):
+    for what, wrong in (
+        ("nobody's token", _WRONG_TOKENS),
+        ("all but its last letter", token[:-1]),
+        ("an empty one", ""),
+    ):
         _answers(bench, 401, what, protocols=(SUBPROTOCOL, entry_of(wrong)))
 
 

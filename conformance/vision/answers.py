@@ -4,6 +4,8 @@ import json
 import math
 import re
 from collections.abc import Callable
+from typing import Any, Final
+
 from sightline.conformance.case import Bench, Case, Level, Suite
 from sightline.conformance.vision.drawing import png
 from sightline.conformance.vision.fixture import Answer, RobotPlayed
@@ -13,8 +15,6 @@ from sightline.protocol.messages import MAX_INTEGER
 from sightline.protocol.spec.message_cases import packed
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE
-from typing import Any, Final
-
 
 SUITE = Suite("V")
 _SESSION: Final = re.compile(r"[0-9a-f]{8}")

@@ -2,21 +2,8 @@
 
 from typing import Final
 
-from sightline.conformance.vision import (
-    answers as vision_answers,
-    causality as vision_causality,
-    flow as vision_flow,
-    hostile as vision_hostile,
-)
-from sightline.conformance.vision import (
-    websocket as vision_doors,
-    hostile as vision_limits,
-    flow as vision_reconnect,
-    websocket as vision_sockets,
-    answers as vision_steering,
-)
-from sightline.conformance.case import Bench
-from sightline.conformance.case import Case
+from sightline.conformance.case import Bench, Case
+from sightline.conformance.vision import answers, causality, flow, hostile, websocket
 from sightline.conformance.vision.fixture import RobotPlayed
 
 _FIRST_US: Final = 20_000_000
@@ -24,10 +11,7 @@ _FIRST_US: Final = 20_000_000
 _AGAIN_US: Final = 3_000_000
 """One that lost its robot in the last case tries again every second."""
 _EVERY_US: Final = 100_000
-_PARTS: Final = (
-    vision_answers, vision_causality, vision_flow, vision_limits, vision_hostile, vision_reconnect, vision_steering,
-    vision_sockets, vision_doors,
-)
+_PARTS: Final = (answers, causality, flow, hostile, websocket)
 
 CASES: Final[tuple[Case, ...]] = tuple(case for part in _PARTS for case in part.SUITE.cases)
 

@@ -4,8 +4,7 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
-from sightline.conformance.case import Bench
-from sightline.conformance.case import Suite
+from sightline.conformance.case import Bench, Suite
 from sightline.conformance.vision.drawing import png
 from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, Answer, RobotPlayed, Sent
 

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from sightline.protocol.messages import CameraModel
 from typing import Final
 
+from sightline.protocol.messages import CameraModel
 
 Pixel = tuple[int, ...]
 """Y, Cb, Cr, each 0 to 255; or Y alone for a grey picture."""

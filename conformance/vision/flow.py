@@ -1,14 +1,15 @@
 """Cases on credit, silence, status and a robot that reconnects. Pure."""
 
 from collections.abc import Callable
+from typing import Final
+
 from sightline.conformance.case import Bench, Case, Level, Suite
-from sightline.conformance.vision.drawing import CAMERA as LENS, HALF_CAMERA
+from sightline.conformance.vision.drawing import CAMERA as LENS
+from sightline.conformance.vision.drawing import HALF_CAMERA
 from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, RobotPlayed
 from sightline.protocol.channels import REQUEST
 from sightline.protocol.messages import Holder, LastRejection, State, Status
 from sightline.protocol.spec.message_cases import packed
-from typing import Final
-
 
 SUITE = Suite("V")
 _BURST: Final = 20

@@ -2,9 +2,13 @@
 
 from collections.abc import Callable
 from random import Random
+from typing import Any, Final
+
 from sightline.conformance.case import Bench, Case, Level, Suite
 from sightline.conformance.vision.drawing import (
     CAMERA as LENS,
+)
+from sightline.conformance.vision.drawing import (
     HALF_CAMERA,
     claiming,
     commented,
@@ -16,8 +20,6 @@ from sightline.conformance.vision.fixture import ANSWER_US, RobotPlayed
 from sightline.protocol.channels import CAMERA, FRAME, MAX_HEADER_BYTES, STATUS
 from sightline.protocol.codec import encode
 from sightline.protocol.spec.message_cases import packed
-from typing import Any, Final
-
 
 SUITE = Suite("V")
 _JSON, _NUMBERS, _VERSION, _FIELDS = "2.1 JSON", "2.2 Numbers", "2.4 Version", "2.8 Fields"
@@ -253,7 +255,9 @@ def _picture_rejected(jpeg: Callable[[], bytes], title: str) -> Callable[[Bench]
 
 for _level, _table in ((Level.MUST, REFUSED), (Level.SHOULD, DOUBTED)):
     for _case_id, (_case_title, _jpeg) in _table.items():
-        SUITE.add(Case(_case_id, _level, _CHECK, f"{_case_title} drives nothing.", _picture_rejected(_jpeg, _case_title)))
+        SUITE.add(
+            Case(_case_id, _level, _CHECK, f"{_case_title} drives nothing.", _picture_rejected(_jpeg, _case_title))
+        )
 
 
 @SUITE.must("V-LIM-31", "13.2 Bounds")

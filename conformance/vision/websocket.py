@@ -15,18 +15,19 @@ import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import TracebackType
+from typing import Any, Final, Self
+
 from sightline.conformance.case import Bench, Suite
-from sightline.conformance.vision.drawing import CAMERA as LENS, picture
-from sightline.protocol.channels import CAMERA, Channel, FRAME
+from sightline.conformance.vision.drawing import CAMERA as LENS
+from sightline.conformance.vision.drawing import picture
+from sightline.protocol.channels import CAMERA, FRAME, Channel
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError, WireError
 from sightline.protocol.messages import FrameHeader, Stamp
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint
 from sightline.protocol.transports.security import server_tls_context
 from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL, pack, parse_hello
-from types import TracebackType
-from typing import Any, Final, Self
-
 
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 SESSION_BEGINS: Final = "5ca1"

@@ -3,12 +3,14 @@
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Annotated
+
 from pydantic import Field
+
 from sightline.protocol.config import Config
-from sightline.protocol.messages import CameraModel, STILL, Twist
+from sightline.protocol.messages import STILL, CameraModel, Twist
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.port import Plan, View
-from typing import Annotated
 
 
 @dataclass(frozen=True, slots=True)

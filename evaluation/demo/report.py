@@ -8,13 +8,11 @@ from typing import Any, Final
 
 from sightline.evaluation.checks import Check, check_line
 from sightline.evaluation.demo.run import RECORDING, DemoRun
-from sightline.operator_side.preflight import needs
-from sightline.evaluation.processes import last_line
-from sightline.operator_side.recording.replay import Replayed, Step, replay
-from sightline.evaluation.score.figures import Score, score
-from sightline.evaluation.score.figures import checks_of
-from sightline.evaluation.score.figures import figures_of
 from sightline.evaluation.demo.shaped_vision import INJECTED
+from sightline.evaluation.processes import last_line
+from sightline.evaluation.score.figures import Score, checks_of, figures_of, score
+from sightline.operator_side.preflight import needs
+from sightline.operator_side.recording.replay import Replayed, Step, replay
 from sightline.protocol.errors import SightlineError
 
 REAL_TIME_FACTOR: Final = 1.5
@@ -74,8 +72,8 @@ def _printed(step: Step) -> tuple[int, str, str]:
 
 def _draw(run: DemoRun, recording: Path) -> None:
     with needs("report"):
-        from sightline.evaluation.plots import plot_run
         from sightline.evaluation.demo.video import film_run
+        from sightline.evaluation.plots import plot_run
     options = run.options
     title = f"{run.scenario.name}, seed {options.seed}, +{options.latency_ms:g} ms, {options.loss:.0%} loss"
     plot_run(run.folder / "trajectory.png", run.samples, run.scenario, title)

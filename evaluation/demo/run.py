@@ -11,13 +11,17 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Protocol, Self
+
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+
 from sightline.evaluation.demo.shaped_vision import Shape
 from sightline.evaluation.processes import Processes, terminated_like_interrupted
 from sightline.evaluation.scenario_config import robot_of, robot_table, vision_config, vision_table
-from sightline.operator_side.client.requests import Operator, SOURCE
+from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.operator_side.client.status import millis, twist_text
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.config.toml_text import toml_text
@@ -32,9 +36,6 @@ from sightline.sim.toml_file import laid_over
 from sightline.sim.truth import Truth
 from sightline.vision_side.detect.registry import BOXES, check_choice
 from sightline.vision_side.missions.registry import configured_mission
-from types import TracebackType
-from typing import Any, Final, Protocol, Self
-
 
 REFRESH_S: Final = 0.2
 PLAIN_S: Final = 1.0

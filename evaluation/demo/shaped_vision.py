@@ -11,6 +11,9 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from random import Random
+from types import TracebackType
+from typing import Any, Final, Self
+
 from sightline.protocol.channels import Channel, Direction
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError
@@ -20,9 +23,6 @@ from sightline.protocol.transports.open import open_link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.pipeline import SOURCE
 from sightline.vision_side.serving.process import serve
-from types import TracebackType
-from typing import Any, Final, Self
-
 
 MAX_WAITING: Final = 256
 """Messages under way on one leg; more are dropped and counted: 8 s of frames at 30 fps."""

@@ -1,19 +1,20 @@
 """run.mp4: the robot's view beside the world from above. Shell (files)."""
 
-import cv2
 import math
-import numpy as np
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from numpy.typing import NDArray
 from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from sightline.evaluation.plots import wall_corners
 from sightline.operator_side.recording.film import Film
 from sightline.operator_side.recording.replay import Step, replay_steps
 from sightline.sim.scenario import Scenario, Static
 from sightline.sim.truth import Truth
-from typing import Final
-
 
 Image = NDArray[np.uint8]
 Point = tuple[int, int]

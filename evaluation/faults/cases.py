@@ -9,8 +9,10 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from typing import Final
+
 from sightline.evaluation.checks import Check, at_least, at_most
-from sightline.evaluation.faults.evidence import INJECTED, MotorRow, REQUESTED, most_gain_mps2, wheel_mps
+from sightline.evaluation.faults.evidence import INJECTED, REQUESTED, MotorRow, most_gain_mps2, wheel_mps
 from sightline.evaluation.faults.fixture import READY_S, RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
 from sightline.evaluation.faults.runner import Case, Injected
@@ -20,11 +22,9 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.websocket.server import MAX_CLIENTS
 from sightline.robot_side.kinematics import DiffDriveConfig
-from sightline.robot_side.safety.limits import SafetyConfig, TICK_US
+from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
 from sightline.sim.network_emulator import LinkShape, LinkShapes
 from sightline.vision_side.config import TrackConfig
-from typing import Final
-
 
 STOPPED_S: Final = 3.0
 SETTLED_S: Final = 1.5
@@ -226,22 +226,72 @@ _MIXED: Final = LinkShape(delay_ms=10, jitter_ms=5, reorder=0.1, duplicate=0.1)
 _THIN: Final = LinkShape(rate_bit_s=1e6)
 
 NETWORK_CASES: Final = (
-    Case("wire.cut3", "network: partition 3 s", partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=3.0), _WIRED,
-        blind=True, again=True, short=True),
-    Case("wire.cut15", "network: partition 15 s", partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=15.0), _WIRED,
-        blind=True, again=True),
-    Case("wire.no_frames", "network: one direction only, frames lost", partial(_cut, shapes=LinkShapes(ab=CUT), seconds=3.0),
-        _WIRED, blind=True, by_frame=True, again=True),
-    Case("wire.no_commands", "network: one direction only, commands lost",
-        partial(_cut, shapes=LinkShapes(ba=CUT), seconds=3.0), _WIRED, blind=True, again=True),
-    Case("wire.delay", "network: 300 ms each way", partial(_worsen, shapes=LinkShapes(ab=_SLOW, ba=_SLOW)), _WIRED,
-        stops=False, again=True),
-    Case("wire.loss", "network: 20 % loss each way", partial(_worsen, shapes=LinkShapes(ab=LOSSY, ba=LOSSY)), _WIRED,
-        stops=False, again=True),
-    Case("wire.mixed", "network: 10 % reordered, 10 % duplicated", partial(_worsen, shapes=LinkShapes(ab=_MIXED, ba=_MIXED)),
-        _WIRED, stops=False, again=True),
-    Case("wire.thin", "network: 1 Mbit/s under a camera of 4 Mbit/s",
-        partial(_worsen, shapes=LinkShapes(ab=_THIN, ba=_THIN)), _HEAVY, stops=False, again=True),
+    Case(
+        "wire.cut3",
+        "network: partition 3 s",
+        partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=3.0),
+        _WIRED,
+        blind=True,
+        again=True,
+        short=True,
+    ),
+    Case(
+        "wire.cut15",
+        "network: partition 15 s",
+        partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=15.0),
+        _WIRED,
+        blind=True,
+        again=True,
+    ),
+    Case(
+        "wire.no_frames",
+        "network: one direction only, frames lost",
+        partial(_cut, shapes=LinkShapes(ab=CUT), seconds=3.0),
+        _WIRED,
+        blind=True,
+        by_frame=True,
+        again=True,
+    ),
+    Case(
+        "wire.no_commands",
+        "network: one direction only, commands lost",
+        partial(_cut, shapes=LinkShapes(ba=CUT), seconds=3.0),
+        _WIRED,
+        blind=True,
+        again=True,
+    ),
+    Case(
+        "wire.delay",
+        "network: 300 ms each way",
+        partial(_worsen, shapes=LinkShapes(ab=_SLOW, ba=_SLOW)),
+        _WIRED,
+        stops=False,
+        again=True,
+    ),
+    Case(
+        "wire.loss",
+        "network: 20 % loss each way",
+        partial(_worsen, shapes=LinkShapes(ab=LOSSY, ba=LOSSY)),
+        _WIRED,
+        stops=False,
+        again=True,
+    ),
+    Case(
+        "wire.mixed",
+        "network: 10 % reordered, 10 % duplicated",
+        partial(_worsen, shapes=LinkShapes(ab=_MIXED, ba=_MIXED)),
+        _WIRED,
+        stops=False,
+        again=True,
+    ),
+    Case(
+        "wire.thin",
+        "network: 1 Mbit/s under a camera of 4 Mbit/s",
+        partial(_worsen, shapes=LinkShapes(ab=_THIN, ba=_THIN)),
+        _HEAVY,
+        stops=False,
+        again=True,
+    ),
     Case("wire.flaps", "network: gone and back every 0.5 s", _flap, _WIRED, stops=False, again=True),
 )
 
@@ -348,17 +398,44 @@ COMMAND_CASES: Final = (
     _command_case("never_issued", "citing frames never issued"),
     _command_case("from_future", "citing frames from the future"),
     _command_case("wrapped", "their numbers wrap"),
-    _command_case("malformed", "nan, inf, 1e400, underscores, full-width, empty, 3 fields, 257 bytes, 10 MB, binary ..."),
-    Case("command.flood", "commands: an old one at 10 kHz", partial(_attack, at_least_times=FLOOD_AT_LEAST),
-        Setup(fault="flood"), also=f">= {FLOOD_AT_LEAST} sent", short=True, alone=True),
-    Case("command.reversal", "commands: full speed ahead and back at 50 Hz", _reverse, Setup(fault="reversal"),
-        also=f"speed changes by <= {GAIN_MPS2:g} m/s2"),
+    _command_case(
+        "malformed", "nan, inf, 1e400, underscores, full-width, empty, 3 fields, 257 bytes, 10 MB, binary ..."
+    ),
+    Case(
+        "command.flood",
+        "commands: an old one at 10 kHz",
+        partial(_attack, at_least_times=FLOOD_AT_LEAST),
+        Setup(fault="flood"),
+        also=f">= {FLOOD_AT_LEAST} sent",
+        short=True,
+        alone=True,
+    ),
+    Case(
+        "command.reversal",
+        "commands: full speed ahead and back at 50 Hz",
+        _reverse,
+        Setup(fault="reversal"),
+        also=f"speed changes by <= {GAIN_MPS2:g} m/s2",
+    ),
     _command_case("heartbeat", "none, but frames are acknowledged and the link is alive", short=True),
     Case("driver.two", "drivers: two visions, then none", _two_visions, Setup(), also="the second is not obeyed"),
-    Case("driver.person", "drivers: a person takes over at full speed, and is lost", _take_over, Setup(), blind=True,
-        also="obeyed <= 1000 ms; vision does not resume by itself"),
-    Case("driver.dies", "drivers: the holder dies while another waits", _holder_dies, Setup(), blind=True, again=True,
-        also="the other drives only after the lease"),
+    Case(
+        "driver.person",
+        "drivers: a person takes over at full speed, and is lost",
+        _take_over,
+        Setup(),
+        blind=True,
+        also="obeyed <= 1000 ms; vision does not resume by itself",
+    ),
+    Case(
+        "driver.dies",
+        "drivers: the holder dies while another waits",
+        _holder_dies,
+        Setup(),
+        blind=True,
+        again=True,
+        also="the other drives only after the lease",
+    ),
 )
 
 

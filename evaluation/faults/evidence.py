@@ -8,12 +8,12 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
+
 from sightline.evaluation.checks import Check, at_most
 from sightline.protocol.clock import monotonic_us
 from sightline.robot_side.kinematics import DiffDriveConfig
-from sightline.robot_side.safety.limits import SafetyConfig, TICK_US, stop_bound
-from typing import Final
-
+from sightline.robot_side.safety.limits import TICK_US, SafetyConfig, stop_bound
 
 FALLS_MS: Final = 340.0
 ZERO_MS: Final = 700.0

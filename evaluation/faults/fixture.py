@@ -12,7 +12,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from sightline.evaluation.faults import camera, evidence as judge
+from types import TracebackType
+from typing import IO, Any, Final, Self
+
+from sightline.evaluation.faults import camera
+from sightline.evaluation.faults import evidence as judge
 from sightline.evaluation.faults.evidence import GOOD, INJECTED, MotorRow, SentCommand, read_events, wheel_mps
 from sightline.evaluation.faults.peer import PeerOptions, Role
 from sightline.evaluation.faults.sampler import Hole, read_holes, stalled_us
@@ -24,9 +28,6 @@ from sightline.robot_side.safety.limits import TICK_US
 from sightline.sim.bus import SimDrive, SimSocketConfig
 from sightline.sim.network_emulator import LinkShapes
 from sightline.sim.tun_emulator import ADDRESS_A, namespaces
-from types import TracebackType
-from typing import Any, Final, IO, Self
-
 
 COMMAND_LINE: Final = "sightline.operator_side.cli.app"
 _RESIDENT: Final = "RssAnon:"
@@ -43,7 +44,7 @@ class Fleet(Processes):
         entering = ["ip", "netns", "exec", namespace] if namespace else []
         with self.log(name).open("ab") as log:
             self._running[name] = subprocess.Popen(
-                [*entering, sys.executable, "-u", "-m", module, *arguments],
+                [*entering, sys.executable, "-P", "-u", "-m", module, *arguments],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
                 env={**os.environ, **(environment or {})},
             )
@@ -135,7 +136,7 @@ class BenchWire:
             self._ending.enter_context(namespaces(self.robot_side, self.far_side))
             log = self._ending.enter_context(self._log.open("wb"))
             self._process = subprocess.Popen(
-                [sys.executable, "-u", "-m", "sightline.sim.tun_emulator", self.robot_side, self.far_side],
+                [sys.executable, "-u", "-P", "-m", "sightline.sim.tun_emulator", self.robot_side, self.far_side],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True,
             )
             self._ending.callback(self._end, self._process)

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Final
 from sightline.evaluation.faults.evidence import INJECTED, EventLog
 from sightline.protocol.channels import FRAME
 from sightline.protocol.codec import encode
-from sightline.protocol.transports.websocket.client import Client
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint
+from sightline.protocol.transports.websocket.client import Client
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, Hello
 from sightline.protocol.transports.websocket.peer import OPEN_S
 from sightline.protocol.transports.websocket.server import RESERVED_SLOTS

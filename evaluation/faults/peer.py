@@ -14,13 +14,17 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from sightline.evaluation.faults.evidence import EventLog, GOOD, INJECTED, REQUESTED
-from sightline.operator_side.client.requests import Operator, SOURCE as OPERATOR_SOURCE
+from types import FrameType, TracebackType
+from typing import Any, Final, Literal, Self
+
+from sightline.evaluation.faults.evidence import GOOD, INJECTED, REQUESTED, EventLog
+from sightline.operator_side.client.requests import SOURCE as OPERATOR_SOURCE
+from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.config.loading import load_service
-from sightline.protocol.channels import ACK, Channel, FRAME, MAX_HEADER_BYTES, TWIST, key_for
+from sightline.protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, TWIST, Channel, key_for
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.config import Config
-from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, MAX_INTEGER, Twist, Verb
+from sightline.protocol.messages import MAX_INTEGER, AnswerHeader, Echo, FrameHeader, Twist, Verb
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
@@ -29,9 +33,6 @@ from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.pipeline import SOURCE as VISION_SOURCE
 from sightline.vision_side.serving.process import serve
-from types import FrameType, TracebackType
-from typing import Any, Final, Literal, Self, TYPE_CHECKING
-
 
 Role = Literal["vision", "driver", "operator"]
 
@@ -395,7 +396,9 @@ def run_vision(options: "PeerOptions", pulled: threading.Event, ledger: EventLog
                           options={"connect": (options.endpoint,)}, environ=os.environ)
     config = loaded.config
     assert isinstance(config, VisionConfig)
-    with LoggingLink(open_zenoh(config.robot, connect=config.connect, role=VISION_SOURCE, timeout_s=15), ledger) as link:
+    with LoggingLink(
+        open_zenoh(config.robot, connect=config.connect, role=VISION_SOURCE, timeout_s=15), ledger
+    ) as link:
         serve(config, link, threading.Event(), lambda line: print(line, flush=True))
     return 0
 

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from sightline.evaluation.checks import Check, number
-from sightline.evaluation.faults.runner import Outcome
 from typing import Any, Final
 
+from sightline.evaluation.checks import Check, number
+from sightline.evaluation.faults.runner import Outcome
 
 PACKAGES: Final = ("eclipse-zenoh", "pybullet", "opencv-python-headless", "pydantic")
 

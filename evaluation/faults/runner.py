@@ -9,15 +9,17 @@ from dataclasses import dataclass, replace
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.evidence import (
-    Blind,
     DISTANCE_M,
     FALLS_MS,
     MEMORY_MB,
     OLD_US,
-    Stop,
     ZERO_MS,
+    Blind,
+    Stop,
     last_valid_us,
     measure_stop,
     moved_on_old_sight,
@@ -28,7 +30,6 @@ from sightline.evaluation.faults.sampler import STALL_US
 from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.protocol.errors import SightlineError
 from sightline.sim.tun_emulator import why_impossible
-from typing import Final, NamedTuple, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sightline.evaluation.faults.fixture import RobotFixture, Setup

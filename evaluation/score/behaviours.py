@@ -5,6 +5,8 @@ from concurrent.futures import Future, as_completed
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
 from sightline.evaluation.checks import Check, number
 from sightline.evaluation.lockstep import Conditions, run_lockstep
 from sightline.evaluation.plots import ROBOT_COLOUR
@@ -17,8 +19,8 @@ from sightline.evaluation.score.figures import (
     REACHED_WITHIN_M,
     READ_WITHIN_M,
     SETTLED_S,
-    Score,
     UNITS,
+    Score,
     checks_of,
     figures_of,
     median_and_worst,
@@ -28,7 +30,6 @@ from sightline.evaluation.score.runs import Case, run_of
 from sightline.operator_side.preflight import needs
 from sightline.sim.scenario import Scenario, Start, load_scenario
 from sightline.sim.truth import Truth
-from typing import Any, Final, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -4,13 +4,16 @@ Every detector gets the same JPEGs through the port that vision uses; each scene
 is checked as vision checks it: whatever a plug-in does, it is an answer that a robot could get, or none.
 """
 
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final
+
 import cv2
 import numpy as np
 import numpy.typing as npt
 import simplejpeg
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+
 from sightline.evaluation.checks import Check
 from sightline.evaluation.score.detectors import (
     BALL_LABELS,
@@ -22,16 +25,15 @@ from sightline.evaluation.score.detectors import (
     precisions,
 )
 from sightline.protocol.messages import FrameHeader
-from sightline.sim.scenes.model import COLUMNS, Column, HEIGHT_PX, JUDGED_FROM, LABELS, Scene, THINGS, WIDTH_PX
+from sightline.sim.scenes.model import COLUMNS, HEIGHT_PX, JUDGED_FROM, LABELS, THINGS, WIDTH_PX, Column, Scene
 from sightline.sim.scenes.plan import as_seen
 from sightline.sim.scenes.render import SceneRenderer
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.plugin_calls import checked_results as checked_answers, close_detector, notices_of
-from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector, NO_DEADLINE
+from sightline.vision_side.detect.plugin_calls import checked_results as checked_answers
+from sightline.vision_side.detect.plugin_calls import close_detector, notices_of
+from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Detector
 from sightline.vision_side.detect.registry import build_detector, check_takes_pictures
-from typing import Any, Final
-
 
 _FRAME_US: Final = 33_333
 _ROBOT: Final = "judge"
@@ -203,7 +205,11 @@ def detections(result: DetectionResult | None) -> tuple[Detection, ...]:
 
 def scene_result(result: DetectionResult | None, scene: Scene, balls: Sequence[str] = BALL_LABELS) -> FrameResult:
     """Of one answer; `balls` is what a ball may be called."""
-    return frame_result(None, scene) if result is None else frame_result(result.detections, scene, result.compute_us, balls)
+    return (
+        frame_result(None, scene)
+        if result is None
+        else frame_result(result.detections, scene, result.compute_us, balls)
+    )
 
 
 # What is demanded of a learned detector, and whether a report keeps it. Pure.  Demanded on `FRAMES` scenes a column
@@ -323,8 +329,10 @@ def silence_lines(report: Report) -> list[str]:
     """One for each detector that did not always answer, and for each that calls things what nobody asks for."""
     silent = [f"{name}: no answer to {one.scenes} of {one.of} scenes, which count as missed: {one.why}"
               for name, one in report.silent.items()]
-    calls = [f"{name}: not counted is what it calls {_some(labels)}; a ball is {' or '.join(BALL_LABELS)}, and target.label"
-             for name, labels in report.uncounted.items()]
+    calls = [
+        f"{name}: not counted is what it calls {_some(labels)}; a ball is {' or '.join(BALL_LABELS)}, and target.label"
+        for name, labels in report.uncounted.items()
+    ]
     return [" ".join(line.split()) for line in (*silent, *calls)]
 
 

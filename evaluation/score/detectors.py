@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from sightline.sim.scenes.model import LabelledBox, Scene
-from sightline.vision_side.detect.port import corners, overlap
-from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.detect.port import Detection, corners, overlap
 
 BALL_LABELS: Final = ("ball", "target")
 HIT_OVERLAP: Final = 0.5
@@ -39,7 +38,10 @@ def ball_of(scene: Scene) -> LabelledBox | None:
 
 
 def frame_result(
-    detections: Sequence[Detection] | None, scene: Scene, compute_us: int | None = None, balls: Sequence[str] = BALL_LABELS
+    detections: Sequence[Detection] | None,
+    scene: Scene,
+    compute_us: int | None = None,
+    balls: Sequence[str] = BALL_LABELS,
 ) -> FrameResult:
     """The verdict on one frame; None is no answer, which is no hit. `balls` is what a ball may be called."""
     ball = ball_of(scene)

@@ -6,11 +6,11 @@ from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from statistics import median
+
 from sightline.evaluation.checks import Check
 from sightline.sim.scenario import Scenario
 from sightline.sim.truth import Truth
-from statistics import median
-
 
 ACQUIRED_WITHIN_DEG = 2.0
 ACQUIRED_WITHIN_M = 0.05

@@ -8,8 +8,11 @@ from concurrent.futures import as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import groupby, product
+from typing import Any, Final
+
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
 from sightline.evaluation.checks import Check, number
 from sightline.evaluation.lockstep import Conditions, Run, run_lockstep
 from sightline.evaluation.processes import worker_pool
@@ -19,8 +22,6 @@ from sightline.protocol.errors import ConfigError
 from sightline.sim.scenario import Scenario, load_scenario, look_named
 from sightline.vision_side.detect.registry import check_choice
 from sightline.vision_side.missions.registry import REGISTRY, configured_mission
-from typing import Any, Final
-
 
 _MOST_NOTICES: Final = 3
 """Of each group: later ones repeat the first with higher counts."""

@@ -3,16 +3,19 @@
 OpenCV counts pixels from the middle of the top-left one, `CameraModel` from its corner: half a pixel is added.
 """
 
-import cv2
 import itertools
 import math
-import numpy as np
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from numpy.typing import NDArray
 from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from sightline.operator_side.client.pictures import Viewer
 from sightline.protocol.channels import CAMERA, FRAME
 from sightline.protocol.codec import decode
@@ -27,8 +30,6 @@ from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.tracking.locate import locate_sphere
-from typing import Any, Generic, TypeVar
-
 
 MIN_BOARDS = 5
 MAX_RMS_PX = 1.0

@@ -4,18 +4,19 @@ The text is cut into statements by a small scanner; what comes out is read again
 what was meant, or nothing is changed.
 """
 
-import cv2
 import re
 import shutil
 import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Final
+
+import cv2
+
 from sightline.operator_side.calibrate.color import Image, Ranges, mask_picture
 from sightline.operator_side.config.loading import load_service
 from sightline.protocol.errors import ConfigError
-from typing import Any, Final
-
 
 _TABLE: Final = ("hsv",)
 _KEY: Final = ("hsv", "ranges")

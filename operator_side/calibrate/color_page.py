@@ -1,13 +1,16 @@
 """The page of `sightline pick-color`, and the pictures that it shows. Shell (threads, files)."""
 
-import cv2
 import json
-import numpy as np
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any, Final, Protocol
+
+import cv2
+import numpy as np
+
 from sightline.operator_side.calibrate.color import (
     Box,
     Image,
@@ -24,8 +27,6 @@ from sightline.operator_side.cockpit.frame_buffer import FrameBuffer
 from sightline.operator_side.cockpit.http_server import Answer, PageRequest, Route, as_json, page
 from sightline.operator_side.recording.film import jpeg_pixels
 from sightline.protocol.errors import ConfigError, LinkError, WireError
-from typing import Any, Final, Protocol
-
 
 MAX_FILE_BYTES: Final = 50_000_000
 MAX_PIXELS: Final = 25_000_000

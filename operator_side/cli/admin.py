@@ -4,19 +4,20 @@ import getpass
 import json
 import os
 import sys
-import typer
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
+from typing import Annotated
+
+import typer
+
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.doctor.finding import Finding, as_object
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.setup import install as units
 from sightline.protocol.transports.open import check_endpoint
 from sightline.robot_side.config import RobotConfig
-from types import ModuleType
-from typing import Annotated
-
 
 Hosts = Annotated[
     list[str] | None,
@@ -172,7 +173,9 @@ def doctor(
 
 
 def _findings(robot: str, peer: str | None, camera: str | None, sets: list[str], secure: str) -> Iterator[Finding]:
-    from sightline.operator_side.doctor import network as between, machine as cameras, machine
+    from sightline.operator_side.doctor import machine
+    from sightline.operator_side.doctor import machine as cameras
+    from sightline.operator_side.doctor import network as between
 
     yield from machine.findings(secure)
     yield from cameras.modes()

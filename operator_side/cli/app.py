@@ -12,26 +12,23 @@ from typing import Final
 
 import typer
 
+from sightline.operator_side.cli.admin import register_doctor, register_install, register_keys
 from sightline.operator_side.cli.bench import register_benches as register_bench
-from sightline.operator_side.cli.calibrate import register_calibrate
-from sightline.operator_side.cli.watch import register_capture
-from sightline.operator_side.cli.services import register_config
+from sightline.operator_side.cli.calibrate import register_calibrate, register_pick_color
 from sightline.operator_side.cli.conform import register_conform
 from sightline.operator_side.cli.detector import register_detector
-from sightline.operator_side.cli.admin import register_doctor
-from sightline.operator_side.cli.evaluate import register_faults
-from sightline.operator_side.cli.admin import register_install
 from sightline.operator_side.cli.evaluate import register_demo_and_score as register_judge
-from sightline.operator_side.cli.admin import register_keys
-from sightline.operator_side.cli.services import register_metrics
+from sightline.operator_side.cli.evaluate import register_faults, register_train
 from sightline.operator_side.cli.operate import register_missions as register_mission
 from sightline.operator_side.cli.operate import register_operator as register_people
-from sightline.operator_side.cli.calibrate import register_pick_color
-from sightline.operator_side.cli.services import register_scenarios
-from sightline.operator_side.cli.services import register_services
 from sightline.operator_side.cli.operate import register_teleop
-from sightline.operator_side.cli.evaluate import register_train
-from sightline.operator_side.cli.watch import register_watch
+from sightline.operator_side.cli.services import (
+    register_config,
+    register_metrics,
+    register_scenarios,
+    register_services,
+)
+from sightline.operator_side.cli.watch import register_capture, register_watch
 from sightline.operator_side.config.errors import no_such_name
 from sightline.protocol.errors import SightlineError
 
@@ -48,26 +45,29 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-register_services(app)
-register_judge(app)
-register_people(app)
-register_bench(app)
-register_faults(app)
-register_calibrate(app)
-register_keys(app)
-register_install(app)
-register_doctor(app)
-register_metrics(app)
-register_config(app)
-register_conform(app)
-register_detector(app)
-register_teleop(app)
-register_mission(app)
-register_scenarios(app)
-register_watch(app)
-register_capture(app)
-register_pick_color(app)
-register_train(app)
+for register in (
+    register_services,
+    register_judge,
+    register_people,
+    register_bench,
+    register_faults,
+    register_calibrate,
+    register_keys,
+    register_install,
+    register_doctor,
+    register_metrics,
+    register_config,
+    register_conform,
+    register_detector,
+    register_teleop,
+    register_mission,
+    register_scenarios,
+    register_watch,
+    register_capture,
+    register_pick_color,
+    register_train,
+):
+    register(app)
 
 
 @app.callback(invoke_without_command=True)

@@ -2,18 +2,21 @@
 
 import json
 import tempfile
-import typer
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+
+import typer
+
 from sightline.operator_side.cli.options import CHECK_FAILED, Json, numbers
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError
-from typing import Annotated, Any, Protocol, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+
     from sightline.benchmarks.loop.figures import LoopCheck
     from sightline.benchmarks.loop.race import Race
     from sightline.benchmarks.network.stage import NetworkRun
@@ -129,8 +132,7 @@ def demo(
     with needs("all"):
         from sightline.benchmarks.real_time import Kinds, measure_demos
         from sightline.evaluation.checks import number
-        from sightline.evaluation.score.figures import AT_LEAST
-        from sightline.evaluation.score.figures import EXACT
+        from sightline.evaluation.score.figures import AT_LEAST, EXACT
         from sightline.sim.scenario import load_scenario, scenario_names
     names = scenario_names() if scenario == "all" else scenario.split(",")
     for name in names:
@@ -235,8 +237,8 @@ def loop(
 ) -> int:
     """Capture to the driver's verdict, beside the in-process floor, bare TCP and what others build."""
     with needs("bench"):
-        from sightline.benchmarks.loop.race import run_race
         from sightline.benchmarks.loop.figures import LoopSetting, peers_of, size_of
+        from sightline.benchmarks.loop.race import run_race
 
         if peers != "none":
             import zmq  # noqa: F401  # a peer's need; said here, not by a process that dies
@@ -361,11 +363,11 @@ def network(
 ) -> int:
     """Robots, visions and people in two network namespaces: what slow, lossy, far, broken and shared wires cost."""
     with needs("all"):
-        from sightline.benchmarks.network.run import Progress, run_network
         from sightline.benchmarks.network.cases import chosen
+        from sightline.benchmarks.network.run import Progress, run_network
+        from sightline.benchmarks.network.scenes import medium
         from sightline.benchmarks.network.stage import NetworkSetting
         from sightline.evaluation.faults.fixture import BenchWire
-        from sightline.benchmarks.network.scenes import medium
     setting = NetworkSetting(transport, seconds, tuple(numbers("--seeds", seeds, int)))
     telling = Progress(lambda line: typer.echo(line, err=True), lambda run: _print_run(run, as_json=as_json))
     runs = run_network(chosen(only or (), transport), setting, BenchWire, telling, {"medium": medium})

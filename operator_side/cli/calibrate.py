@@ -7,16 +7,19 @@ import re
 import sys
 import threading
 import time
-import typer
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
 from sightline.operator_side.calibrate.wheels import check_confirmed, opened_drive, try_wheels, turn_for
 from sightline.operator_side.cli.options import (
+    DEFAULT_CONNECT,
     ConfigFile,
     Connect,
-    DEFAULT_CONNECT,
     Json,
     Port,
     RobotName,
@@ -34,7 +37,6 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import DEFAULT_ENDPOINT, RobotConfig
 from sightline.robot_side.hardware.gpio import table_of, table_text
-from typing import Annotated, Any, Final, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sightline.operator_side.calibrate.camera import Ball, Board, Calibration, Mounting
@@ -457,8 +459,8 @@ def _at_once(pictures: "list[Image]", place: "Box", config: Path | None, mask: P
 
 
 def _on_page(source: _Source, frames: int, config: Path | None, port: int) -> None:
-    from sightline.operator_side.cockpit.http_server import served
     from sightline.operator_side.calibrate.color_page import PickPage
+    from sightline.operator_side.cockpit.http_server import served
 
     said: list[str] = []
 
@@ -478,8 +480,7 @@ def _on_page(source: _Source, frames: int, config: Path | None, port: int) -> No
 
 def _use(ranges: "Ranges", config: Path | None) -> str:
     """Write the ranges where told, and say what was done, or what a person can paste."""
-    from sightline.operator_side.calibrate.color_file import write_ranges
-    from sightline.operator_side.calibrate.color_file import ranges_toml
+    from sightline.operator_side.calibrate.color_file import ranges_toml, write_ranges
 
     if config is None:
         return f"for vision's configuration:\n[hsv]\nranges = {ranges_toml(ranges)}"

@@ -3,15 +3,18 @@
 import json
 import ssl
 import tempfile
-import typer
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import groupby
 from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
+
 from sightline.conformance.benches import LiveBench
 from sightline.conformance.case import Access, Case, Level
 from sightline.conformance.report import summary, to_dict, to_html, to_junit, to_page
@@ -20,8 +23,6 @@ from sightline.operator_side.cli.options import CHECK_FAILED
 from sightline.operator_side.preflight import check_out_file
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.security import own_token
-from typing import Annotated, Any, Final
-
 
 _EXAMPLE = "e.g. --token vision=keys/vision.token"
 
@@ -222,10 +223,10 @@ def robot(
     as_json: Json = False,
 ) -> int:
     """Test a robot as its driver, its watcher and its enemy. It is armed and its wheels turn: lift it off the floor."""
+    from sightline.conformance.benches import FROM_ROBOT
+    from sightline.conformance.raw_peers import RawZenoh
     from sightline.conformance.robot import cases as side
     from sightline.conformance.robot.websocket import put_over_websocket
-    from sightline.conformance.raw_peers import RawZenoh
-    from sightline.conformance.benches import FROM_ROBOT
     from sightline.protocol.transports.open import open_link
 
     cases = chosen(side.CASES, only or (), groups or ())
@@ -272,9 +273,9 @@ def vision(
     as_json: Json = False,
 ) -> int:
     """Test a vision: the kit plays its robot at ENDPOINT; start the vision against it, before or after."""
-    from sightline.conformance.vision import cases as side
-    from sightline.conformance.raw_peers import RawZenoh
     from sightline.conformance.benches import TO_ROBOT
+    from sightline.conformance.raw_peers import RawZenoh
+    from sightline.conformance.vision import cases as side
     from sightline.protocol.transports.open import open_link
 
     cases = chosen(side.CASES, only or (), groups or ())

@@ -3,31 +3,37 @@
 import json
 import math
 import os
-import typer
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
 from sightline.operator_side.cli.options import (
     CHECK_FAILED,
+    DEFAULT_CONNECT,
+    REJECTED_EXIT,
     ConfigFile,
     Connect,
-    DEFAULT_CONNECT,
     Device,
     Json,
     Listen,
-    Listen as MaybeListen,
     LogForm,
     MaybeSecure,
-    REJECTED_EXIT,
     Robot,
     Secure,
-    ServiceConnect as MaybeConnect,
     ServiceConnect,
     Sets,
+)
+from sightline.operator_side.cli.options import (
+    Listen as MaybeListen,
+)
+from sightline.operator_side.cli.options import (
+    ServiceConnect as MaybeConnect,
 )
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import set_log_format
-from typing import Annotated, Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sightline.vision_side.detect.contract import PromiseResult, Times
@@ -173,9 +179,9 @@ def check(
     options: dict[str, Any] = {"detector.device": device}
     given: Any = load_service("vision", file=config, sets=(), options=options, environ=os.environ).config
     with needs("vision"):
+        from sightline.vision_side.detect.contract import check_detector, time_detector
         from sightline.vision_side.detect.plugin_calls import notices_of
         from sightline.vision_side.detect.registry import build_detector, check_device, check_takes_pictures
-        from sightline.vision_side.detect.contract import check_detector, time_detector
     settings = given.model_copy(update={"detector": given.detector.model_copy(update={"kind": name})})
     check_device(settings)
     check_takes_pictures(name)
@@ -226,8 +232,7 @@ def promote(
     as_json: Json = False,
 ) -> int:
     """Let the detector of `vision --shadow NAME` drive from the next frame on, and the other one look on."""
-    from sightline.operator_side.client.missions import MissionClient
-    from sightline.operator_side.client.missions import detector_line
+    from sightline.operator_side.client.missions import MissionClient, detector_line
     from sightline.operator_side.client.requests import SOURCE
     from sightline.protocol.transports.open import open_link
 

@@ -4,19 +4,21 @@ import hashlib
 import json
 import os
 import tempfile
-import typer
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
 from sightline.operator_side.cli.options import CHECK_FAILED, ConfigFile, Device, Json, Sets, numbers
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import check_out_file, needs
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.training.schedule import Training
-from typing import Annotated, Any, Literal, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sightline.evaluation.checks import Check
@@ -58,8 +60,8 @@ def demo(
     """
     _check_installed("pybullet", "av", "matplotlib", "mcap")
     with needs("all"):
-        from sightline.evaluation.demo.run import DemoOptions, run_demo
         from sightline.evaluation.demo.report import report, summary
+        from sightline.evaluation.demo.run import DemoOptions, run_demo
     say = _to_stderr if as_json else typer.echo
     lasting_s = _seconds(scenario, seconds)
     run = run_demo(DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission, detector), say)
@@ -118,8 +120,7 @@ def score(
     if context.invoked_subcommand is not None:
         return 0
     with needs("all"):
-        from sightline.evaluation.score.runs import cases, run_cases
-        from sightline.evaluation.score.runs import progress, score_text
+        from sightline.evaluation.score.runs import cases, progress, run_cases, score_text
         from sightline.sim.scenario import scenario_names
     if page is not None:
         return _write_page(page, numbers("--seeds", seeds, int), jobs or os.cpu_count() or 1)
@@ -175,9 +176,13 @@ def detectors(
     """
     with needs("all"):
         from sightline.evaluation.score.detector_report import FRAMES as DEMANDED_FRAMES
-        from sightline.evaluation.score.detector_report import all_detector_checks
-        from sightline.evaluation.score.detector_report import LIGHT_SHARE, close_subjects, score_scenes
-        from sightline.evaluation.score.detector_report import Sheet
+        from sightline.evaluation.score.detector_report import (
+            LIGHT_SHARE,
+            Sheet,
+            all_detector_checks,
+            close_subjects,
+            score_scenes,
+        )
         from sightline.evaluation.score.runs import progress
     if demand and seeds < FROM:
         raise ConfigError(f"--demand judges, which only seeds from {FROM} up are for, not {seeds}")
@@ -236,8 +241,8 @@ def _check_device(names: Sequence[str], settings: Any) -> None:
 
 
 def _print_report(report: "Report", checks: "list[Check] | None", as_json: bool) -> int:
-    from sightline.operator_side.cli.options import CHECK_FAILED
     from sightline.evaluation.score.detector_report import check_lines, silence_lines, text
+    from sightline.operator_side.cli.options import CHECK_FAILED
 
     ok = all(check.ok for check in checks or ())
     judged = {} if checks is None else {"ok": ok, "checks": [asdict(check) for check in checks]}
@@ -313,10 +318,16 @@ def faults(
 ) -> int:
     """Start real processes, break one thing at a time, and judge from the simulated motors' own log."""
     with needs("all"):
-        from sightline.evaluation.faults.report import describe_machine
-        from sightline.evaluation.faults.runner import run_cases
-        from sightline.evaluation.faults.report import markdown, passed, progress_line, to_dict, with_rows_of
         from sightline.evaluation.faults.cases import chosen
+        from sightline.evaluation.faults.report import (
+            describe_machine,
+            markdown,
+            passed,
+            progress_line,
+            to_dict,
+            with_rows_of,
+        )
+        from sightline.evaluation.faults.runner import run_cases
     rows = chosen(only or (), short=short)
     if listing:
         typer.echo("\n".join(f"{row.id:<22} {row.what}: {row.demanded}" for row in rows))

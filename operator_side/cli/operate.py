@@ -3,16 +3,19 @@
 import json
 import secrets
 import time
-import typer
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Annotated
+
+import typer
+
 from sightline.operator_side.cli.options import (
-    Connect,
     DEFAULT_CONNECT,
+    REJECTED_EXIT,
+    Connect,
     Json,
     MaybeConnect,
-    REJECTED_EXIT,
     Robot,
     Secure,
     options_of,
@@ -30,13 +33,11 @@ from sightline.operator_side.client.missions import (
     waypoints_of_file,
 )
 from sightline.operator_side.client.pictures import viewer_role
-from sightline.operator_side.client.requests import Operator, SOURCE
+from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.operator_side.client.status import status_line, status_lines
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import MissionReport, Reply, Status, Verb
 from sightline.protocol.transports.open import open_link
-from typing import Annotated
-
 
 _REPORT_S = 0.8  # vision reports twice a second; where one drives, that is worth waiting for
 
@@ -279,9 +280,8 @@ def teleop(
 
     The first press arms the robot. STOP is another command (`sightline stop`), and no key starts a stopped robot.
     """
-    from sightline.operator_side.teleop.control import SOURCE, Teleop
+    from sightline.operator_side.teleop.control import SOURCE, Speeds, Teleop
     from sightline.operator_side.teleop.gamepad import Gamepad
-    from sightline.operator_side.teleop.control import Speeds
     from sightline.operator_side.teleop.terminal import Cockpit, check_terminal
     from sightline.protocol.transports.open import open_link
 

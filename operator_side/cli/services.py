@@ -4,14 +4,17 @@ import json
 import os
 import signal
 import threading
-import typer
 from importlib import import_module
 from pathlib import Path
+from typing import Annotated, Any
+
+import typer
 from pydantic import BaseModel
+
 from sightline.operator_side.cli.options import (
+    DEFAULT_CONNECT,
     ConfigFile,
     Connect,
-    DEFAULT_CONNECT,
     Listen,
     LogForm,
     MaybeSecure,
@@ -34,7 +37,6 @@ from sightline.sim.process import SimConfig
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
 from sightline.vision_side.config import VisionConfig
-from typing import Annotated, Any
 
 
 def register_services(app: typer.Typer) -> None:
@@ -403,8 +405,7 @@ def metrics(
     """Serve a robot's status to Prometheus at /metrics, and whether it is heard at /health, until Ctrl-C."""
     with needs("metrics"):
         import_module("prometheus_client")
-    from sightline.operator_side.cockpit.metrics import Watched
-    from sightline.operator_side.cockpit.metrics import serving
+    from sightline.operator_side.cockpit.metrics import Watched, serving
 
     ending = threading.Event()
     with open_link(robot, connect=connect, role=ROLE, secure=secure) as link, serving(Watched(link), host, port) as at:

@@ -3,27 +3,28 @@
 import json
 import sys
 import time
-import typer
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Final, Self
+
+import typer
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
-from sightline.operator_side.cli.options import Connect, DEFAULT_CONNECT, Json, Port, Robot, Secure
+
+from sightline.operator_side.cli.options import DEFAULT_CONNECT, Connect, Json, Port, Robot, Secure
 from sightline.operator_side.client.messages import ChannelInbox, message_line, message_object
 from sightline.operator_side.client.missions import MissionClient, mission_lines
 from sightline.operator_side.client.pictures import Pictures, viewer_role
 from sightline.operator_side.client.status import status_lines
 from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.preflight import needs
-from sightline.protocol.channels import CHANNELS, Channel, Direction, FRAME, OVERLAY, PREVIEW
+from sightline.protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, Channel, Direction
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
-from types import TracebackType
-from typing import Annotated, Final, Self
-
 
 _SHOWN = (OVERLAY.name, PREVIEW.name, FRAME.name)
 _TEXT_PERIOD_S = 0.25

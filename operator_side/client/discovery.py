@@ -6,6 +6,8 @@ import socket
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any, Final
+
 from sightline.operator_side.client.requests import read_report
 from sightline.operator_side.client.status import status_line
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError, WireError
@@ -15,8 +17,6 @@ from sightline.protocol.transports.security import ROBOT_ROLE
 from sightline.protocol.transports.zenoh.discovery import Discovered, discover, find_listeners
 from sightline.protocol.transports.zenoh.presence import PeerInfo
 from sightline.robot_side.config import DEFAULT_ENDPOINT
-from typing import Any, Final
-
 
 _ROLE_WIDTH = 9
 
@@ -123,7 +123,9 @@ def discover_all(connect: Sequence[str] | None, seconds: float, secure: str) -> 
         raise LinkError(f"nobody listens at {DEFAULT_ENDPOINT}, and nobody answers a multicast within {SCOUT_S:g} s; "
                         "name where one listens: sightline robots --connect tcp/ROBOT:7447")
     with ThreadPoolExecutor(len(places)) as pool:
-        return DiscoveryReport(dict(zip(places, pool.map(lambda place: _looked(place, seconds, secure), places), strict=True)))
+        return DiscoveryReport(
+            dict(zip(places, pool.map(lambda place: _looked(place, seconds, secure), places), strict=True))
+        )
 
 
 def _someone(found: DiscoveryReport, seconds: float) -> DiscoveryReport:

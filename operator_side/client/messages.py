@@ -3,16 +3,16 @@
 import math
 import queue
 from collections.abc import Mapping
+from typing import Any, Final
+
 from sightline.operator_side.client.pictures import Viewer
-from sightline.protocol.channels import Channel, FRAME, JPEG, SCAN, TWIST
+from sightline.protocol.channels import FRAME, JPEG, SCAN, TWIST, Channel
 from sightline.protocol.codec import decode, decode_ranges
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import WireModel
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
-from typing import Any, Final
-
 
 MAX_WAITING: Final = 64
 """Words that wait to be printed; what comes while they do is dropped and counted."""

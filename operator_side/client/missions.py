@@ -8,24 +8,25 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final
+
 from pydantic import ValidationError
-from sightline.operator_side.client.requests import Operator, SOURCE
+
+from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.protocol.channels import MISSION, REPORT
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError, LinkError, WireError
 from sightline.protocol.messages import (
-    Echo,
     MAX_OPTIONS,
-    MAX_WAYPOINTS,
     MAX_WAYPOINT_M,
+    MAX_WAYPOINTS,
+    Echo,
     MissionReport,
     MissionRequest,
     RequestHeader,
     RequestId,
 )
 from sightline.protocol.transports.link import Link, Message
-from typing import Any, Final
-
 
 Waypoints = tuple[tuple[float, float], ...]
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?")

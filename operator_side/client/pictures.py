@@ -5,8 +5,10 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
+
 from sightline.operator_side.client.requests import SOURCE as OPERATOR
-from sightline.protocol.channels import ACK, Channel, FRAME, OVERLAY, STATUS
+from sightline.protocol.channels import ACK, FRAME, OVERLAY, STATUS, Channel
 from sightline.protocol.clock import RobotClock, monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import WireError
@@ -14,7 +16,6 @@ from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader, Stamp
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
-from typing import Final
 
 
 class Viewer:

@@ -14,9 +14,8 @@ from typing import Final
 
 from sightline.protocol.channels import REPLY, REQUEST, STATUS
 from sightline.protocol.codec import decode, encode
-from sightline.protocol.errors import LinkError, WireError
+from sightline.protocol.errors import LinkError, RejectReason, WireError
 from sightline.protocol.messages import Echo, Reply, Request, RequestHeader, Stamp, State, Status, Verb
-from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.link import Link, Message
 
 SOURCE: Final = "operator"

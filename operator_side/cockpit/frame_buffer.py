@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from sightline.operator_side.cockpit.http_server import Answer, PageRequest
 from sightline.operator_side.client.pictures import Pictures, Shot
+from sightline.operator_side.cockpit.http_server import Answer, PageRequest
 
 IDLE_S: Final = 3.0
 """A page that asks for nothing for this long is closed: nobody watches."""

@@ -9,12 +9,12 @@ from html import escape
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from importlib.resources import files
 from pathlib import Path
-from sightline.protocol.errors import LinkError, SightlineError
-from sightline.protocol.transports.diagnosis import port_owner
 from socketserver import ThreadingMixIn
 from typing import Any, Final
 from urllib.parse import parse_qsl, urlsplit
 
+from sightline.protocol.errors import LinkError, SightlineError
+from sightline.protocol.transports.diagnosis import port_owner
 
 MAX_CONNECTIONS: Final = 32
 """Security limit: one more is closed at once. A browser holds six."""
@@ -82,7 +82,7 @@ def as_json(value: Any, status: int = 200) -> Answer:
 
 def page(name: str, **words: str) -> Answer:
     """A file of `operator_side/cockpit/pages`, with `{{word}}` filled in; what the words say is text, never HTML."""
-    text = files("sightline.operator_side").joinpath("pages", name).read_text("utf-8")
+    text = files(__package__).joinpath("pages", name).read_text("utf-8")
     for word, value in words.items():
         text = text.replace("{{" + word + "}}", escape(value))
     return Answer(text.encode(), _KINDS[Path(name).suffix])

@@ -11,6 +11,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final, Protocol
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+
 from sightline.operator_side.client.requests import read_report
 from sightline.operator_side.cockpit.http_server import BoundedThreads
 from sightline.protocol.channels import STATUS
@@ -20,8 +23,6 @@ from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.security import ROBOT_ROLE
 from sightline.protocol.transports.zenoh.presence import PeerInfo
-from typing import Any, Final, Protocol, TYPE_CHECKING
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 if TYPE_CHECKING:
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily

@@ -5,12 +5,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sightline.operator_side.cockpit.http_server import Answer, PageRequest, as_json, page, served
-from sightline.operator_side.client.missions import MissionClient
-from sightline.operator_side.client.missions import detector_line, mission_line
+from sightline.operator_side.client.missions import MissionClient, detector_line, mission_line
 from sightline.operator_side.client.pictures import Pictures
-from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
 from sightline.operator_side.client.status import drops_text, encoding_text, millis, refusals_text, twist_text
+from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
+from sightline.operator_side.cockpit.http_server import Answer, PageRequest, as_json, page, served
 from sightline.protocol.channels import Channel
 from sightline.protocol.messages import Status
 from sightline.protocol.transports.link import Link

@@ -3,9 +3,9 @@
 import difflib
 import types
 from collections.abc import Callable, Iterable, Iterator
-from pydantic import BaseModel, ValidationError
 from typing import Annotated, Any, Union, get_args, get_origin
 
+from pydantic import BaseModel, ValidationError
 
 Key = tuple[str, ...]
 

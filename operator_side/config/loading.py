@@ -10,15 +10,16 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Final
+
 from pydantic import ValidationError
+
 from sightline.operator_side.config.errors import explain, is_known, known_keys, no_such_name
 from sightline.protocol.channels import check_robot_id
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import LOG_FORMAT_VARIABLE
 from sightline.protocol.transports.open import check_endpoint
-from typing import Any, Final
-
 
 SERVICES: Final = ("robot", "vision", "sim")
 ENV_PREFIX: Final = "SIGHTLINE_"

@@ -16,14 +16,14 @@ import time
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
+from typing import Final
+
 from sightline.operator_side.doctor.finding import Finding, trouble
 from sightline.operator_side.preflight import needs
 from sightline.protocol import VERSION
 from sightline.protocol.errors import SightlineError
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.zenoh.session import MULTICAST_GROUP
-from typing import Final
-
 
 PORTS = {7447: "Zenoh", 9090: "sightline.v1", 9091: "the older dialect"}
 _HOT_C = 80.0
@@ -33,7 +33,6 @@ CGROUP = Path("/sys/fs/cgroup")
 PROC_STAT = Path("/proc/stat")
 INTERFACES = Path("/sys/class/net")
 _EXPIRES_SOON = datetime.timedelta(days=30)
-_OURS = ("protocol", "robot_side", "vision_side", "sim", "operator_side", "benchmarks")
 _EXTRAS = {"zenoh": "eclipse-zenoh", "websocket": "websockets", "vision": "opencv-python-headless", "sim": "pybullet"}
 
 
@@ -57,7 +56,7 @@ def findings(keys_folder: str) -> Iterator[Finding]:
 def _versions() -> Finding:
     installed = {extra: _version(name) for extra, name in _EXTRAS.items()}
     said = ", ".join(f"{extra} {version}" for extra, version in installed.items() if version)
-    text = f"sightline {_version('sightline')}, protocol {VERSION}, Python {platform.python_version()}; {said}"
+    text = f"sightline {_version('sightline-robot')}, protocol {VERSION}, Python {platform.python_version()}; {said}"
     return Finding("versions", None, text)
 
 
@@ -69,9 +68,9 @@ def _version(distribution: str) -> str:
 
 
 def _collision() -> Finding:
-    """Another distribution may install a package of the same name as one of ours (`protocol` exists)."""
-    owners = metadata.packages_distributions()
-    others = sorted({other for name in _OURS for other in owners.get(name, ()) if other != "sightline"})
+    """Another distribution may install a package of our name (`sightline` on the package index is another project)."""
+    owners = metadata.packages_distributions().get("sightline", ())
+    others = sorted(set(owners) - {"sightline-robot"})
     fix = f"pip uninstall {' '.join(others)}, or give Sightline an environment of its own: python3 -m venv .venv"
     return Finding("package names", not others, f"taken by {', '.join(others)}" if others else "no collision", fix)
 

@@ -9,22 +9,21 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median, quantiles
 
-from sightline.operator_side.client.pictures import Viewer
-from sightline.operator_side.doctor.finding import Finding, histogram, trouble
-from sightline.operator_side.client.pictures import viewer_role
+from sightline.operator_side.client.pictures import Viewer, viewer_role
 from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.client.status import encoding_text, stream_is_whole
+from sightline.operator_side.doctor.finding import Finding, histogram, trouble
 from sightline.protocol.channels import FRAME
 from sightline.protocol.errors import SightlineError
 from sightline.protocol.messages import Status
-from sightline.protocol.transports import endpoints, endpoints as websocket_endpoints
+from sightline.protocol.transports import endpoints
+from sightline.protocol.transports import endpoints as websocket_endpoints
 from sightline.protocol.transports.link import Link
 from sightline.protocol.transports.open import open_link
-from sightline.protocol.transports.zenoh.presence import QUERY_ROUNDS, PeerInfo, best_round_trips
 from sightline.protocol.transports.security import ROBOT_ROLE
 from sightline.protocol.transports.zenoh.discovery import find_listeners
+from sightline.protocol.transports.zenoh.presence import QUERY_ROUNDS, PeerInfo, best_round_trips, software_version
 from sightline.protocol.transports.zenoh.session import LOOPBACK
-from sightline.protocol.transports.zenoh.presence import software_version
 
 ROLE = "doctor"
 ARP_TABLE = Path("/proc/net/arp")
@@ -81,7 +80,9 @@ def _no_link(error: SightlineError, endpoint: str) -> Finding:
 def _found_by_multicast(host: str) -> Finding:
     """Discovery is a comfort: only said."""
     try:
-        there = socket.gethostbyname(host) in {endpoints.parse_zenoh_endpoint(one)[1] for one in find_listeners(_SCOUT_S)}
+        there = socket.gethostbyname(host) in {
+            endpoints.parse_zenoh_endpoint(one)[1] for one in find_listeners(_SCOUT_S)
+        }
     except OSError:
         there = False
     words = "it answers: `sightline robots` finds it" if there else "no answer, as on many networks"

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import cv2
-import numpy as np
-import simplejpeg
 import time
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from numpy.typing import NDArray
 from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+import cv2
+import numpy as np
+import simplejpeg
+from numpy.typing import NDArray
+
 from sightline.operator_side.client.pictures import Pictures, Shot
 from sightline.operator_side.preflight import check_out_file, needs
-from sightline.protocol.channels import Channel, OVERLAY
+from sightline.protocol.channels import OVERLAY, Channel
 from sightline.protocol.errors import ConfigError, LinkError, RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
-from types import TracebackType
-from typing import Any, Final, Self
 
 
 def jpeg_pixels(jpeg: bytes) -> NDArray[np.uint8]:

@@ -17,19 +17,19 @@ from sightline.protocol.messages import (
     CameraModel,
     DetectionsHeader,
     FrameHeader,
+    MissionRequest,
     RequestHeader,
     RequestId,
     Stamp,
 )
-from sightline.protocol.messages import MissionRequest
-from sightline.protocol.transports.link import Message
 from sightline.protocol.text import format_twist
+from sightline.protocol.transports.link import Message
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.tracking.locate import BoxReader
 from sightline.vision_side.detect.registry import configured_detector
+from sightline.vision_side.missions.ranges import decode_scan
 from sightline.vision_side.missions.registry import requested_mission
 from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, PipelineAnswer
-from sightline.vision_side.missions.ranges import decode_scan
+from sightline.vision_side.tracking.locate import BoxReader
 
 VISION_CONFIG = "vision_config"
 """Key of the recording's metadata that holds the configuration of vision, as JSON."""

@@ -42,7 +42,7 @@ def plan(service: str, program: Path, config: Path, user: str, unit_dir: Path = 
         if not text or any(letter.isspace() or letter in "%\"'\\" for letter in text):
             raise ConfigError(f"{what} {text!r} cannot stand in a unit: no spaces, quotes or %")
     name = f"sightline-{service}.service"
-    unit = files(f"{service}_side").joinpath("systemd", name).read_text()
+    unit = files(f"sightline.{service}_side").joinpath("systemd", name).read_text()
     unit = unit.replace("User=sightline", f"User={user}")
     return Plan(service, unit_dir / name, _fitted(unit, service, program, config))
 
@@ -56,7 +56,12 @@ def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UN
         return None
     _, options = load_device("drives", robot.motors)
     pins = " ".join(str(number) for number in (*options.pins, *options.enable_pins))
-    text = files("sightline.robot_side").joinpath("systemd", _DROP_IN).read_text().replace(_DROP_INS_PINS, f"gpio_low {pins}")
+    text = (
+        files("sightline.robot_side")
+        .joinpath("systemd", _DROP_IN)
+        .read_text()
+        .replace(_DROP_INS_PINS, f"gpio_low {pins}")
+    )
     return Plan("robot", drop_in_path(unit_dir), _fitted(text, "robot", program, config))
 
 

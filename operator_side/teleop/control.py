@@ -3,18 +3,20 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
+from typing import Final
+
 from sightline.operator_side.client.requests import Report, read_report
-from sightline.protocol.channels import ACK, Channel, REPLY, REQUEST, TWIST
+from sightline.protocol.channels import ACK, REPLY, REQUEST, TWIST, Channel
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import (
+    STILL,
     AnswerHeader,
     Echo,
     FrameHeader,
     Reply,
     Request,
     RequestHeader,
-    STILL,
     State,
     Status,
     Twist,
@@ -22,8 +24,6 @@ from sightline.protocol.messages import (
 )
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import Message
-from typing import Final
-
 
 _STEP: Final = 1.1
 """A key press changes a speed by 10 %."""

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from sightline.operator_side.preflight import needs
-from sightline.protocol.errors import HardwareError
 from typing import Any, Final
 
+from sightline.operator_side.preflight import needs
+from sightline.protocol.errors import HardwareError
 
 EV_SYN: Final = 0
 EV_KEY: Final = 1

@@ -10,17 +10,17 @@ import time
 import tty
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import Final
+
 from sightline.operator_side.client.status import millis, twist_text
 from sightline.operator_side.teleop.control import Mode, Teleop
 from sightline.operator_side.teleop.gamepad import Gamepad, PadKey
-from sightline.protocol.channels import Channel, FRAME, REPLY, STATUS
+from sightline.protocol.channels import FRAME, REPLY, STATUS, Channel
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import Status
 from sightline.protocol.transports.link import LatestSlot, Link, Message
-from types import FrameType
-from typing import Final
-
 
 KEYS: Final = """\
       forward            hold a key to drive, let go to stop

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from sightline.protocol.errors import WireError
+from sightline.protocol.legacy_text import decode_picture, encode_picture, parse_boxes, parse_dashed
 from sightline.protocol.spec.message_cases import (
     ANSWER,
     ECHO,
@@ -28,7 +29,6 @@ from sightline.protocol.spec.message_cases import (
     packed,
     without,
 )
-from sightline.protocol.text import decode_picture, encode_picture, parse_boxes, parse_dashed
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, parse_hello, unpack
 
 Fields = dict[str, Any]

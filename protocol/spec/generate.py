@@ -16,12 +16,12 @@ from typing import Any, Final
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from sightline.protocol.spec import golden
 from sightline.protocol import errors as refusals
-from sightline.protocol.spec.asyncapi import document
 from sightline.protocol.channels import CHANNELS, key_for
-from sightline.protocol.spec.field_docs import doc_of, unit_of
 from sightline.protocol.errors import CLAMPED, RejectReason
+from sightline.protocol.spec import golden
+from sightline.protocol.spec.asyncapi import document
+from sightline.protocol.spec.field_docs import doc_of, unit_of
 from sightline.protocol.transports.websocket.framing import Hello
 
 HERE: Final = Path(__file__).parent.parent
@@ -189,7 +189,9 @@ def write() -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line; returns the exit code: 0, or 5 if `--verify` found a difference."""
-    parser = argparse.ArgumentParser(prog="python -m sightline.protocol.spec.generate", description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m sightline.protocol.spec.generate", description=__doc__.partition("\n")[0]
+    )
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--write", action="store_true", help="bring the generated files up to date")
     what.add_argument("--verify", action="store_true", help="exit 5 if they are not")
@@ -198,7 +200,10 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     wrong = differing()
     for path in wrong:
-        print(f"protocol/{path} is not what the code says: python -m sightline.protocol.spec.generate --write", file=sys.stderr)
+        print(
+            f"protocol/{path} is not what the code says: python -m sightline.protocol.spec.generate --write",
+            file=sys.stderr,
+        )
     return 5 if wrong else 0
 
 

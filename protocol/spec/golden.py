@@ -18,10 +18,9 @@ from typing import Any
 from sightline.protocol.channels import ACK, JPEG, SCAN, TWIST, Channel, parse_key
 from sightline.protocol.codec import check_sizes, decode, decode_ranges
 from sightline.protocol.errors import WireError
-from sightline.protocol.spec.message_cases import MessageCase
-from sightline.protocol.spec.message_cases import CASES
-from sightline.protocol.spec.framing_cases import FRAMING_CASES, FramingCase, framing_outcome
 from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.spec.framing_cases import FRAMING_CASES, FramingCase, framing_outcome
+from sightline.protocol.spec.message_cases import CASES, MessageCase
 from sightline.protocol.text import parse_twist
 
 INEXACT_KEY = "INEXACT_KEY"

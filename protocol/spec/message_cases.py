@@ -3,8 +3,9 @@
 import json
 import struct
 from dataclasses import dataclass
-from sightline.protocol.channels import CHANNELS, key_for
 from typing import Any
+
+from sightline.protocol.channels import CHANNELS, key_for
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import socket
 import ssl
 from pathlib import Path
+
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
 from sightline.protocol.transports.security import RoleKeys
-
 
 _LISTEN = "0A"
 

@@ -4,16 +4,18 @@ import ipaddress
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from sightline.protocol.errors import ConfigError
 from typing import Final
 
+from sightline.protocol.errors import ConfigError
 
 SEND_BUFFER_BYTES: Final = 262_144
 """A bounded socket buffer keeps frames young: what waits in the socket can no longer be dropped, and credit bounds it.
 It holds what is under way, 200 ms of the whole stream; with a quarter of it, pictures over such a distance had 16 kB in
 place of 34, and their age a p95 of 351 ms in place of 219 (`bench network --only rtt200`)."""
 
-_ZENOH_ENDPOINT = re.compile(r"(tcp|tls|quic|udp|ws)/(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]]+):([0-9]{1,5})(\?[^#\s]*)?(#\S*)?")
+_ZENOH_ENDPOINT = re.compile(
+    r"(tcp|tls|quic|udp|ws)/(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]]+):([0-9]{1,5})(\?[^#\s]*)?(#\S*)?"
+)
 _BUFFERED = ("tcp", "tls")
 
 

@@ -1,18 +1,18 @@
 """The transport interface: `Link`, `Message`, `LatestSlot`, and the rules that every link enforces. Shell (locks).
 
-A `Link` belongs to one robot id. It promises what `tests/protocol/transports/test_link.py` checks on every transport: newest wins,
-memory is bounded, both ends may restart, nothing raised in a callback ends anything, `close` does not hang.
+A `Link` belongs to one robot id. It promises what `tests/protocol/transports/test_link.py` checks on every transport:
+newest wins, memory is bounded, both ends may restart, nothing raised in a callback ends anything, `close` never hangs.
 """
 
 import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from sightline.protocol.channels import Channel, FRAME, MAX_HEADER_BYTES, check_robot_id, key_for, parse_key
-from sightline.protocol.errors import ConfigError
 from types import TracebackType
 from typing import Generic, Protocol, Self, TypeVar
 
+from sightline.protocol.channels import FRAME, MAX_HEADER_BYTES, Channel, check_robot_id, key_for, parse_key
+from sightline.protocol.errors import ConfigError
 
 Item = TypeVar("Item")
 

@@ -18,8 +18,7 @@ from types import TracebackType
 from typing import Final, NamedTuple, Self
 
 from sightline.protocol.channels import FRAME, Channel, Direction, parse_key, pattern_for
-from sightline.protocol.transports.link import LatestSlot, Message
-from sightline.protocol.transports.link import LinkRules
+from sightline.protocol.transports.link import LatestSlot, LinkRules, Message
 
 MAX_IN_FLIGHT: Final = 4096
 """Messages under way in one network; what would go over is dropped and counted as `overflow`."""

@@ -9,12 +9,14 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
-from sightline.protocol.channels import CHANNELS, Channel, FRAME
-from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports import endpoints, endpoints as websocket_endpoints
-from sightline.protocol.transports.link import LatestSlot, Link, Message
 from types import TracebackType
 from typing import Any, Self
+
+from sightline.protocol.channels import CHANNELS, FRAME, Channel
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports import endpoints
+from sightline.protocol.transports import endpoints as websocket_endpoints
+from sightline.protocol.transports.link import LatestSlot, Link, Message
 
 
 def check_endpoint(endpoint: str) -> None:

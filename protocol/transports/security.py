@@ -16,11 +16,11 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from sightline.protocol.channels import CHANNELS, Channel, Direction, KEY_PREFIX, MAX_HEADER_BYTES, REQUEST
-from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_zenoh_endpoint, with_allowed
 from typing import Any, Final
 
+from sightline.protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REQUEST, Channel, Direction
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_zenoh_endpoint, with_allowed
 
 ROBOT_ROLE: Final = "robot"
 SOURCES_OF_ROLE: Final[dict[str, tuple[str, ...]]] = {
@@ -35,7 +35,7 @@ KNOWN_SOURCES: Final = frozenset(source for sources in SOURCES_OF_ROLE.values() 
 """The sources that a role speaks as; any other is made up by its peer, and possible only on a link without keys."""
 ROLES: Final = (ROBOT_ROLE, *SOURCES_OF_ROLE)
 PRESENCE_PREFIX: Final = "sightline-presence"
-"""Where peers say that they are there (`sightline.protocol.transports.zenoh.presence`): beside `sightline/`, the keys of channels."""
+"""Where peers say that they are there (`transports/zenoh/presence.py`): beside `sightline/`, the keys of channels."""
 _TLS: Final = ("tls", "quic")
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from sightline.protocol.channels import ODOMETRY, REPLY, SCAN, STATUS, Channel
 from sightline.protocol.codec import check_sizes, decode, encode, encode_ranges
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import (
     STILL,
     AnswerHeader,
@@ -22,15 +22,14 @@ from sightline.protocol.messages import (
     StreamStatus,
     WireModel,
 )
-from sightline.protocol.errors import RejectReason
-from sightline.protocol.transports.link import Message
 from sightline.protocol.text import parse_twist
+from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.safety.guard import RangeGuard
-from sightline.robot_side.pipe import CommandAck, Motion
 from sightline.robot_side.kinematics import Odometer, wheel_speeds
+from sightline.robot_side.pipe import CommandAck, Motion
 from sightline.robot_side.ports import Ranges, WheelAngles
 from sightline.robot_side.safety.gate import SafetyGate
+from sightline.robot_side.safety.guard import RangeGuard
 
 _PERIODS_US = {STATUS.name: 100_000, ODOMETRY.name: 50_000}
 _CITES_NOTHING_OF_OURS = (RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME, RejectReason.FROM_FUTURE)

@@ -8,9 +8,9 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from sightline.protocol.errors import ConfigError
 from typing import Final
 
+from sightline.protocol.errors import ConfigError
 
 _NO_SYNC: Final = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)  # of a folder, on some file systems in user space
 

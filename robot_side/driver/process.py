@@ -6,6 +6,9 @@ import signal
 import struct
 from collections import Counter
 from contextlib import ExitStack, suppress
+from types import FrameType
+from typing import Final
+
 from sightline.protocol.channels import REQUEST, TWIST, check_robot_id
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
@@ -18,12 +21,9 @@ from sightline.robot_side.driver.persistence import BackgroundWriter, StopLatch
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS, SystemdNotifier, request_real_time
 from sightline.robot_side.pipe import DriverEnd
 from sightline.robot_side.plugins import build_device
-from sightline.robot_side.ports import Drive, RangeSensor, Ranges, WheelAngles
+from sightline.robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
 from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
 from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
-from types import FrameType
-from typing import Final
-
 
 _FIRST_PERIOD_US: Final = 1_000_000
 _LONGEST_PERIOD_US: Final = 60_000_000

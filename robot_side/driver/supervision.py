@@ -8,7 +8,6 @@ import socket
 from collections.abc import Iterator
 from typing import Final
 
-
 EXIT_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 """Whatever a key or a terminal can send ends it by way of zero, Ctrl-\\ and Ctrl-Z too: a driver that is killed or held
 up on the spot leaves the wheels turning."""

@@ -14,14 +14,15 @@ import tomllib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Annotated, Any, Final, Literal, Protocol, Self
+
 from pydantic import Field, ValidationError, field_validator, model_validator
+
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.robot_side.hardware.gpio_low import import_lgpio, leave_low
 from sightline.robot_side.ports import WheelAngles
-from typing import Annotated, Any, Final, Literal, Protocol, Self
-
 
 Duty = Annotated[float, Field(gt=0, le=1)]
 RimSpeed = Annotated[float, Field(gt=0, le=3)]
@@ -104,7 +105,7 @@ def table_text(rows: Sequence[tuple[float, float]], head: str) -> str:
 
 _SPI_DEVICE: Final = Path("/dev/spidev0.0")
 _SPI_PINS: Final = frozenset(range(7, 12))
-_INSTALL: Final = "pip install 'sightline[robot-pi]', or sudo apt install python3-gpiozero python3-lgpio"
+_INSTALL: Final = "pip install 'sightline-robot[robot-pi]', or sudo apt install python3-gpiozero python3-lgpio"
 
 
 class Pins(Protocol):

@@ -1,15 +1,16 @@
 """Logic of the network process: pictures in, frames out, credit, camera adaptation. Pure."""
 
 from collections.abc import Mapping
+
 from sightline.protocol.channels import CAMERA, FRAME
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import (
+    MAX_CHANNELS_SHOWN,
     AnswerHeader,
     CameraModel,
     FrameHeader,
     Holder,
-    MAX_CHANNELS_SHOWN,
     Planar,
     Pose,
     Stamp,

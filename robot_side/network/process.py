@@ -12,6 +12,8 @@ import zlib
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from typing import Final
+
 from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
@@ -25,8 +27,6 @@ from sightline.robot_side.network.core import CameraAdaptation, NetworkCore
 from sightline.robot_side.pipe import NetworkEnd, NetworkSetup
 from sightline.robot_side.plugins import build_device
 from sightline.robot_side.ports import Camera, Picture
-from typing import Final
-
 
 _ASK_ADDRESS: Final = 0x8915  # SIOCGIFADDR of linux/sockios.h
 _ANYWHERE: Final = ("/0.0.0.0:", "/[::]:")

@@ -7,7 +7,7 @@ Liveness is the accepted command: refused commands, acks and open connections re
 import math
 from collections import Counter
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import CLAMPED, RejectReason, WireError
 from sightline.protocol.messages import (
     STILL,
     AnswerHeader,
@@ -19,8 +19,10 @@ from sightline.protocol.messages import (
     Twist,
     Verb,
 )
-from sightline.protocol.errors import CLAMPED, RejectReason
 from sightline.robot_side.safety.guard import RangeGuard
+from sightline.robot_side.safety.lease import HUMANS, RANKS, Lease
+from sightline.robot_side.safety.limits import Ramp, SafetyConfig, age_factor, clamp_twist
+from sightline.robot_side.safety.states import Event, is_armed, next_state
 from sightline.robot_side.safety.validation import (
     AcceptedCommand,
     CommandResult,
@@ -29,9 +31,6 @@ from sightline.robot_side.safety.validation import (
     IssuedRecord,
     SequenceRecord,
 )
-from sightline.robot_side.safety.lease import HUMANS, RANKS, Lease
-from sightline.robot_side.safety.limits import Ramp, SafetyConfig, age_factor, clamp_twist
-from sightline.robot_side.safety.states import Event, is_armed, next_state
 
 _GUEST = Holder(source="guest", session="00000000")
 _MAX_REQUEST_AGE_US = 2_000_000  # an `arm` that a link kept back must not arm when it is delivered at last

@@ -9,13 +9,14 @@ A stale sensor counts as an obstacle all around.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated
+
 from pydantic import Field
+
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, Twist
 from sightline.robot_side.ports import Ranges
-from typing import Annotated
-
 
 # First the speed gives way; without it a turn can come too close to a point looked at before, so it gives way in the
 # second pass, and for all points in the third. At zero speed a smaller turn is safe for every point: no fourth.

@@ -6,9 +6,8 @@ Nothing here trusts a sender: a frame is known because this robot issued it, and
 from collections import OrderedDict
 from dataclasses import dataclass
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import AnswerHeader, Echo, State, Twist
-from sightline.protocol.errors import RejectReason
 
 _KEPT_PER_CHANNEL = 256  # 8 s of 30 fps frames; anything older is STALE long before
 _KEPT_SENDERS = 64
@@ -87,10 +86,13 @@ class IssuedRecord:
             raise WireError(RejectReason.UNKNOWN_FRAME, f"cites {echo.channel} {echo.seq}, which was not issued so")
         age_us = now_us - echo.t_us
         if age_us < 0:
-            raise WireError(RejectReason.FROM_FUTURE, f"cites {echo.channel} {echo.seq} of {-age_us / 1e3:.0f} ms from now")
+            raise WireError(
+                RejectReason.FROM_FUTURE, f"cites {echo.channel} {echo.seq} of {-age_us / 1e3:.0f} ms from now"
+            )
         if age_us > max_age_us:
             raise WireError(
-                RejectReason.STALE, f"{echo.channel} {echo.seq} is {age_us / 1e3:.0f} ms old, at most {max_age_us / 1e3:.0f}"
+                RejectReason.STALE,
+                f"{echo.channel} {echo.seq} is {age_us / 1e3:.0f} ms old, at most {max_age_us / 1e3:.0f}",
             )
         return age_us
 

@@ -11,8 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sightline.sim.scenario import State
-from sightline.sim.scenario import Color
+from sightline.sim.scenario import Color, State
 
 JUDGED_FROM: Final = 900_000
 """Seeds from here on are for judging only."""

@@ -1,35 +1,36 @@
 """Places the things of a scene, and the defects of its picture. Pure."""
 
-import cv2
 import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import numpy.typing as npt
 import simplejpeg
-from collections.abc import Iterator
-from dataclasses import replace
+
 from sightline.sim.scenario import Color
 from sightline.sim.scenes.model import (
     BALL_PX,
-    Column,
     HEIGHT_PX,
     LIGHT_SIZES,
-    Lens,
     MOST_DISTRACTORS,
+    STATES,
+    VALIDATED_FROM,
+    WIDTH_PX,
+    WITHOUT_BALL_EVERY,
+    Column,
+    Lens,
     Point,
     Random,
-    STATES,
     Scene,
     ScenePlan,
     Solid,
     Span,
     Surface,
-    VALIDATED_FROM,
-    WIDTH_PX,
-    WITHOUT_BALL_EVERY,
     is_judged,
 )
 from sightline.sim.scenes.textures import any_rgb, families
-
 
 _YELLOW = {"saturation": (0.72, 1.0), "value": (0.75, 1.0), "hue_deg": (42.0, 58.0)}
 _JUDGED_LIGHT_DEG = ((30.0, 50.0),)  # how high the light stands; between those of training, and never trained on

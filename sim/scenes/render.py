@@ -1,33 +1,34 @@
 """Renders a scene with boxes from the segmentation mask. Shell (PyBullet)."""
 
-import cv2
 import math
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any, Self
+
+import cv2
 import numpy as np
 import numpy.typing as npt
-from collections.abc import Sequence
-from sightline.sim.scenario import Color, LIT, Legs, Light, Part, State, color_of
+
+from sightline.sim.scenario import LIT, Color, Legs, Light, Part, State, color_of
 from sightline.sim.scenes.model import (
+    HEIGHT_PX,
+    MOST_HIDDEN,
+    VALIDATED_FROM,
+    WIDTH_PX,
     Box,
     Column,
-    HEIGHT_PX,
     LabelledBox,
     Lens,
-    MOST_HIDDEN,
     Scene,
     ScenePlan,
     Solid,
     Surface,
-    VALIDATED_FROM,
-    WIDTH_PX,
 )
 from sightline.sim.scenes.plan import plan_scene, with_more_of_the_ball
 from sightline.sim.scenes.textures import SIDE, texture
 from sightline.sim.world.bodies import ball_visual
 from sightline.sim.world.camera import FAR_M, NEAR_M, NOTHING_DEPTH
 from sightline.sim.world.engine import pybullet
-from types import TracebackType
-from typing import Any, Self
-
 
 Plane = npt.NDArray[np.float32]
 _SHADED = (0.7, 1.0)  # the wall's brightness, by its turn

@@ -1,14 +1,15 @@
 """Tileable textures of floors and walls. Pure."""
 
+from collections.abc import Callable
+from functools import cache
+from typing import Final
+
 import cv2
 import numpy as np
 import numpy.typing as npt
-from collections.abc import Callable
-from functools import cache
+
 from sightline.sim.scenes.model import HARDER_FROM, JUDGED_FROM, LATER_FROM, VALIDATED_FROM
 from sightline.sim.world.camera import floor_tile
-from typing import Final
-
 
 SIDE: Final = 128
 """Pixels of a tile, each way."""

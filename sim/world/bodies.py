@@ -1,14 +1,15 @@
 """Things, traffic lights and movers as bodies of PyBullet. Shell (PyBullet)."""
 
 import math
-import numpy as np
 from functools import cache
-from sightline.sim.scenario import Color, Forced, Light, OnPath, Part, Place, Pushed, Rolling, Static, Thing, color_of
-from sightline.sim.world.engine import pybullet
-from sightline.sim.world.physics import FLOOR, ROBOT, TARGET, Vector, WALL, group
-from sightline.sim.world.start import target_phase, thing_phase, thing_place
 from typing import Protocol
 
+import numpy as np
+
+from sightline.sim.scenario import Color, Forced, Light, OnPath, Part, Place, Pushed, Rolling, Static, Thing, color_of
+from sightline.sim.world.engine import pybullet
+from sightline.sim.world.physics import FLOOR, ROBOT, TARGET, WALL, Vector, group
+from sightline.sim.world.start import target_phase, thing_phase, thing_place
 
 _NO_TURN = (0.0, 0.0, 0.0, 1.0)
 

@@ -3,17 +3,18 @@
 One over depth is linear across the picture of a plane, so each face needs one plane equation and one comparison.
 """
 
-import cv2
 import math
+from typing import Any
+
+import cv2
 import numpy as np
 import numpy.typing as npt
 import simplejpeg
+
 from sightline.protocol.messages import CameraModel
 from sightline.robot_side.ports import scaled_quality, scaled_size
 from sightline.sim.scenario import Look, Wall
 from sightline.sim.world.engine import pybullet
-from typing import Any
-
 
 PoseMatrix = npt.NDArray[np.float64]
 SUBPIXEL_BITS = 4

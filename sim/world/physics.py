@@ -10,12 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from sightline.protocol.errors import ConfigError
-from sightline.sim.robot import UrdfBody, urdf_body
-from sightline.sim.world.engine import pybullet
+from sightline.sim.robot import RobotModel, UrdfBody, urdf_body
+from sightline.sim.scenario import Place, Wall
 from sightline.sim.urdf import Transform
-from sightline.sim.scenario import Place
-from sightline.sim.robot import RobotModel
-from sightline.sim.scenario import Wall
+from sightline.sim.world.engine import pybullet
 
 FLOOR, ROBOT, TARGET, WALL = 1, 2, 4, 8
 """Collision groups; rays choose by them what they may hit."""

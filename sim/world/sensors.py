@@ -7,18 +7,19 @@ from __future__ import annotations
 
 import array
 import math
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
-from collections.abc import Iterable
+
 from sightline.protocol.messages import CameraModel
 from sightline.robot_side.ports import Ranges
 from sightline.sim.bus import Label
 from sightline.sim.robot import LidarModel, RangeSensorMount
 from sightline.sim.world.bodies import ThingBodies
 from sightline.sim.world.engine import pybullet
-from sightline.sim.world.physics import TARGET, Vector, WALL
-from typing import Any
-
+from sightline.sim.world.physics import TARGET, WALL, Vector
 
 Numbers = npt.NDArray[np.float64]
 

@@ -4,10 +4,7 @@ import math
 
 import numpy as np
 
-from sightline.sim.scenario import Light
-from sightline.sim.scenario import Place
-from sightline.sim.scenario import Scenario, Start
-from sightline.sim.scenario import OnPath, Static
+from sightline.sim.scenario import Light, OnPath, Place, Scenario, Start, Static
 
 # Each draw has a stream of its own, so that one more thing in a scenario moves nothing else.
 _PATH, _START, _THING_PATH, _JITTER, _LIGHT = 1, 2, 7, 8, 9

@@ -2,6 +2,9 @@
 
 import math
 from random import Random
+from types import TracebackType
+from typing import Any, Self
+
 from sightline.robot_side.ports import Ranges, WheelAngles
 from sightline.sim.bus import Label
 from sightline.sim.robot import RobotModel, Wheels, outline
@@ -10,12 +13,9 @@ from sightline.sim.truth import Truth
 from sightline.sim.world.bodies import LightBodies, Mover, ThingBodies, begin, begin_thing
 from sightline.sim.world.camera import Defects, SceneCamera
 from sightline.sim.world.engine import pybullet
-from sightline.sim.world.physics import Vector, WALL, add_floor, add_robot, add_wall, open_client
+from sightline.sim.world.physics import WALL, Vector, add_floor, add_robot, add_wall, open_client
 from sightline.sim.world.sensors import Lidar, leg_labels
 from sightline.sim.world.start import light_begin, robot_start
-from types import TracebackType
-from typing import Any, Self
-
 
 SLIP_EVERY_STEPS = 25  # 0.1 s of 4 ms steps
 

@@ -6,8 +6,7 @@ import subprocess
 import pytest
 
 from sightline.benchmarks import report
-from sightline.benchmarks.report import page_with, sections_named, write_report
-from sightline.benchmarks.report import SECTIONS
+from sightline.benchmarks.report import SECTIONS, page_with, sections_named, write_report
 from sightline.operator_side.cli.app import app
 from sightline.protocol.errors import ConfigError
 

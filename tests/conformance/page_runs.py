@@ -18,7 +18,7 @@ from tests.fixtures.javascript import EXAMPLES, ROOT, JsRobot, JsVision, free_po
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess
 
-SIGHTLINE = [sys.executable, "-m", "sightline.operator_side.cli.app"]
+SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 KEPT = ROOT / "runs" / "conformance"
 PAGE = ROOT / "docs" / "conformance.md"
 ADAPTER = EXAMPLES.parent / "codec_adapter.py"

@@ -12,16 +12,19 @@ import pytest
 
 from sightline.conformance import codec as codec_process
 from sightline.conformance.case import Level
-from sightline.conformance.codec import CASES, END, run_codec
 from sightline.conformance.codec import (
+    CASES,
+    END,
     MAX_ANSWER_BYTES,
+    VECTORS,
     ProgramError,
     Question,
+    codec_cases,
     read_answer,
     read_question,
+    run_codec,
     same,
 )
-from sightline.conformance.codec import VECTORS, codec_cases
 from sightline.conformance.runner import Outcome
 from sightline.protocol.errors import ConfigError
 from tests.conformance.codec_broken import WRONG

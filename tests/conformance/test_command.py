@@ -7,16 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from sightline.operator_side.cli import app as cli
-from sightline.operator_side.setup import keys
-from sightline.operator_side.cli.conform import access_for
-from sightline.conformance.vision import cases as vision
-from sightline.conformance.case import Access
-from sightline.conformance.case import Case, Level
-from sightline.conformance.report import to_html
-from sightline.conformance.report import summary, to_dict, to_junit, to_page
+from sightline.conformance.case import Access, Case, Level
+from sightline.conformance.report import summary, to_dict, to_html, to_junit, to_page
 from sightline.conformance.robot.cases import CASES
 from sightline.conformance.runner import Outcome, Result
+from sightline.conformance.vision import cases as vision
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side.cli.conform import access_for
+from sightline.operator_side.setup import keys
 from tests.conformance.robot.small_server import SmallServer
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess

@@ -14,9 +14,9 @@ from sightline.protocol.messages import CameraModel, FrameHeader
 from sightline.protocol.text import MAX_TWIST_BYTES, format_twist
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.detect.port import Circle, Detection
+from sightline.vision_side.missions.port import Plan, RangeScan, View
 from sightline.vision_side.missions.registry import MissionSpec
 from sightline.vision_side.missions.switch import MAX_COMMAND
-from sightline.vision_side.missions.port import Plan, RangeScan, View
 
 CAMERA = CameraModel(width_px=320, height_px=240, fx_px=190.7, fy_px=190.7, cx_px=160.0, cy_px=120.0, z_m=0.1)
 LABELS = ("target", "legs", "light", "person")

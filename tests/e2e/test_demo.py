@@ -16,7 +16,7 @@ from sightline.protocol.errors import SightlineError
 
 pytestmark = pytest.mark.slow
 
-COMMAND = [sys.executable, "-m", "sightline.operator_side.cli.app", "demo"]
+COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "demo"]
 
 
 def running_in(folder: Path) -> list[str]:

@@ -1,15 +1,17 @@
 """Detectors in real processes: `sightline vision` drives a real robot by one, another looks on and is promoted live."""
 
 import json
-import numpy as np
 import os
-import pytest
 import signal
 import subprocess
 import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
+import pytest
+
 from sightline.evaluation.processes import Processes
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Decoder
@@ -20,7 +22,6 @@ from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.onnx import brightness_model
 from tests.fixtures.vision.remote import Server, box, grpc_answer, grpc_started, http_reply, said
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
-
 
 pytestmark = pytest.mark.slow
 RIGHT = [[250.0, 100.0, 300.0, 150.0]]
@@ -34,7 +35,7 @@ class VisionProcess:
         self._arguments = arguments
 
     def __enter__(self) -> "VisionProcess":
-        command = [sys.executable, "-m", "sightline.operator_side.cli.app", "vision", *self._arguments]
+        command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "vision", *self._arguments]
         self.process = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT)
         return self
 
@@ -51,8 +52,13 @@ class VisionProcess:
 
 
 def sightline(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "sightline.operator_side.cli.app", *arguments], capture_output=True, text=True,
-                          timeout=30, check=False)
+    return subprocess.run(
+        [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
 
 
 def turning(robot: RobotProcess) -> float:
@@ -134,8 +140,21 @@ def _driving(tmp_path, detector, *options, beside=None):
     robot = RobotProcess(tmp_path)
     (tmp_path / "pictures" / "0.jpg").write_bytes(FAR_BALL)
     log = tmp_path / "vision.log"
-    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli.app", "vision", "--connect", robot.endpoint, "--detector",
-               detector, "--set", "boxes.height_m=0.2", *options]
+    command = [
+        sys.executable,
+        "-u",
+        "-P",
+        "-m",
+        "sightline.operator_side.cli.app",
+        "vision",
+        "--connect",
+        robot.endpoint,
+        "--detector",
+        detector,
+        "--set",
+        "boxes.height_m=0.2",
+        *options,
+    ]
     with robot, log.open("wb") as out:
         assert until(lambda: "on" in robot.output(), 10)
         if beside is not None:

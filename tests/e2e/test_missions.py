@@ -14,11 +14,11 @@ import pytest
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.transports.open import open_link
 from sightline.robot_side.ports import Ranges
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.serving.process import serve
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import jpeg_of
-from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.serving.process import serve
 
 pytestmark = pytest.mark.slow
 QUIET = VisionConfig.model_validate({"search": {"enabled": False}})
@@ -54,8 +54,13 @@ def grey_camera(folder):
 
 def sightline(*arguments):
     """One command as a person gives it."""
-    return subprocess.run([sys.executable, "-m", "sightline.operator_side.cli.app", *arguments], capture_output=True, text=True,
-                          timeout=30, check=False)
+    return subprocess.run(
+        [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
 
 
 @pytest.mark.parametrize("transport", ["zenoh", "websocket"])

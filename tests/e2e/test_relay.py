@@ -1,14 +1,15 @@
 """What peers say to one another goes through the robot once: to every other peer, of either transport, and not back."""
 
 import itertools
-import pytest
 import threading
 from contextlib import ExitStack
+
+import pytest
+
 from sightline.protocol.channels import CHANNELS, DETECTIONS, MISSION, OVERLAY, PREVIEW
 from sightline.protocol.transports.open import open_link
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess
-
 
 pytestmark = pytest.mark.slow
 PAYLOADS = {DETECTIONS.name: b'{"width_px":640,"height_px":480}', MISSION.name: b'{"id":1,"mission":"follow"}'}

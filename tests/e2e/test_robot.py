@@ -138,6 +138,9 @@ def test_bad_input_is_one_line_and_the_right_exit_code(tmp_path, change, code, s
 
 def test_driving_needs_no_heavy_package(tmp_path):
     """The modules that the driver and network processes import, watched in a real interpreter."""
-    code = "import sightline.robot_side.driver.process, sightline.robot_side.network.process, sightline.sim.bus, sys, json; print(json.dumps(sorted(sys.modules)))"
+    code = (
+        "import sightline.robot_side.driver.process, sightline.robot_side.network.process, sightline.sim.bus; "
+        "import json, sys; print(json.dumps(sorted(sys.modules)))"
+    )
     loaded = json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
     assert not {"numpy", "cv2", "pybullet", "simplejpeg", "typer", "rich"} & set(loaded)

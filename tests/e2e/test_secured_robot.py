@@ -32,7 +32,7 @@ def robot(tmp_path):
 
 
 def _sightline(*arguments):
-    command = [sys.executable, "-m", "sightline.operator_side.cli.app", *arguments]
+    command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
 
 

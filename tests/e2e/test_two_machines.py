@@ -61,8 +61,17 @@ class Machines:
         return self._once(self._command(machine, arguments))
 
     def _command(self, machine, arguments):
-        return ["ip", "netns", "exec", self._names[machine], sys.executable, "-m", "sightline.operator_side.cli.app",
-                *arguments.split()]
+        return [
+            "ip",
+            "netns",
+            "exec",
+            self._names[machine],
+            sys.executable,
+            "-P",
+            "-m",
+            "sightline.operator_side.cli.app",
+            *arguments.split(),
+        ]
 
     def _once(self, command):
         done = subprocess.run(command, cwd=self._folder, env=self._env, capture_output=True, text=True, timeout=40,
@@ -110,6 +119,6 @@ def test_the_page_is_true(section, wire, tmp_path):
 
 def test_every_command_of_the_page_is_known():
     names = set(re.findall(r"sightline ([a-z]\w*)", PAGE))
-    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "-h"]
+    command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "-h"]
     known = subprocess.run(command, capture_output=True, text=True, check=True)
     assert names <= set(re.findall(r"^  (\w+) ", known.stdout, re.MULTILINE)), names

@@ -3,8 +3,7 @@
 import pytest
 
 from sightline.evaluation.lockstep import Conditions, run_lockstep
-from sightline.evaluation.score.figures import score
-from sightline.evaluation.score.figures import checks_of
+from sightline.evaluation.score.figures import checks_of, score
 from sightline.protocol.messages import State
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario

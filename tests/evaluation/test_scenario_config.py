@@ -2,13 +2,12 @@
 
 import pytest
 
-from sightline.operator_side.cli import app as cli
 from sightline.evaluation.scenario_config import robot_config, robot_of, vision_config, vision_table
+from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.safety.limits import stop_bound
-from sightline.sim.robot import outline
-from sightline.sim.robot import load_robot, robot_names
+from sightline.sim.robot import load_robot, outline, robot_names
 from sightline.sim.scenario import load_scenario, scenario_names
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.missions.registry import configured_mission

@@ -24,7 +24,7 @@ TABLES = {
     "robot_side/safety/states.py": _GATE,
     "robot_side/safety/validation.py": ("tests/robot_side/safety/test_validation.py",),
     "robot_side/safety/lease.py": ("tests/robot_side/safety/test_lease.py",),
-    "robot_side/safety/limits.py": ("tests/robot_side/safety/test_limits.py", "tests/robot_side/safety/test_limits.py"),
+    "robot_side/safety/limits.py": ("tests/robot_side/safety/test_limits.py",),
     "robot_side/safety/guard.py": ("tests/robot_side/safety/test_guard.py",),
     "robot_side/kinematics.py": ("tests/robot_side/test_kinematics.py",),
     "protocol/text.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),

@@ -9,8 +9,8 @@ import copy
 import re
 from collections.abc import Callable, Iterator
 
-from sightline.protocol.messages import State, Verb
 from sightline.protocol.errors import RejectReason
+from sightline.protocol.messages import State, Verb
 
 _COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),
@@ -38,7 +38,7 @@ _EVENTS = ("ARM", "DISARM", "STOP", "RESET", "FAULT", "FRESH", "AGEING", "OLD", 
 _ENUMS = {
     "State": tuple(State.__members__),
     "Verb": tuple(Verb.__members__),
-    "Refusal": tuple(RejectReason.__members__),
+    "RejectReason": tuple(RejectReason.__members__),
     "Event": _EVENTS,  # spelt out: its file is judged too, and may not be imported before its mutants
 }
 _WORD = re.compile(r"[a-z0-9]{0,16}")

@@ -77,7 +77,8 @@ import sightline.protocol.jpeg
 from pathlib import Path
 from tests.mutation.mutants import mutants
 from tests.mutation.trial import start
-start(next(mutants("protocol/jpeg.py", Path("protocol/jpeg.py").read_text())), ["tests/protocol/test_text_and_jpeg_boundaries.py"])
+mutant = next(mutants("protocol/jpeg.py", Path("protocol/jpeg.py").read_text()))
+start(mutant, ["tests/protocol/test_text_and_jpeg_boundaries.py"])
 """
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert told.returncode == 1 and "imported before its mutants" in told.stderr

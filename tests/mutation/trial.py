@@ -33,7 +33,7 @@ class Outcome(Enum):
 
 def module_name(file: str) -> str:
     """The dotted name of a file of the repository."""
-    return file.removesuffix(".py").replace("/", ".")
+    return "sightline." + file.removesuffix(".py").replace("/", ".")
 
 
 def start(mutant: Mutant, suites: Sequence[str]) -> int:

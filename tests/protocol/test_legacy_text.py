@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import JpegSize
-from sightline.protocol.text import (
+from sightline.protocol.legacy_text import (
     MAX_BOXES,
     LegacyBox,
     decode_picture,
@@ -19,7 +19,6 @@ from sightline.protocol.text import (
     parse_dashed,
     text_bound,
 )
-from sightline.protocol.errors import RejectReason
 from sightline.protocol.text import parse_twist
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)

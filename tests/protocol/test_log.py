@@ -59,7 +59,17 @@ def test_a_form_that_is_none_is_refused(monkeypatch):
 
 
 def test_a_service_says_its_errors_as_json_too():
-    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "vision", "--connect", "nowhere", "--log", "json"]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "sightline.operator_side.cli.app",
+        "vision",
+        "--connect",
+        "nowhere",
+        "--log",
+        "json",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
     assert done.returncode == 2 and done.stdout == ""
     said = json.loads(done.stderr)
@@ -89,7 +99,11 @@ def unread(request):
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_who_tells_does_not_wait_for_who_reads(unread, wrapped):
     read, written = unread
-    stream, teller, begin_s = JsonLineStream(written, "robot", "info") if wrapped else written, AsyncLineWriter(), time.monotonic()
+    stream, teller, begin_s = (
+        JsonLineStream(written, "robot", "info") if wrapped else written,
+        AsyncLineWriter(),
+        time.monotonic(),
+    )
     for number in range(300):
         teller.tell(f"{number} " + 100 * "\U0001f600", stream)
     assert time.monotonic() - begin_s < 2

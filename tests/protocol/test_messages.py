@@ -20,8 +20,7 @@ from sightline.protocol.channels import (
     pattern_for,
 )
 from sightline.protocol.codec import check_sizes, decode, decode_ranges, encode, encode_ranges
-from sightline.protocol.errors import ConfigError, WireError
-from sightline.protocol.spec.message_cases import CASES
+from sightline.protocol.errors import ConfigError, RejectReason, WireError
 from sightline.protocol.messages import (
     MAX_INTEGER,
     AnswerHeader,
@@ -32,7 +31,7 @@ from sightline.protocol.messages import (
     ScanHeader,
     Stamp,
 )
-from sightline.protocol.errors import RejectReason
+from sightline.protocol.spec.message_cases import CASES
 
 MODELS = sorted(
     {channel.header for channel in CHANNELS.values()} | {c.payload for c in CHANNELS.values() if c.payload},

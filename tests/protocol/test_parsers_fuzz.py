@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, SCAN, check_robot_id, key_for, parse_key
 from sightline.protocol.codec import decode, decode_ranges, encode, encode_ranges
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.text import (
+from sightline.protocol.legacy_text import (
     MAX_BOXES,
     MAX_BOXES_BYTES,
     decode_picture,
@@ -26,9 +26,8 @@ from sightline.protocol.text import (
     text_bound,
 )
 from sightline.protocol.messages import WireModel
-from sightline.protocol.errors import RejectReason
-from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
 from sightline.protocol.text import MAX_TWIST_BYTES, format_twist, parse_twist
+from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
 
 CORPUS = Path(__file__).parent / "fuzz_corpus"
 MOST_PICTURE_BYTES = 120

@@ -10,11 +10,10 @@ import simplejpeg
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sightline.protocol.errors import WireError
-from sightline.protocol.spec.message_cases import jpeg, segments
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import MAX_SEGMENTS, JpegSize, read_jpeg_size
 from sightline.protocol.messages import Twist
-from sightline.protocol.errors import RejectReason
+from sightline.protocol.spec.message_cases import jpeg, segments
 from sightline.protocol.text import MAX_TWIST_BYTES, format_twist, parse_twist
 
 ABNF_NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"

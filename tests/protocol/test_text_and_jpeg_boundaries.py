@@ -2,10 +2,9 @@
 
 import pytest
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import JpegSize, read_jpeg_size
 from sightline.protocol.messages import Twist
-from sightline.protocol.errors import RejectReason
 from sightline.protocol.text import format_twist, parse_twist
 
 

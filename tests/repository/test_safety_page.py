@@ -1,4 +1,4 @@
-"""docs/safety.md draws its states from the table in the code; `python -m tests.repository.test_safety_page` writes them."""
+"""docs/safety.md draws its states from the table in the code. `python -m tests.repository.test_safety_page` writes."""
 
 import re
 from pathlib import Path

@@ -10,11 +10,10 @@ from sightline.protocol.channels import FRAME
 from sightline.protocol.messages import CameraModel, State, Status, StreamStatus
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.protocol.transports.open import LinkGroup
-from sightline.robot_side.pipe import NetworkSetup
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.hardware.cameras.timing import LatestPicture
 from sightline.robot_side.network.process import Network
-from sightline.robot_side.pipe import NetworkEnd
+from sightline.robot_side.pipe import NetworkEnd, NetworkSetup
 from sightline.robot_side.ports import Picture
 from tests.fixtures.cameras import jpeg
 from tests.fixtures.links import until

@@ -1,13 +1,15 @@
 """Differential drive and odometry: exact on arcs, the curve kept under saturation."""
 
 import math
+
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 from pydantic import ValidationError
+
 from sightline.protocol.messages import Twist
 from sightline.robot_side.kinematics import DiffDriveConfig, Odometer, twist_of, wheel_speeds
 from sightline.robot_side.ports import WheelAngles
-
 
 DRIVE = DiffDriveConfig()
 

@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from sightline.protocol.clock import monotonic_us
-from sightline.robot_side import pipe as ipc, plugins
-from sightline.robot_side.pipe import DriverEnd
+from sightline.robot_side import pipe as ipc
+from sightline.robot_side import plugins
 from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.pipe import DriverEnd
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import JPEG, RobotProcess
 
@@ -66,8 +67,10 @@ def test_a_class_of_the_folder_comes_after_all_that_is_installed(folder, monkeyp
 def test_from_a_checkout_that_nobody_installed_both_processes_are_the_checkout_s(tmp_path, monkeypatch):
     checkout = tmp_path / "checkout"
     for package in ("protocol", "robot_side"):
-        shutil.copytree(ROOT / package, checkout / package, ignore=shutil.ignore_patterns("__pycache__"))
-    with (checkout / "robot_side" / "network" / "process.py").open("r+") as source:
+        shutil.copytree(ROOT / package, checkout / "sightline" / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "sightline" / "__init__.py", checkout / "sightline")
+    process = checkout / "sightline" / "robot_side" / "network" / "process.py"
+    with process.open("r+") as source:
         text = source.read()
         source.seek(0)
         source.write(text.replace("def main() -> None:", "def main() -> None:\n    print(__file__, flush=True)"))
@@ -75,4 +78,4 @@ def test_from_a_checkout_that_nobody_installed_both_processes_are_the_checkout_s
     popen_there = partial(subprocess.Popen, cwd=checkout, env=environ)
     monkeypatch.setattr(subprocess, "Popen", popen_there)
     with RobotProcess(tmp_path) as robot:
-        assert until(lambda: str(checkout / "robot_side" / "network" / "process.py") in robot.output(), 20), robot.output()
+        assert until(lambda: str(process) in robot.output(), 20), robot.output()

@@ -11,9 +11,8 @@ from sightline.protocol.codec import encode
 from sightline.protocol.messages import Request, RequestHeader, Verb
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from sightline.robot_side.pipe import DriverEnd
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.pipe import MAX_PENDING, PendingRequests
+from sightline.robot_side.pipe import MAX_PENDING, DriverEnd, PendingRequests
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 

@@ -19,15 +19,18 @@ from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.robot_side.ports import Camera, Drive, RangeSensor
 from sightline.sim.bus import MOTION, MOTION_SET, SimCamera, SimDrive, SimRange, TruthReader
+from sightline.sim.process import SimConfig, SocketFolder, run
 from sightline.sim.robot import load_robot
-from sightline.sim.process import SimConfig, run
-from sightline.sim.process import SocketFolder
 
 pytestmark = pytest.mark.slow
 
-SERVE = "import sys; from sightline.sim.process import SimConfig, run; sys.exit(run(SimConfig.model_validate_json(sys.argv[1])))"
+SERVE = (
+    "import sys; from sightline.sim.process import SimConfig, run; "
+    "sys.exit(run(SimConfig.model_validate_json(sys.argv[1])))"
+)
 DRIVE = (
-    "import sys, time; from sightline.sim.bus import SimDrive; drive = SimDrive(SimDrive.Config(socket_dir=sys.argv[1]))\n"
+    "import sys, time; from sightline.sim.bus import SimDrive\n"
+    "drive = SimDrive(SimDrive.Config(socket_dir=sys.argv[1]))\n"
     "drive.set(6.0, 8.0); print('driving', flush=True); time.sleep(60)"
 )
 

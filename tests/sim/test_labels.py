@@ -10,19 +10,17 @@ pytest.importorskip("pybullet")
 import numpy as np
 import simplejpeg
 
-from sightline.evaluation.labels import Labels, boxes_message
-from sightline.evaluation.labels import LabelPublisher
+from sightline.evaluation.labels import LabelPublisher, Labels, boxes_message
 from sightline.protocol.channels import DETECTIONS, FRAME
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import Detections, DetectionsHeader, FrameHeader
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.sim.bus import SimCamera, TruthReader
-from sightline.sim.bus import Label, LabelReader, to_json
+from sightline.sim.bus import Label, LabelReader, SimCamera, TruthReader, to_json
 from sightline.sim.scenario import Wall, load_scenario
 from sightline.sim.world.world import World
+from sightline.vision_side.config import BoxesConfig
 from tests.fixtures.sim import robot_with, seen_at
 from tests.sim.test_bus import eventually, started
-from sightline.vision_side.config import BoxesConfig
 
 
 def world_of(distance_m=1.2, bearing_deg=0.0, walls=(), seed=1) -> World:

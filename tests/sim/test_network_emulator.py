@@ -25,9 +25,18 @@ from sightline.sim.tun_emulator import ADDRESS_A, _read_shapes, why_impossible
 PACKET = bytes(range(100))
 LONG_US = 10**9
 shapes = st.builds(
-    LinkShape, delay_ms=st.floats(0, 100), jitter_ms=st.floats(0, 50), loss=st.floats(0, 1), burst_start=st.floats(0, 1),
-    burst_end=st.floats(0.01, 1), rate_bit_s=st.sampled_from([0, 1e4, 1e6]), duplicate=st.floats(0, 1),
-    reorder=st.floats(0, 1), corrupt=st.floats(0, 1), queue_packets=st.integers(1, MAX_WAITING), cut=st.booleans(),
+    LinkShape,
+    delay_ms=st.floats(0, 100),
+    jitter_ms=st.floats(0, 50),
+    loss=st.floats(0, 1),
+    burst_start=st.floats(0, 1),
+    burst_end=st.floats(0.01, 1),
+    rate_bit_s=st.sampled_from([0, 1e4, 1e6]),
+    duplicate=st.floats(0, 1),
+    reorder=st.floats(0, 1),
+    corrupt=st.floats(0, 1),
+    queue_packets=st.integers(1, MAX_WAITING),
+    cut=st.booleans(),
 )
 
 

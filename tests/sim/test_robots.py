@@ -11,8 +11,8 @@ import simplejpeg
 
 from sightline.evaluation.scenario_config import robot_config
 from sightline.protocol.messages import Twist
-from sightline.robot_side.safety.guard import RangeGuard
 from sightline.robot_side.kinematics import Odometer, wheel_speeds
+from sightline.robot_side.safety.guard import RangeGuard
 from sightline.sim.robot import load_robot, robot_names
 from sightline.sim.scenario import Start, Wall, load_scenario
 from sightline.sim.world.world import World

@@ -9,11 +9,9 @@ from hypothesis import strategies as st
 
 from sightline.protocol.errors import ConfigError
 from sightline.sim.process import PeriodicTimer
-from sightline.sim.scenario import look_named
-from sightline.sim.world.world import Motor
-from sightline.sim.scenario import ClosedPath, Leg, Place
 from sightline.sim.robot import load_robot, robot_names
-from sightline.sim.scenario import OnPath, load_scenario, scenario_names
+from sightline.sim.scenario import ClosedPath, Leg, OnPath, Place, load_scenario, look_named, scenario_names
+from sightline.sim.world.world import Motor
 
 STEP_S = 0.004
 

@@ -7,8 +7,7 @@ from xml.etree import ElementTree
 import pytest
 
 from sightline.protocol.errors import ConfigError
-from sightline.sim.robot import outline, urdf_body, urdf_from_model
-from sightline.sim.robot import ROBOTS, load_robot, robot_names
+from sightline.sim.robot import ROBOTS, load_robot, outline, robot_names, urdf_body, urdf_from_model
 from sightline.sim.urdf import Urdf
 
 WHEELS = ("left_wheel_joint", "right_wheel_joint")
@@ -126,7 +125,7 @@ def test_without_its_extra_a_xacro_file_says_how_to_get_it(tmp_path, monkeypatch
     monkeypatch.setitem(__import__("sys").modules, "xacrodoc", None)
     (tmp_path / "mine.urdf.xacro").write_text("<robot/>")
     path = thymio_with(tmp_path, words=('urdf = "thymio.urdf"', 'urdf = "mine.urdf.xacro"'))
-    with pytest.raises(ConfigError, match=r"pip install 'sightline\[xacro\]'"):
+    with pytest.raises(ConfigError, match=r"pip install 'sightline-robot\[xacro\]'"):
         load_robot(path)
 
 

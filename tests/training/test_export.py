@@ -11,12 +11,11 @@ pytest.importorskip("pybullet")
 import cv2
 
 from sightline.operator_side.cli import app as cli
-from sightline.training.network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
-from sightline.training.schedule import SceneRange
-from sightline.training.scenes import CUT_PX, WHOLE_PX, sample
-from sightline.training.scenes import DrawnScenes, drawn_scenes
 from sightline.protocol.errors import ConfigError
 from sightline.sim.scenes.model import HEIGHT_PX, LABELS, WIDTH_PX, LabelledBox
+from sightline.training.network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
+from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes, drawn_scenes, sample
+from sightline.training.schedule import SceneRange
 from tests.training.fixture import weights
 
 BALL = LabelledBox("ball", (100.0, 60.0, 141.0, 99.0), 1.0)
@@ -191,7 +190,7 @@ def test_training_without_pytorch_says_what_to_install(monkeypatch, capsys, tmp_
     monkeypatch.setitem(__import__("sys").modules, "torch", None)
     assert cli.run(["train", "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err.strip()
-    assert "sightline[train]" in error and "torch" in error and "\n" not in error
+    assert "sightline-robot[train]" in error and "torch" in error and "\n" not in error
 
 
 @pytest.mark.parametrize("arguments", [["--steps", "0"], ["--device", "tpu"], ["--scenes", "3"], ["--batch", "1"]])

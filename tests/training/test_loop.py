@@ -14,19 +14,17 @@ import onnx
 import torch
 
 from sightline.operator_side.cli import app as cli
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.sim.scenes.model import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED_FROM, WIDTH_PX, LabelledBox
 from sightline.training import export as train_export
 from sightline.training import loop as train_run
 from sightline.training.export import onnx_bytes, weights_in
-from sightline.training.loop import train
-from sightline.training.loop import Network, begin_from, folded
+from sightline.training.loop import Network, begin_from, folded, train
 from sightline.training.network import AGAINST, OUTPUTS, Layer, network
+from sightline.training.scenes import CUT_PX, DrawnScenes
 from sightline.training.schedule import Training
-from sightline.training.scenes import CUT_PX
-from sightline.training.scenes import DrawnScenes
-from sightline.protocol.errors import ConfigError, HardwareError
-from sightline.sim.scenes.model import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED_FROM, WIDTH_PX, LabelledBox
-from tests.training.fixture import weights
 from sightline.vision_side.detect.onnx.detector import SHIPPED
+from tests.training.fixture import weights
 
 
 def scenes(count=4):

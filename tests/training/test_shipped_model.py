@@ -7,9 +7,8 @@ import pytest
 
 pytest.importorskip("pybullet")
 
+from sightline.evaluation.score.detector_report import MOST_WRONG, score_scenes, subjects
 from sightline.operator_side.cli import evaluate as cli_train
-from sightline.evaluation.score.detector_report import MOST_WRONG
-from sightline.evaluation.score.detector_report import score_scenes, subjects
 from sightline.sim.scenes.model import COLUMNS, JUDGED_FROM, LABELS, WIDTH_PX
 from sightline.vision_side.detect.onnx.detector import SHIPPED
 from sightline.vision_side.detect.onnx.engine import read_onnx_header

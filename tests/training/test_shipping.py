@@ -9,15 +9,14 @@ import pytest
 pytest.importorskip("pybullet")
 pytest.importorskip("onnx")
 
-from sightline.training.shipping import Card, card_text
+from sightline.sim.scenes.model import COLUMNS, LABELS
 from sightline.training.export import shifted
 from sightline.training.schedule import Training
-from sightline.training.shipping import chosen_thresholds, final_report, written
-from sightline.sim.scenes.model import COLUMNS, LABELS
-from tests.training.fixture import weights
+from sightline.training.shipping import Card, card_text, chosen_thresholds, final_report, written
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.registry import build_detector
 from sightline.vision_side.detect.onnx.engine import read_onnx_header
+from sightline.vision_side.detect.registry import build_detector
+from tests.training.fixture import weights
 
 
 @contextmanager

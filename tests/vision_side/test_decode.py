@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sightline.protocol.errors import WireError
-from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from sightline.vision_side.decode import MAX_SCANS, Decoder
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 GOOD = jpeg_of(scene(camera(), 0.855, 0.1))
 

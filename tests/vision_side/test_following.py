@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import pytest
 
-from tests.fixtures.vision.vision import Path, Rig, acquired_at, circle, eight, errors_after, still
 from sightline.vision_side.config import SearchConfig, VisionConfig
+from tests.fixtures.vision.vision import Path, Rig, acquired_at, circle, eight, errors_after, still
 
 SEEDS = (1, 2, 3, 4, 5, 6)
 

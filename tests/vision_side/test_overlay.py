@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from sightline.protocol.messages import STILL, FrameHeader, Twist
-from tests.fixtures.vision.vision import ball_about_lens, camera, scene
 from sightline.vision_side.detect.port import Circle, Detection
 from sightline.vision_side.overlay import (
     AXES,
@@ -24,6 +23,7 @@ from sightline.vision_side.overlay import (
     raw_px,
 )
 from sightline.vision_side.pipeline import Observation
+from tests.fixtures.vision.vision import ball_about_lens, camera, scene
 
 MODEL = camera()
 HEADER = FrameHeader(session="0000abcd", seq=7, t_us=1_000, applied=(0.1, -0.2), latency_us=34_000)
@@ -128,8 +128,13 @@ def test_no_command_is_said_as_such():
 
 def test_the_age_is_the_robots_own_measure_or_else_the_least_it_can_be():
     unmeasured = HEADER.model_copy(update={"latency_us": None})
-    strips = [draw_overlay(GREY, OverlayData(header, Observation("lost"), None, "follow", MODEL, 0.1, age_us), 640)[:20].tobytes()
-              for header in (HEADER, unmeasured) for age_us in (None, 12_000)]
+    strips = [
+        draw_overlay(GREY, OverlayData(header, Observation("lost"), None, "follow", MODEL, 0.1, age_us), 640)[
+            :20
+        ].tobytes()
+        for header in (HEADER, unmeasured)
+        for age_us in (None, 12_000)
+    ]
     assert strips[0] == strips[1] and len(set(strips)) == 3
 
 

@@ -12,9 +12,9 @@ from sightline.protocol.channels import MAX_HEADER_BYTES
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import STILL, AnswerHeader, FrameHeader, RequestId
 from sightline.protocol.text import format_twist
-from tests.fixtures.vision.vision import Rig, camera, eight, jpeg_of, scene
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header, encode_answer
+from tests.fixtures.vision.vision import Rig, camera, eight, jpeg_of, scene
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -137,8 +137,13 @@ COUNTS = st.integers(0, 2**53 - 1)
 SESSIONS = st.from_regex(r"[0-9a-f]{8}", fullmatch=True)
 
 
-ANSWERS = st.none() | st.builds(PipelineAnswer, twist=st.none(), seen=st.just(Observation("tracking")), scan=st.none() | COUNTS,
-                                mission=st.none() | st.builds(RequestId, session=SESSIONS, id=COUNTS))
+ANSWERS = st.none() | st.builds(
+    PipelineAnswer,
+    twist=st.none(),
+    seen=st.just(Observation("tracking")),
+    scan=st.none() | COUNTS,
+    mission=st.none() | st.builds(RequestId, session=SESSIONS, id=COUNTS),
+)
 
 
 @given(SESSIONS, SESSIONS, st.tuples(COUNTS, COUNTS, COUNTS, COUNTS), ANSWERS)

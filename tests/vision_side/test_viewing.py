@@ -13,11 +13,11 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader, Stamp
 from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.zenoh.session import open_session
-from tests.fixtures.links import free_endpoint, until
-from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from sightline.vision_side import viewing
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.service import open_service
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))

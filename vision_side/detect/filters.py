@@ -1,9 +1,12 @@
 """Detector wrappers: filter by label, filter by color, add track ids. Pure."""
 
-import cv2
-import numpy as np
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
+
+import cv2
+import numpy as np
+
 from sightline.protocol.errors import WireError
 from sightline.vision_side.config import HsvRange
 from sightline.vision_side.decode import Picture
@@ -19,7 +22,6 @@ from sightline.vision_side.detect.port import (
     corners,
     overlap,
 )
-from typing import Final
 
 
 class LabelFilter(DetectorWrapper):

@@ -2,11 +2,11 @@
 
 from collections import OrderedDict
 from collections.abc import Callable
+from typing import Final, Generic, TypeVar
+
 from sightline.protocol.messages import FrameHeader
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.port import DetectFrame
-from typing import Final, Generic, TypeVar
-
 
 Memory = TypeVar("Memory")
 

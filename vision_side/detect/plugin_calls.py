@@ -6,22 +6,22 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from numbers import Real
+from typing import Any, Final
+
 from sightline.protocol.errors import ConfigError, SightlineError
 from sightline.protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.detect.port import (
+    LONGEST_LABEL,
     Circle,
     DetectFrame,
     Detection,
     DetectionResult,
     Detector,
-    LONGEST_LABEL,
     Maker,
     clipped,
     is_label,
 )
-from typing import Any, Final
-
 
 MAX_NOTICES: Final = 16
 """Lines kept for who asks for them seldom; the oldest go first."""
@@ -150,7 +150,9 @@ def checked_results(
     except PLUGIN_ERRORS as error:
         if len(frames) > 1:  # whose frame it failed for is not known, and should cost no other robot its answer
             why = _why(error)
-            return [why if clock() > deadline_us else checked_results(detector, [one], deadline_us)[0] for one in frames]
+            return [
+                why if clock() > deadline_us else checked_results(detector, [one], deadline_us)[0] for one in frames
+            ]
         return [_why(error)] * len(frames)
     return [_answer(frame, result) for frame, result in zip(frames, results, strict=True)]
 

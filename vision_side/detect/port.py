@@ -1,14 +1,15 @@
 """The detector port: `Detector`, frames, results, labels, overlap of boxes. Pure."""
 
-import numpy as np
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from numpy.typing import NDArray
-from pydantic import Field
-from sightline.protocol.messages import FrameHeader
-from sightline.vision_side.decode import Decoder, Picture
 from typing import Annotated, Final, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from sightline.protocol.messages import FrameHeader
+from sightline.vision_side.decode import Decoder, Picture
 
 LONGEST_LABEL: Final = 64
 """As on the wire (`DetectedBox.label`), in characters."""

@@ -11,12 +11,10 @@ from typing import Any, Final
 
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
 from sightline.vision_side.detect.plugin_calls import plugin_guard
-from sightline.vision_side.detect.filters import ColorFilter
-from sightline.vision_side.detect.filters import LabelFilter
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.remote.client import EXAMPLES
-from sightline.vision_side.detect.filters import TrackIds
 from sightline.vision_side.missions.registry import check_missions, configured_mission
 from sightline.vision_side.plugins import PluginRegistry, config_model
 

@@ -9,13 +9,13 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from sightline.protocol.clock import monotonic_us
-from sightline.protocol.transports.link import Link
-from sightline.vision_side.detect.per_robot import DecoderPool, MAX_ROBOTS
-from sightline.vision_side.detect.plugin_calls import Notices, attach_detector, close_detector, notices_of, validated
-from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector, corners, overlap
 from typing import Final
 
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.transports.link import Link
+from sightline.vision_side.detect.per_robot import MAX_ROBOTS, DecoderPool
+from sightline.vision_side.detect.plugin_calls import Notices, attach_detector, close_detector, notices_of, validated
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector, corners, overlap
 
 WINDOW: Final = 300
 """Frames: ten seconds at 30 a second."""

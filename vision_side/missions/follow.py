@@ -16,14 +16,11 @@ from sightline.vision_side.config import (
     TargetConfig,
     TrackConfig,
 )
-from sightline.vision_side.tracking.locate import locate_box
-from sightline.vision_side.detect.port import is_followable
-from sightline.vision_side.detect.port import Detection
-from sightline.vision_side.tracking.prediction import Motion, MotionPredictor
+from sightline.vision_side.detect.port import Detection, is_followable
 from sightline.vision_side.missions.port import Plan, View
-from sightline.vision_side.tracking.steering import Search
-from sightline.vision_side.tracking.locate import Sighting, locate_sphere
-from sightline.vision_side.tracking.steering import Aim, Steer
+from sightline.vision_side.tracking.locate import Sighting, locate_box, locate_sphere
+from sightline.vision_side.tracking.prediction import Motion, MotionPredictor
+from sightline.vision_side.tracking.steering import Aim, Search, Steer
 from sightline.vision_side.tracking.track import Target, Track, from_odometry
 
 

@@ -1,18 +1,19 @@
 """Mission `goto`: footprint, progress checker, and driving to waypoints. Pure."""
 
 import math
+from typing import Annotated, ClassVar
+
 import numpy as np
 from pydantic import Field
+
 from sightline.protocol.config import Config
-from sightline.protocol.messages import CameraModel, Pose, STILL, Twist
+from sightline.protocol.messages import STILL, CameraModel, Pose, Twist
 from sightline.vision_side.config import LatencyConfig
 from sightline.vision_side.missions.planner import CELL_M, Costmap, Planner, Point
 from sightline.vision_side.missions.port import Plan, RangeScan, View
 from sightline.vision_side.missions.ranges import Points, PoseMemory, about_robot, echoes, in_odometry
 from sightline.vision_side.tracking.prediction import Motion, MotionPredictor
 from sightline.vision_side.tracking.track import to_odometry
-from typing import Annotated, ClassVar
-
 
 _STILL_MPS = 1e-6
 

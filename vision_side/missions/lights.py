@@ -16,8 +16,7 @@ from pydantic import Field
 from sightline.protocol.config import Config
 from sightline.vision_side.config import Fraction, HsvRange
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.color.hsv import color_table
-from sightline.vision_side.detect.color.hsv import sharp_outline
+from sightline.vision_side.detect.color.hsv import color_table, sharp_outline
 from sightline.vision_side.detect.port import Detection
 
 Box = tuple[float, float, float, float]

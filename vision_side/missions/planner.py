@@ -4,12 +4,13 @@ Sensors that reach 0.2 m see a wall only while they are beside it. What they saw
 given up again when rays pass where it was: after a drift of the odometry, or when the thing went away.
 """
 
-import cv2
 import math
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from sightline.vision_side.missions.ranges import Points
 
+from sightline.vision_side.missions.ranges import Points
 
 Cells = NDArray[np.int64]
 """(N, 2), whole numbers of cells."""

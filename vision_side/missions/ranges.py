@@ -1,9 +1,11 @@
 """Range scans: decoding, and echoes in the odometry frame. Pure."""
 
 import math
-import numpy as np
 from collections import deque
+
+import numpy as np
 from numpy.typing import NDArray
+
 from sightline.protocol.channels import SCAN
 from sightline.protocol.codec import check_sizes, decode
 from sightline.protocol.errors import RejectReason, WireError

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.messages import CameraModel
-from sightline.protocol.messages import MissionRequest
+from sightline.protocol.messages import CameraModel, MissionRequest
 from sightline.vision_side.config import TargetConfig, VisionConfig
 from sightline.vision_side.detect.port import is_followable
 from sightline.vision_side.missions.port import Mission

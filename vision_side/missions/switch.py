@@ -8,8 +8,8 @@ from typing import Final
 
 from sightline.protocol.messages import STILL, CameraModel
 from sightline.vision_side.detect.plugin_calls import PLUGIN_ERRORS
-from sightline.vision_side.missions.registry import MissionSpec
 from sightline.vision_side.missions.port import Plan, View
+from sightline.vision_side.missions.registry import MissionSpec
 
 SETTLE_S: Final = 1.0
 """A robot that still moves after this long is not moved by us; the new mission begins all the same."""

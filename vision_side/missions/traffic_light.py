@@ -1,19 +1,21 @@
 """Missions `traffic-light` and `traffic-light-boxes`: follow a lane and stop at its lights. Pure."""
 
 import math
+from typing import Annotated, ClassVar
+
 from pydantic import Field
-from sightline.protocol.config import Config, Config as Settings
-from sightline.protocol.messages import CameraModel, Pose, STILL, Twist
+
+from sightline.protocol.config import Config
+from sightline.protocol.config import Config as Settings
+from sightline.protocol.messages import STILL, CameraModel, Pose, Twist
 from sightline.vision_side.config import BoxesConfig, LatencyConfig
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.lane import Lane, LaneConfig, Line
-from sightline.vision_side.missions.lights import BoxLightReader, HousingLightReader, LampConfig, Light, UNKNOWN
+from sightline.vision_side.missions.lights import UNKNOWN, BoxLightReader, HousingLightReader, LampConfig, Light
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.tracking.locate import locate_box
 from sightline.vision_side.tracking.prediction import Motion, MotionPredictor
 from sightline.vision_side.tracking.track import to_odometry
-from typing import Annotated, ClassVar
-
 
 _FRAMES = 2  # a colour that lets go must be seen this often, one after the other; one that stops counts at once
 

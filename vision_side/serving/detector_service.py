@@ -6,21 +6,24 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final, Generic, Protocol, TypeVar
+
 from pydantic import ValidationError
+
 from sightline.protocol.channels import DETECTIONS, FRAME
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import (
+    LEAST_SIDE_PX,
+    MOST_SIDE_PX,
     DetectedBox,
     DetectedCircle,
     Detections,
     DetectionsHeader,
     Echo,
     FrameHeader,
-    LEAST_SIDE_PX,
-    MOST_SIDE_PX,
 )
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 from sightline.vision_side.config import VisionConfig
@@ -28,8 +31,6 @@ from sightline.vision_side.detect.per_robot import DecoderPool
 from sightline.vision_side.detect.plugin_calls import checked_results, maker_of, notices_of
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
 from sightline.vision_side.serving.process import ends_on_signal
-from typing import Final, Generic, Protocol, TypeVar
-
 
 Item = TypeVar("Item")
 

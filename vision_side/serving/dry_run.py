@@ -15,8 +15,8 @@ from sightline.protocol.transports.link import Link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import notices_of
 from sightline.vision_side.detect.registry import configured_detector
-from sightline.vision_side.serving.mission_channel import MissionChannel
 from sightline.vision_side.pipeline import SOURCE, Frame, Observation, Pipeline, PipelineAnswer
+from sightline.vision_side.serving.mission_channel import MissionChannel
 from sightline.vision_side.serving.service import Service
 
 _TELL_EVERY_S = 0.5

@@ -15,11 +15,10 @@ from typing import Protocol, Self
 from sightline.protocol.channels import Channel
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.serving.service import Counts
 from sightline.vision_side.detect.plugin_calls import close_detector
-from sightline.vision_side.detect.registry import configured_detector, waits_for_service
 from sightline.vision_side.detect.port import Detector
-from sightline.vision_side.serving.service import LogLine, Service, open_service
+from sightline.vision_side.detect.registry import configured_detector, waits_for_service
+from sightline.vision_side.serving.service import Counts, LogLine, Service, open_service
 
 _LONGEST_WAIT_S = 0.2
 

@@ -7,6 +7,8 @@ a network kept back does not start anything.
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Final
+
 from sightline.protocol.channels import MISSION, REPORT, SCAN
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError, RejectReason, WireError
@@ -27,9 +29,7 @@ from sightline.vision_side.detect.shadow import ShadowDetector
 from sightline.vision_side.detect.timing import TimedDetector
 from sightline.vision_side.missions.ranges import decode_scan
 from sightline.vision_side.missions.registry import MissionSpec, configured_mission, requested_mission
-from sightline.vision_side.pipeline import Observation, Pipeline, SOURCE
-from typing import Any, Final
-
+from sightline.vision_side.pipeline import SOURCE, Observation, Pipeline
 
 MAX_AGE_US: Final = 2_000_000
 """As old as the status that a request to a robot may cite."""

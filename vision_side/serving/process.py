@@ -8,13 +8,12 @@ from types import FrameType
 
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.serving.service import Observe
 from sightline.vision_side.detect.plugin_calls import close_detector
-from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.detect.port import Detector
+from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.missions.registry import configured_mission
 from sightline.vision_side.pipeline import SOURCE
-from sightline.vision_side.serving.service import LogLine, endpoints_text, open_service
+from sightline.vision_side.serving.service import LogLine, Observe, endpoints_text, open_service
 
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 

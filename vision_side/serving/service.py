@@ -6,6 +6,8 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final, TypeVar
+
 from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MAX_HEADER_BYTES, TWIST
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
@@ -20,10 +22,9 @@ from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.detect.timing import TimedDetector
 from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, encode_answer
-from sightline.vision_side.serving.mission_channel import MissionChannel, NO_FRAMES
-from sightline.vision_side.tracking.locate import BoxReader, REMEMBERED
+from sightline.vision_side.serving.mission_channel import NO_FRAMES, MissionChannel
+from sightline.vision_side.tracking.locate import REMEMBERED, BoxReader
 from sightline.vision_side.viewing import ViewPublisher
-from typing import Final, TypeVar
 
 
 @dataclass(frozen=True, slots=True)

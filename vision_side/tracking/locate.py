@@ -6,20 +6,21 @@ p . w = |p| for any point p of the ray, is linear in w = c / cos(alpha), exact a
 whatever part of the outline is in view.
 """
 
-import cv2
 import math
-import numpy as np
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import lru_cache
+
+import cv2
+import numpy as np
 from numpy.typing import NDArray
+
 from sightline.protocol.channels import DETECTIONS
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import CameraModel, DetectedBox, Detections, DetectionsHeader, FrameHeader
 from sightline.vision_side.config import BoxesConfig
 from sightline.vision_side.detect.port import Circle, Detection
-
 
 Column = NDArray[np.float64]
 

@@ -6,6 +6,7 @@ capture times, gains shrink as latency grows, and integrals give way to whatever
 
 import math
 from dataclasses import dataclass
+
 from sightline.protocol.messages import Planar, Pose, Twist
 from sightline.vision_side.config import SearchConfig, SteerConfig
 

@@ -9,15 +9,11 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
-from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES
-from sightline.protocol.transports.security import bearer_header
-from sightline.protocol.transports.websocket.framing import PeerError
-from sightline.protocol.transports.endpoints import WebSocketEndpoint
-from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL
-from sightline.protocol.transports.security import own_token
-from sightline.protocol.transports.websocket.peer import OPEN_S, PROTOCOL_OPTIONS
-from sightline.protocol.transports.security import client_tls_context, tls_handshake
+from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES, WebSocketEndpoint
+from sightline.protocol.transports.security import bearer_header, client_tls_context, own_token, tls_handshake
 from sightline.protocol.transports.websocket.connection import Connection
+from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL, PeerError
+from sightline.protocol.transports.websocket.peer import OPEN_S, PROTOCOL_OPTIONS
 
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed

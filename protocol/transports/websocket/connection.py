@@ -17,8 +17,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
+from typing import TYPE_CHECKING, Final, NamedTuple
+
 from sightline.protocol.clock import monotonic_us
-from typing import Final, NamedTuple, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from websockets.frames import Frame

@@ -9,15 +9,16 @@ object with fields (most of all none) follows an object of its own: `{"channel":
 import json
 import re
 from collections.abc import Hashable
+from typing import Annotated, Any, Final, NamedTuple, Protocol
+
 from pydantic import Field
+
 from sightline.protocol import VERSION
-from sightline.protocol.channels import CHANNELS, Channel, KEY_PREFIX, MAX_HEADER_BYTES
+from sightline.protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, Channel
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import RobotId, SessionId, Version, WireModel
 from sightline.protocol.transports.link import Message
-from typing import Annotated, Any, Final, NamedTuple, Protocol
-
 
 SUBPROTOCOL: Final = "sightline.v1"
 MAX_BLOCK_BYTES: Final = MAX_HEADER_BYTES + 64

@@ -4,27 +4,26 @@ They all are the same `guest` to the robot, which so cannot tell two that contra
 """
 
 from collections.abc import Callable, Hashable
-from sightline.protocol.channels import ACK, Channel, DETECTIONS, FRAME, KEY_PREFIX, TWIST, key_for
+from typing import Final, NamedTuple
+
+from sightline.protocol.channels import ACK, DETECTIONS, FRAME, KEY_PREFIX, TWIST, Channel, key_for
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader
-from sightline.protocol.text import (
+from sightline.protocol.legacy_text import (
     MAX_BOXES_BYTES,
     decode_picture,
     detections_from_boxes,
     encode_picture,
-    format_twist,
     parse_boxes,
     parse_dashed,
-    parse_twist,
     text_bound,
 )
+from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader
+from sightline.protocol.text import format_twist, parse_twist
 from sightline.protocol.transports.endpoints import LegacyOptions
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.websocket.framing import BAD_FRAMING, IncomingMessage, PeerError
-from typing import Final, NamedTuple
-
 
 DRIVER_SLOT_US: Final = 1_000_000
 """A driver that has said nothing valid for so long has left its seat; as long as the robot's own lease."""

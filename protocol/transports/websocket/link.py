@@ -11,7 +11,10 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from sightline.protocol.channels import CHANNELS, Channel, FRAME, TWIST, parse_key
+from types import TracebackType
+from typing import Final, Protocol, Self
+
+from sightline.protocol.channels import CHANNELS, FRAME, TWIST, Channel, parse_key
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
@@ -24,9 +27,6 @@ from sightline.protocol.transports.websocket.framing import Hello, IncomingMessa
 from sightline.protocol.transports.websocket.legacy import DriverSlot, LegacyClient, LegacyToRobot, LegacyToVision
 from sightline.protocol.transports.websocket.peer import Peer, Promote, Publication, exchange_hellos
 from sightline.protocol.transports.websocket.server import KeyFolder, Server
-from types import TracebackType
-from typing import Final, Protocol, Self
-
 
 Callback = Callable[[Message], None]
 _WATCHED = tuple(one for one in CHANNELS.values() if one.while_watched)
@@ -128,7 +128,7 @@ def open_websocket(
     try:
         import websockets  # noqa: F401
     except ImportError:
-        raise ConfigError("websockets is not installed: pip install 'sightline[websocket]'") from None
+        raise ConfigError("websockets is not installed: pip install 'sightline-robot[websocket]'") from None
     link = WebSocketLink(rules)
     try:
         link.open(doors, far, secure)

@@ -7,13 +7,15 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
-from sightline.protocol.channels import ACK, CHANNELS, Channel, Priority, REQUEST
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from sightline.protocol.channels import ACK, CHANNELS, REQUEST, Channel, Priority
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import WireError
 from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.messages import Request
-from sightline.protocol.transports.link import Message, OVERSIZE
+from sightline.protocol.transports.link import OVERSIZE, Message
 from sightline.protocol.transports.security import KNOWN_SOURCES
 from sightline.protocol.transports.websocket.connection import CLOSE_S, Connection, Keepalive
 from sightline.protocol.transports.websocket.framing import (
@@ -24,7 +26,6 @@ from sightline.protocol.transports.websocket.framing import (
     PeerError,
     SightlineV1,
 )
-from typing import Any, Final, Protocol, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed
@@ -225,7 +226,9 @@ class Peer:
             self._wire.shut()
             self._gone.set()
 
-    def _turn(self, life: Keepalive, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]) -> bool:
+    def _turn(
+        self, life: Keepalive, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]
+    ) -> bool:
         """Read what there is, and send; False if the other end is to be given up."""
         now_us = monotonic_us()  # before reading: however long this end stood still, what came meanwhile counts
         for message in self._wire.receive():
@@ -240,7 +243,9 @@ class Peer:
         self._send()
         return not life.is_over(now_us, self._wire.way_out)
 
-    def _read(self, message: Any, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]) -> None:
+    def _read(
+        self, message: Any, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]
+    ) -> None:
         before = self._dialect.wants
         try:
             packets = self._dialect.read(message)

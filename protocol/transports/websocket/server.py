@@ -16,13 +16,15 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
+
 from sightline.protocol.channels import FRAME, REQUEST, TWIST
 from sightline.protocol.errors import LinkError
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES, WebSocketEndpoint, host_problem, origin_problem
 from sightline.protocol.transports.security import (
-    NOT_LISTED,
     NO_TOKEN,
+    NOT_LISTED,
     certificate_role,
     check_listening,
     client_address_problem,
@@ -33,9 +35,8 @@ from sightline.protocol.transports.security import (
     tls_handshake,
 )
 from sightline.protocol.transports.websocket.connection import CLOSE_S, Connection
-from sightline.protocol.transports.websocket.framing import BAD_FRAMING, MAX_HELLO_BYTES, PeerError, SUBPROTOCOL
+from sightline.protocol.transports.websocket.framing import BAD_FRAMING, MAX_HELLO_BYTES, SUBPROTOCOL, PeerError
 from sightline.protocol.transports.websocket.peer import OPEN_S, PROTOCOL_OPTIONS, Promote, count_close
-from typing import Any, Final, NamedTuple, TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response

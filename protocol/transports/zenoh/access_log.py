@@ -15,11 +15,11 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Final
+
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.log import JsonLineStream, RepeatLimiter
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
-from typing import Final
-
 
 TLS_LOG_FILTER: Final = "off,zenoh_link_tls=warn,zenoh_link_quic=warn,zenoh_link_commons::quic=warn"
 """What is asked of Zenoh's log about handshakes: nothing of it is written per message."""

@@ -14,13 +14,17 @@ from typing import TYPE_CHECKING, Final
 from sightline.protocol.channels import KEY_PREFIX, STATUS, parse_key
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints, parse_zenoh_endpoint
-from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.link import LinkRules
-from sightline.protocol.transports.zenoh.presence import MAX_PEERS, QUERY_ROUNDS, PeerInfo, best_round_trips
+from sightline.protocol.transports.link import LinkRules, Message
 from sightline.protocol.transports.security import RoleKeys, load_role_keys
-from sightline.protocol.transports.zenoh.session import multicast_address
-from sightline.protocol.transports.zenoh.presence import REPLY_TIMEOUT_S, query_presence
-from sightline.protocol.transports.zenoh.session import open_session
+from sightline.protocol.transports.zenoh.presence import (
+    MAX_PEERS,
+    QUERY_ROUNDS,
+    REPLY_TIMEOUT_S,
+    PeerInfo,
+    best_round_trips,
+    query_presence,
+)
+from sightline.protocol.transports.zenoh.session import multicast_address, open_session
 
 if TYPE_CHECKING:
     import zenoh
@@ -126,7 +130,7 @@ def find_listeners(seconds: float) -> list[str]:
     try:
         import zenoh
     except ImportError:
-        raise ConfigError("Zenoh is not installed: pip install 'sightline[zenoh]'") from None
+        raise ConfigError("Zenoh is not installed: pip install 'sightline-robot[zenoh]'") from None
     logging.getLogger("zenoh").addHandler(logging.NullHandler())
     answers: zenoh.handlers.RingChannel[zenoh.Hello] = zenoh.handlers.RingChannel(MAX_LISTENERS)
     config = {"scouting": {"multicast": {"enabled": True, "address": multicast_address()}}}

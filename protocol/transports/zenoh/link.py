@@ -14,15 +14,16 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from fnmatch import fnmatchcase
-from sightline.protocol.channels import Channel, FRAME, KEY_PREFIX, STATUS, parse_key, pattern_for
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from sightline.protocol.channels import FRAME, KEY_PREFIX, STATUS, Channel, parse_key, pattern_for
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints
-from sightline.protocol.transports.link import LatestSlot, Link, LinkRules, Message, NOT_A_PUT
+from sightline.protocol.transports.link import NOT_A_PUT, LatestSlot, Link, LinkRules, Message
 from sightline.protocol.transports.security import KNOWN_SOURCES, ROBOT_ROLE, load_role_keys
 from sightline.protocol.transports.zenoh.presence import PeerInfo, PresenceAnnouncer, query_presence
 from sightline.protocol.transports.zenoh.session import CLOSED_SESSION, open_session
-from types import TracebackType
-from typing import Any, Final, Self, TYPE_CHECKING
 
 if TYPE_CHECKING:
     import zenoh

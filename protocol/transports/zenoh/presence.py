@@ -12,13 +12,15 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
+from typing import TYPE_CHECKING, Annotated, Final
+
 from pydantic import Field, ValidationError
+
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError, LinkError, WireError
 from sightline.protocol.messages import Microseconds, SessionId, Source, WireModel
 from sightline.protocol.transports.security import PRESENCE_PREFIX, ROBOT_ROLE, certificate_role
-from typing import Annotated, Final, TYPE_CHECKING
 
 if TYPE_CHECKING:
     import zenoh
@@ -194,7 +196,7 @@ def query_presence(session: zenoh.Session, timeout_s: float = REPLY_TIMEOUT_S) -
 def software_version() -> str:
     """This program's name and version."""
     try:
-        return f"sightline {metadata.version('sightline')}"
+        return f"sightline {metadata.version('sightline-robot')}"
     except metadata.PackageNotFoundError:
         return "sightline"
 

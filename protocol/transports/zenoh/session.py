@@ -11,11 +11,12 @@ import logging
 import re
 import socket
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError
 from sightline.protocol.transports.diagnosis import diagnose_tls, port_owner
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
 from sightline.protocol.transports.security import RoleKeys, size_limit_section
-from typing import Any, Final, TYPE_CHECKING
 
 if TYPE_CHECKING:
     import zenoh
@@ -87,7 +88,7 @@ def open_session(
     try:
         import zenoh
     except ImportError:
-        raise ConfigError("Zenoh is not installed: pip install 'sightline[zenoh]'") from None
+        raise ConfigError("Zenoh is not installed: pip install 'sightline-robot[zenoh]'") from None
     logging.getLogger("zenoh").addHandler(logging.NullHandler())  # else Python prints its warnings to the terminal
     try:
         return _open(session_config(listen, connect, timeout_s, secured))

@@ -3,14 +3,16 @@
 import math
 import time
 from pathlib import Path
+from typing import Annotated, Any
+
 from pydantic import Field
+
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError, WireError
 from sightline.protocol.jpeg import JpegSize, read_jpeg_size
 from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
 from sightline.robot_side.hardware.cameras.timing import FrameTimer
 from sightline.robot_side.ports import Picture, scaled_quality, scaled_size
-from typing import Annotated, Any
 
 
 class FolderCameraConfig(LensConfig):
@@ -223,5 +225,5 @@ def _packages() -> tuple[Any, Any]:
         import cv2
         import simplejpeg
     except ImportError:
-        raise ConfigError("camera video needs OpenCV and simplejpeg: pip install 'sightline[camera]'") from None
+        raise ConfigError("camera video needs OpenCV and simplejpeg: pip install 'sightline-robot[camera]'") from None
     return simplejpeg.encode_jpeg, cv2

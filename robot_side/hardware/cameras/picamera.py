@@ -10,10 +10,8 @@ from pydantic import Field
 
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import JpegSize
-from sightline.robot_side.hardware.cameras.timing import CaptureClock
 from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
-from sightline.robot_side.hardware.cameras.timing import LatestPicture
-from sightline.robot_side.hardware.cameras.timing import read_clocks
+from sightline.robot_side.hardware.cameras.timing import CaptureClock, LatestPicture, read_clocks
 from sightline.robot_side.ports import Picture
 
 _LIST = "`rpicam-hello --list-cameras` lists what is connected"

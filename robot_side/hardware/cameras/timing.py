@@ -6,10 +6,10 @@ monotonic clock, some with the clock of the day or with the time since boot; som
 
 import time
 from dataclasses import dataclass
+
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.transports.link import LatestSlot
 from sightline.robot_side.ports import Picture
-
 
 _OLDEST_US = 2_000_000  # until its clock is known, what seems older than this was stamped by another
 

@@ -10,14 +10,16 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated, Any, Literal
+
 from pydantic import Field
+
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import CameraModel
 from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
 from sightline.robot_side.hardware.cameras.timing import CaptureClock, LatestPicture, read_clocks
 from sightline.robot_side.ports import Picture, scaled_quality, scaled_size
-from typing import Annotated, Any, Literal
 
 
 def check_device(path: Path) -> None:
@@ -150,7 +152,7 @@ def _opencv() -> Any:
     try:
         import cv2
     except ImportError:
-        raise ConfigError("camera v4l2 needs OpenCV: pip install 'sightline[camera]'") from None
+        raise ConfigError("camera v4l2 needs OpenCV: pip install 'sightline-robot[camera]'") from None
     return cv2
 
 
@@ -228,7 +230,10 @@ class V4l2Device:
             size = scaled_size(full.width_px, full.height_px, scale_percent)
             bgr = cv2.resize(bgr, (size.width_px, size.height_px), interpolation=cv2.INTER_AREA)
         jpeg: bytes = simplejpeg.encode_jpeg(
-            bgr, quality=scaled_quality(self._config.quality, quality_percent), colorspace="BGR", colorsubsampling="422",
+            bgr,
+            quality=scaled_quality(self._config.quality, quality_percent),
+            colorspace="BGR",
+            colorsubsampling="422",
             fastdct=True,
         )
         return Picture(jpeg, t_us, scale_percent)

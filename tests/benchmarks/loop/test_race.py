@@ -7,12 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.benchmarks.loop.race import run_race
-from sightline.benchmarks.loop.figures import Course, Sample, course_of_headers, course_of_tally, joined
-from sightline.benchmarks.loop.figures import figures_of, loop_checks, percentile
 from sightline.benchmarks.loop.counters import Reading, taken_percent
-from sightline.benchmarks.loop.vision import overloaded, with_overload
-from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.figures import (
     FLOOR,
     MAX_FPS,
@@ -21,10 +16,21 @@ from sightline.benchmarks.loop.figures import (
     PEERS,
     TCP,
     WITH_OUR_DETECTOR,
+    Course,
     LoopSetting,
+    Sample,
+    course_of_headers,
+    course_of_tally,
+    figures_of,
+    joined,
+    loop_checks,
     peers_of,
+    percentile,
     size_of,
 )
+from sightline.benchmarks.loop.pictures import write_pictures
+from sightline.benchmarks.loop.race import run_race
+from sightline.benchmarks.loop.vision import overloaded, with_overload
 from sightline.protocol.errors import ConfigError
 
 SMALL = LoopSetting(Path(), 160, 120, fps=30.0, seconds=2.0, tries=1)

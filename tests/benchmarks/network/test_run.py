@@ -8,16 +8,16 @@ import sys
 import pytest
 
 from sightline.benchmarks.loop.figures import LoopCheck, at_most
-from sightline.benchmarks.network.run import SCENES, write_film
-from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks, sent_between, worst_of_seeds
 from sightline.benchmarks.network.cases import CASES, Case, chosen, spans_s
+from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks, sent_between, worst_of_seeds
+from sightline.benchmarks.network.run import SCENES, write_film
 from sightline.benchmarks.network.stage import NetworkSetting
 from sightline.protocol.errors import ConfigError
 from sightline.sim.network_emulator import EmulatedLink, LinkShape, LinkShapes
 from sightline.sim.tun_emulator import why_impossible
 
 SECOND_US = 1_000_000
-COMMAND = [sys.executable, "-m", "sightline.operator_side.cli.app", "bench", "network"]
+COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "bench", "network"]
 
 
 def status(at_s, state="ACTIVE", accepted=0, stale=0, age_ms=50, sent=0):
@@ -170,7 +170,10 @@ def test_an_unknown_row_is_one_line(tmp_path):
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="drops root")
 def test_without_root_it_says_what_it_needs():
-    drop = "import os, sys; os.setgid(65534); os.setuid(65534); from sightline.operator_side.cli.app import main; sys.exit(main())"
+    drop = (
+        "import os, sys; os.setgid(65534); os.setuid(65534); "
+        "from sightline.operator_side.cli.app import main; sys.exit(main())"
+    )
     command = [sys.executable, "-c", drop, "bench", "network", "--only", "rtt40"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if "ModuleNotFoundError" in done.stderr or "Permission" in done.stderr:

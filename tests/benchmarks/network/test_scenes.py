@@ -6,10 +6,9 @@ import sys
 
 import pytest
 
-from sightline.benchmarks.network.scenes import ROBOTS, fleet_checks
 from sightline.benchmarks.network.figures import moves_again_s, on_old_sight, read_wheel_commands
+from sightline.benchmarks.network.scenes import ROBOTS, fleet_checks, reached_ms, reported_check, stop_checks_of
 from sightline.evaluation.faults.evidence import MotorRow
-from sightline.benchmarks.network.scenes import reached_ms, reported_check, stop_checks_of
 from sightline.sim.tun_emulator import why_impossible
 
 TICK_US = 20_000
@@ -141,8 +140,19 @@ def test_a_robot_that_is_missing_is_noticed():
 @pytest.mark.slow
 @pytest.mark.skipif(bool(why_impossible()), reason="needs root and /dev/net/tun")
 def test_a_standby_is_run_for_real():
-    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "bench", "network", "--only", "standby", "--seconds", "4",
-               "--json"]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "sightline.operator_side.cli.app",
+        "bench",
+        "network",
+        "--only",
+        "standby",
+        "--seconds",
+        "4",
+        "--json",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     said = json.loads(done.stdout)
     taken = next(check for check in said["checks"] if "drives again" in check["name"])

@@ -4,17 +4,18 @@ import array
 import functools
 import math
 
-from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST, key_for
 from sightline.conformance.benches import FROM_ROBOT, VirtualBench
+from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST, key_for
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import CameraModel
-from sightline.protocol.transports import link as link_rules, memory
+from sightline.protocol.transports import link as link_rules
+from sightline.protocol.transports import memory
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.core import DriverCore
-from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
-from sightline.robot_side.ports import Picture, Ranges, WheelAngles
 from sightline.robot_side.network.core import NetworkCore
+from sightline.robot_side.ports import Picture, Ranges, WheelAngles
+from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
 from tests.fixtures.robot_process import JPEG
 
 MODEL = CameraModel(width_px=16, height_px=16, fx_px=20.0, fy_px=20.0, cx_px=8.0, cy_px=8.0)

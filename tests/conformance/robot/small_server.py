@@ -15,10 +15,9 @@ import socket
 import threading
 import time
 
-from sightline.protocol.channels import CHANNELS, Direction, key_for
 from sightline.conformance.raw_peers import xor
-from sightline.protocol.errors import WireError
-from sightline.protocol.errors import RejectReason
+from sightline.protocol.channels import CHANNELS, Direction, key_for
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.transports.memory import MemoryNetwork
 from tests.conformance.robot.reference import ReferenceRobot
 

@@ -5,21 +5,20 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from sightline.conformance.case import KEPT_MESSAGES
-from sightline.conformance.case import GROUPS, Case, Level, Suite
+from sightline.conformance.case import GROUPS, KEPT_MESSAGES, Case, Level, Suite
 from sightline.conformance.robot.cases import CASES, prepare
 from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_cases
 from sightline.protocol.errors import ConfigError
+from tests.conformance.clauses import clauses
 from tests.conformance.robot.broken import arming as broken_arming  # noqa: F401  (they fill BROKEN)
-from tests.conformance.robot.broken import validation as broken_judging  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken import credit as broken_traffic  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken import frames as broken_output  # noqa: F401  (they fill BROKEN)
 from tests.conformance.robot.broken import lease as broken_lease  # noqa: F401  (they fill BROKEN)
 from tests.conformance.robot.broken import motion as broken_motion  # noqa: F401  (they fill BROKEN)
 from tests.conformance.robot.broken import order as broken_order  # noqa: F401  (they fill BROKEN)
-from tests.conformance.robot.broken import frames as broken_output  # noqa: F401  (they fill BROKEN)
 from tests.conformance.robot.broken import requests as broken_requests  # noqa: F401  (they fill BROKEN)
-from tests.conformance.robot.broken import credit as broken_traffic  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken import validation as broken_judging  # noqa: F401  (they fill BROKEN)
 from tests.conformance.robot.broken.breaking import BROKEN
-from tests.conformance.clauses import clauses
 from tests.conformance.robot.reference import quicken, virtual_robot
 
 VIRTUAL = [case for case in CASES if not case.real]

@@ -6,12 +6,11 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
+from sightline.conformance.benches import FROM_ROBOT, LiveBench
 from sightline.conformance.case import Access
-from sightline.conformance.benches import LiveBench
 from sightline.conformance.raw_peers import LOST, PING, TEXT, RawWebSocket, split_url, xor
 from sightline.conformance.robot.cases import CASES, prepare
 from sightline.conformance.runner import Outcome, run_cases
-from sightline.conformance.benches import FROM_ROBOT
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.open import open_link
 from tests.conformance.robot.broken.websocket import BEHIND_TOKENS, DEFECTS

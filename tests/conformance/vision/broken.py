@@ -4,14 +4,14 @@
 and no other. The steps that a broken one may change, in the order of a frame's way, are the methods of `BrokenVision`.
 """
 
-from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST, key_for
 from sightline.conformance.vision.drawing import HALF_CAMERA
-from sightline.protocol.spec.message_cases import packed
+from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST, key_for
 from sightline.protocol.messages import STILL, FrameHeader
-from sightline.protocol.transports.link import Message
+from sightline.protocol.spec.message_cases import packed
 from sightline.protocol.text import format_twist
-from tests.conformance.vision.fixture import COMPUTE_US, VirtualVision
+from sightline.protocol.transports.link import Message
 from sightline.vision_side.pipeline import Observation, PipelineAnswer, answer_header
+from tests.conformance.vision.fixture import COMPUTE_US, VirtualVision
 
 BROKEN = {}
 STANDING = PipelineAnswer(STILL, Observation("broken"))

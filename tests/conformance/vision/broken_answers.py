@@ -1,11 +1,11 @@
 """Broken visions: wrong headers, wrong twists, wrong echoes, wrong counts. Pure."""
 
-from sightline.protocol.channels import REQUEST, key_for
 from sightline.conformance.vision.drawing import picture
-from sightline.protocol.spec.message_cases import packed
+from sightline.protocol.channels import REQUEST, key_for
 from sightline.protocol.messages import Stamp
-from tests.conformance.vision.broken import STANDING, BrokenVision, breaks, frame_header
+from sightline.protocol.spec.message_cases import packed
 from sightline.vision_side.pipeline import Observation, PipelineAnswer
+from tests.conformance.vision.broken import STANDING, BrokenVision, breaks, frame_header
 
 
 def rewriting(case, wrong, change=lambda fields: {}, text=lambda text: text, **how):

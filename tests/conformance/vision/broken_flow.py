@@ -3,11 +3,11 @@
 import json
 from collections import deque
 
-from sightline.protocol.channels import FRAME
 from sightline.conformance.vision.flow import BROKEN_STATUS
+from sightline.protocol.channels import FRAME
+from sightline.vision_side.pipeline import Observation, PipelineAnswer
 from tests.conformance.vision.broken import STANDING, BrokenVision, breaks
 from tests.conformance.vision.broken_answers import PerSession
-from sightline.vision_side.pipeline import Observation, PipelineAnswer
 
 
 class Queueing(BrokenVision):

@@ -3,9 +3,8 @@
 import json
 from contextlib import suppress
 
-from sightline.conformance.vision.hostile import CAMERAS
-from sightline.conformance.vision.hostile import DOUBTED, READ, REFUSED
 from sightline.conformance.vision.drawing import CAMERA, picture
+from sightline.conformance.vision.hostile import CAMERAS, DOUBTED, READ, REFUSED
 from tests.conformance.vision.broken import STANDING, BrokenVision, breaks, frame_header, header_of
 
 

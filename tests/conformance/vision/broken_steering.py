@@ -1,9 +1,9 @@
 """Broken visions: those that steer where they should not. Pure."""
 
 from sightline.protocol.messages import Twist
+from sightline.vision_side.pipeline import PipelineAnswer
 from tests.conformance.vision.broken import breaks
 from tests.conformance.vision.broken_answers import PerSession
-from sightline.vision_side.pipeline import PipelineAnswer
 
 
 class Steering(PerSession):

@@ -5,8 +5,8 @@ What a picture holds is computed once per picture and process: the pictures of t
 
 from functools import cache
 
-from sightline.conformance.case import Bench
 from sightline.conformance.benches import TO_ROBOT, VirtualBench
+from sightline.conformance.case import Bench
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import CameraModel, FrameHeader
 from sightline.protocol.transports.memory import MemoryLink, MemoryNetwork

@@ -7,11 +7,11 @@ from sightline.conformance.codec import CASES as CODEC_CASES
 from sightline.conformance.robot.cases import CASES as ROBOT_CASES
 from sightline.conformance.runner import Outcome, run_case
 from sightline.conformance.vision.cases import CASES, prepare
+from tests.conformance.clauses import UNTESTED, clauses
 from tests.conformance.vision import broken_answers as vision_broken_answers  # noqa: F401
 from tests.conformance.vision import broken_flow as vision_broken_flow  # noqa: F401
 from tests.conformance.vision import broken_inputs as vision_broken_inputs  # noqa: F401
 from tests.conformance.vision import broken_steering as vision_broken_steering  # noqa: F401
-from tests.conformance.clauses import UNTESTED, clauses
 from tests.conformance.vision.broken import BROKEN, BrokenVision
 from tests.conformance.vision.fixture import VirtualVision, virtual_bench
 

@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sightline.conformance.vision import drawing as vision_pictures
-from sightline.conformance.vision.drawing import encode_jpeg
 from sightline.conformance.vision.drawing import (
     CAMERA,
     DRAWINGS,
     HALF_CAMERA,
     claiming,
     commented,
+    encode_jpeg,
     many_scans,
     picture,
     png,

@@ -8,16 +8,15 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
+from sightline.conformance.benches import TO_ROBOT, LiveBench
 from sightline.conformance.case import Access
-from sightline.conformance.benches import LiveBench
 from sightline.conformance.runner import Outcome, run_case
-from sightline.conformance.benches import TO_ROBOT
 from sightline.conformance.vision.cases import CASES
 from sightline.conformance.vision.websocket import _take
 from sightline.protocol.transports.open import open_link
-from tests.conformance.vision.sockets import SOCKETS, SocketVision
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.process import serve
+from tests.conformance.vision.sockets import SOCKETS, SocketVision
 
 REAL = [case for case in CASES if case.real]
 TOKEN = "0123456789abcdefABCDEF_-"

@@ -140,7 +140,7 @@ class Containers:
 
     def sightline(self, command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         """A command of a person outside, through the published port."""
-        return ask(sys.executable, "-m", "sightline.operator_side.cli.app", command, *arguments, *self.reached)
+        return ask(sys.executable, "-P", "-m", "sightline.operator_side.cli.app", command, *arguments, *self.reached)
 
     def state(self, robot: str) -> str:
         """A robot's state; "" if it is not heard."""

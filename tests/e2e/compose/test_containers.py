@@ -104,7 +104,7 @@ def test_who_has_no_keys_is_refused_and_told(running):
     only(running, "secure")
     assert running.sightline("status", "r1").returncode == 0
     plain = f"tcp/127.0.0.1:{running.ports['7447']}"
-    refused = ask(sys.executable, "-m", "sightline.operator_side.cli.app", "status", "r1", "--connect", plain)
+    refused = ask(sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "status", "r1", "--connect", plain)
     assert refused.returncode == 4
     assert plain in refused.stderr
 

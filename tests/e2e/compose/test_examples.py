@@ -16,8 +16,8 @@ from sightline.protocol.channels import DETECTIONS
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import Detections, DetectionsHeader
-from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.text import parse_twist
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.e2e.compose.fixture import ROOT
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess

@@ -1,5 +1,6 @@
-"""compose.yaml and Dockerfile say what they must, without an engine; `tests/e2e/compose/test_containers.py` runs them."""
+"""compose.yaml and Dockerfile say what they must, without an engine; `test_containers.py` runs them."""
 
+import ast
 import json
 import re
 import shutil
@@ -13,8 +14,8 @@ from typer.main import get_command
 
 from sightline.operator_side.cli.app import app
 from sightline.operator_side.config.loading import load_service
-from sightline.robot_side.pipe import _END_S
 from sightline.robot_side.driver.process import _SHUTDOWN_US
+from sightline.robot_side.pipe import _END_S
 from tests.e2e.compose.fixture import COMPOSE, DEFAULT, HEAVY, PROFILES, ROOT, SERVICES, ask
 from tests.fixtures.links import free_endpoint
 
@@ -192,7 +193,8 @@ def test_the_robot_image_is_light_and_the_others_are_complete():
 
 
 def test_images_hold_every_package_and_nothing_is_ignored_that_they_copy():
-    packages = set(PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"])
+    tree = ast.parse((ROOT / "setup.py").read_text())
+    packages = {"sightline", *next(ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign))}
     copied = {rest.split()[0] for word, rest in STAGES["wheel"] if word == "COPY"}
     assert copied == packages
     assert set(re.search(r"mkdir ([\w ]+?) +&&", str(STAGES["build"]))[1].split()) == packages

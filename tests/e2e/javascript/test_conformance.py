@@ -9,7 +9,7 @@ import pytest
 
 from tests.fixtures.javascript import EXAMPLES, JsRobot, JsVision, free_port, node
 
-CONFORM = [sys.executable, "-m", "sightline.operator_side.cli.app", "conform"]
+CONFORM = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "conform"]
 NOT_APPLICABLE = (
     "the kit has no way to send on this transport",
     "this robot publishes no scans",

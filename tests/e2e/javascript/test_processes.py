@@ -14,7 +14,7 @@ from tests.fixtures.javascript import ROOT, JsProcess, JsRobot, JsVision, free_p
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, driving
 
-SIGHTLINE = [sys.executable, "-m", "sightline.operator_side.cli.app"]
+SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 
 
 def sightline(*arguments: str, ok: bool = True) -> str:

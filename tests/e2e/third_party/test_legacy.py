@@ -155,7 +155,7 @@ def our_vision(folder: Path, endpoint: str):
     """`sightline vision` for a robot that says nothing of its camera."""
     lens = "\n".join(f"{name} = {json.dumps(value)}" for name, value in camera_of(640, 480).model_dump().items())
     (folder / "vision.toml").write_text(f'connect = ["{endpoint}"]\n[camera]\n{lens}\n')
-    command = ("-m", "sightline.operator_side.cli.app", "vision", "--config", folder / "vision.toml")
+    command = ("-P", "-m", "sightline.operator_side.cli.app", "vision", "--config", folder / "vision.toml")
     with running(*command) as process:
         yield process
 

@@ -65,7 +65,7 @@ class Process:
 
 def vision(endpoint: str) -> Process:
     """`sightline vision`, as a person starts it."""
-    return Process("-m", "sightline.operator_side.cli.app", "vision", "--connect", endpoint)
+    return Process("-P", "-m", "sightline.operator_side.cli.app", "vision", "--connect", endpoint)
 
 
 def port_of(endpoint: str) -> str:

@@ -6,12 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from sightline.evaluation.baselines.goto import GotoBaseline
 from sightline.protocol.messages import FrameHeader, Pose
+from sightline.vision_side.missions.goto import Footprint
+from sightline.vision_side.missions.port import Plan, RangeScan, View
 from tests.fixtures.vision.course import Course, Drive, Row
 from tests.fixtures.vision.vision import camera
-from sightline.vision_side.missions.goto import Footprint
-from sightline.evaluation.baselines.goto import GotoBaseline
-from sightline.vision_side.missions.port import Plan, RangeScan, View
 
 THYMIO = Footprint(front_m=0.08, rear_m=0.03, half_width_m=0.0635)
 RAY_RAD = math.radians(3)

@@ -8,11 +8,10 @@ from sightline.benchmarks.real_time import Kinds, _figures
 from sightline.evaluation.demo import report as demo_report
 from sightline.evaluation.demo.run import RECORDING, DemoOptions, DemoRun
 from sightline.evaluation.lockstep import Conditions, Lockstep
+from sightline.evaluation.scenario_config import robot_config, robot_of, vision_config
+from sightline.evaluation.score.figures import AT_LEAST, EXACT
 from sightline.operator_side.recording.recorder import Recorder
 from sightline.operator_side.recording.replay import VISION_CONFIG
-from sightline.evaluation.scenario_config import robot_config, robot_of, vision_config
-from sightline.evaluation.score.figures import AT_LEAST
-from sightline.evaluation.score.figures import EXACT
 from sightline.protocol.channels import CAMERA
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import Stamp

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.evaluation.demo.shaped_vision import MAX_WAITING, DelayLine, ShapedLink
-from sightline.evaluation.demo.shaped_vision import Shape
+from sightline.evaluation.demo.shaped_vision import MAX_WAITING, DelayLine, Shape, ShapedLink
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.memory import Leg, MemoryNetwork

@@ -11,28 +11,29 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.operator_side.cli import evaluate as cli_faults
 from sightline.evaluation.checks import Check, at_most
 from sightline.evaluation.faults import camera
-from sightline.evaluation.faults.peer import ATTACKS, MALFORMED, OVERSIZED
-from sightline.evaluation.faults.runner import run_case, watched_us
+from sightline.evaluation.faults.cases import CASES, chosen
 from sightline.evaluation.faults.evidence import (
+    GOOD,
+    INJECTED,
     Blind,
+    EventLog,
     MotorRow,
     SentCommand,
     last_valid_us,
     measure_stop,
     most_gain_mps2,
     moved_on_old_sight,
+    read_events,
     read_motors,
     stop_checks,
 )
-from sightline.evaluation.faults.evidence import GOOD, INJECTED, EventLog, read_events
-from sightline.evaluation.faults.report import describe_machine
-from sightline.evaluation.faults.report import markdown, passed, run_line, to_dict, worst_checks
-from sightline.evaluation.faults.runner import Outcome
-from sightline.evaluation.faults.cases import CASES, chosen
+from sightline.evaluation.faults.peer import ATTACKS, MALFORMED, OVERSIZED
+from sightline.evaluation.faults.report import describe_machine, markdown, passed, run_line, to_dict, worst_checks
+from sightline.evaluation.faults.runner import Outcome, run_case, watched_us
 from sightline.evaluation.faults.sampler import read_holes, stalled_us
+from sightline.operator_side.cli import evaluate as cli_faults
 from sightline.protocol.channels import TWIST
 from sightline.protocol.errors import ConfigError, WireError
 from sightline.protocol.jpeg import read_jpeg_size

@@ -5,12 +5,11 @@ from pathlib import Path
 import pytest
 import typer
 
-from sightline.operator_side.cli import evaluate as cli_faults
-from sightline.evaluation.faults.evidence import MotorRow
-from sightline.evaluation.faults.report import with_rows_of
 from sightline.evaluation.faults.cases import _tick_checks, permille_us, undisturbed_gaps_us
+from sightline.evaluation.faults.evidence import MotorRow
+from sightline.evaluation.faults.report import page_with_summary, with_rows_of
 from sightline.evaluation.faults.sampler import Hole
-from sightline.evaluation.faults.report import page_with_summary
+from sightline.operator_side.cli import evaluate as cli_faults
 
 DOCS = Path(__file__).parent.parent.parent.parent / "docs"
 PAGE = "before\n<!-- worst values: x -->\nold\n<!-- /worst values -->\nafter\n"

@@ -10,10 +10,9 @@ import pytest
 
 from sightline.evaluation.checks import Check
 from sightline.evaluation.faults import runner as parallel
-from sightline.evaluation.faults.runner import run_cases
-from sightline.evaluation.faults.report import progress_line
 from sightline.evaluation.faults.fixture import Setup
-from sightline.evaluation.faults.runner import Case, Outcome
+from sightline.evaluation.faults.report import progress_line
+from sightline.evaluation.faults.runner import Case, Outcome, run_cases
 
 GOOD = (Check("zero", 1.0, "ms", 2.0, True),)
 

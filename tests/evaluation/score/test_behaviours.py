@@ -5,11 +5,24 @@ from dataclasses import replace
 
 import pytest
 
-from sightline.evaluation.score.behaviours import write_page
-from sightline.evaluation.score.behaviours import kept, page_lines, picture_name
-from sightline.evaluation.score.behaviours import CHARACTER, LOOKS, ROWS, Row
+from sightline.evaluation.score.behaviours import (
+    CHARACTER,
+    GOALS_M,
+    LAWS,
+    LOOKS,
+    ROWS,
+    Row,
+    SpeedCase,
+    free_way,
+    kept,
+    page_lines,
+    picture_name,
+    speed_cases,
+    speed_run,
+    speeds_of,
+    write_page,
+)
 from sightline.evaluation.score.figures import Score
-from sightline.evaluation.score.behaviours import GOALS_M, LAWS, SpeedCase, free_way, speed_cases, speed_run, speeds_of
 from sightline.sim.scenario import load_scenario, scenario_names
 from tests.evaluation.score.test_figures import truth
 

@@ -4,9 +4,17 @@ from dataclasses import replace
 
 import pytest
 
-from sightline.evaluation.score.figures import median_and_worst, score
-from sightline.evaluation.score.figures import BOUNDS, UNITS, checks_of
-from sightline.evaluation.score.figures import figures_of, goal_figures, legs_figures, light_figures
+from sightline.evaluation.score.figures import (
+    BOUNDS,
+    UNITS,
+    checks_of,
+    figures_of,
+    goal_figures,
+    legs_figures,
+    light_figures,
+    median_and_worst,
+    score,
+)
 from sightline.sim.scenario import load_scenario, scenario_names
 from tests.evaluation.score.test_figures import samples, truth
 

@@ -10,18 +10,26 @@ import pytest
 
 pytest.importorskip("pybullet")
 
+from sightline.evaluation.score import detector_report as score_scenes_file
+from sightline.evaluation.score.detector_report import (
+    LABELLED,
+    LEAST_HITS,
+    Report,
+    all_detector_checks,
+    check_lines,
+    close_subjects,
+    detector_checks,
+    score_scenes,
+    subjects,
+)
+from sightline.evaluation.score.detectors import Figures
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import evaluate as cli_score_detectors
-from sightline.evaluation.score import detector_report as score_scenes_file
-from sightline.evaluation.score.detectors import Figures
-from sightline.evaluation.score.detector_report import LEAST_HITS, all_detector_checks, detector_checks
-from sightline.evaluation.score.detector_report import check_lines
-from sightline.evaluation.score.detector_report import LABELLED, Report, close_subjects, score_scenes, subjects
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError
 from sightline.sim.scenes.model import COLUMNS
-from tests.fixtures.vision.remote import frame
 from sightline.vision_side.detect.port import Detection, Maker, result_of
+from tests.fixtures.vision.remote import frame
 
 GOOD = Figures(500, 400, 0.85, 0.1, 0.05, 0.05, 1.0, 3.0, 900.0)
 EVERY = dict.fromkeys(LABELLED, (300, 0.8))
@@ -174,7 +182,9 @@ def test_the_sheet_says_the_same_as_the_table(capsys, eyes, monkeypatch, tmp_pat
     monkeypatch.setattr(eyes.Eyes, "answer", staticmethod(
         lambda frame: result_of(frame, [Detection(1, 1, 9, 9, 0.9, "cup")], Maker("eyes"))))
     said = []
-    monkeypatch.setattr("sightline.evaluation.score.detector_report.cv2.putText", lambda _picture, text, *_rest: said.append(text))
+    monkeypatch.setattr(
+        "sightline.evaluation.score.detector_report.cv2.putText", lambda _picture, text, *_rest: said.append(text)
+    )
     _, out, _ = told(capsys, NAME, "--json", "--set", "target.label=cup", "--sheet", str(tmp_path / "sheet.png"))
     table = json.loads(out)["columns"]["nominal"][NAME]
     assert table["missed"] == 0 and said and f"{NAME}: none" not in said and f"{NAME}: missed" not in said

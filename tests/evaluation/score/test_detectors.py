@@ -10,17 +10,14 @@ pytest.importorskip("pybullet")
 
 import cv2
 
+from sightline.evaluation.score.detector_report import Sheet, markdown, score_scenes, subjects, text
+from sightline.evaluation.score.detectors import FrameResult, LabelMatches, figures, frame_result, precisions
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import evaluate as cli_score_detectors
-from sightline.evaluation.score.detectors import FrameResult, LabelMatches, figures, frame_result, precisions
-from sightline.evaluation.score.detector_report import markdown, text
-from sightline.evaluation.score.detector_report import score_scenes, subjects
-from sightline.evaluation.score.detector_report import Sheet
-from sightline.training.shipping import ball_threshold, label_threshold
-from sightline.sim.scenes.plan import plan_scene
 from sightline.sim.scenes.model import COLUMNS, JUDGED_FROM, LabelledBox, Scene
-from sightline.vision_side.detect.port import overlap
-from sightline.vision_side.detect.port import Circle, Detection
+from sightline.sim.scenes.plan import plan_scene
+from sightline.training.shipping import ball_threshold, label_threshold
+from sightline.vision_side.detect.port import Circle, Detection, overlap
 
 BALL = LabelledBox("ball", (100.0, 100.0, 140.0, 140.0), 1.0, (100.0, 100.0, 140.0, 140.0))
 OTHER = (200.0, 100.0, 240.0, 160.0)
@@ -75,8 +72,13 @@ def test_legs_and_lights_are_wrong_objects_too():
 
 def test_figures_count_each_frame_where_it_belongs():
     frames = [
-        FrameResult(True, "hit", 0.9, 1.0, 900), FrameResult(True, "hit", 0.9, 3.0, 1100), FrameResult(True, "wrong object", 0.6),
-        FrameResult(True, "none"), FrameResult(False, "none"), FrameResult(False, "nowhere", 0.5), FrameResult(False, "wrong object", 0.5),
+        FrameResult(True, "hit", 0.9, 1.0, 900),
+        FrameResult(True, "hit", 0.9, 3.0, 1100),
+        FrameResult(True, "wrong object", 0.6),
+        FrameResult(True, "none"),
+        FrameResult(False, "none"),
+        FrameResult(False, "nowhere", 0.5),
+        FrameResult(False, "wrong object", 0.5),
         FrameResult(False, "none"),
     ]
     one = figures(frames)
@@ -126,7 +128,9 @@ def test_thresholds_hold_false_alarms_and_wrong_objects_down():
 
 def test_a_labels_threshold_balances_what_is_found_and_what_is_right():
     assert label_threshold(LabelMatches(2, [(0.9, True), (0.4, True), (0.3, False)])) == pytest.approx(0.4)
-    assert label_threshold(LabelMatches(2, [(0.9, True), (0.2, False), (0.19, False), (0.1, False)])) == pytest.approx(0.9)
+    assert label_threshold(LabelMatches(2, [(0.9, True), (0.2, False), (0.19, False), (0.1, False)])) == pytest.approx(
+        0.9
+    )
     overlooked_is_worse = LabelMatches(2, [(0.9, True), (0.5, False), (0.4, False), (0.35, False), (0.3, True)])
     assert label_threshold(overlooked_is_worse) == pytest.approx(0.3)
     assert label_threshold(LabelMatches()) == pytest.approx(0.3)

@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from sightline.evaluation.score.figures import median_and_worst, score
-from sightline.evaluation.score.figures import checks_of
+from sightline.evaluation.score.figures import checks_of, median_and_worst, score
 from sightline.sim.truth import Truth
 
 

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from sightline.operator_side.cli import app as cli
 from sightline.evaluation.score.figures import Score
-from sightline.evaluation.score.runs import Case, ScoreReport, cases, run_case, run_cases, scored_figures
-from sightline.evaluation.score.runs import score_text
+from sightline.evaluation.score.runs import Case, ScoreReport, cases, run_case, run_cases, score_text, scored_figures
+from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import ConfigError
 
 GOOD = Score(

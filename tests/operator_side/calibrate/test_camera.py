@@ -9,27 +9,27 @@ import numpy as np
 import pytest
 import typer
 
-from sightline.operator_side.cli import calibrate as cli_calibrate
 from sightline.operator_side.calibrate.camera import (
     Ball,
     Board,
     Mounting,
     ball_finder,
+    collect,
     find_board,
     from_balls,
     from_boards,
     is_new_view,
 )
-from sightline.operator_side.calibrate.camera import collect
+from sightline.operator_side.cli import calibrate as cli_calibrate
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.jpeg import JpegSize
-from sightline.robot_side.hardware.cameras.lens import guessed_model, read_model
 from sightline.robot_side.hardware.cameras.files import StillCamera
-from tests.operator_side.calibrate.board import BOARD, TRUTH, draw_board, rays, tilted_views, turned
+from sightline.robot_side.hardware.cameras.lens import guessed_model, read_model
+from sightline.vision_side.config import HsvConfig
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
-from sightline.vision_side.config import HsvConfig
+from tests.operator_side.calibrate.board import BOARD, TRUTH, draw_board, rays, tilted_views, turned
 
 SIZE = JpegSize(TRUTH.width_px, TRUTH.height_px, 3)
 EMPTY = jpeg_of(np.full((TRUTH.height_px, TRUTH.width_px, 3), 120, np.uint8))

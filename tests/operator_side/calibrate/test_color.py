@@ -19,10 +19,10 @@ from sightline.operator_side.calibrate.color import (
     try_out,
 )
 from sightline.protocol.errors import ConfigError
-from tests.fixtures.vision.vision import camera, scene
 from sightline.vision_side.config import HsvConfig, HsvRange
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.detect.color.hsv import HsvDetector
+from tests.fixtures.vision.vision import camera, scene
 
 MODEL = camera()
 

@@ -9,14 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
+from sightline.operator_side.calibrate.color_file import check_config, ranges_toml, with_ranges, write_ranges
 from sightline.operator_side.cli.app import run
-from sightline.operator_side.recording.film import Film
-from sightline.operator_side.calibrate.color_file import check_config, write_ranges
-from sightline.operator_side.calibrate.color_file import ranges_toml, with_ranges
 from sightline.operator_side.config.loading import load_service
+from sightline.operator_side.recording.film import Film
 from sightline.protocol.errors import ConfigError
-from tests.operator_side.calibrate.test_color import ball_picture
 from sightline.vision_side.config import HsvRange
+from tests.operator_side.calibrate.test_color import ball_picture
 
 YELLOW = (HsvRange(hue_low_deg=41, hue_high_deg=57, saturation_low=0.42, value_low=0.4),)
 RED = (HsvRange(hue_low_deg=352, hue_high_deg=360), HsvRange(hue_low_deg=0, hue_high_deg=11))

@@ -7,8 +7,9 @@ import tomllib
 
 import pytest
 
-from sightline.operator_side.cli import app as cli, calibrate as cli_robot_tools
 from sightline.operator_side.calibrate import wheels as wheel_test
+from sightline.operator_side.cli import app as cli
+from sightline.operator_side.cli import calibrate as cli_robot_tools
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS

@@ -203,8 +203,8 @@ def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
 @pytest.mark.parametrize(
     ("package", "version", "expected"),
     [
-        ("av.video", (3, 11), "av is not installed: pip install 'sightline[sim]'"),
-        ("pybullet", (3, 11), "pip install 'sightline[sim]'"),
+        ("av.video", (3, 11), "av is not installed: pip install 'sightline-robot[sim]'"),
+        ("pybullet", (3, 11), "pip install 'sightline-robot[sim]'"),
         ("pybullet", (3, 13), "Python 3.13: use Python 3.11, or `docker compose up`"),
     ],
 )
@@ -216,4 +216,4 @@ def test_a_missing_package_names_the_command_that_installs_it(package, version, 
 
 def test_a_missing_module_of_ours_is_a_fault_and_stays_one():
     with pytest.raises(ModuleNotFoundError), needs("sim"):
-        raise ModuleNotFoundError(name="sim.nothing")
+        raise ModuleNotFoundError(name="sightline.sim.nothing")

@@ -9,11 +9,11 @@ import pytest
 
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import detector as cli_detector
-from tests.fixtures.vision.onnx import brightness_model, without_gpu
-from sightline.vision_side.serving import detector_service
-from sightline.vision_side.detect.onnx import detector as onnx_detector
 from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.onnx import detector as onnx_detector
 from sightline.vision_side.detect.remote import oip_grpc
+from sightline.vision_side.serving import detector_service
+from tests.fixtures.vision.onnx import brightness_model, without_gpu
 
 BROKEN = '''
 from sightline.vision_side.detect.color.detectors import Hsv
@@ -62,7 +62,7 @@ def test_every_detector_is_listed_with_whether_it_can_be_used(capsys) -> None:
 def test_a_list_says_what_has_to_be_installed_first(capsys, monkeypatch) -> None:
     monkeypatch.setattr(oip_grpc, "find_spec", lambda name: None)
     code, out, _ = run(capsys, "detector", "list")
-    assert code == 0 and "oip+grpc     grpcio is not installed: pip install 'sightline[grpc]'" in out
+    assert code == 0 and "oip+grpc     grpcio is not installed: pip install 'sightline-robot[grpc]'" in out
 
 
 def test_a_detector_that_keeps_its_promises_passes(capsys) -> None:
@@ -180,7 +180,10 @@ def test_the_group_alone_shows_its_help(capsys) -> None:
 
 def test_listing_imports_nothing_heavy_before_it_is_needed() -> None:
     """`detector --help` answers without OpenCV."""
-    code = "import sys; from sightline.operator_side.cli import app as cli; cli.run(['detector', '--help']); print('cv2' in sys.modules)"
+    code = (
+        "import sys; from sightline.operator_side.cli import app; "
+        "app.run(['detector', '--help']); print('cv2' in sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.rstrip().endswith("False")
 

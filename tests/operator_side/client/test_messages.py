@@ -2,10 +2,13 @@
 
 import json
 import math
-import pytest
 import struct
-from hypothesis import given, strategies as st
-from sightline.operator_side.client.messages import ChannelInbox, MAX_WAITING, message_line, message_object
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sightline.operator_side.client.messages import MAX_WAITING, ChannelInbox, message_line, message_object
 from sightline.protocol.channels import CHANNELS, JPEG, SCAN, STATUS, TWIST
 from sightline.protocol.spec.message_cases import CASES, USUAL, packed
 from sightline.protocol.transports.link import Message

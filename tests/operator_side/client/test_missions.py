@@ -3,9 +3,14 @@
 import pytest
 
 from sightline.operator_side.cli.options import options_of
-from sightline.operator_side.client.missions import request_of
-from sightline.operator_side.client.missions import cannot, mission_line, mission_lines
-from sightline.operator_side.client.missions import waypoints_of, waypoints_of_file
+from sightline.operator_side.client.missions import (
+    cannot,
+    mission_line,
+    mission_lines,
+    request_of,
+    waypoints_of,
+    waypoints_of_file,
+)
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import MissionReport
 

@@ -7,13 +7,13 @@ from contextlib import ExitStack
 import pytest
 
 from sightline.operator_side.client import pictures as pictures_module
-from sightline.operator_side.cockpit import frame_buffer as reel_module
 from sightline.operator_side.client.pictures import Pictures, viewer_role
+from sightline.operator_side.cockpit import frame_buffer as reel_module
 from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
 from sightline.protocol.channels import ACK, FRAME, OVERLAY, STATUS
 from sightline.protocol.codec import decode, encode
-from sightline.protocol.spec.message_cases import jpeg
 from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader, Stamp
+from sightline.protocol.spec.message_cases import jpeg
 from sightline.protocol.transports.open import open_link
 from tests.fixtures.links import free_endpoint, until
 

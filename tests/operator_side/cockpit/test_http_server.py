@@ -7,8 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from sightline.operator_side.cockpit.http_server import MAX_CONNECTIONS
-from sightline.operator_side.cockpit.http_server import MAX_BODY_BYTES, Answer, as_json, page, served
+from sightline.operator_side.cockpit.http_server import MAX_BODY_BYTES, MAX_CONNECTIONS, Answer, as_json, page, served
 from sightline.protocol.errors import ConfigError, LinkError
 from tests.fixtures.links import until
 

@@ -39,7 +39,16 @@ def _health(port):
 def test_a_robot_is_measured_and_its_end_is_seen(tmp_path):
     port = _free_port()
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
-        command = [sys.executable, "-m", "sightline.operator_side.cli.app", "metrics", "r1", "--connect", robot.endpoint]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "sightline.operator_side.cli.app",
+            "metrics",
+            "r1",
+            "--connect",
+            robot.endpoint,
+        ]
         exporter = subprocess.Popen([*command, "--port", str(port)], stdout=subprocess.PIPE, text=True)
         try:
             assert exporter.stdout.readline() == f"metrics of r1: http://127.0.0.1:{port}/metrics\n"
@@ -68,7 +77,16 @@ def test_a_robot_is_measured_and_its_end_is_seen(tmp_path):
 
 def test_a_busy_port_is_said_with_its_owner(tmp_path):
     with RobotProcess(tmp_path) as robot, socket.create_server(("127.0.0.1", 0)) as taken:
-        command = [sys.executable, "-m", "sightline.operator_side.cli.app", "metrics", "--connect", robot.endpoint, "--port"]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "sightline.operator_side.cli.app",
+            "metrics",
+            "--connect",
+            robot.endpoint,
+            "--port",
+        ]
         assert until(lambda: "robot r1: on" in robot.output(), 20)
         port = str(taken.getsockname()[1])
         done = subprocess.run([*command, port], capture_output=True, text=True, timeout=60, check=False)
@@ -80,7 +98,7 @@ def test_a_vision_is_measured_and_its_health_is_whether_it_hears_a_robot(tmp_pat
     port = _free_port()
     with RobotProcess(tmp_path) as robot:
         assert until(lambda: "robot r1: on" in robot.output(), 40)
-        command = [sys.executable, "-m", "sightline.operator_side.cli.app", "vision", "--connect", robot.endpoint]
+        command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "vision", "--connect", robot.endpoint]
         vision = subprocess.Popen([*command, "--metrics", str(port)], stdout=subprocess.PIPE, text=True)
         try:
             assert until(lambda: _health_if_up(port) == 200, 40)

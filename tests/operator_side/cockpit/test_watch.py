@@ -15,9 +15,9 @@ import pytest
 
 from sightline.operator_side.cli.app import run
 from sightline.operator_side.recording.film import Film
+from tests.e2e.javascript.test_browser import LEVELS, PATIENCE_S, Started
 from tests.fixtures.javascript import Browser, chromium
 from tests.fixtures.links import free_endpoint, until
-from tests.e2e.javascript.test_browser import LEVELS, PATIENCE_S, Started
 from tests.operator_side.calibrate.test_color import ball_picture
 
 pytestmark = pytest.mark.slow

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.operator_side.config.loading import load_service
-from sightline.operator_side.config.loading import ENV_PREFIX, SERVICES, load, model_of
 from sightline.operator_side.config.errors import is_known, known_keys
+from sightline.operator_side.config.loading import ENV_PREFIX, SERVICES, load, load_service, model_of
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.protocol.errors import ConfigError
 

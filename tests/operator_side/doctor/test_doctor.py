@@ -9,9 +9,11 @@ import sys
 import pytest
 
 from sightline.operator_side.cli import app as cli
-from sightline.operator_side.setup import keys
-from sightline.operator_side.doctor import network as between, machine as cameras, machine
+from sightline.operator_side.doctor import machine
+from sightline.operator_side.doctor import machine as cameras
+from sightline.operator_side.doctor import network as between
 from sightline.operator_side.doctor.finding import Finding, as_object, histogram
+from sightline.operator_side.setup import keys
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.fixtures.links import free_endpoint, until
@@ -136,9 +138,10 @@ def test_a_busy_port_is_told_with_its_owner(capsys, monkeypatch):
 
 
 def test_a_package_of_the_same_name_is_told(capsys, monkeypatch):
-    monkeypatch.setattr(machine.metadata, "packages_distributions", lambda: {"protocol": ["sightline", "protocol"]})
+    owners = {"sightline": ["sightline-robot", "sightline"]}
+    monkeypatch.setattr(machine.metadata, "packages_distributions", lambda: owners)
     check = _checks(capsys)["package names"]
-    assert not check["ok"] and check["fix"].startswith("pip uninstall protocol")
+    assert not check["ok"] and check["fix"].startswith("pip uninstall sightline,")
 
 
 def test_certificates_near_their_end_are_told_with_the_command(capsys, tmp_path):
@@ -155,7 +158,7 @@ def test_certificates_that_cannot_be_read_here_are_told_with_the_extra(capsys, t
     for name in [one for one in sys.modules if one.partition(".")[0] == "cryptography"]:
         monkeypatch.setitem(sys.modules, name, None)
     check = _checks(capsys, "--secure", str(tmp_path / "k"))["certificates"]
-    assert not check["ok"] and "pip install 'sightline[secure]'" in str(check)
+    assert not check["ok"] and "pip install 'sightline-robot[secure]'" in str(check)
 
 
 def test_nobody_listening_is_told_apart_from_no_such_name(capsys, monkeypatch):

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sightline.operator_side.recording import recorder as recording
 from sightline.evaluation.lockstep import Conditions, Lockstep
+from sightline.evaluation.scenario_config import robot_config, vision_config
+from sightline.operator_side.recording import recorder as recording
 from sightline.operator_side.recording.recorder import CHUNK_BYTES, MAX_WAITING, Recorder, read_about, read_recording
 from sightline.operator_side.recording.replay import VISION_CONFIG, replay, replay_steps
-from sightline.evaluation.scenario_config import robot_config, vision_config
 from sightline.protocol.channels import CAMERA, CHANNELS, FRAME, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError

@@ -3,19 +3,19 @@
 import pytest
 
 from sightline.evaluation.lockstep import Conditions, Lockstep
+from sightline.evaluation.scenario_config import robot_config, vision_config
 from sightline.operator_side.recording.recorder import Recorder, read_about, read_recording
 from sightline.operator_side.recording.replay import VISION_CONFIG, replay, replay_steps
-from sightline.evaluation.scenario_config import robot_config, vision_config
 from sightline.protocol.channels import CAMERA, MISSION, SCAN, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Stamp
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
 from sightline.sim.world.world import World
+from sightline.vision_side.config import MissionConfig
+from tests.fixtures.vision.vision import camera
 from tests.operator_side.recording.test_recorder import record
 from tests.vision_side.serving.test_mission_channel import FRAME_US, GOTO, MODEL, Bench, scan
-from tests.fixtures.vision.vision import camera
-from sightline.vision_side.config import MissionConfig
 
 
 def scanned(bench, count):

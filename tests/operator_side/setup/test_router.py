@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 @contextmanager
 def _router(*arguments):
-    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "router", *arguments]
+    command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "router", *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             yield process

@@ -2,13 +2,12 @@
 
 import random
 
-from sightline.operator_side.teleop.control import Teleop
-from sightline.operator_side.teleop.control import Speeds
+from sightline.operator_side.teleop.control import Speeds, Teleop
 from sightline.protocol.channels import ACK, FRAME, REPLY, REQUEST, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Request
-from sightline.protocol.transports.link import Message
 from sightline.protocol.text import parse_twist
+from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.core import DriverCore
 

@@ -2,8 +2,7 @@
 
 import pytest
 
-from sightline.operator_side.teleop.control import Mode
-from sightline.operator_side.teleop.control import MOVES
+from sightline.operator_side.teleop.control import MOVES, Mode
 from sightline.protocol.messages import STILL, State, Twist, Verb
 from tests.operator_side.teleop.fixture import PERSON, VISION, TeleopRig, vision_drives
 

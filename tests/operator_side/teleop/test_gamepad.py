@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from sightline.operator_side.teleop.gamepad import Gamepad
 from sightline.operator_side.teleop.gamepad import (
     ABS_X,
     ABS_Y,
@@ -17,6 +16,7 @@ from sightline.operator_side.teleop.gamepad import (
     EV_KEY,
     EV_SYN,
     SYN_DROPPED,
+    Gamepad,
     Pad,
     PadKey,
 )
@@ -89,7 +89,7 @@ def test_without_a_gamepad_it_is_one_line(plugged, path, says):
 
 def test_without_evdev_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "evdev", None)
-    with pytest.raises(ConfigError, match=r"evdev is not installed: pip install 'sightline\[gamepad\]'"):
+    with pytest.raises(ConfigError, match=r"evdev is not installed: pip install 'sightline-robot\[gamepad\]'"):
         Gamepad("auto")
 
 

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from sightline.operator_side.teleop.control import LONGEST_HOLD_US, MOVES, Hold, split_keys
+from sightline.operator_side.teleop.control import LONGEST_HOLD_US, MOVES, Hold, Speeds, SpeedUp, split_keys
 from sightline.operator_side.teleop.gamepad import (
     ABS_RX,
     ABS_X,
@@ -16,7 +16,6 @@ from sightline.operator_side.teleop.gamepad import (
     Pad,
     PadKey,
 )
-from sightline.operator_side.teleop.control import Speeds, SpeedUp
 from sightline.protocol.messages import STILL, State, Status, Twist
 
 # --- keys ------------------------------------------------------------------------------------------------------------

@@ -2,8 +2,7 @@
 
 import pytest
 
-from sightline.operator_side.teleop.control import Teleop
-from sightline.operator_side.teleop.control import Speeds
+from sightline.operator_side.teleop.control import Speeds, Teleop
 from sightline.operator_side.teleop.terminal import live_line
 from sightline.protocol.channels import STATUS
 from sightline.protocol.messages import STILL, State, Twist, Verb

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sightline.protocol.spec import generate as schema
 from sightline.protocol.channels import CHANNELS, Direction
+from sightline.protocol.spec import generate as schema
 
 DOCUMENT = json.loads((Path(schema.__file__).parent.parent / "asyncapi.json").read_text("utf-8"))
 ALLOWED = {

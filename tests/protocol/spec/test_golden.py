@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from pydantic import TypeAdapter
 
-from sightline.protocol.spec import golden, generate as schema
 from sightline.protocol.channels import CHANNELS
-from sightline.protocol.spec.field_docs import doc_of, unit_of
-from sightline.protocol.spec.message_cases import MessageCase
-from sightline.protocol.spec.message_cases import CASES
-from sightline.protocol.spec.framing_cases import FRAMING_CASES, READERS
 from sightline.protocol.errors import RejectReason
+from sightline.protocol.spec import generate as schema
+from sightline.protocol.spec import golden
+from sightline.protocol.spec.field_docs import doc_of, unit_of
+from sightline.protocol.spec.framing_cases import FRAMING_CASES, READERS
+from sightline.protocol.spec.message_cases import CASES, MessageCase
 from sightline.protocol.text import MAX_TWIST_BYTES
 
 VECTORS = Path(schema.__file__).parent.parent / "vectors"

@@ -7,11 +7,11 @@ import math
 
 import pytest
 
+from sightline.protocol.errors import RejectReason
+from sightline.protocol.messages import MAX_INTEGER
+from sightline.protocol.spec.framing_cases import FRAMING_CASES, framing_outcome
 from sightline.protocol.spec.golden import INEXACT_KEY, outcome
 from sightline.protocol.spec.message_cases import CASES
-from sightline.protocol.spec.framing_cases import FRAMING_CASES, framing_outcome
-from sightline.protocol.messages import MAX_INTEGER
-from sightline.protocol.errors import RejectReason
 
 ACCEPTED = [case for case in CASES if case.refuse is None]
 WIRED = [case for case in FRAMING_CASES if case.refuse is None]
@@ -85,7 +85,9 @@ def test_a_websocket_message_cut_or_changed_anywhere_is_taken_apart_or_refused(c
         if "accept" in got:
             assert len(got["accept"]["header_hex"]) // 2 <= 576 and len(one) >= len(got["accept"]["payload_hex"]) // 2
     for one in cut(message[:block]):
-        assert check(framing_outcome("websocket", case.given | {"message_hex": one.hex()})), "a block cut short is refused"
+        assert check(framing_outcome("websocket", case.given | {"message_hex": one.hex()})), (
+            "a block cut short is refused"
+        )
 
 
 @pytest.mark.parametrize(

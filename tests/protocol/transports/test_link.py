@@ -1,4 +1,4 @@
-"""What every `Link` promises, run over every transport. A transport joins by adding a rig to `tests/fixtures/links.py`."""
+"""What every `Link` promises, run over every transport. A transport joins by a rig in `tests/fixtures/links.py`."""
 
 import itertools
 import random
@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from sightline.protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST
-from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE, LinkRules
+from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE, LinkRules, Message
 from tests.fixtures.links import RIGS, MemoryRig
 
 

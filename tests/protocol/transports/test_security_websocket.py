@@ -11,20 +11,21 @@ from websockets.sync.client import connect
 
 from sightline.protocol.channels import ACK, DETECTIONS, FRAME, REQUEST, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.transports.websocket.link import open_websocket
+from sightline.protocol.log import BurstLimiter
+from sightline.protocol.transports.endpoints import parse_websocket_endpoint, with_allowed
 from sightline.protocol.transports.security import (
     NO_TOKEN,
     NOT_LISTED,
     check_listening,
     client_address_problem,
     grants_of_role,
+    own_token,
+    read_tokens,
     role_of_token,
 )
-from sightline.protocol.log import BurstLimiter
-from sightline.protocol.transports.endpoints import parse_websocket_endpoint, with_allowed
-from sightline.protocol.transports.security import own_token, read_tokens
-from sightline.protocol.transports.websocket.peer import NOT_GRANTED
 from sightline.protocol.transports.websocket.legacy import DRIVER_SLOT_US, DriverSlot
+from sightline.protocol.transports.websocket.link import open_websocket
+from sightline.protocol.transports.websocket.peer import NOT_GRANTED
 from sightline.robot_side.config import RobotConfig
 from tests.fixtures.links import claim, until
 from tests.fixtures.websocket import V1, free_ws

@@ -28,10 +28,10 @@ from sightline.protocol.transports.security import (
     load_role_keys,
     may_publish,
     may_subscribe,
+    read_tokens,
 )
-from sightline.protocol.transports.security import read_tokens
-from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.discovery import list_robots
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.session import MAX_MESSAGE_BYTES, open_session
 from tests.fixtures.links import free_endpoint, until
 

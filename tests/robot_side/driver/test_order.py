@@ -12,12 +12,11 @@ from sightline.protocol.codec import encode
 from sightline.protocol.messages import AnswerHeader, Echo
 from sightline.protocol.transports.link import Message
 from sightline.robot_side import pipe as ipc
-from sightline.robot_side.pipe import DriverEnd
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.process import Driver
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
+from sightline.robot_side.pipe import DriverEnd, NetworkEnd
 from sightline.robot_side.safety.limits import SafetyConfig
-from sightline.robot_side.pipe import NetworkEnd
 
 SEQ, T_US = 7, 1_000
 

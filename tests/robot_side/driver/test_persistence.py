@@ -4,10 +4,12 @@ import errno
 import io
 import json
 import os
-import pytest
 import stat
 import sys
 import threading
+
+import pytest
+
 from sightline.protocol.log import JsonLineStream
 from sightline.robot_side.driver.persistence import BackgroundWriter, StopLatch
 from tests.fixtures.links import until

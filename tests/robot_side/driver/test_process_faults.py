@@ -12,12 +12,11 @@ from sightline.protocol.config import Config
 from sightline.protocol.messages import Twist
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver.persistence import BackgroundWriter, StopLatch
 from sightline.robot_side.driver.process import Driver, run
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
-from sightline.robot_side.driver.persistence import StopLatch
-from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.ports import WheelAngles
-from sightline.robot_side.driver.persistence import BackgroundWriter
+from sightline.robot_side.safety.limits import SafetyConfig
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 

@@ -15,8 +15,7 @@ from gpiozero.pins.mock import MockFactory
 from sightline.operator_side.config.loading import load_service
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import Twist
-from sightline.robot_side.hardware.gpio import GpioDrive
-from sightline.robot_side.hardware.gpio import DutyTable, table_of, table_text
+from sightline.robot_side.hardware.gpio import DutyTable, GpioDrive, table_of, table_text
 from sightline.robot_side.kinematics import DiffDriveConfig, wheel_speeds
 from sightline.robot_side.plugins import load_device
 from tests.contracts.drives import check_drive

@@ -14,7 +14,8 @@ from gpiozero.pins.mock import MockFactory
 
 from sightline.operator_side.config.loading import load_service
 from sightline.protocol.errors import ConfigError, HardwareError
-from sightline.robot_side.hardware import gpio_low, gpio as gpio_pins
+from sightline.robot_side.hardware import gpio as gpio_pins
+from sightline.robot_side.hardware import gpio_low
 from sightline.robot_side.hardware.gpio import GpioDrive
 from sightline.robot_side.plugins import load_device
 from tests.fixtures.gpio import NotingPin, config
@@ -43,7 +44,7 @@ def test_a_missing_package_names_its_extra(monkeypatch, module):
     monkeypatch.setattr(Device, "pin_factory", None)
     monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.delitem(sys.modules, "gpiozero.pins.lgpio", raising=False)
-    with pytest.raises(ConfigError, match=rf"needs {module}: pip install 'sightline\[robot-pi\]'"):
+    with pytest.raises(ConfigError, match=rf"needs {module}: pip install 'sightline-robot\[robot-pi\]'"):
         GpioDrive(config())
 
 

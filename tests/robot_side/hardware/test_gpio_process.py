@@ -59,7 +59,7 @@ def zero_motors() -> float:
     started_s = time.monotonic()
     radius = f"drive.options.wheel_radius_m={OPTIONS['wheel_radius_m']}"
     sets = ["--set", f"drive.kind={DRIVE['kind']}", "--set", radius, "--set", "drive.options.enable_pins=[17]"]
-    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "robot", *sets, "--zero-motors"]
+    command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "robot", *sets, "--zero-motors"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     return time.monotonic() - started_s

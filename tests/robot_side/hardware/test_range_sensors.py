@@ -3,9 +3,9 @@
 import pytest
 
 from sightline.protocol.clock import monotonic_us
+from tests.e2e.test_missions import FarSensor
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
-from tests.e2e.test_missions import FarSensor
 
 pytestmark = pytest.mark.slow
 

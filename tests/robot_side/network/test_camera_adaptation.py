@@ -10,11 +10,10 @@ from sightline.protocol.channels import CAMERA
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import MAX_CHANNELS_SHOWN, CameraModel, FrameHeader, StreamStatus
-from sightline.robot_side.network.core import CameraAdaptation
 from sightline.robot_side.network.bitrate_control import EncodingTarget
-from sightline.robot_side.ports import Picture, scaled_model, scaled_size
-from sightline.robot_side.network.core import NetworkCore
+from sightline.robot_side.network.core import CameraAdaptation, NetworkCore
 from sightline.robot_side.network.stream import StreamConfig
+from sightline.robot_side.ports import Picture, scaled_model, scaled_size
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.pipeline import Frame, Pipeline
 
@@ -61,7 +60,13 @@ class PlainEye:
 def test_a_wish_is_passed_on_once_per_change():
     eye = Eye()
     adjusting = CameraAdaptation(eye)
-    for wish in (EncodingTarget(), EncodingTarget(80, 100), EncodingTarget(80, 100), EncodingTarget(80, 50), EncodingTarget()):
+    for wish in (
+        EncodingTarget(),
+        EncodingTarget(80, 100),
+        EncodingTarget(80, 100),
+        EncodingTarget(80, 50),
+        EncodingTarget(),
+    ):
         adjusting.follow(wish)
     assert eye.asked == [(80, 100), (80, 50), (100, 100)]
 

@@ -5,14 +5,14 @@ import math
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, State, Twist
+from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.protocol.text import format_twist
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.core import DriverCore
-from sightline.robot_side.safety.limits import STOP_TIME_BOUND_US, SafetyConfig
-from sightline.robot_side.ports import Picture, WheelAngles
 from sightline.robot_side.network.core import NetworkCore
+from sightline.robot_side.ports import Picture, WheelAngles
+from sightline.robot_side.safety.limits import STOP_TIME_BOUND_US, SafetyConfig
 
 TICK_US, FRAME_US = 20_000, 33_333
 OUTAGE_US = (300_000_000, 302_000_000)

@@ -2,15 +2,18 @@
 
 import array
 import math
+
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from sightline.protocol.errors import RejectReason, WireError
-from sightline.protocol.messages import Echo, Request, RequestHeader, STILL, State, Twist, Verb
+from sightline.protocol.messages import STILL, Echo, Request, RequestHeader, State, Twist, Verb
 from sightline.robot_side.ports import Ranges
 from sightline.robot_side.safety.guard import GuardConfig, RangeGuard
 from sightline.robot_side.safety.limits import SafetyConfig, age_factor
 from sightline.robot_side.safety.states import is_armed
-from tests.fixtures.safety import HUMAN, MS, OTHER, ROBOT, Rig, VISION
+from tests.fixtures.safety import HUMAN, MS, OTHER, ROBOT, VISION, Rig
 
 
 def refusal(rig, verb, **kwargs):
@@ -65,10 +68,13 @@ def test_degraded_keeps_the_curve():
 def test_only_frames_issued_by_this_session_count():
     rig = Rig().armed()
     frame = rig.frame()
-    assert rig.offer(header=rig.header(frame.model_copy(update={"session": OTHER}))).reason is RejectReason.OTHER_SESSION
+    assert (
+        rig.offer(header=rig.header(frame.model_copy(update={"session": OTHER}))).reason is RejectReason.OTHER_SESSION
+    )
     assert rig.offer(header=rig.header(frame.model_copy(update={"seq": 10_000}))).reason is RejectReason.UNKNOWN_FRAME
     assert (
-        rig.offer(header=rig.header(frame.model_copy(update={"t_us": frame.t_us + 1}))).reason is RejectReason.UNKNOWN_FRAME
+        rig.offer(header=rig.header(frame.model_copy(update={"t_us": frame.t_us + 1}))).reason
+        is RejectReason.UNKNOWN_FRAME
     )
     status = Echo(channel="status", session=ROBOT, seq=1, t_us=rig.now_us)
     rig.gate.issued.add("status", 1, rig.now_us)
@@ -85,7 +91,9 @@ def test_the_record_is_bounded_and_forgets_the_oldest():
     assert rig.offer(header=rig.header(old)).reason is RejectReason.UNKNOWN_FRAME
 
 
-@pytest.mark.parametrize(("seq", "reason"), [(99, RejectReason.OUT_OF_ORDER), (100, RejectReason.OUT_OF_ORDER), (101, None)])
+@pytest.mark.parametrize(
+    ("seq", "reason"), [(99, RejectReason.OUT_OF_ORDER), (100, RejectReason.OUT_OF_ORDER), (101, None)]
+)
 def test_sequence_numbers_only_grow(seq, reason):
     rig = Rig().armed()
     assert rig.offer(header=rig.header(seq=100)).accepted
@@ -119,7 +127,9 @@ def test_unknown_sources_do_not_drive(source):
 
 def test_key_and_header_must_agree():
     rig = Rig().armed()
-    assert rig.gate.offer("teleop", rig.header(source="vision"), STILL, rig.now_us).reason is RejectReason.UNKNOWN_SOURCE
+    assert (
+        rig.gate.offer("teleop", rig.header(source="vision"), STILL, rig.now_us).reason is RejectReason.UNKNOWN_SOURCE
+    )
 
 
 def test_guests_are_off_unless_switched_on_and_slow_then():

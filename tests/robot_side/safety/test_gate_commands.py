@@ -4,14 +4,29 @@ import math
 
 import pytest
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import STILL, Echo, LastRejection, State, Twist, Verb
-from sightline.protocol.errors import RejectReason
-from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.gate import Decision, SafetyGate
+from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.states import TRANSITIONS, Event, is_armed, next_state
-from tests.fixtures.safety import GUEST, VISION_HOLDER, A, D, F, G, H, S, driving, guest, guest_driving
-from tests.fixtures.safety import HUMAN, OTHER, ROBOT, VISION, Rig
+from tests.fixtures.safety import (
+    GUEST,
+    HUMAN,
+    OTHER,
+    ROBOT,
+    VISION,
+    VISION_HOLDER,
+    A,
+    D,
+    F,
+    G,
+    H,
+    Rig,
+    S,
+    driving,
+    guest,
+    guest_driving,
+)
 
 # --- the table of states -----------------------------------------------------------------------------------------
 

@@ -2,13 +2,24 @@
 
 import pytest
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import STILL, AnswerHeader, Echo, Holder, Request, RequestHeader, Verb
-from sightline.protocol.errors import RejectReason
-from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.gate import Decision, SafetyGate
-from tests.fixtures.safety import HUMAN_HOLDER, VISION_HOLDER, A, D, H, driving, refused
-from tests.fixtures.safety import HUMAN, OTHER, ROBOT, VISION, Rig
+from sightline.robot_side.safety.limits import SafetyConfig
+from tests.fixtures.safety import (
+    HUMAN,
+    HUMAN_HOLDER,
+    OTHER,
+    ROBOT,
+    VISION,
+    VISION_HOLDER,
+    A,
+    D,
+    H,
+    Rig,
+    driving,
+    refused,
+)
 
 # --- lease: acquire, release, losing a human ---------------------------------------------------------------------
 
@@ -84,7 +95,9 @@ def test_a_human_who_acquires_and_then_is_silent_was_lost():
     assert rig.step(20) == Decision(STILL, D, "the person driving was lost; arm again")
 
 
-@pytest.mark.parametrize(("silent_us", "reason"), [(999_999, RejectReason.NOT_HOLDER), (1_000_000, RejectReason.DISARMED)])
+@pytest.mark.parametrize(
+    ("silent_us", "reason"), [(999_999, RejectReason.NOT_HOLDER), (1_000_000, RejectReason.DISARMED)]
+)
 def test_a_human_lost_between_two_ticks_is_not_succeeded(silent_us, reason):
     rig = driving(A)
     rig.offer(source="teleop", session=HUMAN)

@@ -4,9 +4,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import STILL, State, Verb
-from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety import gate as safety
 from sightline.robot_side.safety.states import TRANSITIONS
 from tests.fixtures.safety import HUMAN, MS, OTHER, VISION, Rig

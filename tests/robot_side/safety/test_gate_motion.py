@@ -6,9 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import STILL, State, Twist, Verb
-from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.limits import (
     STOP_DISTANCE_BOUND_M,
     STOP_TIME_BOUND_US,

@@ -2,13 +2,11 @@
 
 import pytest
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import STILL, Echo, Request, RequestHeader, Verb
-from sightline.protocol.errors import RejectReason
-from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.gate import SafetyGate
-from tests.fixtures.safety import A, D, F, H, S, driving, refused
-from tests.fixtures.safety import HUMAN, OTHER, ROBOT, Rig
+from sightline.robot_side.safety.limits import SafetyConfig
+from tests.fixtures.safety import HUMAN, OTHER, ROBOT, A, D, F, H, Rig, S, driving, refused
 
 # --- requests ----------------------------------------------------------------------------------------------------
 
@@ -20,12 +18,15 @@ def test_stop_disarm_and_release_need_no_echo(verb):
         assert rig.request(verb, echo=False)
     else:
         error = refused(rig, verb, echo=False)
-        assert error.reason is RejectReason.MALFORMED and error.detail == "what lets a robot move again must cite a status"
+        assert (
+            error.reason is RejectReason.MALFORMED and error.detail == "what lets a robot move again must cite a status"
+        )
 
 
 @pytest.mark.parametrize("verb", [Verb.ARM, Verb.RESET, Verb.ACQUIRE])
 @pytest.mark.parametrize(
-    ("age_us", "reason"), [(-1, RejectReason.FROM_FUTURE), (0, None), (2_000_000, None), (2_000_001, RejectReason.STALE)]
+    ("age_us", "reason"),
+    [(-1, RejectReason.FROM_FUTURE), (0, None), (2_000_000, None), (2_000_001, RejectReason.STALE)],
 )
 def test_other_requests_cite_something_young(verb, age_us, reason):
     gate = SafetyGate(SafetyConfig(), ROBOT)

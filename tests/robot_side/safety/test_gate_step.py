@@ -5,22 +5,22 @@ import math
 
 import pytest
 
-from sightline.protocol.messages import STILL, Verb
 from sightline.protocol.errors import RejectReason
-from sightline.robot_side.safety.guard import GuardConfig, RangeGuard
-from sightline.robot_side.safety.limits import AxisRamp
+from sightline.protocol.messages import STILL, Verb
 from sightline.robot_side.ports import Ranges
 from sightline.robot_side.safety.gate import Decision
+from sightline.robot_side.safety.guard import GuardConfig, RangeGuard
+from sightline.robot_side.safety.limits import AxisRamp
 from tests.fixtures.safety import (
     A,
     D,
     G,
     H,
+    Rig,
     S,
     driving,
     twist,
 )
-from tests.fixtures.safety import Rig
 
 # --- step: silence, age, holding ---------------------------------------------------------------------------------
 

@@ -2,10 +2,12 @@
 
 import array
 import math
-import pytest
 import time
 from pathlib import Path
+
+import pytest
 from pydantic import ValidationError
+
 from sightline.evaluation.scenario_config import robot_config
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
@@ -15,7 +17,6 @@ from sightline.robot_side.safety.guard import BlindZoneError, GuardConfig, Range
 from sightline.sim.robot import load_robot
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
-
 
 DEFAULTS = {
     "front_m": 0.07,

@@ -1,24 +1,25 @@
 """Every number of the gate's limits: just inside, at it, just outside. The expected values are worked out by hand."""
 
 import math
+
 import pytest
 from pydantic import ValidationError
+
 from sightline.protocol.messages import STILL
 from sightline.robot_side.safety.limits import (
-    AxisRamp,
     MIN_TICK_US,
-    Ramp,
     STOP_DISTANCE_BOUND_M,
     STOP_TIME_BOUND_US,
+    TICK_US,
+    AxisRamp,
+    Ramp,
     SafetyConfig,
     StopBound,
-    TICK_US,
     age_factor,
     clamp_twist,
     stop_bound,
 )
 from tests.fixtures.safety import BOUNDS, DEFAULTS, WHOLE, config, twist
-
 
 # --- configuration -----------------------------------------------------------------------------------------------
 

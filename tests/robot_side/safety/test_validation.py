@@ -2,9 +2,8 @@
 
 import pytest
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import AnswerHeader, Echo, Holder
-from sightline.protocol.errors import RejectReason
 from sightline.robot_side.safety.validation import CommandResult, FreshnessRecord, IssuedRecord, SequenceRecord
 
 ROBOT, OTHER = "0000aaaa", "0000cccc"

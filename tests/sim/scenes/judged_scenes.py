@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import simplejpeg
 
+from sightline.sim.scenes.model import COLUMNS, HEIGHT_PX, JUDGED_FROM, THINGS, WIDTH_PX
 from sightline.sim.scenes.plan import as_seen
 from sightline.sim.scenes.render import SceneRenderer
-from sightline.sim.scenes.model import COLUMNS, HEIGHT_PX, JUDGED_FROM, THINGS, WIDTH_PX
 
 FILE = Path(__file__).parent.parent.parent / "judged_scenes.json"
 PINNED = [(COLUMNS["nominal"], 1), (COLUMNS["same-colour boxes"], 212), (COLUMNS["all at once"], 333), (THINGS, 1204)]

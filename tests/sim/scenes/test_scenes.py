@@ -11,11 +11,6 @@ pytest.importorskip("pybullet")
 import simplejpeg
 
 from sightline.sim.scenes import render as scene_backdrop
-from sightline.sim.scenes.plan import as_seen, streak, with_defects
-from sightline.sim.scenes.plan import plan_scene
-from sightline.sim.scenes.render import SceneRenderer
-from sightline.sim.scenes.textures import SIDE
-from sightline.sim.scenes.textures import FAMILIES, JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED, texture
 from sightline.sim.scenes.model import (
     BALL_PX,
     COLUMNS,
@@ -34,6 +29,18 @@ from sightline.sim.scenes.model import (
     trained_column,
 )
 from sightline.sim.scenes.model import TRAINED as TRAINED_COLUMN
+from sightline.sim.scenes.plan import as_seen, plan_scene, streak, with_defects
+from sightline.sim.scenes.render import SceneRenderer
+from sightline.sim.scenes.textures import (
+    FAMILIES,
+    JUDGED,
+    SIDE,
+    TRAINED,
+    TRAINED_HARDER,
+    TRAINED_LATER,
+    VALIDATED,
+    texture,
+)
 from tests.sim.scenes import judged_scenes
 
 ALL = [*COLUMNS.values(), THINGS, TRAINED_COLUMN]
@@ -170,7 +177,9 @@ def test_light_and_quality_do_what_they_say(renderer):
     means = [simplejpeg.decode_jpeg(with_defects(scene.rgb, one, np.random.default_rng(4)), "RGB").mean()
              for one in (nominal, light)]
     assert 0.15 < means[1] / means[0] < 0.4
-    sizes = [len(with_defects(scene.rgb, COLUMNS[name], np.random.default_rng(4))) for name in ("nominal", "quality 30")]
+    sizes = [
+        len(with_defects(scene.rgb, COLUMNS[name], np.random.default_rng(4))) for name in ("nominal", "quality 30")
+    ]
     assert sizes[1] < 0.7 * sizes[0]
 
 

@@ -13,13 +13,11 @@ import numpy as np
 import simplejpeg
 
 from sightline.protocol.errors import ConfigError
-from sightline.sim.scenario import LIT, Light, Phase, color_of
 from sightline.sim.robot import load_robot
-from sightline.sim.scenario import load_scenario
-from sightline.sim.world.start import goals_seen
-from sightline.sim.world.bodies import PathMover
-from sightline.sim.scenario import Legs
+from sightline.sim.scenario import LIT, Legs, Light, Phase, color_of, load_scenario
 from sightline.sim.toml_file import laid_over
+from sightline.sim.world.bodies import PathMover
+from sightline.sim.world.start import goals_seen
 from sightline.sim.world.world import World
 from tests.fixtures.sim import robot_with
 

@@ -10,8 +10,7 @@ pytest.importorskip("pybullet")
 import simplejpeg
 
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.sim.scenario import look_named
-from sightline.sim.scenario import Wall, load_scenario
+from sightline.sim.scenario import Wall, load_scenario, look_named
 from sightline.sim.world.world import World
 from tests.fixtures.sim import robot_with, seen_at
 

@@ -6,17 +6,15 @@ from dataclasses import replace
 import pytest
 
 from sightline.protocol.messages import MAX_DETECTED_BOXES
-from tests.contracts.detectors import assert_kept
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.registry import build_detector
-from sightline.vision_side.detect.filters import ColorFilter
-from sightline.vision_side.detect.contract import check_detector
-from sightline.vision_side.detect.filters import LabelFilter
 from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.contract import check_detector
+from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
 from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Detection, DetectionResult
+from sightline.vision_side.detect.registry import build_detector
 from sightline.vision_side.detect.remote.fallback import Fallback
 from sightline.vision_side.detect.shadow import ShadowDetector
-from sightline.vision_side.detect.filters import TrackIds
+from tests.contracts.detectors import assert_kept
 
 CONFIG = VisionConfig()
 

@@ -7,22 +7,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sightline.protocol.messages import FrameHeader
-from tests.fixtures.vision.detector import Told, box
-from tests.fixtures.vision.vision import YELLOW_BGR, jpeg_of
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.filters import ColorFilter
-from sightline.vision_side.detect.filters import LabelFilter
-from sightline.vision_side.detect.port import corners, overlap
+from sightline.vision_side.detect.filters import KEPT_US, MAX_TRACKS, ColorFilter, LabelFilter, TrackIds
 from sightline.vision_side.detect.port import (
     NO_DEADLINE,
-    Circle,
     DetectFrame,
     Detection,
-    DetectionResult,
     clipped,
+    corners,
+    overlap,
 )
-from sightline.vision_side.detect.filters import KEPT_US, MAX_TRACKS, TrackIds
+from tests.fixtures.vision.detector import Told, box
+from tests.fixtures.vision.vision import YELLOW_BGR, jpeg_of
 
 GREY = np.full((240, 320, 3), 140, np.uint8)
 

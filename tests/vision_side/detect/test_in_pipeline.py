@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from sightline.protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER, FrameHeader
-from tests.fixtures.vision.detector import Bench, Told, box
-from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from sightline.vision_side.config import DetectorConfig, TargetConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.plugin_calls import checked_results, validated
 from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.plugin_calls import checked_results, validated
 from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Maker, result_of
 from sightline.vision_side.pipeline import NO_ANSWER, Frame, Pipeline
+from tests.fixtures.vision.detector import Bench, Told, box
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))

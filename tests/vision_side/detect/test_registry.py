@@ -11,10 +11,13 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import FrameHeader
-from tests.fixtures.vision.onnx import brightness_model, without_gpu
 from sightline.vision_side import plugins as plugin_choice
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.color.detectors import Adaptive, Hsv
+from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
+from sightline.vision_side.detect.onnx.detector import OnnxDetector
+from sightline.vision_side.detect.port import DetectFrame, result_of
 from sightline.vision_side.detect.registry import (
     GROUP,
     REGISTRY,
@@ -23,13 +26,8 @@ from sightline.vision_side.detect.registry import (
     is_plain,
     split_kind,
 )
-from sightline.vision_side.detect.filters import ColorFilter
-from sightline.vision_side.detect.filters import LabelFilter
-from sightline.vision_side.detect.color.detectors import Adaptive, Hsv
-from sightline.vision_side.detect.onnx.detector import OnnxDetector
-from sightline.vision_side.detect.port import DetectFrame, result_of
 from sightline.vision_side.detect.shadow import ShadowDetector
-from sightline.vision_side.detect.filters import TrackIds
+from tests.fixtures.vision.onnx import brightness_model, without_gpu
 
 
 @pytest.fixture(autouse=True)

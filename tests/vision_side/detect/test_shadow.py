@@ -10,15 +10,14 @@ import pytest
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import FrameHeader
-from tests.fixtures.vision.detector import BALL, Bench
-from tests.fixtures.links import until
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.shadow import REPORT_EVERY_US, Agreement, disagreement
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Maker, result_of
-from sightline.vision_side.detect.shadow import ShadowDetector
+from sightline.vision_side.detect.shadow import REPORT_EVERY_US, Agreement, ShadowDetector, disagreement
 from sightline.vision_side.missions.registry import configured_mission
+from tests.fixtures.links import until
+from tests.fixtures.vision.detector import BALL, Bench
 
 
 def result(t_us: int, *boxes: tuple[float, float, float, float], name: str = "hsv") -> DetectionResult:

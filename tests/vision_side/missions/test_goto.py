@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from sightline.vision_side.missions.goto import Footprint, Goto
+from sightline.vision_side.missions.port import Plan
 from tests.fixtures.vision.course import Course, Drive, Eyes, Lidar, Row, Segment
 from tests.fixtures.vision.vision import camera
-from sightline.vision_side.missions.goto import Footprint
-from sightline.vision_side.missions.goto import Goto
-from sightline.vision_side.missions.port import Plan
 
 THYMIO = Footprint(front_m=0.08, rear_m=0.03, half_width_m=0.0635)
 CLEAR_M = 0.10

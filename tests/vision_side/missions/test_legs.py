@@ -7,15 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from sightline.evaluation.baselines.legs import LegsBaseline
 from sightline.protocol.messages import FrameHeader
-from tests.fixtures.vision.course import Course, Drive, Lidar, Row
-from tests.fixtures.vision.vision import camera
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.goto import Footprint
 from sightline.vision_side.missions.legs import Legs, nearest_legs
-from sightline.evaluation.baselines.legs import LegsBaseline
 from sightline.vision_side.missions.port import RangeScan, View
 from sightline.vision_side.tracking.track import from_odometry
+from tests.fixtures.vision.course import Course, Drive, Lidar, Row
+from tests.fixtures.vision.vision import camera
 
 LENS = camera()
 LEG_M = 0.055

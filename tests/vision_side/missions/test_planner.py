@@ -8,13 +8,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sightline.protocol.messages import FrameHeader
-from tests.fixtures.vision.vision import camera
-from sightline.vision_side.missions.goto import Footprint, braking_mps, clear_of
-from sightline.vision_side.missions.goto import ProgressChecker, ProgressCheckerConfig
-from sightline.vision_side.missions.planner import CELL_M, Costmap, cells_of
+from sightline.vision_side.missions.goto import Footprint, ProgressChecker, ProgressCheckerConfig, braking_mps, clear_of
+from sightline.vision_side.missions.planner import CELL_M, HORIZON_M, Costmap, Planner, cells_of
 from sightline.vision_side.missions.port import RangeScan, View
 from sightline.vision_side.missions.ranges import PoseMemory, about_robot, echoes, in_odometry
-from sightline.vision_side.missions.planner import HORIZON_M, Planner
+from tests.fixtures.vision.vision import camera
 
 LENGTH = st.floats(-5, 5)
 ANGLE = st.floats(-9, 9)

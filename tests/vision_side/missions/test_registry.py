@@ -9,15 +9,14 @@ from pathlib import Path
 import pytest
 
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.messages import STILL, CameraModel, FrameHeader
-from sightline.protocol.messages import MissionRequest
-from tests.contracts.missions import CAMERA, check_mission
+from sightline.protocol.messages import STILL, CameraModel, FrameHeader, MissionRequest
 from sightline.vision_side import plugins as plugin_choice
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.port import Circle, Detection
 from sightline.vision_side.missions import registry as choice
-from sightline.vision_side.missions.registry import BUILT_IN, configured_mission, mission_spec, requested_mission
 from sightline.vision_side.missions.port import Plan, View
+from sightline.vision_side.missions.registry import BUILT_IN, configured_mission, mission_spec, requested_mission
+from tests.contracts.missions import CAMERA, check_mission
 
 CONFIG = VisionConfig()
 ROOT = Path(__file__).parent.parent.parent.parent

@@ -4,13 +4,13 @@ import pytest
 
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, FrameHeader, RequestId, Twist
-from tests.contracts.missions import CAMERA
-from tests.fixtures.vision.vision import jpeg_of, scene
 from sightline.vision_side.config import MissionConfig, VisionConfig
+from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.registry import mission_spec
 from sightline.vision_side.missions.switch import SETTLE_S, MissionSwitch
-from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.pipeline import Frame, Pipeline
+from tests.contracts.missions import CAMERA
+from tests.fixtures.vision.vision import jpeg_of, scene
 
 CONFIG = VisionConfig()
 FRAME_US = 33_333

@@ -8,15 +8,14 @@ import pytest
 
 from sightline.protocol.messages import FrameHeader
 from sightline.sim.scenario import look_named
-from tests.fixtures.vision.course import Course, Drive, Row
-from tests.fixtures.vision.lane import BLOCK_M, LENS, LaneWorld
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.missions.goto import Footprint
-from sightline.vision_side.missions.lights import COLOURS, UNKNOWN, BoxLightReader, HousingLightReader, LampConfig
 from sightline.vision_side.missions.lane import Lane, LaneConfig
+from sightline.vision_side.missions.lights import COLOURS, UNKNOWN, BoxLightReader, HousingLightReader, LampConfig
 from sightline.vision_side.missions.port import View
-from sightline.vision_side.missions.traffic_light import StopConfig, StopLine
-from sightline.vision_side.missions.traffic_light import TrafficLight, TrafficLightBoxes
+from sightline.vision_side.missions.traffic_light import StopConfig, StopLine, TrafficLight, TrafficLightBoxes
+from tests.fixtures.vision.course import Course, Drive, Row
+from tests.fixtures.vision.lane import BLOCK_M, LENS, LaneWorld
 
 LOOKS = ("plain", "dim", "bright", "warm", "cold", "desaturated", "quality30")
 RASPBERRY = Footprint(front_m=0.07, rear_m=0.10, half_width_m=0.09)

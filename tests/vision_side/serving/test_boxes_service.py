@@ -18,18 +18,18 @@ from sightline.protocol.messages import (
     Stamp,
     Status,
 )
+from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from sightline.protocol.text import parse_twist
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.serving.process import serve
+from sightline.vision_side.serving.service import BoxesService
+from sightline.vision_side.tracking.locate import REMEMBERED, locate_box
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import Rig, acquired_at, ball_about_lens, camera, circle, errors_after, still
-from sightline.vision_side.serving.service import BoxesService
-from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.tracking.locate import REMEMBERED, locate_box
-from sightline.vision_side.detect.port import Detection
-from sightline.vision_side.serving.process import serve
 
 MODEL = camera()
 FRAME_US = 33_333

@@ -9,12 +9,12 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import Detections, FrameHeader
 from sightline.protocol.transports.memory import MemoryNetwork
-from tests.fixtures.vision.remote import BALL_JPEG
 from sightline.vision_side.config import HsvConfig
-from sightline.vision_side.detect.filters import LabelFilter
 from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.filters import LabelFilter
 from sightline.vision_side.detect.port import Circle, Detection, Maker, result_of
 from sightline.vision_side.serving.detector_service import DetectorService, ServingOptions
+from tests.fixtures.vision.remote import BALL_JPEG
 
 HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
 GOOD = Detection(10.0, 10.0, 50.0, 50.0, 0.9, "ball")

@@ -9,12 +9,12 @@ from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import AnswerHeader, FrameHeader, Stamp, Twist
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.robot_side.ports import Picture
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.pipeline import Observation, PipelineAnswer
+from sightline.vision_side.serving.dry_run import AckingService, ProgressPrinter, watch_camera, watch_robot
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
-from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.serving.dry_run import AckingService, ProgressPrinter, watch_camera, watch_robot
-from sightline.vision_side.pipeline import Observation, PipelineAnswer
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.transports.memory import MemoryNetwork
-from tests.fixtures.vision.detector import BALL, MODEL
-from tests.fixtures.vision.detector import Bench as DrivingBench
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.detect.port import Maker, result_of
 from sightline.vision_side.serving.dry_run import AckingService, LocalRun
+from tests.fixtures.vision.detector import BALL, MODEL
+from tests.fixtures.vision.detector import Bench as DrivingBench
 
 STARTS, GONE = "m.onnx runs on cpu: no GPU runtime is installed", "detector far: no answer: LATE"
 

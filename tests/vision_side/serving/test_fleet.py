@@ -11,12 +11,11 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import AnswerHeader, FrameHeader, Stamp, State, Status
 from sightline.protocol.transports.link import LatestSlot
-from sightline.protocol.transports.zenoh.link import open_zenoh
-from sightline.protocol.transports.zenoh.link import open_fleet
-from tests.fixtures.links import free_endpoint, until
-from tests.fixtures.robot_process import JPEG
+from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.fleet import Fleet
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.robot_process import JPEG
 
 
 class Robot:

@@ -11,17 +11,16 @@ from sightline.protocol.codec import encode
 from sightline.protocol.config import Config
 from sightline.protocol.messages import FrameHeader, Stamp, State, Status
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.protocol.transports.zenoh.link import open_zenoh
-from sightline.protocol.transports.zenoh.link import open_fleet
-from tests.fixtures.links import free_endpoint, until
-from tests.fixtures.vision.remote import BALL_JPEG, MODEL, Server, box, http_reply, said
+from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.vision_side.config import DetectorConfig, HsvConfig, VisionConfig
+from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.plugin_calls import close_detector
 from sightline.vision_side.detect.registry import configured_detector
-from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.serving.detector_service import DetectorService, ServingOptions
 from sightline.vision_side.serving.fleet import Fleet
 from sightline.vision_side.serving.service import Service
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.vision.remote import BALL_JPEG, MODEL, Server, box, http_reply, said
 
 DEADLINE_S = 0.5
 ROBOTS = {"ra1": "00000001", "rb": "00000002", "ra2": "00000003", "ra3": "00000004"}

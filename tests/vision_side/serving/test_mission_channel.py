@@ -12,19 +12,20 @@ from sightline.protocol.messages import (
     DetectionsHeader,
     Echo,
     FrameHeader,
+    MissionReport,
+    MissionRequest,
     RequestHeader,
     RequestId,
     ScanHeader,
     Stamp,
 )
-from sightline.protocol.messages import MissionReport, MissionRequest
 from sightline.protocol.transports.memory import MemoryNetwork
-from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from sightline.vision_side.config import DetectorConfig, VisionConfig
-from sightline.vision_side.serving.dry_run import AckingService
 from sightline.vision_side.pipeline import Observation
+from sightline.vision_side.serving.dry_run import AckingService
 from sightline.vision_side.serving.mission_channel import LEAST_GAP_S, PERIOD_S, Reporter
 from sightline.vision_side.serving.service import Service
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -160,7 +161,9 @@ def test_reports_come_twice_a_second_and_at_once_on_a_change_but_not_with_every_
 
 
 def test_a_report_says_what_a_mission_says_on_one_line_and_within_bounds():
-    report = Reporter(DetectorConfig()).due(0.0, "m" * 90, Observation("two\nlines" + "x" * 90, note="a\n" * 300), None, "")
+    report = Reporter(DetectorConfig()).due(
+        0.0, "m" * 90, Observation("two\nlines" + "x" * 90, note="a\n" * 300), None, ""
+    )
     assert "\n" not in report.phase + report.note and decode(MissionReport, encode(report), 2048) == report
 
 

@@ -13,13 +13,13 @@ import pytest
 from sightline.protocol.channels import ACK, CAMERA, FRAME, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, CameraModel, FrameHeader, Stamp
+from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Message
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.protocol.text import parse_twist
-from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.serving.service import Service
 from sightline.vision_side.serving.process import serve
+from sightline.vision_side.serving.service import Service
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -140,8 +140,11 @@ def test_the_process_ends_within_a_second_of_a_signal(number: signal.Signals) ->
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    code = (f"from sightline.vision_side.config import VisionConfig; from sightline.vision_side.serving.process import run; "
-            f"raise SystemExit(run(VisionConfig(connect=(), listen=('{endpoint}',))))")
+    code = (
+        "from sightline.vision_side.config import VisionConfig; "
+        "from sightline.vision_side.serving.process import run; "
+        f"raise SystemExit(run(VisionConfig(connect=(), listen=('{endpoint}',))))"
+    )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert "looking for robot r1" in process.stdout.readline()

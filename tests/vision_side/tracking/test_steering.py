@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from sightline.protocol.messages import Pose, Twist
 from sightline.vision_side.config import LatencyConfig, SearchConfig, SteerConfig, TrackConfig
 from sightline.vision_side.detect.port import Detection
-from sightline.vision_side.tracking.prediction import MotionPredictor
-from sightline.vision_side.tracking.steering import Search
 from sightline.vision_side.tracking.locate import Sighting
-from sightline.vision_side.tracking.steering import Aim, Steer
+from sightline.vision_side.tracking.prediction import MotionPredictor
+from sightline.vision_side.tracking.steering import Aim, Search, Steer
 from sightline.vision_side.tracking.track import Track, from_odometry, to_odometry
 
 DT_S = 1 / 30

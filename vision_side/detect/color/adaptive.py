@@ -4,19 +4,20 @@ Chromaticity is red and green as shares of the whole, so that neither shade nor 
 does, slowly, and the cloud goes along.
 """
 
-import cv2
 import math
-import numpy as np
 from functools import lru_cache
+from typing import Annotated, Any, Final
+
+import cv2
+import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+
 from sightline.protocol.config import Config as Settings
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.detect.color.hsv import HsvDetector, Region, codes_565, colors_565
 from sightline.vision_side.detect.port import Circle, Detection, Label
-from typing import Annotated, Any, Final
-
 
 Shares = NDArray[np.float32]
 """(..., 2): red and green shares."""

@@ -8,10 +8,9 @@ from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.detect.color.adaptive import AdaptiveConfig, AdaptiveTracker
-from sightline.vision_side.detect.per_robot import PerSession
 from sightline.vision_side.detect.color.hsv import HsvDetector
-from sightline.vision_side.detect.port import Label
-from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
+from sightline.vision_side.detect.per_robot import PerSession
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Label, Maker
 from sightline.vision_side.detect.timing import timed
 
 _CPU: Final = "cpu"

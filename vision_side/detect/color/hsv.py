@@ -3,17 +3,18 @@
 The table is over BGR565, so any number of ranges, and a hue range through red, cost the same.
 """
 
-import cv2
 import math
-import numpy as np
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
 from numpy.typing import NDArray
+
 from sightline.vision_side.config import HsvConfig, HsvRange
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.detect.port import Circle, Detection
-from typing import Any
-
 
 COARSE = 4
 """Where to look is decided on every fourth pixel of every fourth row, which no disc worth measuring slips between."""

@@ -11,9 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.color.hsv import Fit, Outline, fit_round_part
-from sightline.vision_side.detect.color.hsv import Box, blob_between
-from sightline.vision_side.detect.color.hsv import disc_detection, own_edge
+from sightline.vision_side.detect.color.hsv import (
+    Box,
+    Fit,
+    Outline,
+    blob_between,
+    disc_detection,
+    fit_round_part,
+    own_edge,
+)
 from sightline.vision_side.detect.port import Circle, Detection
 
 _WITHIN: Final = 0.7  # of the box: surely the ball, even where the box is a little off

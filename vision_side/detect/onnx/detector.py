@@ -18,9 +18,9 @@ from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.vision_side.config import Device
 from sightline.vision_side.decode import Picture
+from sightline.vision_side.detect.color.refine import refined
+from sightline.vision_side.detect.onnx.engine import Engine, OnnxHeader, open_engine, read_onnx_header
 from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
-from sightline.vision_side.detect.onnx.engine import Engine, open_engine
-from sightline.vision_side.detect.onnx.engine import OnnxHeader, read_onnx_header
 from sightline.vision_side.detect.onnx.tensors import (
     ModelFormat,
     fit_picture,
@@ -30,7 +30,6 @@ from sightline.vision_side.detect.onnx.tensors import (
     split_batch,
 )
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
-from sightline.vision_side.detect.color.refine import refined
 from sightline.vision_side.detect.timing import timed_together
 
 SHIPPED: Final = Path(__file__).parent.parent.parent / "models" / "sightline.onnx"
@@ -168,12 +167,16 @@ def read_onnx_model(config: OnnxDetector.Config) -> OnnxModel:
         if KEY not in header.metadata:
             return OnnxModel(path, header, form, least, None, form, _least(None, header), digest)
         own = replace(form, labels=own_labels(header.metadata))
-        return OnnxModel(path, header, form, least, read_golden(header.metadata[KEY]), own, _least(None, header), digest)
+        return OnnxModel(
+            path, header, form, least, read_golden(header.metadata[KEY]), own, _least(None, header), digest
+        )
     except ValueError as error:
         raise ConfigError(f"model {path}: {error}; see docs/detectors.md") from None
 
 
-def _found(engine: Engine, pictures: Sequence[Picture], form: ModelFormat, min_score: float) -> list[tuple[Detection, ...]]:
+def _found(
+    engine: Engine, pictures: Sequence[Picture], form: ModelFormat, min_score: float
+) -> list[tuple[Detection, ...]]:
     """In each picture; more than one only where form and engine take them."""
     fitted = [fit_picture(picture, form) for picture in pictures]
     if len(fitted) == 1:

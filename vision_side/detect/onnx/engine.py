@@ -4,16 +4,17 @@ An ONNX file is a protocol buffer; the few fields that matter are read, all else
 """
 
 import importlib
-import numpy as np
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from numpy.typing import NDArray
 from pathlib import Path
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.vision_side.config import Device
 from sightline.vision_side.detect.protobuf import Bytes, Field, as_bytes, fields, text
-from typing import Any, Final, Protocol
-
 
 _GRAPH, _METADATA = 7, 14  # of a model
 _INITIALIZER, _INPUT, _OUTPUT = 5, 11, 12  # of a graph
@@ -185,7 +186,7 @@ class _OpenCv:
 
     device = "cpu"
     batches = False
-    note = "onnxruntime is not installed, so OpenCV runs the model; pip install 'sightline[onnx]' is faster"
+    note = "onnxruntime is not installed, so OpenCV runs the model; pip install 'sightline-robot[onnx]' is faster"
 
     def __init__(self, path: Path, header: OnnxHeader) -> None:
         import cv2

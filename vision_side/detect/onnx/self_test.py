@@ -11,8 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sightline.vision_side.detect.port import corners, overlap
-from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.detect.port import Detection, corners, overlap
 
 KEY: Final = "golden"
 SIZE_PX: Final = (320, 240)

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.port import clean_label
 from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor
-from sightline.vision_side.detect.port import Detection, clipped
+from sightline.vision_side.detect.port import Detection, clean_label, clipped
 
 Arrays = Mapping[str, NDArray[Any]]
 _MAX_ROWS: Final = 100_000

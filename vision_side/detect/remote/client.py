@@ -2,18 +2,21 @@
 Shell (a clock).
 """
 
-import numpy as np
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any, Final, Protocol
+
+import numpy as np
 from numpy.typing import NDArray
+
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.messages import DetectedBox, MAX_DETECTED_BOXES
+from sightline.protocol.messages import MAX_DETECTED_BOXES, DetectedBox
 from sightline.vision_side.detect.plugin_calls import Notices
 from sightline.vision_side.detect.port import (
     Circle,
@@ -25,8 +28,6 @@ from sightline.vision_side.detect.port import (
     clipped,
     result_of,
 )
-from typing import Any, Final, Protocol
-
 
 DEFAULT_PORTS: Final = {"oip+http": 8000, "oip+grpc": 8001, "http+jpeg": 80}
 """Those of Triton, and of HTTP."""

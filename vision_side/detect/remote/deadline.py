@@ -14,10 +14,15 @@ from pydantic import Field
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import SightlineError
 from sightline.protocol.transports.link import LatestSlot, Link
-from sightline.vision_side.detect.plugin_calls import attach_detector, close_detector, notices_of
-from sightline.vision_side.detect.plugin_calls import NO_ANSWER_IN_TIME, checked_results
-from sightline.vision_side.detect.plugin_calls import Notices
 from sightline.vision_side.detect.per_robot import DecoderPool
+from sightline.vision_side.detect.plugin_calls import (
+    NO_ANSWER_IN_TIME,
+    Notices,
+    attach_detector,
+    checked_results,
+    close_detector,
+    notices_of,
+)
 from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
 from sightline.vision_side.detect.remote.client import LONGEST_WAIT_S, seconds_left
 

@@ -11,9 +11,8 @@ from typing import Final, Protocol, runtime_checkable
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.transports.link import Link
-from sightline.vision_side.detect.plugin_calls import attach_detector, close_detector, notices_of
 from sightline.vision_side.detect.per_robot import MAX_ROBOTS
-from sightline.vision_side.detect.plugin_calls import Notices
+from sightline.vision_side.detect.plugin_calls import Notices, attach_detector, close_detector, notices_of
 from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
 from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, DeadlineDetector
 

@@ -10,7 +10,10 @@ import socket
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Annotated, Any, Final
+
 from pydantic import Field
+
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.config import Config as Settings
@@ -19,11 +22,11 @@ from sightline.protocol.messages import Counter, Detections, SessionId
 from sightline.vision_side.config import Fraction
 from sightline.vision_side.detect.port import DetectFrame, Maker, clean_label
 from sightline.vision_side.detect.remote.client import (
-    Address,
     MIN_SCORE,
+    REMOTE,
+    Address,
     NoAnswerError,
     NoAnswerReason,
-    REMOTE,
     ServerAnswer,
     ServerDetector,
     hash_of,
@@ -31,9 +34,7 @@ from sightline.vision_side.detect.remote.client import (
     read_boxes,
     seconds_left,
 )
-from sightline.vision_side.detect.remote.deadline import DeadlineDetector, MAX_PIXELS, PixelBound
-from typing import Annotated, Any, Final
-
+from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, DeadlineDetector, PixelBound
 
 MAX_ANSWER_BYTES: Final = 1 << 20
 """Security limit: 1024 rows of boxes as JSON are a tenth of it."""
@@ -157,7 +158,9 @@ class HttpExchange:
         if self._socket is None:
             self._not_before_us = monotonic_us() + RETRY_US
         why = error.strerror or str(error) or type(error).__name__
-        return NoAnswerError(NoAnswerReason.UNREACHABLE, f"{self._host}:{self._port}: {why}; does the server run there?")
+        return NoAnswerError(
+            NoAnswerReason.UNREACHABLE, f"{self._host}:{self._port}: {why}; does the server run there?"
+        )
 
     def _read(self, connection: socket.socket, method: str, until_us: int) -> Reply:
         source: Any = _Timed(connection, until_us)
@@ -165,7 +168,9 @@ class HttpExchange:
             response.begin()
             encoding = response.headers.get("Content-Encoding", "identity").strip().lower()
             if encoding not in ("", "identity"):
-                raise NoAnswerError(NoAnswerReason.ENCODED, f"Content-Encoding {encoding[:20]!r}, where none was asked for")
+                raise NoAnswerError(
+                    NoAnswerReason.ENCODED, f"Content-Encoding {encoding[:20]!r}, where none was asked for"
+                )
             if (response.length or 0) > MAX_ANSWER_BYTES:
                 raise NoAnswerError(NoAnswerReason.TOO_LARGE, f"{response.length} bytes, at most {MAX_ANSWER_BYTES}")
             body = response.read(MAX_ANSWER_BYTES + 1)
@@ -174,7 +179,9 @@ class HttpExchange:
             if response.length:
                 raise NoAnswerError(NoAnswerReason.UNREACHABLE, f"it went away {response.length} bytes before the end")
             if response.status != http.client.OK:
-                raise NoAnswerError(NoAnswerReason.REFUSED, f"status {response.status}: {body[:80].decode('utf-8', 'replace')}")
+                raise NoAnswerError(
+                    NoAnswerReason.REFUSED, f"status {response.status}: {body[:80].decode('utf-8', 'replace')}"
+                )
             if response.will_close or not response.isclosed():
                 self.close()
             return Reply({name.lower(): value for name, value in response.headers.items()}, body)
@@ -294,10 +301,16 @@ def read_jpeg_answer(body: bytes, frame: DetectFrame) -> JpegAnswer:
     if said.session not in (None, frame.header.session) or said.seq not in (None, frame.header.seq):
         raise NoAnswerError(NoAnswerReason.OTHER_FRAME, f"it answers frame {said.seq} of {said.session}")
     if (said.width_px, said.height_px) != (frame.width_px, frame.height_px):
-        raise NoAnswerError(NoAnswerReason.OTHER_SIZE, f"boxes of a {said.width_px}x{said.height_px} picture, the frame is "
-                                          f"{frame.width_px}x{frame.height_px}")
+        raise NoAnswerError(
+            NoAnswerReason.OTHER_SIZE,
+            f"boxes of a {said.width_px}x{said.height_px} picture, the frame is {frame.width_px}x{frame.height_px}",
+        )
     return said
 
 
 def _reason(error: WireError) -> NoAnswerReason:
-    return NoAnswerReason.NOT_FINITE if "finite number" in error.detail else _REASONS.get(error.reason, NoAnswerReason.MALFORMED)
+    return (
+        NoAnswerReason.NOT_FINITE
+        if "finite number" in error.detail
+        else _REASONS.get(error.reason, NoAnswerReason.MALFORMED)
+    )

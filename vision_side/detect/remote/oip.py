@@ -5,20 +5,21 @@ model that can be used here takes one input, a JPEG (datatype BYTES) or its pixe
 `boxes` (K, 4) xyxy in pixels of what it was given, `scores` (K) and, if it knows several things, `labels` (K).
 """
 
-import cv2
 import math
-import numpy as np
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Any, Final, Literal
+
+import cv2
+import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+
 from sightline.protocol.config import Config as Settings
 from sightline.vision_side.config import Fraction
 from sightline.vision_side.detect.port import DetectFrame, Detection, Label
 from sightline.vision_side.detect.remote.client import MIN_SCORE, NoAnswerError, NoAnswerReason, read_columns
 from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, PixelBound
-from typing import Annotated, Any, Final, Literal
-
 
 NUMBERS: Final = {"FP16": "<f2", "FP32": "<f4", "FP64": "<f8", "UINT8": "u1", "INT8": "i1", "INT16": "<i2",
                   "UINT16": "<u2", "INT32": "<i4", "UINT32": "<u4", "INT64": "<i8", "UINT64": "<u8", "BOOL": "?"}
@@ -159,7 +160,9 @@ def read_number_tensor(datatype: str, shape: Sequence[int], data: bytes) -> NDAr
         raise NoAnswerError(NoAnswerReason.MALFORMED, f"a tensor of datatype {datatype[:20]!r}")
     count = elements_of(shape)
     if len(data) != count * np.dtype(kind).itemsize:
-        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{len(data)} bytes for a {datatype} tensor of shape {list(shape)}")
+        raise NoAnswerError(
+            NoAnswerReason.MALFORMED, f"{len(data)} bytes for a {datatype} tensor of shape {list(shape)}"
+        )
     return np.frombuffer(data, kind).reshape(tuple(shape))
 
 
@@ -223,8 +226,10 @@ def _labels(found: NDArray[Any] | list[str] | None, rows: int, names: tuple[str,
         whole = numbers.astype(np.int64)  # many exported models give their classes as floats
         numbers = whole if np.array_equal(whole, numbers) else numbers
     if numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer):
-        raise NoAnswerError(NoAnswerReason.MALFORMED, f"labels of shape {numbers.shape} and type {numbers.dtype}; they are "
-                                              "text or whole numbers")
+        raise NoAnswerError(
+            NoAnswerReason.MALFORMED,
+            f"labels of shape {numbers.shape} and type {numbers.dtype}; they are text or whole numbers",
+        )
     return [names[number] if 0 <= number < len(names) else str(number) for number in numbers.tolist()]
 
 

@@ -7,15 +7,18 @@ Numbers of fields: grpc_service.proto of https://github.com/kserve/open-inferenc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from typing import Any, Final
+
 from numpy.typing import NDArray
+
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.detect.port import DetectFrame, Maker
 from sightline.vision_side.detect.protobuf import Bytes, as_bytes, fields, integers, put, put_integers, text
 from sightline.vision_side.detect.remote.client import (
+    REMOTE,
     Address,
     NoAnswerError,
     NoAnswerReason,
-    REMOTE,
     ServerAnswer,
     ServerDetector,
     parse_address,
@@ -24,8 +27,8 @@ from sightline.vision_side.detect.remote.client import (
 from sightline.vision_side.detect.remote.deadline import DeadlineDetector
 from sightline.vision_side.detect.remote.http_client import MAX_ANSWER_BYTES
 from sightline.vision_side.detect.remote.oip import (
-    Inferred,
     MAX_TENSORS,
+    Inferred,
     OipModel,
     OipSettings,
     OutputOptions,
@@ -37,8 +40,6 @@ from sightline.vision_side.detect.remote.oip import (
     read_text_tensor,
     tensor_of,
 )
-from typing import Any, Final
-
 
 METADATA: Final = "/inference.GRPCInferenceService/ModelMetadata"
 INFER: Final = "/inference.GRPCInferenceService/ModelInfer"
@@ -89,7 +90,9 @@ def read_infer(data: bytes, number: str) -> Inferred:
     version, slots, contents = "", list[Slot](), list[bytes]()
     for which, value in fields(data):
         if which == 3 and text(value) not in ("", number):
-            raise NoAnswerError(NoAnswerReason.OTHER_FRAME, f"the answer's id is {text(value)[:40]!r}, asked was {number!r}")
+            raise NoAnswerError(
+                NoAnswerReason.OTHER_FRAME, f"the answer's id is {text(value)[:40]!r}, asked was {number!r}"
+            )
         if which == 2:
             version = text(value)
         elif which == 5:
@@ -97,7 +100,9 @@ def read_infer(data: bytes, number: str) -> Inferred:
         elif which == 6:
             contents.append(bytes(as_bytes(value)))
     if len(slots) != len(contents) or len(slots) > MAX_TENSORS:
-        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{len(slots)} outputs, {len(contents)} raw contents; they go together")
+        raise NoAnswerError(
+            NoAnswerReason.MALFORMED, f"{len(slots)} outputs, {len(contents)} raw contents; they go together"
+        )
     return Inferred({slot.name: _tensor(slot, raw) for slot, raw in zip(slots, contents, strict=True)}, version)
 
 
@@ -131,7 +136,7 @@ _OPTIONS: Final = (
     ("grpc.enable_http_proxy", 0),
     ("grpc.enable_retries", 0),
 )
-_NO_GRPC: Final = "grpcio is not installed: pip install 'sightline[grpc]', or use oip+http://"
+_NO_GRPC: Final = "grpcio is not installed: pip install 'sightline-robot[grpc]', or use oip+http://"
 _REASONS: Final = {"DEADLINE_EXCEEDED": NoAnswerReason.LATE, "UNAVAILABLE": NoAnswerReason.UNREACHABLE,
                    "RESOURCE_EXHAUSTED": NoAnswerReason.TOO_LARGE, "INTERNAL": NoAnswerReason.MALFORMED}
 

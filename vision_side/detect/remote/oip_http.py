@@ -1,15 +1,18 @@
 """The detector `oip+http`: JSON with binary tensors. Shell."""
 
 import json
+from typing import Annotated, Any, Final, TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
 from sightline.vision_side.detect.port import DetectFrame, Maker
 from sightline.vision_side.detect.remote.client import (
+    REMOTE,
     Address,
     NoAnswerError,
     NoAnswerReason,
-    REMOTE,
     ServerAnswer,
     ServerDetector,
     parse_address,
@@ -17,10 +20,10 @@ from sightline.vision_side.detect.remote.client import (
 from sightline.vision_side.detect.remote.deadline import DeadlineDetector
 from sightline.vision_side.detect.remote.http_client import HttpExchange
 from sightline.vision_side.detect.remote.oip import (
-    Inferred,
     MAX_DIMENSIONS,
     MAX_TENSORS,
     NUMBERS,
+    Inferred,
     OipModel,
     OipSettings,
     OutputOptions,
@@ -33,8 +36,6 @@ from sightline.vision_side.detect.remote.oip import (
     read_text_tensor,
     tensor_of,
 )
-from typing import Annotated, Any, Final, TypeVar
-
 
 HEADER_LENGTH: Final = "Inference-Header-Content-Length"
 """How many bytes of a body are JSON; tensors follow."""

@@ -16,11 +16,17 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.messages import Detections, DetectionsHeader, Source
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 from sightline.vision_side.config import Fraction
-from sightline.vision_side.detect.port import clean_label
-from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Maker, result_of
-from sightline.vision_side.detect.remote.client import REMOTE, FrameByFrame, seconds_left
-from sightline.vision_side.detect.remote.client import MIN_SCORE, hash_of, read_boxes
-from sightline.vision_side.detect.remote.client import NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Maker, clean_label, result_of
+from sightline.vision_side.detect.remote.client import (
+    MIN_SCORE,
+    REMOTE,
+    FrameByFrame,
+    NoAnswerError,
+    NoAnswerReason,
+    hash_of,
+    read_boxes,
+    seconds_left,
+)
 
 ROLE: Final = "detector"
 """The source under which a detector service speaks."""
@@ -108,7 +114,9 @@ class ZenohDetector(FrameByFrame):
 
     def _of(self, robot: str) -> _Heard:
         if robot not in self._heard:
-            raise NoAnswerError(NoAnswerReason.UNREACHABLE, f"there is no link to robot {robot}: it works within a vision only")
+            raise NoAnswerError(
+                NoAnswerReason.UNREACHABLE, f"there is no link to robot {robot}: it works within a vision only"
+            )
         return self._heard[robot]
 
     def _wait(self, heard: _Heard, frame: DetectFrame, deadline_us: int) -> DetectionResult:
@@ -121,7 +129,9 @@ class ZenohDetector(FrameByFrame):
                                      f"{frame.robot}; the first is kept to. End the others, or share the robots out "
                                      "among them with --robot")
             if message is None:
-                raise NoAnswerError(NoAnswerReason.LATE, f"no boxes from {self._config.source} by the deadline; does it run?")
+                raise NoAnswerError(
+                    NoAnswerReason.LATE, f"no boxes from {self._config.source} by the deadline; does it run?"
+                )
             try:
                 header, ahead = _cites(message, frame)
             except NoAnswerError as error:
@@ -146,7 +156,9 @@ def _cites(message: Message, frame: DetectFrame) -> tuple[DetectionsHeader, int]
         raise NoAnswerError(NoAnswerReason.MALFORMED, error.detail) from None
     echo, asked = header.echo, frame.header
     if header.source != message.source or echo is None or echo.channel != FRAME.name or echo.session != asked.session:
-        raise NoAnswerError(NoAnswerReason.OTHER_FRAME, "boxes of no frame of this robot's session, or not of who says so")
+        raise NoAnswerError(
+            NoAnswerReason.OTHER_FRAME, "boxes of no frame of this robot's session, or not of who says so"
+        )
     ahead = echo.seq - asked.seq
     is_newer = ahead > 0 and asked.t_us < echo.t_us <= asked.t_us + _NEWER_US
     is_older = ahead < 0 and echo.t_us < asked.t_us

@@ -1,10 +1,9 @@
 """Robots that arm, disarm, stop or reset wrongly. Pure."""
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import State, Twist, Verb
-from sightline.protocol.errors import RejectReason
-from sightline.robot_side.safety.validation import AcceptedCommand, CommandResult
 from sightline.robot_side.safety.lease import RANKS
+from sightline.robot_side.safety.validation import AcceptedCommand, CommandResult
 from tests.conformance.robot.broken.breaking import breaks, wrap
 
 

@@ -1,13 +1,12 @@
 """Robots that are wrong about credit, guests, hostile peers and reconnects. Pure."""
 
 from sightline.protocol.channels import CHANNELS
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import Twist
-from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.link import Message
-from sightline.robot_side.safety.validation import AcceptedCommand
-from sightline.robot_side.safety.lease import Lease
 from sightline.robot_side.ports import Picture
+from sightline.robot_side.safety.lease import Lease
+from sightline.robot_side.safety.validation import AcceptedCommand
 from tests.conformance.robot.broken.breaking import as_json, bend_acks, bend_out, breaks, fields_of, wrap
 from tests.conformance.robot.broken.lease import lease_of
 from tests.fixtures.robot_process import JPEG
@@ -322,7 +321,9 @@ def goes_on_where_it_was(robot):
 
     def resume():
         now_us = robot.now()
-        gate._command = AcceptedCommand(Twist(linear_mps=0.2, angular_rad_s=0.0), now_us + 300_000, now_us + 300_000, 500_000)
+        gate._command = AcceptedCommand(
+            Twist(linear_mps=0.2, angular_rad_s=0.0), now_us + 300_000, now_us + 300_000, 500_000
+        )
 
     on_return(robot, resume)
 

@@ -1,8 +1,7 @@
 """Robots whose wheels do something wrong: limits and silence. Pure."""
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import CLAMPED, RejectReason, WireError
 from sightline.protocol.messages import State, Twist
-from sightline.protocol.errors import CLAMPED, RejectReason
 from sightline.robot_side.safety.validation import AcceptedCommand
 from tests.conformance.robot.broken.breaking import bend_out, breaks, fields_of, wrap
 from tests.conformance.robot.broken.lease import who_sends

@@ -3,14 +3,13 @@
 import re
 
 from sightline.protocol.channels import ACK, REPLY
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import MAX_INTEGER, Reply, State, Verb
-from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.link import Message
-from tests.conformance.robot.broken.breaking import bend_out, bend_twists, breaks, fields_of, wrap
 from tests.conformance.robot.broken.arming import absent, forgives
-from tests.conformance.robot.broken.validation import refuse, refuses
+from tests.conformance.robot.broken.breaking import bend_out, bend_twists, breaks, fields_of, wrap
 from tests.conformance.robot.broken.credit import owns_too, stream_of
+from tests.conformance.robot.broken.validation import refuse, refuses
 
 
 def record_of(robot):

@@ -1,8 +1,7 @@
 """Robots that read, grant or answer requests wrongly. Pure."""
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import Verb
-from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.link import Message
 from tests.conformance.robot.broken.breaking import as_json, bend_out, bend_requests, breaks, fields_of, wrap
 

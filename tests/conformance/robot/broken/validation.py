@@ -3,9 +3,8 @@
 import json
 import re
 
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import MAX_INTEGER
-from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.link import Message
 from tests.conformance.robot.broken.breaking import as_json, bend_twists, breaks, fields_of, wrap
 

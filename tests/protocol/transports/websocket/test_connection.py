@@ -1,21 +1,23 @@
 """Who is given up, by time and by what is known of the way out: tables over `websocket_life`, to the microsecond."""
 
-import pytest
 import random
-from hypothesis import example, given, settings, strategies as st
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from websockets.frames import Frame, Opcode
+from websockets.protocol import CLIENT, SERVER, Protocol
+
 from sightline.protocol.transports.websocket.connection import (
-    Keepalive,
     MAX_FRAGMENTS,
-    MessageReader,
     PING_EVERY_US,
     SILENCE_US,
     STALLED_LIMIT_US,
+    Keepalive,
+    MessageReader,
     SendPath,
     unmasked_head,
 )
-from websockets.frames import Frame, Opcode
-from websockets.protocol import CLIENT, Protocol, SERVER
-
 
 CLEAR = SendPath(full=False, taken_bytes=7, lost=False)
 FULL = SendPath(full=True, taken_bytes=7, lost=False)

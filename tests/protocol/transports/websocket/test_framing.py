@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, TWIST, key_for
-from sightline.protocol.errors import WireError
-from sightline.protocol.errors import RejectReason
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, IncomingMessage, pack, parse_hello, unpack
 
 ROLES = st.from_regex(r"[a-z][a-z0-9_]{0,15}", fullmatch=True)

@@ -11,10 +11,10 @@ import pytest
 from sightline.protocol.channels import STATUS, TWIST
 from sightline.protocol.errors import RejectReason
 from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE
-from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.framing import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
-from sightline.protocol.transports.websocket.server import CROSS_SITE, TOO_MANY_CLIENTS, WRONG_SUBPROTOCOL
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.peer import SILENT
+from sightline.protocol.transports.websocket.server import CROSS_SITE, TOO_MANY_CLIENTS, WRONG_SUBPROTOCOL
 from tests.fixtures.links import until
 from tests.fixtures.websocket import address_of, free_ws
 

@@ -1,28 +1,29 @@
 """The older text dialect over real sockets: the write-up's client, and vision against the write-up's robot."""
 
 import base64
-import pytest
 import random
 import socket
 import threading
 import time
 from contextlib import contextmanager, suppress
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+from websockets.sync.server import serve
+
 from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason
 from sightline.protocol.messages import AnswerHeader, Detections, DetectionsHeader, FrameHeader
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint
-from sightline.protocol.transports.link import Message, OVERSIZE
+from sightline.protocol.transports.link import OVERSIZE, Message
 from sightline.protocol.transports.websocket.framing import BAD_FRAMING
 from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.server import CROSS_SITE
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import JPEG as SMALL_JPEG
 from tests.fixtures.websocket import address_of, received, upgrade
-from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import connect
-from websockets.sync.server import serve
-
 
 JPEG = bytes(range(256)) * 40
 TEXT = base64.encodebytes(JPEG).decode("ascii")

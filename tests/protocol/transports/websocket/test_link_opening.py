@@ -16,8 +16,8 @@ from sightline.operator_side.setup import keys
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.framing import OTHER_ROBOT
+from sightline.protocol.transports.websocket.link import open_websocket
 from tests.fixtures.links import until
 from tests.fixtures.websocket import Robot, free_ws
 
@@ -60,7 +60,7 @@ def test_bad_arguments_are_refused_before_anything_is_opened(arguments, said):
 
 def test_websockets_that_is_not_installed_is_one_line_with_the_fix(monkeypatch):
     monkeypatch.setitem(sys.modules, "websockets", None)
-    with pytest.raises(ConfigError, match=re.escape("pip install 'sightline[websocket]'")):
+    with pytest.raises(ConfigError, match=re.escape("pip install 'sightline-robot[websocket]'")):
         open_websocket("r1", connect="ws://127.0.0.1:9090")
 
 

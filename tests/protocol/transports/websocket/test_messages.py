@@ -12,10 +12,9 @@ from websockets.sync.client import connect
 from sightline.protocol.channels import ACK, FRAME, SCAN, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import FrameHeader
-from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.link import OVERSIZE
-from sightline.protocol.transports.websocket.link import open_websocket
+from sightline.protocol.transports.link import OVERSIZE, Message
 from sightline.protocol.transports.websocket.framing import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
+from sightline.protocol.transports.websocket.link import open_websocket
 from tests.fixtures.links import claim, hail, until
 from tests.fixtures.websocket import HELLO, TWIST_KEY, V1, Robot, bare_client, closed_with, received
 

@@ -7,16 +7,15 @@ import pytest
 
 from sightline.protocol.channels import CHANNELS, DETECTIONS, FRAME, REPLY, REQUEST, SCAN, STATUS, TWIST
 from sightline.protocol.codec import encode
-from sightline.protocol.text import encode_picture
+from sightline.protocol.legacy_text import encode_picture
 from sightline.protocol.messages import Request
+from sightline.protocol.transports.endpoints import LegacyOptions
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.security import KNOWN_SOURCES
-from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.framing import SightlineV1
-from sightline.protocol.transports.endpoints import LegacyOptions
-from sightline.protocol.transports.websocket.legacy import LegacyClient, LegacyToVision
+from sightline.protocol.transports.websocket.legacy import DriverSlot, LegacyClient, LegacyToVision
+from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.peer import MAX_UNKNOWN_SOURCES, Outbox, Publication
-from sightline.protocol.transports.websocket.legacy import DriverSlot
 from tests.fixtures.links import until
 from tests.fixtures.websocket import free_ws
 

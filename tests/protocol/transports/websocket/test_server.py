@@ -7,10 +7,15 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
-from sightline.protocol.transports.websocket.framing import BAD_FRAMING
 from sightline.protocol.transports.endpoints import host_problem, origin_problem
-from sightline.protocol.transports.websocket.server import CROSS_SITE, TOO_MANY_CLIENTS, WRONG_SUBPROTOCOL
-from sightline.protocol.transports.websocket.server import MAX_CLIENTS, MAX_HANDSHAKES
+from sightline.protocol.transports.websocket.framing import BAD_FRAMING
+from sightline.protocol.transports.websocket.server import (
+    CROSS_SITE,
+    MAX_CLIENTS,
+    MAX_HANDSHAKES,
+    TOO_MANY_CLIENTS,
+    WRONG_SUBPROTOCOL,
+)
 from tests.fixtures.links import hail, until
 from tests.fixtures.websocket import V1, Robot, upgrade
 

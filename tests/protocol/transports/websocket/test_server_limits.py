@@ -14,15 +14,14 @@ from sightline.protocol.channels import REQUEST
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import Request
-from sightline.protocol.transports.security import ROLES
+from sightline.protocol.transports.security import ROLES, grants_of_role
 from sightline.protocol.transports.websocket.link import open_websocket
-from sightline.protocol.transports.security import grants_of_role
-from sightline.protocol.transports.websocket.server import TOO_MANY_CLIENTS
 from sightline.protocol.transports.websocket.server import (
     MAX_CLIENTS,
     MAX_HANDSHAKES,
     MAX_HANDSHAKES_PER_ADDRESS,
     RESERVED_SLOTS,
+    TOO_MANY_CLIENTS,
     ConnectionLimits,
     may_control,
 )
@@ -91,7 +90,9 @@ def test_an_address_has_few_strangers_and_all_together_not_many():
 
 def test_a_client_is_no_stranger_any_more():
     places = ConnectionLimits()
-    assert [settled(places, True) for _ in range(2 * MAX_HANDSHAKES_PER_ADDRESS)] == [""] * 2 * MAX_HANDSHAKES_PER_ADDRESS
+    assert [settled(places, True) for _ in range(2 * MAX_HANDSHAKES_PER_ADDRESS)] == [
+        ""
+    ] * 2 * MAX_HANDSHAKES_PER_ADDRESS
     assert places.knock("10.0.0.1") is not None
 
 

@@ -9,9 +9,7 @@ import pytest
 
 from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.zenoh import access_log as tcp_table
-from sightline.protocol.transports.zenoh.access_log import Certificates
-from sightline.protocol.transports.zenoh.access_log import Visitors
-from sightline.protocol.transports.zenoh.access_log import refusal_cause
+from sightline.protocol.transports.zenoh.access_log import Certificates, Visitors, refusal_cause
 from tests.fixtures.links import free_endpoint, until
 
 SECOND_US = 1_000_000
@@ -167,8 +165,19 @@ def test_a_router_names_who_it_refuses_among_its_own_lines(tmp_path, log):
     keys.make(tmp_path / "k", [])
     endpoint = free_endpoint().replace("tcp/", "tls/")
     port = int(endpoint.rpartition(":")[2])
-    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "router", "--listen", endpoint, "--secure",
-               str(tmp_path / "k"), "--log", log]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "sightline.operator_side.cli.app",
+        "router",
+        "--listen",
+        endpoint,
+        "--secure",
+        str(tmp_path / "k"),
+        "--log",
+        log,
+    ]
     out = (tmp_path / "out").open("w+")
     with subprocess.Popen(command, stdout=out, stderr=out) as router:
         try:

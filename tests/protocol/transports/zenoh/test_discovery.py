@@ -7,8 +7,7 @@ import sys
 import pytest
 
 from sightline.protocol.transports.zenoh.discovery import find_listeners
-from sightline.protocol.transports.zenoh.session import MULTICAST_OFF, multicast_section
-from sightline.protocol.transports.zenoh.session import session_config
+from sightline.protocol.transports.zenoh.session import MULTICAST_OFF, multicast_section, session_config
 
 INSIDE = """
 import fcntl, os, socket, struct, subprocess, sys

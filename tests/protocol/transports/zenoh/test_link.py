@@ -15,13 +15,12 @@ from sightline.protocol.channels import DETECTIONS, FRAME, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.messages import FrameHeader
+from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
 from sightline.protocol.transports.link import NOT_A_PUT
-from sightline.protocol.transports.diagnosis import port_owner
-from sightline.protocol.transports.zenoh.link import MAX_KEPT_PUBLISHERS, ZenohLink, open_zenoh
 from sightline.protocol.transports.zenoh.discovery import list_robots
+from sightline.protocol.transports.zenoh.link import MAX_KEPT_PUBLISHERS, ZenohLink, open_fleet, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session
-from sightline.protocol.transports.zenoh.link import open_fleet
 from tests.fixtures.links import free_endpoint, until
 
 NO_ENDPOINTS = (
@@ -85,7 +84,7 @@ def test_bad_arguments_are_refused_before_anything_is_opened(arguments, said):
 
 def test_zenoh_that_is_not_installed_is_one_line_with_the_fix(monkeypatch):
     monkeypatch.setitem(sys.modules, "zenoh", None)
-    with pytest.raises(ConfigError, match=re.escape("pip install 'sightline[zenoh]'")):
+    with pytest.raises(ConfigError, match=re.escape("pip install 'sightline-robot[zenoh]'")):
         open_zenoh("r1", connect=["tcp/127.0.0.1:7447"])
 
 

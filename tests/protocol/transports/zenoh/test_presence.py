@@ -5,13 +5,16 @@ import time
 import pytest
 
 from sightline.operator_side.cli import app as cli
-from sightline.operator_side.setup import keys
 from sightline.operator_side.client.discovery import as_object, lines
+from sightline.operator_side.setup import keys
 from sightline.protocol.channels import STATUS
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.messages import Stamp, State, Status
 from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
+from sightline.protocol.transports.zenoh.discovery import discover, peers_at
+from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.protocol.transports.zenoh.presence import (
     MAX_PEERS,
     PeerInfo,
@@ -21,11 +24,7 @@ from sightline.protocol.transports.zenoh.presence import (
     presence_key,
     robot_with_same_id,
 )
-from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
-from sightline.protocol.transports.zenoh.link import open_zenoh
-from sightline.protocol.transports.zenoh.discovery import discover, peers_at
 from sightline.protocol.transports.zenoh.session import open_session
-from sightline.protocol.transports.zenoh.link import open_fleet
 from tests.fixtures.links import free_endpoint
 
 ROBOT = Presence(role="robot", robot="r1", session="0000abcd", software="sightline 9", host="shed", up_us=5_000_000)

@@ -15,8 +15,7 @@ import zenoh
 from sightline.operator_side.setup import keys
 from sightline.protocol.channels import ACK, FRAME, REQUEST, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.transports.zenoh.link import open_zenoh
-from sightline.protocol.transports.zenoh.link import open_fleet
+from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
@@ -117,7 +116,7 @@ def test_a_stock_zenoh_router_does_as_well_as_ours():
 
 @contextmanager
 def _router(endpoint):
-    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "router", "--listen", endpoint]
+    command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "router", "--listen", endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout.readline().startswith("router: on ")

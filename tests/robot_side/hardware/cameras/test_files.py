@@ -13,10 +13,8 @@ from sightline.operator_side.config.toml_text import toml_text
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import CameraModel
-from sightline.robot_side.hardware.cameras.files import FolderCamera
+from sightline.robot_side.hardware.cameras.files import FolderCamera, StillCamera, VideoCamera
 from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
-from sightline.robot_side.hardware.cameras.files import StillCamera
-from sightline.robot_side.hardware.cameras.files import VideoCamera
 from tests.contracts.cameras import next_picture
 from tests.fixtures.cameras import jpeg, video
 

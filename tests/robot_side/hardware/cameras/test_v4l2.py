@@ -14,9 +14,7 @@ import pytest
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.robot_side.config import PluginChoice
 from sightline.robot_side.hardware.cameras.timing import CaptureClock, Clocks
-from sightline.robot_side.hardware.cameras.v4l2 import V4l2Camera
-from sightline.robot_side.hardware.cameras.v4l2 import whole_jpeg
-from sightline.robot_side.hardware.cameras.v4l2 import check_device, device_owner, open_error
+from sightline.robot_side.hardware.cameras.v4l2 import V4l2Camera, check_device, device_owner, open_error, whole_jpeg
 from sightline.robot_side.plugins import build_device
 from tests.contracts.cameras import next_picture
 from tests.fixtures.cameras import FakeDevice, jpeg

@@ -6,10 +6,8 @@ import pytest
 
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.color.adaptive import AdaptiveConfig, AdaptiveTracker
-from sightline.vision_side.detect.color.adaptive import ColorModel
+from sightline.vision_side.detect.color.adaptive import AdaptiveConfig, AdaptiveTracker, ColorModel, PixelTrack
 from sightline.vision_side.detect.color.hsv import HsvDetector
-from sightline.vision_side.detect.color.adaptive import PixelTrack
 from sightline.vision_side.detect.port import Circle
 
 YELLOW = (13, 199, 242)

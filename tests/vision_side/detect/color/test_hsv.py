@@ -9,14 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sightline.protocol.messages import CameraModel
-from tests.fixtures.vision.vision import ball_about_lens, camera, draw_ball, jpeg_of, scene
 from sightline.vision_side.config import HsvConfig, HsvRange
 from sightline.vision_side.decode import Decoder, Picture
-from sightline.vision_side.detect.color.hsv import color_table
-from sightline.vision_side.detect.color.hsv import fit_circle, fit_round_part
-from sightline.vision_side.detect.color.hsv import HsvDetector
+from sightline.vision_side.detect.color.hsv import HsvDetector, color_table, fit_circle, fit_round_part
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.tracking.locate import locate_sphere
+from tests.fixtures.vision.vision import ball_about_lens, camera, draw_ball, jpeg_of, scene
 
 SIZES = [(320, 240), (640, 480)]
 

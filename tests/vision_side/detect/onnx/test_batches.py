@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.fixtures.vision.onnx import brightness_model, several_model
-from tests.vision_side.detect.onnx.test_detector import NEEDS_RUNTIME, detector, frame
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.onnx.engine import read_onnx_header
 from sightline.vision_side.detect.onnx.tensors import model_format
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame
+from tests.fixtures.vision.onnx import brightness_model, several_model
+from tests.vision_side.detect.onnx.test_detector import NEEDS_RUNTIME, detector, frame
 
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 300.0, 200.0]]
 LEVELS = (40, 230, 130)

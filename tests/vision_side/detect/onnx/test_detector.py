@@ -11,20 +11,19 @@ from hypothesis import strategies as st
 
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import FrameHeader
+from sightline.vision_side.decode import Decoder, Picture
+from sightline.vision_side.detect.onnx.detector import OnnxDetector
+from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor, open_engine, read_onnx_header
+from sightline.vision_side.detect.onnx.self_test import difference, golden_picture, golden_text, read_golden
+from sightline.vision_side.detect.onnx.tensors import Letterbox, ModelFormat, fit_picture, model_format, read_outputs
+from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection
 from tests.contracts.detectors import assert_kept
 from tests.fixtures.vision.onnx import brightness_model, model, node, part, tensor, value, without_gpu, yolo_model
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
-from sightline.vision_side.decode import Decoder, Picture
-from sightline.vision_side.detect.onnx.self_test import difference, golden_picture, golden_text, read_golden
-from sightline.vision_side.detect.onnx.detector import OnnxDetector
-from sightline.vision_side.detect.onnx.engine import open_engine
-from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor, read_onnx_header
-from sightline.vision_side.detect.onnx.tensors import Letterbox, ModelFormat, fit_picture, model_format, read_outputs
-from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection
 
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 400.0, 300.0]]
 NEEDS_RUNTIME = pytest.mark.skipif(importlib.util.find_spec("onnxruntime") is None,
-                                   reason="onnxruntime is not installed: pip install 'sightline[onnx]'")
+                                   reason="onnxruntime is not installed: pip install 'sightline-robot[onnx]'")
 PICTURE = Picture(np.full((240, 320, 3), 128, np.uint8), 1)
 
 

@@ -10,17 +10,16 @@ import pytest
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import FrameHeader
-from tests.fixtures import demanded
-from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder, Picture
-from sightline.vision_side.detect.registry import build_detector
-from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
 from sightline.vision_side.detect.onnx.detector import SHIPPED
-from sightline.vision_side.detect.onnx.engine import open_engine
-from sightline.vision_side.detect.onnx.engine import read_onnx_header
+from sightline.vision_side.detect.onnx.engine import open_engine, read_onnx_header
+from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
 from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame
+from sightline.vision_side.detect.registry import build_detector
+from tests.fixtures import demanded
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 GPU = "cuda"
 MODEL = camera()

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from sightline.protocol.errors import HardwareError
-from tests.fixtures.vision.onnx import brightness_model, yolo_model
-from tests.vision_side.detect.onnx.test_detector import NEEDS_RUNTIME, detector, engine, frame
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.detect.onnx import detector as onnx_detector
 from sightline.vision_side.detect.onnx.self_test import golden_picture, golden_text
 from sightline.vision_side.detect.port import NO_DEADLINE, Detection
+from tests.fixtures.vision.onnx import brightness_model, yolo_model
+from tests.vision_side.detect.onnx.test_detector import NEEDS_RUNTIME, detector, engine, frame
 
 __all__ = ["engine"]
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 300.0, 200.0]]

@@ -8,14 +8,14 @@ import pytest
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError
-from tests.fixtures.links import until
-from tests.fixtures.vision.remote import GREY_JPEG, frame, within
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.per_robot import MAX_DECODERS, DecoderPool
 from sightline.vision_side.detect.port import Detection, Maker, result_of
 from sightline.vision_side.detect.remote.deadline import FAILED, DeadlineDetector
 from sightline.vision_side.detect.remote.fallback import GOOD_ANSWERS, RESERVE_US, Fallback
+from tests.fixtures.links import until
+from tests.fixtures.vision.remote import GREY_JPEG, frame, within
 
 
 class Held:

@@ -10,12 +10,12 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.zenoh.link import MAX_ROBOTS as MOST_AT_A_SITE
-from tests.fixtures.vision.remote import frame, within
-from tests.vision_side.detect.remote.test_deadline import FakeRemote, Held, _who
 from sightline.vision_side.detect.per_robot import MAX_ROBOTS, PerSession
 from sightline.vision_side.detect.port import Maker, result_of
 from sightline.vision_side.detect.remote.fallback import GOOD_ANSWERS, Fallback
 from sightline.vision_side.detect.remote.zenoh_detector import ROLE, ZenohDetector
+from tests.fixtures.vision.remote import frame, within
+from tests.vision_side.detect.remote.test_deadline import FakeRemote, Held, _who
 
 
 class Partly(FakeRemote):

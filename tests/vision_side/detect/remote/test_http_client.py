@@ -9,12 +9,10 @@ import time
 import pytest
 
 from sightline.protocol.errors import ConfigError
+from sightline.vision_side.detect.remote.client import ServerDetector, parse_address
+from sightline.vision_side.detect.remote.http_client import MAX_ANSWER_BYTES, RETRY_US, HttpJpeg, JpegServer
 from tests.fixtures.links import until
 from tests.fixtures.vision.remote import BALL_JPEG, GREY_JPEG, Server, box, frame, http_reply, said, within
-from sightline.vision_side.detect.remote.client import parse_address
-from sightline.vision_side.detect.remote.client import ServerDetector
-from sightline.vision_side.detect.remote.http_client import MAX_ANSWER_BYTES, RETRY_US
-from sightline.vision_side.detect.remote.http_client import HttpJpeg, JpegServer
 
 GOOD = http_reply(said(box()))
 

@@ -8,8 +8,8 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from tests.fixtures.vision.remote import ASKED, BALL_JPEG, COLUMNS, JPEG_INPUT, OUTPUTS, frame, grpc_answer
 from sightline.vision_side.detect.protobuf import fields, put, put_integers, varint
+from sightline.vision_side.detect.remote.client import NoAnswerError, NoAnswerReason
 from sightline.vision_side.detect.remote.oip import (
     Inferred,
     OipModel,
@@ -20,11 +20,11 @@ from sightline.vision_side.detect.remote.oip import (
     model_of,
     tensor_of,
 )
-from sightline.vision_side.detect.remote.oip_http import read_infer, read_metadata
 from sightline.vision_side.detect.remote.oip_grpc import infer_request, metadata_request
 from sightline.vision_side.detect.remote.oip_grpc import read_infer as read_grpc
 from sightline.vision_side.detect.remote.oip_grpc import read_metadata as read_grpc_metadata
-from sightline.vision_side.detect.remote.client import NoAnswerError, NoAnswerReason
+from sightline.vision_side.detect.remote.oip_http import read_infer, read_metadata
+from tests.fixtures.vision.remote import ASKED, BALL_JPEG, COLUMNS, JPEG_INPUT, OUTPUTS, frame, grpc_answer
 
 PIXELS = Slot("image", "UINT8", (-1, 240, 320, 3))
 SIZE = (320, 240)

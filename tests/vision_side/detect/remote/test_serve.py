@@ -8,13 +8,13 @@ import time
 import pytest
 
 from sightline.benchmarks.detector import DEADLINE_MS, measure_streams
-from sightline.operator_side.cli import app as cli
 from sightline.evaluation.processes import Processes
+from sightline.operator_side.cli import app as cli
 from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.vision_side.detect.remote.zenoh_detector import ZenohDetector
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.vision.remote import within
 from tests.vision_side.detect.remote.test_zenoh_detector import Robot
-from sightline.vision_side.detect.remote.zenoh_detector import ZenohDetector
 
 
 @pytest.mark.parametrize(("arguments", "what"), [
@@ -52,7 +52,18 @@ def test_a_process_that_serves_is_found_answers_and_ends_when_it_is_told_to(tmp_
 
 def test_it_ends_within_a_second_of_a_signal(tmp_path):
     endpoint = free_endpoint()
-    command = [sys.executable, "-u", "-m", "sightline.operator_side.cli.app", "detector", "--serve", "hsv", "--listen", endpoint]
+    command = [
+        sys.executable,
+        "-u",
+        "-P",
+        "-m",
+        "sightline.operator_side.cli.app",
+        "detector",
+        "--serve",
+        "hsv",
+        "--listen",
+        endpoint,
+    ]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert "for robots" in process.stdout.readline()

@@ -8,9 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from sightline.vision_side.config import DetectorConfig, HsvConfig, VisionConfig
+from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.contract import check_detector
+from sightline.vision_side.detect.registry import build_detector
+from sightline.vision_side.detect.remote.fallback import Fallback
 from tests.fixtures import demanded
-from tests.fixtures.vision import triton_server
 from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.vision import triton_server
 from tests.fixtures.vision.remote import (
     BALL_JPEG,
     COLUMNS,
@@ -20,11 +25,6 @@ from tests.fixtures.vision.remote import (
     grpc_started,
     within,
 )
-from sightline.vision_side.config import DetectorConfig, HsvConfig, VisionConfig
-from sightline.vision_side.detect.registry import build_detector
-from sightline.vision_side.detect.contract import check_detector
-from sightline.vision_side.detect.color.detectors import Hsv
-from sightline.vision_side.detect.remote.fallback import Fallback
 
 ROOT = Path(__file__).parent.parent.parent.parent.parent
 HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
@@ -180,7 +180,7 @@ def test_grpc_without_its_package_is_said_with_the_command(monkeypatch):
     from sightline.protocol.errors import ConfigError
 
     monkeypatch.setitem(sys.modules, "grpc", None)
-    with pytest.raises(ConfigError, match=r"pip install 'sightline\[grpc\]'"):
+    with pytest.raises(ConfigError, match=r"pip install 'sightline-robot\[grpc\]'"):
         _detector("oip+grpc://127.0.0.1/ball")
 
 

@@ -7,12 +7,16 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from tests.fixtures.vision.remote import COLUMNS, JPEG_INPUT, OUTPUTS, Server, frame, http_reply, within
-from sightline.vision_side.detect.remote.client import parse_address
-from sightline.vision_side.detect.remote.client import ServerDetector
+from sightline.vision_side.detect.remote.client import (
+    ErrorCounters,
+    NoAnswerError,
+    NoAnswerReason,
+    ServerDetector,
+    parse_address,
+)
 from sightline.vision_side.detect.remote.oip import Inferred, OutputOptions, detections_of
 from sightline.vision_side.detect.remote.oip_http import HttpServer
-from sightline.vision_side.detect.remote.client import ErrorCounters, NoAnswerError, NoAnswerReason
+from tests.fixtures.vision.remote import COLUMNS, JPEG_INPUT, OUTPUTS, Server, frame, http_reply, within
 
 
 def _refuse(tally, count):
@@ -114,7 +118,9 @@ def test_a_model_is_asked_for_once_and_again_after_an_error(closes):
 def test_a_server_that_was_late_once_is_not_made_later_by_asking_for_its_model_again():
     """60 ms for each request of 100: once the model is known that is enough, with its metadata asked for it is not."""
     with ModelServer(closes=False) as server:
-        detector = ServerDetector("oip", HttpServer(parse_address(f"oip+http://127.0.0.1:{server.port}/ball"), OutputOptions(("b",))))
+        detector = ServerDetector(
+            "oip", HttpServer(parse_address(f"oip+http://127.0.0.1:{server.port}/ball"), OutputOptions(("b",)))
+        )
         assert detector.detect([frame(1)], within(2)) != [None]
         server.takes_s = 0.2
         assert detector.detect([frame(2)], within(0.1)) == [None]

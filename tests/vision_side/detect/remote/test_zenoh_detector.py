@@ -22,18 +22,17 @@ from sightline.protocol.messages import (
     State,
     Status,
 )
-from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.discovery import peers_at
-from sightline.protocol.transports.zenoh.link import open_fleet
-from tests.fixtures.links import free_endpoint, until
-from tests.fixtures.vision.remote import BALL_JPEG, GREY_JPEG, frame, within
-from tests.fixtures.vision.vision import jpeg_of
+from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.vision_side.config import DetectorConfig, HsvConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.port import DetectFrame
 from sightline.vision_side.detect.remote.zenoh_detector import ZenohDetector
 from sightline.vision_side.serving.detector_service import ROLE, DetectorService, ServingOptions
+from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.vision.remote import BALL_JPEG, GREY_JPEG, frame, within
+from tests.fixtures.vision.vision import jpeg_of
 
 CORNERS = ("x1_px", "y1_px", "x2_px", "y2_px")
 DEADLINE_S = DetectorConfig().deadline_s

@@ -1,0 +1,1 @@
+../../sightline/__init__.py
