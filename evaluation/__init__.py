@@ -1,1 +1,6 @@
-"""Runs the system and judges it: scores, demos, faults, and the older laws that it is compared with."""
+"""Runs the system and scores it: lockstep, demos, faults, and the older controllers that it is compared with.
+
+May import: the four sides, `operator_side` without `cli/`.
+Interface: `lockstep` runs the loop in virtual time; `checks.Check` is one figure with its bound; `processes` runs
+    real services.
+"""

@@ -1,4 +1,8 @@
-"""The wire contract: channels, messages, codecs and the transports that carry them. Imports nothing of ours."""
+"""The wire contract: channels, messages, codecs and the transports that carry them.
+
+May import: no other package of Sightline.
+Interface: `channels`, `messages` and `codec` for what crosses the network; `transports.open.open_link` for a `Link`.
+"""
 
 from typing import Final
 

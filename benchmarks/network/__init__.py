@@ -1,1 +1,5 @@
-"""`sightline bench network`: robot and vision in two network namespaces with a shaped wire between."""
+"""`sightline bench network`: robot and vision service in two network namespaces with a shaped wire between.
+
+May import: as `benchmarks`.
+Interface: `run` runs the rows of `cases` and `scenes`.
+"""

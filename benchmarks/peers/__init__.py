@@ -1,1 +1,5 @@
-"""What else a user might have built: the same pictures, the same pipeline, other ways between them."""
+"""What else a user might have built: the same images, the same detector, other transports.
+
+May import: as `benchmarks`; zenoh, websockets and ZeroMQ as other projects use them.
+Interface: `python -m sightline.benchmarks.peers NAME ROLE SETTINGS`.
+"""

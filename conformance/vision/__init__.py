@@ -1,1 +1,5 @@
-"""Cases for visions, by chapter of the specification."""
+"""Cases for vision services, by chapter of the specification.
+
+May import: `protocol`, `conformance`.
+Interface: `cases` lists them in the order of the report; `fixture` is the robot that they share.
+"""

@@ -1,1 +1,5 @@
-"""Control laws of older systems, only for comparison."""
+"""Controllers of older systems, only for comparison. Pure.
+
+May import: `protocol`, `vision_side`.
+Interface: Missions for `sightline score --mission`.
+"""

@@ -1,1 +1,5 @@
-"""One run in real time: simulation, robot and vision as processes, then scored and filmed."""
+"""One run in real time: simulation, robot and vision service as processes, then scored and filmed.
+
+May import: the four sides, `operator_side`, `evaluation`.
+Interface: `run` runs it, `report` scores and films it.
+"""

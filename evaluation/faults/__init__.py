@@ -1,1 +1,5 @@
-"""The fault bench: real processes, injected faults, judged from the simulated motors' own log."""
+"""The fault bench: real processes, injected faults, evaluated from the simulated motors' own log.
+
+May import: the four sides, `operator_side`, `evaluation`.
+Interface: `runner` runs the rows of `cases`; `report` writes them.
+"""

@@ -1,1 +1,5 @@
-"""A robot and its vision as an operator reaches them, over any link."""
+"""A robot and its vision service as an operator reaches them, over any link.
+
+May import: `protocol`, `operator_side`.
+Interface: `requests` (arm, STOP ...), `missions`, `status`, `discovery`, and frames to look at.
+"""

@@ -1,1 +1,5 @@
-"""What is set up once: keys, services that start with the machine, a router."""
+"""What is set up once: keys, services that start with the machine, a router.
+
+May import: `protocol`, `operator_side`.
+Interface: `keys`, `install`, `router`.
+"""

@@ -1,3 +1,5 @@
-"""What is generated from the models: README tables, JSON Schema, AsyncAPI and the golden vectors. No service imports
-it.
+"""Generates the specification from the models: README tables, JSON Schema, AsyncAPI and golden vectors.
+
+May import: `protocol`. No service imports this folder.
+Interface: `python -m sightline.protocol.spec.generate --write` or `--verify`.
 """

@@ -1,1 +1,5 @@
-"""A `Link` over Zenoh, WebSocket or memory. Only zenoh/ imports zenoh, only websocket/ imports websockets."""
+"""A `Link` over Zenoh, WebSocket or memory.
+
+May import: `protocol`. Only `zenoh/` imports zenoh, only `websocket/` imports websockets.
+Interface: `link.Link`; `open.open_link` makes one from endpoints.
+"""

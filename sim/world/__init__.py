@@ -1,1 +1,5 @@
-"""The simulated world on PyBullet."""
+"""The simulated world on PyBullet: bodies, motors, camera, lidar.
+
+May import: `protocol`, `robot_side`, `sim`.
+Interface: `world.World`, on the clock that its caller steps.
+"""

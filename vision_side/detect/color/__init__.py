@@ -1,1 +1,5 @@
-"""Detectors by color."""
+"""Detectors by color. Pure.
+
+May import: `protocol`, `vision_side`; NumPy, OpenCV.
+Interface: The entry points `hsv` and `adaptive`.
+"""

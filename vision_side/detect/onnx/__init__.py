@@ -1,1 +1,5 @@
-"""Detectors that are ONNX models."""
+"""Detectors that are ONNX models.
+
+May import: `protocol`, `vision_side`; ONNX Runtime.
+Interface: The entry point `onnx`, also as `onnx:PATH`.
+"""
