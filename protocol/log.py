@@ -43,10 +43,6 @@ class JsonLineStream(io.TextIOBase):
         self._stream, self._service, self._level = stream, service, level
         self._begun = ""
 
-    def over(self, stream: TextIO) -> JsonLineStream:
-        """The same on another stream."""
-        return JsonLineStream(stream, self._service, self._level)
-
     def write(self, text: str) -> int:
         """Keep `text` until its line ends."""
         *lines, self._begun = (self._begun + text).split("\n")

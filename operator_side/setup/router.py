@@ -10,8 +10,7 @@ from contextlib import closing
 
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints
 from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
-from sightline.protocol.transports.zenoh.access_log import log_rejected_peers
-from sightline.protocol.transports.zenoh.session import open_session
+from sightline.protocol.transports.zenoh.session import open_session, report_floods
 
 _REACH_S = 5.0
 
@@ -21,7 +20,7 @@ def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
     check_zenoh_endpoints(listen, connect)
     secured = load_role_keys(secure, ROBOT_ROLE)
     ending = threading.Event()
-    with log_rejected_peers(listen, secure, _print_line), closing(open_session(listen, connect, _REACH_S, secured)):
+    with report_floods(listen, _print_line), closing(open_session(listen, connect, _REACH_S, secured)):
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: ending.set())
         rules = f"keys of {secure}, access rules on" if secure else "plain, open to whoever reaches it"

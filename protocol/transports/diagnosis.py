@@ -1,33 +1,54 @@
-"""Explains why an endpoint cannot be opened: which process holds the port, what is wrong with TLS. Shell."""
+"""Reads who uses a TCP port from the system's table, and finds what is wrong with a TLS link. Shell."""
 
 from __future__ import annotations
 
+import ipaddress
 import socket
 import ssl
+from collections import Counter
+from collections.abc import Collection
 from pathlib import Path
+from typing import Final
 
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
 from sightline.protocol.transports.security import RoleKeys
 
-_LISTEN = "0A"
+TABLES: Final = Path("/proc/net")
+"""Linux's lists of TCP sockets."""
+_LISTEN: Final = "0A"
 
 
 def port_owner(port: int) -> str:
     """`python3 (pid 4711)` for the process listening on TCP `port`; "" where that cannot be found out."""
-    sockets = {f"socket:[{inode}]" for table in ("tcp", "tcp6") for inode in _listening_inodes(table, port)}
+    sockets = {f"socket:[{row[9]}]" for row in _rows({port}) if row[3] == _LISTEN}
     for process in Path("/proc").glob("[0-9]*") if sockets else ():
         if any(_target(link) in sockets for link in _descriptors(process)):
             return f"{_name(process)} (pid {process.name})"
     return ""
 
 
-def _listening_inodes(table: str, port: int) -> list[str]:
-    try:
-        rows = Path("/proc/net", table).read_text("ascii").splitlines()[1:]
-    except OSError:
-        return []
-    fields = [row.split() for row in rows]
-    return [row[9] for row in fields if row[3] == _LISTEN and int(row[1].rpartition(":")[2], 16) == port]
+def connections(ports: Collection[int]) -> Counter[str]:
+    """How many TCP connections each host has to `ports` of this machine, those that are ending included."""
+    return Counter(_host(row[2]) for row in _rows(ports) if row[3] != _LISTEN)
+
+
+def _rows(ports: Collection[int]) -> list[list[str]]:
+    """The table's rows whose local port is one of `ports`."""
+    rows: list[list[str]] = []
+    for table in ("tcp", "tcp6"):
+        try:
+            rows += [line.split() for line in (TABLES / table).read_text("ascii").splitlines()[1:]]
+        except OSError:  # another system, or no IPv6
+            continue
+    return [row for row in rows if int(row[1].rpartition(":")[2], 16) in ports]
+
+
+def _host(address: str) -> str:
+    """The table has each 32 bits of an address in the machine's own byte order, in hex digits."""
+    digits = address.rpartition(":")[0]
+    words = [bytes.fromhex(digits[start:start + 8])[::-1] for start in range(0, len(digits), 8)]
+    host = ipaddress.ip_address(b"".join(words))
+    return str(getattr(host, "ipv4_mapped", None) or host)
 
 
 def _descriptors(process: Path) -> list[Path]:

@@ -21,7 +21,7 @@ from sightline.protocol.errors import HardwareError, SightlineError, WireError
 from sightline.protocol.log import log_line, set_log_format
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
-from sightline.protocol.transports.zenoh.access_log import log_rejected_peers
+from sightline.protocol.transports.zenoh.session import report_floods
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.network.core import CameraAdaptation, NetworkCore
 from sightline.robot_side.pipe import NetworkEnd, NetworkSetup
@@ -207,7 +207,7 @@ def _run(driver: NetworkEnd) -> None:
     with ExitStack() as ending:
         camera: Camera = build_device("cameras", config.camera)
         ending.callback(camera.close)
-        ending.enter_context(log_rejected_peers(config.doors, config.secure, lambda line: _say(config.robot, line)))
+        ending.enter_context(report_floods(config.doors, lambda line: _say(config.robot, line)))
         link = ending.enter_context(
             open_link(
                 config.robot, listen=config.doors, connect=config.connect, role="robot", secure=config.secure,

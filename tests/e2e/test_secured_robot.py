@@ -14,7 +14,6 @@ from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader
-from sightline.protocol.transports.zenoh.access_log import WHY
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
@@ -48,16 +47,14 @@ def test_vision_drives_an_operator_stops_it_and_a_viewer_sees_that(robot, tmp_pa
         (tmp_path / "viewer" / name).write_bytes(Path(folder, name).read_bytes())
     looked = _sightline("status", "r1", "--connect", robot.endpoint, "--secure", str(tmp_path / "viewer"))
     assert "STOPPED" in looked.stdout, "to look, a viewer's keys are enough"
-    assert "refused a" not in robot.output(), "nobody was turned away"
 
 
 @pytest.mark.parametrize("role", ["viewer", "operator"])
 def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, role):
     """It sees the frames and answers each of them correctly, under a certificate that is not vision's."""
     with open_zenoh("r1", connect=[robot.endpoint], role=role, secure=robot.config["secure"]) as rogue:
-        frames, session, answered, told_s = rogue.latest(FRAME), secrets.token_hex(4), 0, None
-        began_s = time.monotonic()
-        ends_s = began_s + 1.5
+        frames, session, answered = rogue.latest(FRAME), secrets.token_hex(4), 0
+        ends_s = time.monotonic() + 1.5
         while time.monotonic() < ends_s:
             message = frames.take(0.2)
             if message is None:
@@ -67,13 +64,8 @@ def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, ro
             answer = AnswerHeader(source="vision", session=session, seq=answered, echo=echo)
             rogue.publish(TWIST, encode(answer), b"0.4000|0.0000", "vision")
             answered += 1
-            if told_s is None and "refused a message" in robot.output():
-                told_s = time.monotonic() - began_s
         assert answered > 5, "it could have driven, had it been heard"
-        assert robot.speed() == 0.0 and told_s is not None and told_s < 1.0, robot.output()
-    told = [line for line in robot.output().splitlines() if "refused a message" in line]
-    assert told[0].startswith(f"robot r1: refused a message of {role} from 127.0.0.1 at {robot.endpoint}"), told
-    assert told[0].endswith(WHY) and len(told) <= 3, "a rogue does not fill the log"
+        assert robot.speed() == 0.0, robot.output()
 
 
 def test_without_keys_nobody_even_watches(robot):
@@ -97,29 +89,24 @@ def _expired(folder, tmp_path):
 
 
 REFUSALS = {
-    "plain": (None, "it does not speak TLS: connect it to tls/... with --secure DIR"),
-    "other authority": (_with_other_keys, "authority: use keys of one `sightline keys init` on both"),
-    "expired": (_expired, "its certificate has expired: sightline keys add DIR ROLE"),
+    "plain": (None, "it speaks TLS only; write tls/... and give --secure DIR"),
+    "other authority": (_with_other_keys, "authority; use keys of one `sightline keys init`"),
+    "expired": (_expired, "it finds our certificate expired; sightline keys add DIR ROLE"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSALS)
-def test_who_is_refused_is_named_in_the_robots_own_log_within_a_second(robot, name, tmp_path):
+def test_rejected_peer_receives_the_reason_and_its_robot_goes_on(robot, name, tmp_path):
     spoil, words = REFUSALS[name]
     (tmp_path / "spoilt").mkdir()
     secure = str(spoil(Path(robot.config["secure"]), tmp_path / "spoilt")) if spoil else ""
     endpoint = robot.endpoint if secure else robot.endpoint.replace("tls/", "tcp/")
-    with pytest.raises(LinkError):
+    with pytest.raises(LinkError, match=re.escape(words)):
         open_zenoh("r1", connect=[endpoint], role="vision", secure=secure, timeout_s=0.3)
-    assert until(lambda: words in robot.output(), 1.0), robot.output()
-    told = [line for line in robot.output().splitlines() if "refused a connection" in line]
-    # Whence is said where the kernel still knows it when Zenoh has told why.
-    where = rf"robot r1: refused a connection (from 127\.0\.0\.1 )?at {re.escape(robot.endpoint)}: "
-    assert re.match(where, told[0]), told
-    assert len(told) <= 4, "a peer that tries again does not fill the log"
+    assert _sightline("status", "r1", "--connect", robot.endpoint, "--secure", robot.config["secure"]).returncode == 0
 
 
-def test_who_asks_for_another_name_refuses_the_robot_and_both_say_so(tmp_path, monkeypatch):
+def test_robot_with_a_certificate_for_another_name_is_rejected(tmp_path, monkeypatch):
     monkeypatch.setattr(keys, "LOOPBACK", ("elsewhere.local",))
     keys.make(tmp_path / "keys", [])
     endpoint = free_endpoint().replace("tcp/", "tls/")
@@ -127,7 +114,6 @@ def test_who_asks_for_another_name_refuses_the_robot_and_both_say_so(tmp_path, m
         assert until(lambda: "robot r1: on" in robot.output(), 20)
         with pytest.raises(LinkError, match="names other addresses"):
             open_zenoh("r1", connect=[endpoint], role="vision", secure=str(tmp_path / "keys"), timeout_s=0.3)
-        assert until(lambda: "our certificate does not name the address" in robot.output(), 1.0), robot.output()
 
 
 def test_on_a_plain_network_a_rogue_gets_nothing_accepted_while_another_drives_and_that_is_said_at_once(tmp_path):

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import pty
+import random
 import subprocess
 import sys
 import time
@@ -18,11 +19,14 @@ from sightline.protocol.log import (
     LOG_FORMAT_VARIABLE,
     AsyncLineWriter,
     JsonLineStream,
+    RepeatLimiter,
     set_log_format,
     to_json_line,
 )
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
+
+SECOND_US = 1_000_000
 
 
 def _written(*texts):
@@ -132,3 +136,29 @@ def test_a_line_for_nobody_at_all_is_dropped(monkeypatch):
     monkeypatch.setattr(sys, "stderr", io.StringIO())
     teller.tell("kept")
     assert sys.stderr.getvalue() == "kept\n"
+
+
+def test_a_cause_is_told_at_once_and_then_ever_more_seldom_with_every_one_counted():
+    lines, told = RepeatLimiter(), {}
+    for second in range(200):
+        for tenth in range(10):
+            now_us = second * SECOND_US + tenth * 100_000
+            times = lines.is_due("wrong keys", now_us)
+            if times:
+                told[now_us / SECOND_US] = times
+    assert list(told)[:7] == [0.0, 1.0, 3.0, 7.0, 15.0, 31.0, 63.0] and len(told) <= 10
+    assert sum(told.values()) >= list(told)[-1] * 10
+
+
+def test_two_causes_do_not_hide_one_another_and_an_old_one_is_news_again():
+    lines = RepeatLimiter()
+    assert (lines.is_due("a", 0), lines.is_due("b", 1), lines.is_due("a", 2)) == (1, 1, 0)
+    assert lines.is_due("a", 200 * SECOND_US) == 2
+    assert lines.is_due("a", 201 * SECOND_US) == 1
+
+
+def test_ever_new_causes_take_no_memory():
+    lines, draw = RepeatLimiter(), random.Random(3)
+    for number in range(2_000):
+        assert lines.is_due(f"{draw.random()}", number * 1_000) == 1
+    assert len(lines._told) + len(lines._untold) <= 33

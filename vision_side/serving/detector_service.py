@@ -157,11 +157,11 @@ class FleetLink(Protocol):
 
 def run(config: VisionConfig, detector: Detector, serving: ServingOptions) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code 0. Raises ConfigError, LinkError as `open_site` does."""
-    from sightline.protocol.transports.zenoh.access_log import log_rejected_peers
     from sightline.protocol.transports.zenoh.link import open_fleet
+    from sightline.protocol.transports.zenoh.session import report_floods
 
     ending, services = threading.Event(), list[DetectorService]()
-    with log_rejected_peers(config.listen, config.secure, lambda line: _say(f"detector: {line}")):
+    with report_floods(config.listen, lambda line: _say(f"detector: {line}")):
         opened = open_fleet(
             config.robot, listen=config.listen, connect=config.connect, role=ROLE, secure=config.secure,
             max_frame_bytes=config.max_frame_bytes,

@@ -42,13 +42,13 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
 
     Raises ConfigError for an endpoint or a mission that is none, LinkError if the link cannot be opened.
     """
-    from sightline.protocol.transports.zenoh.access_log import log_rejected_peers
+    from sightline.protocol.transports.zenoh.session import report_floods
 
     configured_mission(config)  # a mission that there is not is said before anything is opened
     ending, eyes = threading.Event(), configured_detector(config)
     run_it = _run_fleet if set("*?") & set(config.robot) else _run_one
     try:
-        with log_rejected_peers(config.listen, config.secure, lambda line: _say(f"vision: {line}")):
+        with report_floods(config.listen, lambda line: _say(f"vision: {line}")):
             return run_it(config, ending, observe, eyes)
     finally:
         close_detector(eyes)

@@ -10,11 +10,15 @@ import json
 import logging
 import re
 import socket
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
+from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError
-from sightline.protocol.transports.diagnosis import diagnose_tls, port_owner
+from sightline.protocol.log import RepeatLimiter
+from sightline.protocol.transports.diagnosis import connections, diagnose_tls, port_owner
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
 from sightline.protocol.transports.security import RoleKeys, size_limit_section
 
@@ -54,6 +58,7 @@ HANDSHAKE_MS: Final = 3000
 MAX_SESSIONS: Final = 64
 """At one who listens: a fleet of twenty robots, its visions, and the people who watch."""
 _OVER_UDP: Final = ("udp", "quic")
+_FLOOD_CHECK_S: Final = 0.5
 _PROBE_TIMEOUT_S: Final = 0.3
 RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
@@ -89,6 +94,7 @@ def open_session(
         import zenoh
     except ImportError:
         raise ConfigError("Zenoh is not installed: pip install 'sightline-robot[zenoh]'") from None
+    zenoh.init_log_from_env_or("off")  # RUST_LOG, see docs/security.md
     logging.getLogger("zenoh").addHandler(logging.NullHandler())  # else Python prints its warnings to the terminal
     try:
         return _open(session_config(listen, connect, timeout_s, secured))
@@ -164,7 +170,9 @@ def _error_of(
         trouble = next((found for endpoint in connect if (found := diagnose_tls(endpoint, secured))), "")
         if trouble:
             return LinkError(f"refused at {where}: {trouble}")
-        more = "" if "quic/" not in where else ", or one end refuses the other's keys: the robot's log says which"
+        more = ""
+        if "quic/" in where:
+            more = ", or one end rejects the other's keys: start the robot with RUST_LOG=zenoh_link_commons=warn"
         more += ", and what listens there does not speak Zenoh" if any(map(_is_open, connect)) else ""
         return LinkError(f"nobody answers at {where}; is the robot or router running? tried for {timeout_s:g} s{more}")
     where = next((endpoint for endpoint in listen if endpoint.partition("#")[0] in text), " or ".join(listen))
@@ -189,3 +197,26 @@ def _port_in_use(endpoint: str) -> LinkError:
     owner = port_owner(port)
     by = f" by {owner}" if owner else " by another process"
     return LinkError(f"cannot listen on {endpoint}: port {port} is in use{by}; end it or choose another port")
+
+
+@contextmanager
+def report_floods(listen: Sequence[str], report: Callable[[str], None]) -> Iterator[None]:
+    """While inside, `report` each host that has more connections to `listen` than Zenoh accepts from all together."""
+    ports = {parse_zenoh_endpoint(endpoint)[2] for endpoint in listen if "://" not in endpoint}
+    ending = threading.Event()
+    if ports:
+        arguments = (ports, report, ending)
+        threading.Thread(target=_watch_floods, args=arguments, name="zenoh-floods", daemon=True).start()
+    try:
+        yield
+    finally:
+        ending.set()
+
+
+def _watch_floods(ports: set[int], report: Callable[[str], None], ending: threading.Event) -> None:
+    due = RepeatLimiter()
+    while not ending.wait(_FLOOD_CHECK_S):
+        for host, count in connections(ports).most_common(1):
+            if count > MAX_SESSIONS and due.is_due(host, monotonic_us()):
+                report(f"{count} connections from {host}, more than the {MAX_SESSIONS} accepted from all; "
+                       "block that address or end the program there")

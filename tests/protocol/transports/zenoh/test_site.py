@@ -62,7 +62,7 @@ def test_nobody_there_is_said_in_time_with_what_was_tried(transport, folder):
     assert time.monotonic() - began_s < 5.0
     said = f"nobody answers at {endpoint}; is the robot or router running? tried for 0.5 s"
     assert str(refusal.value).startswith(said)
-    assert (", or one end refuses" in str(refusal.value)) is (transport == "quic")
+    assert (", or one end rejects" in str(refusal.value)) is (transport == "quic")
 
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])

@@ -1,0 +1,42 @@
+"""Who uses a port: the system's table of TCP sockets, and reports of a host with too many connections."""
+
+import socket
+from contextlib import ExitStack
+
+import pytest
+
+from sightline.protocol.transports import diagnosis
+from sightline.protocol.transports.diagnosis import connections
+from sightline.protocol.transports.zenoh.session import MAX_SESSIONS, report_floods
+from tests.fixtures.links import until
+
+_ROWS = "  sl  local_address rem_address   st\n   0: {local} {remote} {state} 0 0 0 0\n"
+
+
+@pytest.mark.parametrize(("table", "local", "remote", "host"), [
+    ("tcp", "0100007F:1D17", "0701A8C0:C001", "192.168.1.7"),
+    ("tcp6", "00000000000000000000000000000000:1D17", "0000000000000000FFFF00000701A8C0:C001", "192.168.1.7"),
+    ("tcp6", "00000000000000000000000000000000:1D17", "000080FE000000000000000001000000:C001", "fe80::1"),
+])  # fmt: skip
+def test_a_far_end_is_read_from_the_table(monkeypatch, tmp_path, table, local, remote, host):
+    (tmp_path / table).write_text(_ROWS.format(local=local, remote=remote, state="01"))
+    monkeypatch.setattr(diagnosis, "TABLES", tmp_path)
+    assert connections([0x1D17]) == {host: 1}
+    assert connections([0x1D18]) == {}
+
+
+def test_a_flood_of_connections_is_reported_once_with_its_address():
+    reported = []
+    with socket.create_server(("127.0.0.1", 0), backlog=MAX_SESSIONS * 2) as server, ExitStack() as ending:
+        address = server.getsockname()
+        ending.enter_context(report_floods([f"tls/127.0.0.1:{address[1]}"], reported.append))
+        for _ in range(MAX_SESSIONS):
+            ending.enter_context(socket.create_connection(address))
+        assert not until(lambda: reported, 1.2), "as many as are accepted are not a flood"
+        for _ in range(3):
+            ending.enter_context(socket.create_connection(address))
+        assert until(lambda: reported, 3.0)
+        assert reported == [
+            "67 connections from 127.0.0.1, more than the 64 accepted from all; "
+            "block that address or end the program there"
+        ]
