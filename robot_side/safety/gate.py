@@ -6,6 +6,7 @@ Liveness is the accepted command: refused commands, acks and open connections re
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 
 from sightline.protocol.errors import CLAMPED, RejectReason, WireError
 from sightline.protocol.messages import (
@@ -22,7 +23,7 @@ from sightline.protocol.messages import (
 from sightline.robot_side.safety.guard import RangeGuard
 from sightline.robot_side.safety.lease import HUMANS, RANKS, Lease
 from sightline.robot_side.safety.limits import Ramp, SafetyConfig, age_factor, clamp_twist
-from sightline.robot_side.safety.states import Event, is_armed, next_state
+from sightline.robot_side.safety.states import Cause, Event, is_armed, next_state
 from sightline.robot_side.safety.validation import (
     AcceptedCommand,
     CommandResult,
@@ -154,32 +155,38 @@ class SafetyGate:
         return limited
 
     def _goal(self, now_us: int) -> Twist:
-        """The commanded twist under the limit that the frame's age leaves; zero, and HOLD, without a young one."""
-        if self.pictures.unchanged_us() > self.config.max_age_us:
-            return self._hold("the camera's picture does not change", now_us)
+        """The commanded twist under the smallest limit that a cause leaves; HOLD and zero where that is zero."""
         command = self._command
-        if command is None:
-            return self._hold("armed; no command yet", now_us)
-        silent_us, age_us = now_us - command.arrival_us, now_us - command.echo_us
-        if silent_us > command.life_us:
-            return self._hold(f"no accepted command for more than {command.life_us // 1000} ms", now_us)
-        factor = age_factor(self.config, age_us)
-        if factor == 0.0:
-            return self._hold(f"the frame behind the command is {self.config.zero_speed_age_ms} ms old", now_us)
-        if factor == 1.0:
-            self._go(Event.FRESH, "driving")
+        cause = min(self._causes(command, now_us), key=lambda cause: cause.factor)
+        if cause.event is Event.MUST_HOLD:
+            self._hold(cause.reason, now_us)
         else:
-            self._go(Event.AGEING, "the frames are ageing; slower")
-        return clamp_twist(command.twist, factor * self.config.max_linear_mps, factor * self.config.max_angular_rad_s)
+            self._go(cause.event, cause.reason)
+        twist, config = STILL if command is None else command.twist, self.config
+        return clamp_twist(twist, cause.factor * config.max_linear_mps, cause.factor * config.max_angular_rad_s)
 
-    def _hold(self, reason: str, now_us: int) -> Twist:
+    def _causes(self, command: AcceptedCommand | None, now_us: int) -> Iterator[Cause]:
+        """Everything that may slow or hold the robot. The smallest factor wins, the first of equal ones."""
+        config = self.config
+        if self.pictures.unchanged_us() > config.max_age_us:
+            yield Cause(0.0, "the camera's picture does not change")
+        if command is None:
+            yield Cause(0.0, "armed; no command yet")
+            return
+        if now_us - command.arrival_us > command.life_us:
+            yield Cause(0.0, f"no accepted command for more than {command.life_us // 1000} ms")
+        factor = age_factor(config, now_us - command.echo_us)
+        if factor == 0.0:
+            yield Cause(factor, f"the frame behind the command is {config.zero_speed_age_ms} ms old")
+        else:
+            yield Cause(factor, "the frames are ageing; slower" if factor < 1.0 else "driving")
+
+    def _hold(self, reason: str, now_us: int) -> None:
         if self.state is not State.HOLD:
             self._hold_since_us = now_us
-        self._go(Event.OLD, reason)
+        self._go(Event.MUST_HOLD, reason)
         if now_us - self._hold_since_us > self.config.disarm_after_hold_s * 1e6:
-            reason = f"disarmed after {self.config.disarm_after_hold_s:g} s without commands"
-            self._leave(Event.EXPIRED, reason)
-        return STILL
+            self._leave(Event.EXPIRED, f"disarmed after {self.config.disarm_after_hold_s:g} s without commands")
 
     # --- what people ask -----------------------------------------------------------------------------------------
 

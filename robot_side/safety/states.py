@@ -9,6 +9,7 @@
     FAULT      zero, the drive failed         reset
 """
 
+from dataclasses import dataclass
 from enum import Enum
 
 from sightline.protocol.messages import State
@@ -22,9 +23,9 @@ class Event(Enum):
     STOP = "stop"
     RESET = "reset"
     FAULT = "the drive fails"
-    FRESH = "a command on a young frame"
-    AGEING = "a command on an ageing frame"
-    OLD = "no young command"
+    FREE = "nothing limits the speed"
+    SLOWED = "something lowers the speed limit"
+    MUST_HOLD = "something permits no motion"
     EXPIRED = "ten seconds in HOLD"
     HUMAN_LOST = "the human holder is lost"
 
@@ -37,14 +38,29 @@ TRANSITIONS: dict[tuple[State, Event], State] = {
     (State.HOLD, Event.EXPIRED): State.DISARMED,
     (State.STOPPED, Event.RESET): State.DISARMED,
     (State.FAULT, Event.RESET): State.DISARMED,
-    **{(state, Event.FRESH): State.ACTIVE for state in _ARMED},
-    **{(state, Event.AGEING): State.DEGRADED for state in _ARMED},
-    **{(state, Event.OLD): State.HOLD for state in _ARMED},
+    **{(state, Event.FREE): State.ACTIVE for state in _ARMED},
+    **{(state, Event.SLOWED): State.DEGRADED for state in _ARMED},
+    **{(state, Event.MUST_HOLD): State.HOLD for state in _ARMED},
     **{(state, Event.DISARM): State.DISARMED for state in _ARMED},
     **{(state, Event.HUMAN_LOST): State.DISARMED for state in _ARMED},
     **{(state, Event.FAULT): State.FAULT for state in _ANY if state is not State.STOPPED},
     **{(state, Event.STOP): State.STOPPED for state in _ANY},
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Something that limits the speed: the share of the limit that it leaves, and why."""
+
+    factor: float
+    reason: str
+
+    @property
+    def event(self) -> Event:
+        """What it does to the state."""
+        if self.factor == 0.0:
+            return Event.MUST_HOLD
+        return Event.SLOWED if self.factor < 1.0 else Event.FREE
 
 
 def next_state(state: State, event: Event) -> State:

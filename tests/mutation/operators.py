@@ -34,7 +34,7 @@ _ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
 }
 _SWAPPED_CALLS = {"min": "max", "max": "min", "any": "all", "all": "any", "sin": "cos", "cos": "sin"}
 _SWAPPED_KEYWORDS = {"gt": "ge", "ge": "gt", "lt": "le", "le": "lt"}
-_EVENTS = ("ARM", "DISARM", "STOP", "RESET", "FAULT", "FRESH", "AGEING", "OLD", "EXPIRED", "HUMAN_LOST")
+_EVENTS = ("ARM", "DISARM", "STOP", "RESET", "FAULT", "FREE", "SLOWED", "MUST_HOLD", "EXPIRED", "HUMAN_LOST")
 _ENUMS = {
     "State": tuple(State.__members__),
     "Verb": tuple(Verb.__members__),

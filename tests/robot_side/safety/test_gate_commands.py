@@ -36,9 +36,9 @@ WHERE_TO = {
     Event.STOP: dict.fromkeys(State, S),
     Event.RESET: {S: D, F: D},
     Event.FAULT: {D: F, H: F, A: F, G: F, F: F},
-    Event.FRESH: {H: A, A: A, G: A},
-    Event.AGEING: {H: G, A: G, G: G},
-    Event.OLD: {H: H, A: H, G: H},
+    Event.FREE: {H: A, A: A, G: A},
+    Event.SLOWED: {H: G, A: G, G: G},
+    Event.MUST_HOLD: {H: H, A: H, G: H},
     Event.EXPIRED: {H: D},
     Event.HUMAN_LOST: {H: D, A: D, G: D},
 }
