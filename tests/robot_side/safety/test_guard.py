@@ -363,6 +363,15 @@ def test_what_is_between_the_robot_and_a_sensor_ahead_of_it_is_not_seen_either()
     assert is_refused(blind_scan(0.0), sensor_x_m=0.76) and not is_refused(blind_scan(0.0), sensor_x_m=0.74)
 
 
+@pytest.mark.parametrize(("sensor_x_m", "rejected"), [(0.755, True), (0.745, False)])
+def test_a_sensor_ahead_that_looks_back_counts_from_where_it_sits(sensor_x_m, rejected):
+    assert is_refused(blind_scan(0.0, math.pi), sensor_x_m=sensor_x_m) == rejected
+
+
+def test_a_scan_without_rays_has_no_blind_zone():
+    assert not is_refused(blind_scan(8.0, rays=0), stop_m=0.02)
+
+
 @pytest.mark.parametrize(("first_rad", "each_rad", "refused"), [
     (-math.pi, math.pi / 2, True), (-math.pi, math.pi, False), (math.pi / 4, math.pi / 4, True),
 ])  # fmt: skip
