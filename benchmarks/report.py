@@ -70,7 +70,6 @@ SECTIONS: Final = (
         "from the simulated motors' own log. [faults.md](faults.md) has more faults.",
         ("faults", "--only", "vision.kill", "--only", "network.kill", "--only", "vision.restart", "--repeat", "10"),
     ),
-    Section("odometry", "Odometry", "Against the simulated world's truth.", ("bench", "odometry")),
     Section("gate", "Gate", "One command judged and one step decided.", ("bench", "gate")),
     Section("messages", "Messages", "Encode and decode, hot.", ("bench", "codec")),
     Section(
@@ -161,19 +160,6 @@ SECTIONS: Final = (
         "The same networks over WebSocket",
         "With `sightline.v1` between robot and vision; rows with a router or a fleet need Zenoh.",
         ("bench", "network", "--transport", "websocket", "--seeds", "1,2,3,4,5", "--seconds", "60"),
-    ),
-    Section(
-        "camera",
-        "Camera pass-through",
-        "A V4L2 camera's own JPEGs through the plug-in, its thread included, into the network process; the device is a "
-        "stand-in that gives 640x480 at 30 fps, and what it takes itself is left out.",
-        ("bench", "camera", "--seconds", "60"),
-    ),
-    Section(
-        "robot",
-        "A robot without NumPy, OpenCV and PyBullet",
-        "`sightline-robot[zenoh]` in a new environment, driving in the simulation; memory: the kernel's peak.",
-        ("bench", "robot", "--seconds", "60"),
     ),
 )
 

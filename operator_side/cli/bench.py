@@ -29,8 +29,6 @@ def register_benches(app: typer.Typer) -> None:
     group.command(epilog="Example: sightline bench codec --json")(codec)
     group.command(epilog="Example: sightline bench gate")(gate)
     group.command(epilog="Example: sightline bench pipeline")(pipeline)
-    group.command(epilog="Example: sightline bench odometry")(odometry)
-    group.command(epilog="Example: sightline bench robot --seconds 60")(robot)
     group.command(epilog="Example: sightline bench demo --scenario circle --seeds 201,202,203")(demo)
     group.command(epilog="Example: sightline bench report --section loop --section watchers")(report)
     register_loop_benches(group)
@@ -80,42 +78,6 @@ def pipeline(*, as_json: Json = False) -> int:
         eyes.network_us, "us", LEARNED_BOUND_US, eyes.network_us <= LEARNED_BOUND_US,
     ))
     checks.append(Check("pictures in which onnx finds no ball", eyes.missed, "", 0, eyes.missed == 0))
-    return print_checks(checks, as_json)
-
-
-def odometry(
-    *,
-    robot_model: Annotated[
-        list[str] | None, typer.Option(help="Only this robot, a name or a .toml; may be given again [default: all].")
-    ] = None,
-    as_json: Json = False,
-) -> int:
-    """Dead reckoning against the simulated world's truth, of every simulated robot."""
-    with needs("sim"):
-        from sightline.benchmarks.odometry import measure_odometry
-    from sightline.evaluation.checks import Check
-
-    errors = measure_odometry(robot_model or ())
-    checks = [Check(one.name, one.percent, "%", one.bound_percent, one.percent <= one.bound_percent) for one in errors]
-    return print_checks(checks, as_json)
-
-
-def robot(
-    *, seconds: Annotated[float, typer.Option(min=5, max=600, help="How long to drive.")] = 60.0, as_json: Json = False
-) -> int:
-    """The robot service in a bare environment of its own: frame rate and memory. Needs a checkout and pip."""
-    with needs("all"):
-        from sightline.benchmarks.light_robot import NETWORK_BOUND_MB, measure_light_robot
-    from sightline.evaluation.checks import Check
-
-    seen = measure_light_robot(seconds)
-    checks = [
-        Check("heavy packages installed", len(seen.heavy_packages), "", 0, not seen.heavy_packages),
-        Check("missing from 30 fps", 30 - seen.fps, "fps", 0.6, seen.fps >= 29.4),
-        Check("time not driving", 100 - seen.driving_percent, "%", 2.0, seen.driving_percent >= 98),
-        Check("memory, network process", seen.network_mb, "MB", NETWORK_BOUND_MB, seen.network_mb <= NETWORK_BOUND_MB),
-        Check("memory, driver", seen.driver_mb, "MB", NETWORK_BOUND_MB, seen.driver_mb <= NETWORK_BOUND_MB),
-    ]
     return print_checks(checks, as_json)
 
 
@@ -218,7 +180,6 @@ def register_loop_benches(group: typer.Typer) -> None:
     """Add the commands to the `bench` group."""
     group.command(epilog="Example: sightline bench loop --detector-delay-ms 80 --seconds 20 --out runs/loop")(loop)
     group.command(epilog="Example: sightline bench watchers --viewers 10 --seconds 20")(watchers)
-    group.command(epilog="Example: sightline bench camera --seconds 30")(camera)
 
 
 def loop(
@@ -271,25 +232,6 @@ def watchers(
 
     setting = LoopSetting(Path(), transport=transport, seconds=seconds)
     return _print_loop_checks(measure_watchers(setting, viewers, lambda line: typer.echo(line, err=True)), as_json)
-
-
-def camera(
-    *,
-    seconds: Annotated[float, typer.Option(min=3, max=600, help="Of pictures at 30 fps.")] = 30.0,
-    as_json: Json = False,
-) -> int:
-    """What passing a camera's own JPEGs through costs the network process; the device is a stand-in."""
-    with needs("camera"):
-        from sightline.benchmarks.camera import BOUND_MS, MISSED_BOUND, measure_camera
-    from sightline.benchmarks.loop.figures import at_most
-
-    seen = measure_camera(seconds)
-    name = f"camera pass-through, CPU a frame (until the frame is ready {seen.ready_ms:.2f})"
-    checks = [
-        at_most(name, seen.cpu_ms, "ms", BOUND_MS),
-        at_most(f"missed frames of {seen.jpeg_bytes:.0f} bytes", seen.missed, "", MISSED_BOUND),
-    ]
-    return _print_loop_checks(checks, as_json)
 
 
 def _print_loop_checks(checks: "Sequence[LoopCheck]", as_json: bool) -> int:

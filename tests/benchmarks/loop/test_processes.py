@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 import typer
 
-from sightline.benchmarks.camera import measure_camera
 from sightline.benchmarks.loop.counters import carried_between, carried_bytes, children_of
 from sightline.benchmarks.loop.figures import FLOOR, OUR_DETECTOR, OURS, PEERS, TCP, WITH_OUR_DETECTOR, LoopSetting
 from sightline.benchmarks.loop.pictures import COUNT, camera_of, write_pictures
@@ -151,10 +150,3 @@ def test_a_process_that_cannot_start_is_said_in_its_own_words(monkeypatch):
     with pytest.raises(HardwareError, match="No module named"):
         run_race(replace(SMALL, peers=()), lambda _: None)
 
-
-@pytest.mark.slow
-def test_a_cameras_pictures_are_passed_through_and_counted():
-    seen = measure_camera(3.0)
-    assert 40_000 < seen.jpeg_bytes < 52_000
-    assert 0 < seen.cpu_ms < seen.ready_ms
-    assert seen.missed < 30

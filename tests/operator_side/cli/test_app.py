@@ -56,7 +56,7 @@ def test_the_commands_of_this_version_exist():
         "config": ("check", "show", "schema"),
         "detector": ("list", "check", "promote"),
         "score": ("detectors",),
-        "bench": ("codec", "pipeline", "odometry", "robot", "demo", "report"),
+        "bench": ("codec", "pipeline", "demo", "report"),
     }
     assert {(group, name) for group, names in groups.items() for name in names} <= set(COMMANDS)
 

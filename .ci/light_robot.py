@@ -1,7 +1,8 @@
-"""The robot side alone in a bare environment: what it installs, how it drives, what it needs. Shell (processes).
+"""Checks the robot side alone in a bare environment: what it installs, how it drives, how much memory it needs.
 
-A new virtual environment gets `sightline-robot[zenoh]` and nothing else; in it runs the robot service, beside a
-simulation and a vision of this environment. Memory is the kernel's own high-water mark of each process.
+A new virtual environment gets `sightline-robot[zenoh]` and nothing else. In it runs the robot service, beside a
+simulation and a vision service of this environment. Memory is the kernel's own high-water mark of each process.
+    .venv/bin/python .ci/light_robot.py [SECONDS]
 """
 
 import signal
@@ -26,7 +27,7 @@ from sightline.protocol.transports.zenoh.link import open_zenoh
 ROOT: Final = Path(__file__).parent.parent
 ENDPOINT: Final = "tcp/127.0.0.1:17461"
 HEAVY: Final = ("numpy", "cv2", "pybullet", "simplejpeg", "matplotlib")
-NETWORK_BOUND_MB: Final = 52.0
+MEMORY_BOUND_MB: Final = 52.0
 _START_S: Final = 30.0
 
 
@@ -127,3 +128,22 @@ def _watch(statuses: LatestSlot[Message], seconds: float) -> tuple[float, float]
 def _high_water_mb(pid: int) -> float:
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+
+
+def main() -> int:
+    """Print each figure beside its bound. Returns the number of those that are not reached."""
+    seen = measure_light_robot(float(sys.argv[1]) if len(sys.argv) > 1 else 20.0)
+    figures = (
+        ("heavy packages installed", len(seen.heavy_packages), 0),
+        ("frames/s missing from 30", 30 - seen.fps, 0.6),
+        ("% of the time not driving", 100 - seen.driving_percent, 2.0),
+        ("MB, network process", seen.network_mb, MEMORY_BOUND_MB),
+        ("MB, driver process", seen.driver_mb, MEMORY_BOUND_MB),
+    )
+    for name, value, bound in figures:
+        print(f"light robot: {name}: {value:.3g} (at most {bound:g}){'' if value <= bound else ' NOT REACHED'}")
+    return sum(value > bound for _, value, bound in figures)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
