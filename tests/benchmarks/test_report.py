@@ -46,7 +46,7 @@ def test_names_are_unique_and_every_section_is_a_command_that_exists():
 
 def test_only_the_chosen_section_is_measured_and_the_rest_of_the_page_stays(tmp_path, commands):
     page = tmp_path / "performance.md"
-    assert write_report(page, sections_named(["odometry", "gate"]), lambda _: None)
+    assert write_report(page, sections_named(["killed", "gate"]), lambda _: None)
     before = page.read_text()
     page.write_text(before.replace("| 13.2 |", "| 99.9 |"))
     commands.clear()
@@ -55,16 +55,16 @@ def test_only_the_chosen_section_is_measured_and_the_rest_of_the_page_stays(tmp_
     after = page.read_text()
     assert (after.count("| 99.9 |"), after.count("| 13.2 |")) == (1, 1)
     assert after.count("\nMeasured 20") == 2
-    assert after.index("## Odometry") < after.index("| 99.9 |") < after.index("## Gate") < after.index("| 13.2 |")
+    assert after.index("## Killed at speed") < after.index("| 99.9 |") < after.index("## Gate") < after.index("| 13.2 |")
     assert after.count("# Performance") == 1
 
 
 def test_sections_keep_the_order_of_the_page_whatever_was_measured_first(tmp_path, commands):
     page = tmp_path / "performance.md"
-    for name in ("camera", "messages", "following"):
+    for name in ("vision", "messages", "following"):
         write_report(page, sections_named([name]), lambda _: None)
     titles = [line[3:] for line in page.read_text().splitlines() if line.startswith("## ")]
-    assert titles == [NAMED[name].title for name in ("following", "messages", "camera")]
+    assert titles == [NAMED[name].title for name in ("following", "messages", "vision")]
 
 
 def test_a_section_that_is_no_longer_known_is_kept_at_the_end():
