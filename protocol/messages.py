@@ -17,7 +17,8 @@ MAX_CHANNELS_SHOWN = 16
 MAX_DETECTED_BOXES = 64
 """Security limit: more is no scene that a robot steers by."""
 
-Version = Annotated[int, Field(ge=VERSION, le=VERSION)]  # a Literal would let `true` and 1.0 pass as 1
+# A Literal would let `true` and 1.0 pass as 1.
+Version = Annotated[int, Field(ge=VERSION, le=VERSION, description="version of this protocol")]
 SessionId = Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")]
 Source = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,15}$")]
 RobotId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
@@ -56,88 +57,95 @@ class Stamp(WireModel):
     """Header of everything a robot publishes: its session (new at each start), a count per channel, its clock."""
 
     v: Version = VERSION
-    session: SessionId
-    seq: Counter
-    t_us: Microseconds
+    session: SessionId = Field(description="the sender's start: 8 hex digits drawn at random")
+    seq: Counter = Field(description="count of the sender's messages on this channel within the session")
+    t_us: Microseconds = Field(description="the robot's monotonic clock: capture of a frame or scan, else publishing")
 
 
 class FrameHeader(Stamp):
     """Header of a frame. `t_us` is the capture time; the rest is what the robot did and knew at that moment."""
 
-    pose: Pose = (0.0, 0.0, 0.0)
-    """Odometry."""
-    moving: Planar = (0.0, 0.0)
-    """Twist measured from the wheels."""
-    applied: Planar = (0.0, 0.0)
-    """Twist last given to the wheels by the gate, after every limit."""
-    latency_us: Microseconds | None = None
-    """Capture to accepted command, as the robot itself measured for the last accepted command."""
+    pose: Pose = Field(default=(0.0, 0.0, 0.0), description="odometry: x, y, yaw")
+    moving: Planar = Field(default=(0.0, 0.0), description="measured at the wheels: linear, angular")
+    applied: Planar = Field(
+        default=(0.0, 0.0), description="last given to the wheels, after every limit: linear, angular"
+    )
+    latency_us: Microseconds | None = Field(
+        default=None, description="capture to accepted command, the robot's own measure, of the last accepted command"
+    )
 
 
 class ScanHeader(Stamp):
     """Header of a lidar scan; the payload is little-endian float32 ranges in metres, inf for no return."""
 
-    angle_min_rad: Number
-    angle_increment_rad: Number
-    range_min_m: Number
-    range_max_m: Number
+    angle_min_rad: Number = Field(description="direction of the first ray; 0 is ahead, left positive")
+    angle_increment_rad: Number = Field(description="from one ray to the next")
+    range_min_m: Number = Field(
+        description="a smaller range: something is there, too close to measure; 0: no echo, so nothing is known"
+    )
+    range_max_m: Number = Field(description="nothing is known beyond; inf: nothing is there")
 
 
 class Echo(WireModel):
-    """Names one thing the robot issued, field for field, so that the robot can judge its age by its own record."""
+    """Names one thing the robot issued, field for field, so that the robot can compute its age from its own record."""
 
-    channel: Literal["frame", "status", "beat"]
-    session: SessionId
-    seq: Counter
-    t_us: Microseconds
+    channel: Literal["frame", "status", "beat"] = Field(description="which of its channels")
+    session: SessionId = Field(description="the robot's")
+    seq: Counter = Field(description="as in that message")
+    t_us: Microseconds = Field(description="as in that message")
 
 
 class RequestId(WireModel):
-    """Names a mission that somebody asked for: the asker's session, and the id in the payload."""
+    """Names a requested mission: the requester's session, and the id in the payload."""
 
-    session: SessionId
-    id: Counter
+    session: SessionId = Field(description="of the requester")
+    id: Counter = Field(description="of the mission")
 
 
-class AnswerHeader(WireModel):
-    """Header of a twist and of an ack: who answers, which frame, and how long the computing took.
+class SenderHeader(WireModel):
+    """Header of everything that a peer sends to a robot or beside its twists: role, session, count per channel."""
 
-    `scan` and `mission` name what else it went by, so that a recording can be answered again, byte for byte.
+    v: Version = VERSION
+    source: Source = Field(description="the sender's role; equal to the one in the key")
+    session: SessionId = Field(description="the sender's start: 8 hex digits drawn at random")
+    seq: Counter = Field(description="count of the sender's messages on this channel within the session")
+
+
+class AnswerHeader(SenderHeader):
+    """Header of a twist and of an ack: the sender, the frame, and how long the computing took.
+
+    `scan` and `mission` name what else it used, so that a recording can be answered again, byte for byte.
     """
 
-    v: Version = VERSION
-    source: Source
-    session: SessionId
-    seq: Counter
-    echo: Echo
-    compute_us: Microseconds = 0
-    scan: Counter | None = None
-    mission: RequestId | None = None
+    echo: Echo = Field(description="what this message answers, field for field")
+    compute_us: Microseconds = Field(
+        default=0, description="how long the sender computed, from receiving the frame to sending this"
+    )
+    scan: Counter | None = Field(
+        default=None, description="`seq` of the newest scan that was used, of the frame's session"
+    )
+    mission: RequestId | None = Field(default=None, description="the requested mission that it carries out")
 
 
-class RequestHeader(WireModel):
+class RequestHeader(SenderHeader):
     """Header of a request or mission. `echo` names the newest `status` seen; only stop, disarm, release may lack it."""
 
-    v: Version = VERSION
-    source: Source
-    session: SessionId
-    seq: Counter
-    echo: Echo | None = None
+    echo: Echo | None = Field(default=None, description="the newest `status` seen")
 
 
-class DetectionsHeader(WireModel):
-    """Header of what vision says beside its twists: who looked, at which frame; without `echo` for showing only."""
+class DetectionsHeader(SenderHeader):
+    """Header of what vision sends beside its twists: the sender and the frame; without `echo` for display only."""
 
-    v: Version = VERSION
-    source: Source
-    session: SessionId
-    seq: Counter
-    echo: Echo | None = None
-    compute_us: Microseconds = 0
+    echo: Echo | None = Field(
+        default=None, description="the frame that was examined or is shown; of a report the newest"
+    )
+    compute_us: Microseconds = Field(
+        default=0, description="how long the sender computed, from receiving the frame to sending this"
+    )
 
 
 class Verb(StrEnum):
-    """What can be asked of a robot."""
+    """What can be requested of a robot."""
 
     ARM = "arm"
     DISARM = "disarm"
@@ -148,20 +156,20 @@ class Verb(StrEnum):
 
 
 class Request(WireModel):
-    """A request; `id` is the asker's own and comes back in the reply."""
+    """A request; `id` comes back in the reply."""
 
-    id: Counter
-    verb: Annotated[Verb, Field(strict=False)]
+    id: Counter = Field(description="the requester's own count of requests")
+    verb: Verb = Field(strict=False, description="what is requested")
 
 
 class Reply(WireModel):
-    """The answer to a request: `to` and `id` name it; `detail` is one line for a person."""
+    """The answer to a request: `to` and `id` name it."""
 
-    to: SessionId
-    id: Counter
-    ok: bool
-    state: Annotated[str, Field(max_length=32)]
-    detail: Annotated[str, Field(max_length=200)]
+    to: SessionId = Field(description="session of the requester")
+    id: Counter = Field(description="of the request")
+    ok: bool = Field(description="whether it was done, or was so already")
+    state: str = Field(max_length=32, description="of the gate, afterwards")
+    detail: str = Field(max_length=200, description="one line for the operator; of a rejected request `REASON: words`")
 
 
 class State(StrEnum):
@@ -178,87 +186,93 @@ class State(StrEnum):
 class Holder(WireModel):
     """The driver of the moment."""
 
-    source: Source
-    session: SessionId
+    source: Source = Field(description="the sender's role; equal to the one in the key")
+    session: SessionId = Field(description="the sender's start: 8 hex digits drawn at random")
 
 
 class LastRejection(WireModel):
-    """The newest refusal, in words."""
+    """The newest rejection."""
 
-    source: Annotated[str, Field(max_length=32)]
-    reason: Annotated[str, Field(max_length=32)]
-    detail: Annotated[str, Field(max_length=200)]
+    source: str = Field(max_length=32, description="role in the key of the rejected message")
+    reason: str = Field(max_length=32, description="as counted in `refused`")
+    detail: str = Field(max_length=200, description="one line for the operator")
 
 
 class StreamStatus(WireModel):
     """What the robot's stream does: frames sent, answers that never came, frames allowed in flight, rate."""
 
-    sent: Counter = 0
-    credit_timeouts: Counter = 0
-    window: Counter = 1
-    fps: Number = 0.0
-    dropped_commands: Counter = 0
-    refused_pictures: Counter = 0
-    calibrated: bool = False
-    """Whether the camera's model was measured."""
-    overtaken: Counter = 0
-    """Frames that a newer one replaced on the way: in a slot of the peer, or on the link."""
-    dropped: Annotated[dict[str, Counter], Field(max_length=MAX_CHANNELS_SHOWN)] = {}
-    """By channel: what was published and replaced by something newer before a peer had room for it."""
-    missed_captures: Counter = 0
-    """Captures that the camera's slot dropped because the stream asked for none."""
-    quality_percent: Percent = 100
-    scale_percent: Percent = 100
-    """How pictures are encoded to fit the link: shares of the configured quality and of the side lengths."""
+    sent: Counter = Field(default=0, description="frames sent")
+    credit_timeouts: Counter = Field(default=0, description="frames whose answer never came")
+    window: Counter = Field(default=1, description="frames that may be in flight")
+    fps: Number = Field(default=0.0, description="frames sent in the last second")
+    dropped_commands: Counter = Field(default=0, description="commands that the driver did not take in time")
+    refused_pictures: Counter = Field(
+        default=0, description="images of the camera too large or not newer than the last"
+    )
+    calibrated: bool = Field(default=False, description="whether the camera's model was measured")
+    overtaken: Counter = Field(default=0, description="frames that a newer one replaced on the way")
+    dropped: dict[str, Counter] = Field(
+        default={},
+        max_length=MAX_CHANNELS_SHOWN,
+        description="by channel: what a newer one replaced before a peer had room for it",
+    )
+    missed_captures: Counter = Field(default=0, description="images of the camera that were not requested in time")
+    quality_percent: Percent = Field(default=100, description="of the configured JPEG quality, to fit the link")
+    scale_percent: Percent = Field(default=100, description="of the configured side lengths, to fit the link")
 
 
 class Status(WireModel):
-    """Everything a person needs to know why the robot moves or does not. Published at 10 Hz."""
+    """Everything an operator needs to know why the robot moves or does not. Published at 10 Hz."""
 
-    state: Annotated[State, Field(strict=False)]
-    reason: Annotated[str, Field(max_length=200)]
-    holder: Holder | None = None
-    applied: Planar = (0.0, 0.0)
-    frame_age_us: Microseconds | None = None
-    latency_us: Microseconds | None = None
-    accepted: Counter = 0
-    refused: dict[str, Counter] = {}
-    last_refusal: LastRejection | None = None
-    stream: StreamStatus = StreamStatus()
-    auto_arm: bool = False
-    tick_late_max_us: Microseconds = 0
-    network_restarts: Counter = 0
-    max_linear_mps: Number = 0.0
-    max_angular_rad_s: Number = 0.0
+    state: State = Field(strict=False, description="of the gate")
+    reason: str = Field(max_length=200, description="why it is in this state, one line for the operator")
+    holder: Holder | None = Field(default=None, description="the driver; null without one")
+    applied: Planar = Field(
+        default=(0.0, 0.0), description="last given to the wheels, after every limit: linear, angular"
+    )
+    frame_age_us: Microseconds | None = Field(
+        default=None, description="of the frame behind the command in force; null without one"
+    )
+    latency_us: Microseconds | None = Field(
+        default=None, description="capture to accepted command, the robot's own measure, of the last accepted command"
+    )
+    accepted: Counter = Field(default=0, description="commands accepted since the start")
+    refused: dict[str, Counter] = Field(default={}, description="rejections since the start, by reason")
+    last_refusal: LastRejection | None = Field(default=None, description="the newest rejection")
+    stream: StreamStatus = Field(default=StreamStatus(), description="the flow of frames")
+    auto_arm: bool = Field(default=False, description="whether the robot arms without an operator")
+    tick_late_max_us: Microseconds = Field(default=0, description="the latest that a tick of the driver's loop was")
+    network_restarts: Counter = Field(default=0, description="how often the network process was started again")
+    max_linear_mps: Number = Field(default=0.0, description="limit of speed")
+    max_angular_rad_s: Number = Field(default=0.0, description="limit of turning")
 
 
 class Odometry(WireModel):
-    """Where the wheels say the robot is, and how it moves."""
+    """Where the robot is by its wheels, and how it moves."""
 
-    pose: Pose
-    moving: Planar
+    pose: Pose = Field(description="odometry: x, y, yaw")
+    moving: Planar = Field(description="measured at the wheels: linear, angular")
 
 
 class DetectedCircle(WireModel):
     """A circle in pixels of the encoded picture, where the detector knows one."""
 
-    cx_px: Number
-    cy_px: Number
-    radius_px: Annotated[float, Field(gt=0, le=1e6)]
+    cx_px: Number = Field(description="center, from the left")
+    cy_px: Number = Field(description="center, from the top")
+    radius_px: float = Field(gt=0, le=1e6, description="radius")
 
 
 class DetectedBox(WireModel):
     """One object in pixels of the encoded picture; `x2_px` >= `x1_px` and `y2_px` >= `y1_px`, which are exclusive."""
 
-    label: Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,64}$")]
-    score: Annotated[float, Field(ge=0, le=1)]
-    x1_px: Number
-    y1_px: Number
-    x2_px: Number
-    y2_px: Number
-    circle: DetectedCircle | None = None
-    track: Counter | None = None
-    """The detector's own number for an object that it follows from frame to frame."""
+    label: str = Field(pattern=r"^[^\x00-\x1f\x7f]{1,64}$", description="what it is, as the detector names it")
+    score: float = Field(ge=0, le=1, description="how sure the detector is")
+    x1_px: Number = Field(description="left edge")
+    y1_px: Number = Field(description="top edge")
+    x2_px: Number = Field(description="right edge, exclusive; not left of `x1_px`")
+    y2_px: Number = Field(description="bottom edge, exclusive; not above `y1_px`")
+    circle: DetectedCircle | None = Field(default=None, description="where the detector knows one")
+    track: Counter | None = Field(default=None, description="the detector's number for an object that it follows")
 
     @model_validator(mode="after")
     def _is_not_inside_out(self) -> Self:
@@ -268,14 +282,16 @@ class DetectedBox(WireModel):
 
 
 class Detections(WireModel):
-    """What was found in one picture of this size, best first. No boxes: looked, and saw nothing."""
+    """What was found in one image of this size."""
 
-    width_px: PixelCount
-    height_px: PixelCount
-    boxes: Annotated[tuple[DetectedBox, ...], Field(max_length=MAX_DETECTED_BOXES)] = ()
-    detector: Annotated[str, Field(max_length=64)] = ""
-    device: Annotated[str, Field(max_length=32)] = ""
-    model: Annotated[str, Field(max_length=64)] = ""
+    width_px: PixelCount = Field(description="width of the picture as encoded")
+    height_px: PixelCount = Field(description="height of the picture as encoded")
+    boxes: tuple[DetectedBox, ...] = Field(
+        default=(), max_length=MAX_DETECTED_BOXES, description="best first; empty: nothing was found"
+    )
+    detector: str = Field(default="", max_length=64, description="name of the detector")
+    device: str = Field(default="", max_length=32, description="what the detector runs on")
+    model: str = Field(default="", max_length=64, description="hash of its model")
 
 
 class CameraModel(WireModel):
@@ -285,22 +301,23 @@ class CameraModel(WireModel):
     tilted up by `pitch_rad`.
     """
 
-    width_px: PixelCount
-    height_px: PixelCount
-    fx_px: Annotated[float, Field(gt=0, le=1e5)]
-    fy_px: Annotated[float, Field(gt=0, le=1e5)]
-    cx_px: Number
-    cy_px: Number
-    distortion: Annotated[tuple[Number, ...], Field(max_length=8)] = ()
-    """OpenCV order k1, k2, p1, p2, k3 ...; empty when there is none."""
-    x_m: Number = 0.0
-    y_m: Number = 0.0
-    z_m: Number = 0.0
-    pitch_rad: Number = 0.0
-    calibrated: bool = False
+    width_px: PixelCount = Field(description="width of the picture as encoded")
+    height_px: PixelCount = Field(description="height of the picture as encoded")
+    fx_px: float = Field(gt=0, le=1e5, description="focal length, across")
+    fy_px: float = Field(gt=0, le=1e5, description="focal length, down")
+    cx_px: Number = Field(description="principal point, from the left")
+    cy_px: Number = Field(description="principal point, from the top")
+    distortion: tuple[Number, ...] = Field(
+        default=(), max_length=8, description="k1, k2, p1, p2, k3 ... in OpenCV's order; empty for none"
+    )
+    x_m: Number = Field(default=0.0, description="the lens, ahead of the axle's middle")
+    y_m: Number = Field(default=0.0, description="the lens, left of it")
+    z_m: Number = Field(default=0.0, description="the lens, above the floor")
+    pitch_rad: Number = Field(default=0.0, description="upwards positive")
+    calibrated: bool = Field(default=False, description="whether the camera's model was measured")
 
 
-# What is said about missions: what vision is to do, and what it does. Frozen, strict, bounded models. Pure.
+# Missions: what vision is to do, and what it does.
 
 
 MAX_WAYPOINTS: Final = 64
@@ -317,30 +334,32 @@ Metres = Annotated[float, Field(ge=-MAX_WAYPOINT_M, le=MAX_WAYPOINT_M)]
 
 
 class MissionRequest(WireModel):
-    """What vision is to do from now on; `id` is the asker's own and comes back in the report."""
+    """What vision is to do from now on; `id` comes back in the report."""
 
-    id: Counter
-    name: MissionName
-    waypoints: Annotated[tuple[tuple[Metres, Metres], ...], Field(max_length=MAX_WAYPOINTS)] = ()
-    """(x_m, y_m) in the odometry frame."""
-    options: Annotated[dict[OptionName, OptionValue], Field(max_length=MAX_OPTIONS)] = {}
-    """For the mission's own configuration; a dot reaches into its tables."""
+    id: Counter = Field(description="the requester's own count of missions; the same in a repetition")
+    name: MissionName = Field(description="of the mission, as vision's own machine knows it")
+    waypoints: tuple[tuple[Metres, Metres], ...] = Field(
+        default=(), max_length=MAX_WAYPOINTS, description="x, y in the odometry frame, in order"
+    )
+    options: dict[OptionName, OptionValue] = Field(
+        default={},
+        max_length=MAX_OPTIONS,
+        description="of the mission's own configuration; a dot reaches into its tables",
+    )
 
 
 class MissionReport(WireModel):
-    """What vision does at the moment.
+    """What vision does at the moment."""
 
-    `phase` is one or two words for a person, `note` the rest of the line. `asked` names the newest mission that was
-    asked for, `refused` says why it was not taken up.
-    """
-
-    mission: Annotated[str, Field(max_length=64)]
-    phase: Annotated[str, Field(max_length=32)]
-    note: Annotated[str, Field(max_length=200)] = ""
-    done: bool = False
-    asked: RequestId | None = None
-    refused: Annotated[str, Field(max_length=200)] = ""
-    detector: Annotated[str, Field(max_length=64)] = ""
-    device: Annotated[str, Field(max_length=32)] = ""
-    model: Annotated[str, Field(max_length=64)] = ""
-    inference_us: Microseconds | None = None
+    mission: str = Field(max_length=64, description="its name")
+    phase: str = Field(max_length=32, description="one or two words for the operator")
+    note: str = Field(default="", max_length=200, description="the rest of the line")
+    done: bool = Field(default=False, description="whether the mission is over; the robot stays where it is")
+    asked: RequestId | None = Field(default=None, description="the newest requested mission")
+    refused: str = Field(default="", max_length=200, description="why `asked` was rejected; empty if it was not")
+    detector: str = Field(default="", max_length=64, description="name of the detector")
+    device: str = Field(default="", max_length=32, description="what the detector runs on")
+    model: str = Field(default="", max_length=64, description="hash of its model")
+    inference_us: Microseconds | None = Field(
+        default=None, description="of the newest image; null where the detector does not report it"
+    )

@@ -21,12 +21,30 @@ from sightline.protocol.channels import CHANNELS, key_for
 from sightline.protocol.errors import CLAMPED, RejectReason
 from sightline.protocol.spec import golden
 from sightline.protocol.spec.asyncapi import document
-from sightline.protocol.spec.field_docs import doc_of, unit_of
 from sightline.protocol.transports.websocket.framing import Hello
 
 HERE: Final = Path(__file__).parent.parent
 _BLOCK = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- /generated -->)", re.DOTALL)
+_UNITS: Final = {
+    "_mps": "m/s",
+    "_rad_s": "rad/s",
+    "_rad": "rad",
+    "_us": "µs",
+    "_px": "px",
+    "_m": "m",
+    "fps": "1/s",
+    "_percent": "%",
+    "pose": "m, m, rad",
+    "moving": "m/s, rad/s",
+    "applied": "m/s, rad/s",
+}
+"""Ending of a field's name -> its unit; the first that fits."""
 Schema = dict[str, Any]
+
+
+def unit_of(field: str) -> str:
+    """The unit of `field`; "" for a number without one and for text."""
+    return next((unit for ending, unit in _UNITS.items() if field.endswith(ending)), "")
 
 
 def channel_table() -> str:
@@ -85,7 +103,7 @@ def _model_table(name: str, schema: Schema) -> str:
     required = schema.get("required", [])
     for field, definition in schema["properties"].items():
         default = "refused" if field in required else _default_of(definition)
-        words = f"{unit_of(field)} | {default} | {doc_of(name, field)}"
+        words = f"{unit_of(field)} | {default} | {definition.get('description', '')}"
         rows.append(f"| `{field}` | {_type_of(definition)} | {words} |")
     return "\n".join(rows) + "\n"
 

@@ -36,12 +36,16 @@ class Hello(WireModel):
     """Who a peer is and what it wants; the first message each way, as JSON text, sent again when `wants` changes."""
 
     v: Version = VERSION
-    robot: RobotId
-    role: Annotated[str, Field(pattern=r"^([a-z][a-z0-9_]{0,15})?$")] = ""
-    """The source of what it sends towards the robot; empty for a robot and for who only watches."""
-    session: SessionId
-    wants: Annotated[tuple[Annotated[str, Field(max_length=32)], ...], Field(max_length=32)] = ()
-    """Names of channels; unknown ones are ignored."""
+    robot: RobotId = Field(description="the robot's id; of a peer that connects, the one that it means")
+    role: str = Field(
+        default="",
+        pattern=r"^([a-z][a-z0-9_]{0,15})?$",
+        description="`source` of what the sender sends towards the robot; empty or `robot` for a robot",
+    )
+    session: SessionId = Field(description="the sender's start: 8 hex digits drawn at random")
+    wants: tuple[Annotated[str, Field(max_length=32)], ...] = Field(
+        default=(), max_length=32, description="channels that the other end is to send; unknown names are ignored"
+    )
 
 
 class IncomingMessage(NamedTuple):
