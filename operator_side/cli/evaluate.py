@@ -23,7 +23,7 @@ from sightline.training.schedule import Training
 if TYPE_CHECKING:
     from sightline.evaluation.checks import Check
     from sightline.evaluation.faults.report import Results
-    from sightline.evaluation.score.detector_report import Report, ScoredScene, Sheet, Subject
+    from sightline.evaluation.score.detector_report import Report, Subject
     from sightline.operator_side.config.loading import Loaded
     from sightline.training.network import Weights
 
@@ -35,7 +35,7 @@ def register_demo_and_score(app: typer.Typer) -> None:
         help=score.__doc__, rich_markup_mode=None, invoke_without_command=True, callback=score,
         epilog="Example: sightline score --scenario circle,eight --seeds 101,102,103",
     )
-    group.command(epilog="Example: sightline score detectors hsv onnx --sheet runs/sheet.png")(detectors)
+    group.command(epilog="Example: sightline score detectors hsv onnx --demand")(detectors)
     app.add_typer(group, name="score")
 
 
@@ -168,7 +168,6 @@ def detectors(
     device: Device = None,
     config: ConfigFile = None,
     sets: Sets = None,
-    sheet: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a PNG of scenes and answers.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> int:
     """Compare detectors on drawn scenes: hits, wrong objects, false alarms, centre error, time. Seeds from 900000 are
@@ -178,7 +177,6 @@ def detectors(
         from sightline.evaluation.score.detector_report import FRAMES as DEMANDED_FRAMES
         from sightline.evaluation.score.detector_report import (
             LIGHT_SHARE,
-            Sheet,
             all_detector_checks,
             close_subjects,
             score_scenes,
@@ -186,20 +184,14 @@ def detectors(
         from sightline.evaluation.score.runs import progress
     if demand and seeds < FROM:
         raise ConfigError(f"--demand judges, which only seeds from {FROM} up are for, not {seeds}")
-    if sheet is not None:
-        check_out_file(sheet)
     columns, shown = _columns(column), frames or (DEMANDED_FRAMES if demand else FRAMES)
     asked = _subjects(names or COMPARED, config, sets or (), device)
     try:
-        drawn = Sheet(asked) if sheet else None
         with progress(int((len(columns) + LIGHT_SHARE) * shown)) as advance:
-            report = score_scenes(asked, shown, seeds, looks=looks, columns=columns, each=_each(advance, drawn))
+            report = score_scenes(asked, shown, seeds, looks=looks, columns=columns, each=lambda _scene: advance())
     finally:
         close_subjects(asked)
-    code = _print_report(report, all_detector_checks(report) if demand else None, as_json)
-    if sheet and drawn:
-        _write_sheet(sheet, drawn)
-    return code
+    return _print_report(report, all_detector_checks(report) if demand else None, as_json)
 
 
 def _subjects(
@@ -264,24 +256,6 @@ def _columns(asked: str) -> list[str]:
         if one not in COLUMNS:
             raise ConfigError(f"--column: {no_such_name('column', one, list(COLUMNS))}")
     return names
-
-
-def _each(advance: Callable[[], None], drawn: "Sheet | None") -> Callable[["ScoredScene"], None]:
-    def each(seen: "ScoredScene") -> None:
-        advance()
-        if drawn is not None:
-            drawn.add(seen)
-
-    return each
-
-
-def _write_sheet(path: Path, drawn: "Sheet") -> None:
-    import cv2
-
-    try:
-        path.write_bytes(cv2.imencode(".png", drawn.picture())[1].tobytes())
-    except OSError as error:
-        raise ConfigError(f"--sheet {path}: {error.strerror}") from None
 
 
 # The command `faults`: break things on purpose and judge what the wheels did. Shell. Exit code 5 when a row fails.

@@ -178,18 +178,6 @@ def test_who_calls_a_ball_something_else_is_told_why_it_has_no_hits(capsys, eyes
     assert "cup 3" not in err and json.loads(out)["columns"]["nominal"][NAME]["missed"] == 0
 
 
-def test_the_sheet_says_the_same_as_the_table(capsys, eyes, monkeypatch, tmp_path):
-    monkeypatch.setattr(eyes.Eyes, "answer", staticmethod(
-        lambda frame: result_of(frame, [Detection(1, 1, 9, 9, 0.9, "cup")], Maker("eyes"))))
-    said = []
-    monkeypatch.setattr(
-        "sightline.evaluation.score.detector_report.cv2.putText", lambda _picture, text, *_rest: said.append(text)
-    )
-    _, out, _ = told(capsys, NAME, "--json", "--set", "target.label=cup", "--sheet", str(tmp_path / "sheet.png"))
-    table = json.loads(out)["columns"]["nominal"][NAME]
-    assert table["missed"] == 0 and said and f"{NAME}: none" not in said and f"{NAME}: missed" not in said
-
-
 def test_who_cannot_be_asked_here_says_why(capsys):
     assert "127.0.0.1:1: Connection refused" in told(capsys, "http+jpeg://127.0.0.1:1/eyes")[2]
 

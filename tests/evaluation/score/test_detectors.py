@@ -8,9 +8,8 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-import cv2
 
-from sightline.evaluation.score.detector_report import Sheet, markdown, score_scenes, subjects, text
+from sightline.evaluation.score.detector_report import markdown, score_scenes, subjects, text
 from sightline.evaluation.score.detectors import FrameResult, LabelMatches, figures, frame_result, precisions
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import evaluate as cli_score_detectors
@@ -142,23 +141,19 @@ def test_the_command_line_begins_where_judging_begins():
 
 def test_detectors_are_judged_on_the_same_pictures():
     asked = subjects(["hsv", "adaptive"])
-    sheet = Sheet(asked)
-    report = score_scenes(asked, 10, looks=4, columns=["nominal", "same-colour boxes"], each=sheet.add)
+    report = score_scenes(asked, 10, looks=4, columns=["nominal", "same-colour boxes"])
     assert set(report.columns) == {"nominal", "same-colour boxes"}
     hsv = report.columns["nominal"]["hsv"]
     assert (hsv.frames, hsv.balls) == (10, 8) and hsv.hits >= 0.25 and hsv.compute_p50_us
     assert report.columns["nominal"]["adaptive"].hits > 0  # four looks are enough to be sure
     assert report.made_by["hsv"]["device"] == "cpu"
-    assert sheet.picture().shape == (3 * (240 + 18), 6 * 320, 3)
     assert "same-colour boxes" in text(report) and markdown(report).count("| nominal |") == 2
 
 
-def test_the_command_gives_json_and_a_sheet(tmp_path, capsys):
-    sheet = tmp_path / "sheet.png"
-    code = cli.run(["score", "detectors", "hsv", "--frames", "2", "--column", "blur", "--json", "--sheet", str(sheet)])
+def test_the_command_gives_json(capsys):
+    code = cli.run(["score", "detectors", "hsv", "--frames", "2", "--column", "blur", "--json"])
     told = json.loads(capsys.readouterr().out)
     assert code == 0 and told["frames"] == 2 and set(told["columns"]) == {"blur"}
-    assert cv2.imread(str(sheet)).shape[1] == 6 * 320
 
 
 @pytest.mark.parametrize(("arguments", "says"), [
@@ -166,7 +161,6 @@ def test_the_command_gives_json_and_a_sheet(tmp_path, capsys):
     (["hsv", "--column", "blurr"], "did you mean 'blur'"),
     (["hsv", "--frames", "0"], "--frames"),
     (["onnx:nowhere.onnx"], "nowhere.onnx"),
-    (["hsv", "--frames", "1", "--column", "blur", "--sheet", "/nowhere/sheet.png"], "there is no folder /nowhere"),
 ])
 def test_a_bad_argument_is_one_line(arguments, says, capsys):
     assert cli.run(["score", "detectors", *arguments]) == 2

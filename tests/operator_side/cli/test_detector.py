@@ -114,7 +114,6 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("detector", "check", "tests.operator_side.cli.test_detector:Leaves"), 2, "raises SystemExit: 7"),
         (("vision", "--dry-run", "--detector", "onnx", "--set", "detector.labels=[\"bal\"]", "--camera", "folder",
           "--camera-set", "path=examples/pictures"), 2, "onnx knows no 'bal'; did you mean 'ball'?"),
-        (("score", "detectors", "hsv", "--sheet", "/nowhere/x.png"), 2, "there is no folder /nowhere"),
         (("detector", "check", "hsv", "--set", "hsv.min_radius_px=900"), 2, "'hsv.min_radius_px'"),
         (("detector", "check", "hsv", "--set", "label=a", "--set", "label.b=1"), 2, "'label' has a value"),
         (("demo", "--detector", "hsw", "--out", "/nowhere/made"), 2, "did you mean 'hsv'"),
