@@ -1,10 +1,13 @@
-"""Commands that test a peer against the protocol: conform robot, vision, codec, page. Shell."""
+"""Commands that test a peer against the protocol: conform robot, vision, codec. Shell."""
 
+import functools
+import inspect
 import json
 import ssl
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -17,7 +20,7 @@ from rich.table import Table
 
 from sightline.conformance.benches import LiveBench
 from sightline.conformance.case import Access, Case, Level
-from sightline.conformance.report import summary, to_dict, to_html, to_junit, to_page
+from sightline.conformance.report import summary, to_dict, to_junit
 from sightline.conformance.runner import Outcome, Result, chosen, passed, run_cases
 from sightline.operator_side.cli.options import CHECK_FAILED
 from sightline.operator_side.preflight import check_out_file
@@ -185,10 +188,62 @@ OwnToken = Annotated[
     list[str] | None, typer.Option("--token", metavar="FILE", help="File with the WebSocket token to ask for.")
 ]
 Junit = Annotated[Path | None, typer.Option("--junit", metavar="FILE", help="Write JUnit XML, for a CI.")]
-Html = Annotated[Path | None, typer.Option("--html", metavar="FILE", help="Write one HTML file, for a person.")]
-Save = Annotated[Path | None, typer.Option("--save", metavar="FILE", help="Write the JSON, for `conform page`.")]
+Save = Annotated[Path | None, typer.Option("--save", metavar="FILE", help="Write the JSON to a file too.")]
 Name = Annotated[str, typer.Option("--name", metavar="TEXT", help="The peer's name in reports [default: where it is].")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Which cases run, and where their results go: the options that each command has."""
+
+    only: Only = None
+    groups: Groups = None
+    list_cases: Listing = False
+    junit: Junit = None
+    save: Save = None
+    name: Name = ""
+    as_json: Json = False
+
+    def chosen(self, cases: Sequence[Case]) -> Sequence[Case]:
+        """Those of `cases` to run; none once listed. Raises ConfigError for a file that cannot be written."""
+        found = chosen(cases, self.only or (), self.groups or ())
+        if self.list_cases:
+            typer.echo(listing(found))
+            return ()
+        for path in filter(None, (self.junit, self.save)):
+            check_out_file(path)
+        return found
+
+    def report(self, results: Sequence[Result], side: str, peer: str) -> int:
+        """Print and write the results. Returns the exit code."""
+        found = to_dict(results, side, self.name or peer)
+        if self.junit is not None:
+            self.junit.write_text(to_junit(results, side, self.name or peer), "utf-8")
+        if self.save is not None:
+            self.save.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
+        if self.as_json:
+            typer.echo(json.dumps(found))
+        else:
+            print_results(results)
+        return 0 if passed(results) else CHECK_FAILED
+
+
+def with_run_options(command: Callable[..., int]) -> Callable[..., int]:
+    """`command(..., run=RunOptions)` as a command that has each field of RunOptions as an option of its own."""
+    fields = inspect.signature(RunOptions).parameters
+
+    @functools.wraps(command)
+    def with_options(*arguments: Any, **options: Any) -> int:
+        run = RunOptions(**{name: options.pop(name) for name in fields})
+        return command(*arguments, run=run, **options)
+
+    own = [parameter for parameter in inspect.signature(command).parameters.values() if parameter.name != "run"]
+    shared = [field.replace(kind=inspect.Parameter.KEYWORD_ONLY) for field in fields.values()]
+    with_options.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]
+    with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *shared)}
+    del with_options.__wrapped__
+    return with_options
 
 
 def register_conform(app: typer.Typer) -> None:
@@ -197,10 +252,9 @@ def register_conform(app: typer.Typer) -> None:
         help="Test any robot, vision or codec against the wire protocol, case by case.",
         no_args_is_help=False, rich_markup_mode=None,
     )  # fmt: skip
-    group.command(epilog="Example: sightline conform robot ws://192.168.1.20:9090 --html report.html")(robot)
-    group.command(epilog="Example: sightline conform vision tcp/127.0.0.1:7447")(vision)
-    group.command(epilog="Example: sightline conform codec -- node codec.js")(codec)
-    group.command(epilog="Example: sightline conform page --out docs/conformance.md robot.json vision.json")(page)
+    group.command(epilog="Example: sightline conform robot ws://192.168.1.20:9090")(with_run_options(robot))
+    group.command(epilog="Example: sightline conform vision tcp/127.0.0.1:7447")(with_run_options(vision))
+    group.command(epilog="Example: sightline conform codec -- node codec.js")(with_run_options(codec))
     app.add_typer(group, name="conform")
 
 
@@ -213,14 +267,7 @@ def robot(
     ] = "",
     secure: Secure = "",
     tokens: Tokens = None,
-    only: Only = None,
-    groups: Groups = None,
-    list_cases: Listing = False,
-    junit: Junit = None,
-    html: Html = None,
-    save: Save = None,
-    name: Name = "",
-    as_json: Json = False,
+    run: RunOptions,
 ) -> int:
     """Test a robot as its driver, its watcher and its enemy. It is armed and its wheels turn: lift it off the floor."""
     from sightline.conformance.benches import FROM_ROBOT
@@ -229,11 +276,9 @@ def robot(
     from sightline.conformance.robot.websocket import put_over_websocket
     from sightline.protocol.transports.open import open_link
 
-    cases = chosen(side.CASES, only or (), groups or ())
-    if list_cases:
-        typer.echo(listing(cases))
+    cases = run.chosen(side.CASES)
+    if not cases:
         return 0
-    _check_files(junit, html, save)
     with ExitStack() as ending:
         access = access_for(secure, tokens or (), _ROLES, ending)
 
@@ -253,7 +298,7 @@ def robot(
             raise LinkError(f"{endpoint} answers, but no robot {robot} says its status there; is that its id?")
         tell = ending.enter_context(progress(len(cases)))
         results = run_cases(cases, bench, side.prepare, tell, TRIES)
-    return _report(results, "robot", name or endpoint, (junit, html, save), as_json)
+    return run.report(results, "robot", endpoint)
 
 
 def vision(
@@ -263,14 +308,7 @@ def vision(
     dial: Annotated[bool, typer.Option("--dial", help="Connect to a vision or router that listens there.")] = False,
     secure: Secure = "",
     tokens: OwnToken = None,
-    only: Only = None,
-    groups: Groups = None,
-    list_cases: Listing = False,
-    junit: Junit = None,
-    html: Html = None,
-    save: Save = None,
-    name: Name = "",
-    as_json: Json = False,
+    run: RunOptions,
 ) -> int:
     """Test a vision: the kit plays its robot at ENDPOINT; start the vision against it, before or after."""
     from sightline.conformance.benches import TO_ROBOT
@@ -278,11 +316,9 @@ def vision(
     from sightline.conformance.vision import cases as side
     from sightline.protocol.transports.open import open_link
 
-    cases = chosen(side.CASES, only or (), groups or ())
-    if list_cases:
-        typer.echo(listing(cases))
+    cases = run.chosen(side.CASES)
+    if not cases:
         return 0
-    _check_files(junit, html, save)
     with ExitStack() as ending:
         access = access_for(secure, tokens or (), _ROLES[:1], ending)
 
@@ -300,78 +336,22 @@ def vision(
                             f"sightline vision --connect {endpoint} --robot {robot}")
         tell = ending.enter_context(progress(len(cases)))
         results = run_cases(cases, bench, side.prepare, tell, TRIES)
-    return _report(results, "vision", name or endpoint, (junit, html, save), as_json)
+    return run.report(results, "vision", endpoint)
 
 
 def codec(
     command: Annotated[list[str] | None, typer.Argument(metavar="-- COMMAND", help="The adapter.")] = None,
     *,
-    only: Only = None,
-    groups: Groups = None,
-    list_cases: Listing = False,
-    junit: Junit = None,
-    html: Html = None,
-    save: Save = None,
-    name: Name = "",
-    as_json: Json = False,
+    run: RunOptions,
 ) -> int:
     """Test a codec in any language: a program that answers one line of JSON with one line of JSON."""
     from sightline.conformance import codec as side
 
-    cases = chosen(side.CASES, only or (), groups or ())
-    if list_cases:
-        typer.echo(listing(cases))
+    cases = run.chosen(side.CASES)
+    if not cases:
         return 0
     if not command:
         raise ConfigError("no command: write it after two dashes, e.g. sightline conform codec -- node codec.js")
-    _check_files(junit, html, save)
     with progress(len(cases)) as tell:
         results = side.run_codec(command, cases, tell)
-    return _report(results, "codec", name or " ".join(command), (junit, html, save), as_json)
-
-
-def page(
-    runs: Annotated[list[Path], typer.Argument(metavar="FILE...", help="What --save wrote, one for each peer.")],
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write it here, e.g. docs/conformance.md.")] = None,
-) -> None:
-    """Make one Markdown page of several runs."""
-    text = to_page([_read(path) for path in runs])
-    if out is None:
-        typer.echo(text)
-    else:
-        _check_files(out)
-        out.write_text(text, "utf-8")
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        run = json.loads(path.read_text("utf-8"))
-        return {name: run[name] for name in ("ok", "side", "peer", "counts", "checks")}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        what = f"{path}: not a run of this kit ({type(error).__name__}); make one: sightline conform ... --save FILE"
-        raise ConfigError(what) from None
-
-
-def _check_files(*files: Path | None) -> None:
-    """So that what cannot be written is known before the run. Raises ConfigError."""
-    for path in files:
-        if path is not None:
-            check_out_file(path)
-
-
-def _report(
-    results: Sequence[Result], side: str, peer: str, files: tuple[Path | None, Path | None, Path | None], as_json: bool
-) -> int:
-    junit, html, save = files
-    for path, text in (
-        (junit, to_junit(results, side, peer)),
-        (html, to_html(results, side, peer)),
-        (save, json.dumps(to_dict(results, side, peer), indent=1) + "\n"),
-    ):
-        if path is not None:
-            path.write_text(text, "utf-8")
-    if as_json:
-        typer.echo(json.dumps(to_dict(results, side, peer)))
-    else:
-        print_results(results)
-    return 0 if passed(results) else CHECK_FAILED
+    return run.report(results, "codec", " ".join(command))

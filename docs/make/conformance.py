@@ -1,18 +1,21 @@
-"""Runs the kit over every peer of this repository and rewrites docs/conformance.md. Shell (processes).
+"""Runs the kit over every peer of this repository and rewrites docs/conformance.md.
 
-    python -m tests.conformance.page_runs                    # all, one after another: most of an hour
-    python -m tests.conformance.page_runs "vision, Zenoh"    # one anew; the others keep their last run
+    python -m docs.make.conformance                    # all, one after another: most of an hour
+    python -m docs.make.conformance "vision, Zenoh"    # one again; the others keep their last run
 
 Results lie in runs/conformance, one JSON for each peer; the page is made of what is there.
 """
 
+import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
+from sightline.conformance.runner import Outcome, printable
 from sightline.operator_side.setup import keys
 from tests.fixtures.javascript import EXAMPLES, ROOT, JsRobot, JsVision, free_port, node
 from tests.fixtures.links import free_endpoint, until
@@ -22,8 +25,16 @@ SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 KEPT = ROOT / "runs" / "conformance"
 PAGE = ROOT / "docs" / "conformance.md"
 ADAPTER = EXAMPLES.parent / "codec_adapter.py"
+MARKS = {Outcome.PASSED: "ok", Outcome.FAILED: "FAIL", Outcome.SKIPPED: "n/a"}
 START_S = 90.0
 TOKEN = "conformance-0123456789abcdef"
+
+PREFACE = """`python -m docs.make.conformance` runs the kit over these peers and writes this page. A case that a peer's
+choices leave nothing to test in (no guests, no scan, no port of the legacy protocol, no token, another transport)
+counts as not applicable. Clauses are those of [protocol/README.md](../protocol/README.md)."""
+
+LISTED_ELSEWHERE = ("codec",)
+"""Sides without a table of every case: a codec's are the golden vectors, each of which says what it is for."""
 
 
 def end_at(scheme: str) -> str:
@@ -123,12 +134,54 @@ RUNS: dict[str, Callable[[str], None]] = {
 }
 
 
+def to_page(runs: Sequence[Mapping[str, Any]]) -> str:
+    """The Markdown page of several runs (their JSON): peers, what did not pass at once, every case of each side."""
+    lines = ["# Conformance", "", PREFACE, ""]
+    lines += ["| peer | side | conforms | passed | failed | SHOULD failed | not applicable | cases |", "|" + "---|" * 8]
+    for run in runs:
+        found = run["counts"]
+        figures = (found.get(name, 0) for name in ("passed", "failed", "SHOULD failed", "not applicable"))
+        row = [run["peer"], run["side"], "yes" if run["ok"] else "no", *figures, len(run["checks"])]
+        lines.append("| " + " | ".join(str(cell) for cell in row) + " |")
+    for run in runs:
+        lines += remarks(run)
+    for side in dict.fromkeys(run["side"] for run in runs if run["side"] not in LISTED_ELSEWHERE):
+        lines += case_table(side, [run for run in runs if run["side"] == side])
+    return "\n".join(lines) + "\n"
+
+
+def remarks(run: Mapping[str, Any]) -> list[str]:
+    told = [check for check in run["checks"] if check["reason"]]
+    if not told:
+        return []
+    alike: dict[tuple[str, str], list[str]] = {}
+    for one in told:
+        alike.setdefault((one["value"], one["reason"]), []).append(one["name"])
+    lines = ["", f"## {run['peer']}: what did not pass at once", "", "| cases | outcome | why |", "|---|---|---|"]
+    return lines + [f"| {', '.join(names)} | {what} | {cell(why)} |" for (what, why), names in alike.items()]
+
+
+def case_table(side: str, runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    peers = [run["peer"] for run in runs]
+    lines = ["", f"## Cases: {side}", "", f"| case | | clause | what | {' | '.join(peers)} |",
+             "|" + "---|" * (4 + len(peers))]
+    outcomes = [{check["name"]: MARKS[Outcome(check["value"])] for check in run["checks"]} for run in runs]
+    cases = {check["name"]: check for run in runs for check in run["checks"]}
+    for name, check in cases.items():
+        found = " | ".join(outcome.get(name, "") for outcome in outcomes)
+        lines.append(f"| {name} | {check['level']} | {check['clause']} | {cell(check['title'])} | {found} |")
+    return lines
+
+
+def cell(text: str) -> str:
+    return " ".join(printable(text).replace("|", "\\|").split())
+
+
 def main(names: Sequence[str]) -> None:
     """Run what is named, or all, and make the page of what is there."""
     for name in names or RUNS:
         RUNS[name](name)
-    kept = [str(file_of(name)) for name in RUNS if file_of(name).exists()]
-    subprocess.run([*SIGHTLINE, "conform", "page", *kept, "--out", str(PAGE)], check=True)
+    PAGE.write_text(to_page([json.loads(file_of(name).read_text()) for name in RUNS if file_of(name).exists()]))
 
 
 if __name__ == "__main__":
