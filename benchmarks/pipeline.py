@@ -16,7 +16,6 @@ from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.onnx.detector import OnnxDetector, read_onnx_model
-from sightline.vision_side.detect.onnx.engine import open_engine
 from sightline.vision_side.detect.onnx.tensors import fit_picture
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame
 from sightline.vision_side.pipeline import Frame, Pipeline
@@ -81,15 +80,15 @@ def time_learned(frames: int = 600) -> LearnedTime:
     pictures, decoder = _pictures(*size), Decoder(*size, size[0] * size[1])
     config = OnnxDetector.Config(device="cpu")
     detector, model = OnnxDetector(config), read_onnx_model(config)
-    engine = open_engine(model.path, model.header, "cpu", config.threads)
     asked = [DetectFrame("r1", one.header, one.jpeg, decoder) for one in islice(_frames(pictures), frames)]
     pixels = [fit_picture(decoder.decode(jpeg), model.form)[0].copy() for jpeg in pictures]
     seen = [detector.detect([one], NO_DEADLINE)[0] for one in asked[:_PICTURES]]
-    network_us = _took_us(engine.run, islice(cycle(pixels), frames))
+    network_us = _took_us(model.engine.run, islice(cycle(pixels), frames))
     whole_us = _took_us(lambda one: detector.detect([one], NO_DEADLINE), asked)
     decode_us = _took_us(decoder.decode, islice(cycle(pictures), frames))
     missed = sum(one is None or not one.detections for one in seen)
-    return LearnedTime(engine.name, missed, median(network_us), _alone(network_us), median(whole_us), _alone(decode_us))
+    return LearnedTime(model.engine.name, missed, median(network_us), _alone(network_us), median(whole_us),
+                       _alone(decode_us))
 
 
 def _time_size(size: tuple[int, int], frames: int, paced_frames: int) -> StepTime:

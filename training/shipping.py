@@ -41,7 +41,7 @@ from sightline.training.network import Weights
 from sightline.training.schedule import LEAST_SHARE, WHOLE_FROM, Training
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.onnx.engine import open_engine, read_onnx_header
+from sightline.vision_side.detect.onnx.engine import open_engine
 from sightline.vision_side.detect.onnx.self_test import KEY, golden_picture, golden_text
 from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.registry import build_detector
@@ -190,11 +190,11 @@ def written(path: Path, weights: Weights) -> None:
     """The ONNX file, with what it answers to the known picture in its metadata."""
     properties = {"min_score": str(COUNTS_FROM)}
     path.write_bytes(onnx_bytes(weights, properties))
-    header = read_onnx_header(path.read_bytes())
-    form = model_format(header, (), "auto")
+    engine = open_engine(path, "cpu", 1)
+    form = model_format(engine.header, (), "auto")
     picture = Picture(golden_picture(), 1)
     pixels, fitting = fit_picture(picture, form)
-    found = read_outputs(open_engine(path, header, "cpu", 1).run(pixels), form, fitting, picture, COUNTS_FROM)
+    found = read_outputs(engine.run(pixels), form, fitting, picture, COUNTS_FROM)
     beside = path.with_suffix(".part")
     beside.write_bytes(onnx_bytes(weights, {**properties, KEY: golden_text(found)}))
     beside.replace(path)

@@ -9,18 +9,16 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from sightline.evaluation.processes import Processes
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.hsv import HsvDetector
-from sightline.vision_side.detect.protobuf import fields
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.onnx import brightness_model
-from tests.fixtures.vision.remote import Server, box, grpc_answer, grpc_started, http_reply, said
+from tests.fixtures.vision.remote import Server, box, http_reply, said
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 pytestmark = pytest.mark.slow
@@ -127,13 +125,6 @@ def _answer(_request):
     return http_reply(said(box(*_corners())))
 
 
-def _infer(request, _context):
-    """The same over gRPC, under the id that was asked with."""
-    asked = bytes(dict(fields(request))[3]).decode()
-    columns = {"boxes": np.float32([_corners()]), "scores": np.float32([0.9]), "labels": np.int64([0])}
-    return grpc_answer(columns, asked)
-
-
 @contextmanager
 def _driving(tmp_path, detector, *options, beside=None):
     """The robot and what vision says, once the wheels turn; `beside(endpoint)` starts what else there is."""
@@ -212,22 +203,6 @@ def test_hostile_answers_do_not_move_the_robot(tmp_path, hostile):
         time.sleep(0.5)
         assert not [row for row in robot.motor_rows() if row[0] > still_us and (row[1] or row[2])]
         assert "no answer" in log.read_text()
-
-
-def test_a_grpc_server_that_is_gone_is_the_same(tmp_path):
-    server, port = grpc_started(_infer)
-    labels = "detector.options.labels=['ball']"
-    try:
-        with _driving(tmp_path, f"oip+grpc://127.0.0.1:{port}/ball", "--set", labels) as (robot, log):
-            gone_us = time.monotonic_ns() // 1000
-            server.stop(0).wait()
-            assert until(lambda: _wheels_us(robot, gone_us), 3)
-            assert _wheels_us(robot, gone_us) - gone_us <= ZERO_US + DEADLINE_US
-            server, _ = grpc_started(_infer, port)
-            assert until(lambda: robot.speed() > 0.5, 3.0), log.read_text()
-            assert "searching" not in log.read_text() and "answers again" in log.read_text()
-    finally:
-        server.stop(0)
 
 
 def test_a_killed_detector_service_is_the_same_over_zenoh(tmp_path):

@@ -11,7 +11,7 @@ from sightline.evaluation.score.detector_report import MOST_WRONG, score_scenes,
 from sightline.operator_side.cli import evaluate as cli_train
 from sightline.sim.scenes.model import COLUMNS, JUDGED_FROM, LABELS, WIDTH_PX
 from sightline.vision_side.detect.onnx.detector import SHIPPED
-from sightline.vision_side.detect.onnx.engine import read_onnx_header
+from sightline.vision_side.detect.onnx.engine import open_engine
 
 CARD = SHIPPED.with_suffix(".md").read_text("utf-8")
 SEED = JUDGED_FROM + 40_000  # other scenes than those of the card
@@ -26,7 +26,7 @@ def columns_of_the_card():
 def test_the_card_is_of_this_file():
     data = SHIPPED.read_bytes()
     assert len(data) < 1_000_000 and hashlib.sha256(data).hexdigest() in CARD
-    header = read_onnx_header(data)
+    header = open_engine(SHIPPED, "cpu", 1).header
     assert header.inputs[0].shape == (1, 240, WIDTH_PX, 3) and header.metadata["min_score"] == "0.5"
     assert all(f"`{label}`" in CARD for label in LABELS)
 

@@ -14,7 +14,7 @@ from sightline.training.export import shifted
 from sightline.training.schedule import Training
 from sightline.training.shipping import Card, card_text, chosen_thresholds, final_report, written
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.onnx.engine import read_onnx_header
+from sightline.vision_side.detect.onnx.engine import open_engine
 from sightline.vision_side.detect.registry import build_detector
 from tests.training.fixture import weights
 
@@ -32,7 +32,7 @@ def test_weights_become_a_file_with_thresholds_and_a_card_that_is_true_of_it(tmp
     assert len(thresholds) == len(LABELS) and all(0.05 < one < 0.96 for one in thresholds)
     model = tmp_path / "model.onnx"
     written(model, shifted(weights(), thresholds))
-    header = read_onnx_header(model.read_bytes())
+    header = open_engine(model, "cpu", 1).header
     assert header.metadata["min_score"] == "0.5" and "golden" in header.metadata
     build_detector(f"onnx:{model}", {}, VisionConfig())  # its own answer to the known picture is checked on the way
     report = final_report(model, 5, partial(told, counts))

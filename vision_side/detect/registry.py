@@ -24,7 +24,6 @@ BUILT_IN: Final = {
     "onnx": "sightline.vision_side.detect.onnx.detector:OnnxDetector",
     "zenoh": "sightline.vision_side.detect.remote.zenoh_detector:ZenohDetector",
     "oip+http": "sightline.vision_side.detect.remote.oip_http:OipHttp",
-    "oip+grpc": "sightline.vision_side.detect.remote.oip_grpc:OipGrpc",
     "http+jpeg": "sightline.vision_side.detect.remote.http_client:HttpJpeg",
 }
 """Here and not as entry points, so that a checkout that nobody installed has them too."""

@@ -11,7 +11,6 @@ from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import detector as cli_detector
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.onnx import detector as onnx_detector
-from sightline.vision_side.detect.remote import oip_grpc
 from sightline.vision_side.serving import detector_service
 from tests.fixtures.vision.onnx import brightness_model, without_gpu
 
@@ -57,12 +56,6 @@ def test_every_detector_is_listed_with_whether_it_can_be_used(capsys) -> None:
     assert listed["hsv"] == {"name": "hsv", "usable": True, "why": ""}
     code, out, _ = run(capsys, "detector", "list")
     assert code == 0 and "adaptive     ok" in out
-
-
-def test_a_list_says_what_has_to_be_installed_first(capsys, monkeypatch) -> None:
-    monkeypatch.setattr(oip_grpc, "find_spec", lambda name: None)
-    code, out, _ = run(capsys, "detector", "list")
-    assert code == 0 and "oip+grpc     grpcio is not installed: pip install 'sightline-robot[grpc]'" in out
 
 
 def test_a_detector_that_keeps_its_promises_passes(capsys) -> None:

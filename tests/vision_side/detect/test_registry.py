@@ -64,7 +64,7 @@ def config(**detector: object) -> VisionConfig:
 
 
 def test_every_built_in_name_can_be_imported() -> None:
-    assert {"hsv", "adaptive", "onnx", "zenoh", "oip+http", "oip+grpc", "http+jpeg"} <= set(REGISTRY.names())
+    assert {"hsv", "adaptive", "onnx", "zenoh", "oip+http", "http+jpeg"} <= set(REGISTRY.names())
     for name in REGISTRY.built_in:
         assert hasattr(REGISTRY.load(name), "detect") and hasattr(REGISTRY.load(name), "Config")
 

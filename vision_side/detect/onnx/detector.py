@@ -19,7 +19,7 @@ from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.vision_side.config import Device
 from sightline.vision_side.decode import Picture
 from sightline.vision_side.detect.color.refine import refined
-from sightline.vision_side.detect.onnx.engine import Engine, OnnxHeader, open_engine, read_onnx_header
+from sightline.vision_side.detect.onnx.engine import Engine, OnnxHeader, open_engine
 from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
 from sightline.vision_side.detect.onnx.tensors import (
     ModelFormat,
@@ -70,11 +70,11 @@ class OnnxDetector:
         self.labels = model.form.labels
         """All that it can call a thing; empty where the model has only numbers."""
         self._refine = frozenset(config.refine)
-        self._engine = open_engine(path, model.header, config.device, config.threads)
+        self._engine = model.engine
         self._news = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
         self.maker = Maker(f"onnx:{path.name}"[:_NAME_LENGTH], model.digest, self._engine.device)
         self._failed = False
-        self._at_once = _MOST_AT_ONCE if self._form.batched and self._engine.batches else 1
+        self._at_once = _MOST_AT_ONCE if self._form.batched else 1
         self._warm_up(model, config)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
@@ -130,7 +130,7 @@ class OnnxDetector:
             for _ in range(_WARM_UP):
                 (found,) = _found(self._engine, [picture], form, least)
             if expected is None and self._engine.device != "cpu":
-                on_cpu = open_engine(path, model.header, "cpu", config.threads)
+                on_cpu = open_engine(path, "cpu", config.threads)
                 expected = list(_found(on_cpu, [picture], form, least)[0])
         except Exception as error:  # whatever an engine raises
             raise ConfigError(f"model {path} does not run: {' '.join(str(error).split())}"[:200]) from None
@@ -143,10 +143,10 @@ class OnnxDetector:
 
 @dataclass(frozen=True, slots=True)
 class OnnxModel:
-    """A model's file and what it says of itself."""
+    """A model's file, loaded, and what it says of itself."""
 
     path: Path
-    header: OnnxHeader
+    engine: Engine
     form: ModelFormat
     min_score: float
     expected: list[Detection] | None
@@ -157,18 +157,23 @@ class OnnxModel:
 
 
 def read_onnx_model(config: OnnxDetector.Config) -> OnnxModel:
-    """The model, without running it. Raises ConfigError for a file that is none, or none of a form known here."""
+    """Load the model that `config` names.
+
+    Raises:
+        ConfigError: for a file that is not a model, or of a form unknown here.
+        HardwareError: for a device that is not there.
+    """
     path = Path(config.address).expanduser() if config.address else SHIPPED
-    data = _bytes_of(path)
-    digest = hashlib.sha256(data).hexdigest()[:HASH_DIGITS]
+    digest = hashlib.sha256(_bytes_of(path)).hexdigest()[:HASH_DIGITS]
+    engine = open_engine(path, config.device, config.threads)
     try:
-        header = read_onnx_header(data)
+        header = engine.header
         form, least = model_format(header, config.names, config.colour), _least(config.min_score, header)
         if KEY not in header.metadata:
-            return OnnxModel(path, header, form, least, None, form, _least(None, header), digest)
+            return OnnxModel(path, engine, form, least, None, form, _least(None, header), digest)
         own = replace(form, labels=own_labels(header.metadata))
         return OnnxModel(
-            path, header, form, least, read_golden(header.metadata[KEY]), own, _least(None, header), digest
+            path, engine, form, least, read_golden(header.metadata[KEY]), own, _least(None, header), digest
         )
     except ValueError as error:
         raise ConfigError(f"model {path}: {error}; see docs/detectors.md") from None

@@ -1,31 +1,39 @@
-"""Runs an ONNX model with ONNX Runtime or OpenCV, and reads the inputs, outputs and metadata of its file. Shell.
+"""Runs an ONNX model with ONNX Runtime, and reads the inputs, outputs and metadata of its file. Shell (loads files).
 
-An ONNX file is a protocol buffer; the few fields that matter are read, all else is stepped over.
+It reports the device that the session really got, read after it was made: a runtime built for a GPU lists the GPU and
+silently runs on the CPU when it cannot have it.
 """
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
-import numpy as np
 from numpy.typing import NDArray
 
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.vision_side.config import Device
-from sightline.vision_side.detect.protobuf import Bytes, Field, as_bytes, fields, text
 
-_GRAPH, _METADATA = 7, 14  # of a model
-_INITIALIZER, _INPUT, _OUTPUT = 5, 11, 12  # of a graph
-_TENSOR_NAME: Final = 8
-_MAX_METADATA: Final = 64
-_TYPES: Final = {1: "float32", 2: "uint8", 7: "int64", 10: "float16"}
+Arrays = dict[str, NDArray[Any]]
+PROVIDERS: Final = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider",
+                    "tensorrt": "TensorrtExecutionProvider"}
+_TYPES: Final = {"tensor(float)": "float32", "tensor(uint8)": "uint8", "tensor(int64)": "int64",
+                 "tensor(float16)": "float16"}
+_DEVICES: Final = {provider: device for device, provider in PROVIDERS.items()}
+_BEHIND: Final = {"tensorrt": ("tensorrt", "cuda", "cpu"), "cuda": ("cuda", "cpu"), "cpu": ("cpu",)}
+"""What a session for a device may fall back on for single operations."""
+_MISSING: Final = ("onnxruntime is not installed: pip install 'sightline-robot[vision]', or [vision-gpu] for an NVIDIA "
+                   "GPU; it has no wheel for 32-bit ARM")
+_FIX: Final = ("install onnxruntime-gpu in place of onnxruntime (never both), see that `nvidia-smi` shows the GPU, or "
+               "take --device auto")
+_ERRORS_ONLY: Final = 3
+_LONGEST: Final = 200
 
 
 @dataclass(frozen=True, slots=True)
 class Tensor:
-    """An input or output; `shape` has None where the model does not say."""
+    """An input or output; `shape` has None where the model leaves it open."""
 
     name: str
     type: str
@@ -41,107 +49,41 @@ class OnnxHeader:
     metadata: dict[str, str] = field(default_factory=dict)
 
 
-def read_onnx_header(data: Bytes) -> OnnxHeader:
-    """Raises ValueError for what is no ONNX model."""
-    graph: Bytes | None = None
-    metadata: dict[str, str] = {}
-    for number, value in _fields(memoryview(data)):
-        if number == _GRAPH and not isinstance(value, int):
-            graph = value
-        elif number == _METADATA and not isinstance(value, int) and len(metadata) < _MAX_METADATA:
-            entry = dict(_fields(value))
-            metadata[text(entry.get(1, b""))] = text(entry.get(2, b""))
-    if graph is None:
-        raise ValueError("it holds no graph")
-    inputs, outputs, constant = [], [], set()
-    for number, value in _fields(graph):
-        if isinstance(value, int):
-            continue
-        if number == _INPUT:
-            inputs.append(_tensor(value))
-        elif number == _OUTPUT:
-            outputs.append(_tensor(value))
-        elif number == _INITIALIZER:
-            constant.add(text(dict(_fields(value)).get(_TENSOR_NAME, b"")))
-    return OnnxHeader(tuple(one for one in inputs if one.name not in constant), tuple(outputs), metadata)
+def _tensors(slots: Iterable[Any]) -> tuple[Tensor, ...]:
+    return tuple(Tensor(one.name, _TYPES.get(one.type, "other"), tuple(map(_size, one.shape))) for one in slots)
 
 
-def _tensor(value: Bytes) -> Tensor:
-    own = dict(_fields(value))
-    kind = dict(_fields(as_bytes(own.get(2, b""))))
-    tensor = dict(_fields(as_bytes(kind.get(1, b""))))
-    element = tensor.get(1, 0)
-    dimensions = [one for number, one in _fields(as_bytes(tensor.get(2, b""))) if number == 1]
-    shape = tuple(_size(dict(_fields(as_bytes(one))).get(1)) for one in dimensions)
-    return Tensor(text(own.get(1, b"")), _TYPES.get(element if isinstance(element, int) else 0, "other"), shape)
+def _size(dimension: object) -> int | None:
+    return dimension if isinstance(dimension, int) and dimension > 0 else None
 
 
-def _size(value: int | Bytes | None) -> int | None:
-    return value if isinstance(value, int) and value > 0 else None
+def open_engine(path: Path, device: Device, threads: int) -> "Engine":
+    """Load the model.
 
-
-def _fields(data: Bytes) -> Iterator[Field]:
-    """Of a part of any size: large models have many."""
-    try:
-        yield from fields(data, most=len(data) + 1)
-    except ValueError:
-        raise ValueError("it is cut short, or no ONNX model") from None
-
-
-# What runs an ONNX model: ONNX Runtime where it is installed, else OpenCV. Shell (imports them, loads files).  It is
-# honest about the device: what the session really got is asked after it was made. A runtime built for a GPU lists the
-# GPU and quietly runs on the CPU when it cannot have it.
-
-
-Arrays = dict[str, NDArray[Any]]
-PROVIDERS: Final = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider",
-                    "tensorrt": "TensorrtExecutionProvider"}
-_DEVICES: Final = {provider: device for device, provider in PROVIDERS.items()}
-_BEHIND: Final = {"tensorrt": ("tensorrt", "cuda", "cpu"), "cuda": ("cuda", "cpu"), "cpu": ("cpu",)}
-"""What a session for a device may fall back on for single operations."""
-_FIX: Final = ("install onnxruntime-gpu in place of onnxruntime (never both), see that `nvidia-smi` shows the GPU, or "
-               "take --device auto")
-_ERRORS_ONLY: Final = 3
-_LONGEST: Final = 200
-
-
-class Engine(Protocol):
-    """A model that is loaded. `device` is what it runs on, `note` what a person should know about that."""
-
-    name: str
-    device: str
-    note: str
-    batches: bool
-    """Whether it runs several pictures at once, where the model does."""
-
-    def run(self, pixels: NDArray[Any]) -> Arrays:
-        """The outputs, by name, for one input. Raises whatever the engine raises."""
-        ...
-
-
-def open_engine(path: Path, header: OnnxHeader, device: Device, threads: int) -> Engine:
-    """Raises ConfigError for a file that is no model, HardwareError for a device that the model did not get."""
+    Raises:
+        ConfigError: without ONNX Runtime, or for a file that is not a model.
+        HardwareError: for a device that the model did not get.
+    """
     try:
         runtime = importlib.import_module("onnxruntime")
     except ImportError:
-        runtime = None
+        raise ConfigError(_MISSING) from None
     try:
-        engine: Engine = _OpenCv(path, header) if runtime is None else _Runtime(runtime, path, header, device, threads)
-    except (ConfigError, HardwareError):
+        engine = Engine(runtime, path, device, threads)
+    except HardwareError:
         raise
-    except Exception as error:  # engines raise what they like for a bad file
+    except Exception as error:  # ONNX Runtime raises classes of its own for a bad file
         raise ConfigError(f"model {path} cannot be opened: {' '.join(str(error).split())}"[:_LONGEST]) from None
     if device not in ("auto", engine.device):
         raise HardwareError(f"--device {device}: {engine.name} runs {path.name} on {engine.device} instead; {_FIX}")
     return engine
 
 
-class _Runtime:
-    """A session of ONNX Runtime."""
+class Engine:
+    """A session of ONNX Runtime. `device` is what it runs on, `note` what an operator should know about that."""
 
-    batches = True
-
-    def __init__(self, runtime: Any, path: Path, header: OnnxHeader, device: Device, threads: int) -> None:
+    def __init__(self, runtime: Any, path: Path, device: Device, threads: int) -> None:
+        """Raises HardwareError for a device that this runtime was not built for."""
         self.name = f"onnxruntime {runtime.__version__}"
         available = set(runtime.get_available_providers())
         wanted = device if device != "auto" else ("cuda" if PROVIDERS["cuda"] in available else "cpu")
@@ -159,12 +101,13 @@ class _Runtime:
         got = self._session.get_providers()[0]
         self.device = _DEVICES.get(got, got)
         self.note = "" if device != "auto" or self.device != "cpu" else _why_cpu(wanted)
-        self._input = header.inputs[0].name
-        self._outputs = [one.name for one in header.outputs]
+        self.header = OnnxHeader(_tensors(self._session.get_inputs()), _tensors(self._session.get_outputs()),
+                                 dict(self._session.get_modelmeta().custom_metadata_map))
 
     def run(self, pixels: NDArray[Any]) -> Arrays:
-        """All outputs."""
-        return dict(zip(self._outputs, self._session.run(self._outputs, {self._input: pixels}), strict=True))
+        """All outputs, by name, for one input. Raises whatever ONNX Runtime raises."""
+        names = [one.name for one in self.header.outputs]
+        return dict(zip(names, self._session.run(names, {self.header.inputs[0].name: pixels}), strict=True))
 
 
 def _session(runtime: Any, path: Path, options: Any, providers: list[str]) -> Any:
@@ -179,24 +122,3 @@ def _session(runtime: Any, path: Path, options: Any, providers: list[str]) -> An
 
 def _why_cpu(wanted: str) -> str:
     return "the GPU was listed, but the model did not get it" if wanted != "cpu" else "no GPU runtime is installed"
-
-
-class _OpenCv:
-    """OpenCV's own engine, which is there anyway; CPU only."""
-
-    device = "cpu"
-    batches = False
-    note = "onnxruntime is not installed, so OpenCV runs the model; pip install 'sightline-robot[onnx]' is faster"
-
-    def __init__(self, path: Path, header: OnnxHeader) -> None:
-        import cv2
-
-        self.name = f"OpenCV {cv2.__version__}"
-        self._net = cv2.dnn.readNetFromONNX(str(path))
-        self._input = header.inputs[0].name
-        self._outputs = [one.name for one in header.outputs]
-
-    def run(self, pixels: NDArray[Any]) -> Arrays:
-        """All outputs."""
-        self._net.setInput(np.ascontiguousarray(pixels), self._input)
-        return dict(zip(self._outputs, self._net.forward(self._outputs), strict=True))

@@ -29,13 +29,13 @@ from sightline.vision_side.detect.port import (
     result_of,
 )
 
-DEFAULT_PORTS: Final = {"oip+http": 8000, "oip+grpc": 8001, "http+jpeg": 80}
+DEFAULT_PORTS: Final = {"oip+http": 8000, "http+jpeg": 80}
 """Those of Triton, and of HTTP."""
 _HOST = r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)"
-_FORM = re.compile(rf"(oip\+http|oip\+grpc|http\+jpeg)://{_HOST}(?::([0-9]{{1,5}}))?(/[!-~]*)?")
+_FORM = re.compile(rf"(oip\+http|http\+jpeg)://{_HOST}(?::([0-9]{{1,5}}))?(/[!-~]*)?")
 _MODEL = re.compile(r"/([A-Za-z0-9_.-]{1,128})(?:/([0-9]{1,9}))?")
 EXAMPLES: Final = {
-    "oip+http": "oip+http://127.0.0.1:8000/ball", "oip+grpc": "oip+grpc://127.0.0.1:8001/ball",
+    "oip+http": "oip+http://127.0.0.1:8000/ball",
     "http+jpeg": "http+jpeg://127.0.0.1:8080/detect",
 }
 

@@ -1,6 +1,6 @@
 """The Open Inference Protocol v2: models, tensors, configuration. Pure.
 
-Specification: https://github.com/kserve/open-inference-protocol (JSON over HTTP, gRPC), with Triton's binary tensors. A
+Specification: https://github.com/kserve/open-inference-protocol (JSON over HTTP), with Triton's binary tensors. A
 model that can be used here takes one input, a JPEG (datatype BYTES) or its pixels (UINT8, three channels), and gives
 `boxes` (K, 4) xyxy in pixels of what it was given, `scores` (K) and, if it knows several things, `labels` (K).
 """
@@ -65,7 +65,7 @@ class OipModel:
 
 @dataclass(frozen=True, slots=True)
 class Tensor:
-    """One tensor to send: little-endian bytes, as the binary extension and gRPC's raw contents have it."""
+    """One tensor to send: little-endian bytes of the binary extension."""
 
     name: str
     datatype: str
@@ -233,11 +233,11 @@ def _labels(found: NDArray[Any] | list[str] | None, rows: int, names: tuple[str,
     return [names[number] if 0 <= number < len(names) else str(number) for number in numbers.tolist()]
 
 
-# What is configured of a model that is asked by the Open Inference Protocol, over HTTP and gRPC alike. Pure.
+# What is configured of a model that is asked by the Open Inference Protocol, over HTTP. Pure.
 
 
 class OipSettings(Settings):
-    """The detectors `oip+http` and `oip+grpc`."""
+    """The detector `oip+http`."""
 
     address: str
     labels: Annotated[tuple[Label, ...], Field(max_length=1024)] = ()

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from sightline.vision_side.decode import Decoder
-from sightline.vision_side.detect.onnx.engine import read_onnx_header
 from sightline.vision_side.detect.onnx.tensors import model_format
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame
 from tests.fixtures.vision.onnx import brightness_model, several_model
-from tests.vision_side.detect.onnx.test_detector import NEEDS_RUNTIME, detector, frame
+from tests.vision_side.detect.onnx.test_detector import detector, frame, header_of
 
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 300.0, 200.0]]
 LEVELS = (40, 230, 130)
@@ -28,7 +27,6 @@ def counted(eye: object, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return runs
 
 
-@NEEDS_RUNTIME
 def test_several_pictures_are_one_run_with_the_answers_that_each_gets_alone(tmp_path: Path, monkeypatch) -> None:
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1, refine=())
     alone = [eye.detect([grey(level, seq)], NO_DEADLINE)[0] for seq, level in enumerate(LEVELS)]
@@ -40,7 +38,6 @@ def test_several_pictures_are_one_run_with_the_answers_that_each_gets_alone(tmp_
     assert [one.seq for one in together] == [0, 1, 2] and all(one.compute_us is not None for one in together)
 
 
-@NEEDS_RUNTIME
 def test_what_is_no_picture_is_left_out_and_no_run_is_too_large(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("sightline.vision_side.detect.onnx.detector._MOST_AT_ONCE", 2)
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1, refine=())
@@ -53,7 +50,6 @@ def test_what_is_no_picture_is_left_out_and_no_run_is_too_large(tmp_path: Path, 
     assert eye.detect(good, 1) == [None] * 3 and len(runs) == 2, "their time is over"
 
 
-@NEEDS_RUNTIME
 def test_a_model_that_cannot_do_with_many_pictures_is_given_fewer(tmp_path: Path, monkeypatch) -> None:
     """Its outputs are for two at most, whatever its input says; so it is for what a GPU's memory does not hold."""
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1)
@@ -68,7 +64,6 @@ def test_a_model_that_cannot_do_with_many_pictures_is_given_fewer(tmp_path: Path
     assert all(eye.detect(frames, NO_DEADLINE)) and runs[4:] == [2, 2, 1] and not eye.news()
 
 
-@NEEDS_RUNTIME
 def test_an_engine_that_fails_on_every_picture_is_told_of_and_gives_no_answer(tmp_path: Path, monkeypatch) -> None:
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1)
     eye.news()
@@ -82,16 +77,9 @@ def test_an_engine_that_fails_on_every_picture_is_told_of_and_gives_no_answer(tm
     assert all(eye.detect([grey(level) for level in LEVELS], NO_DEADLINE)) and runs == [3], "all at once again"
 
 
-def test_opencv_is_asked_about_one_after_the_other(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
-    eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]), min_score=0.1)
-    runs = counted(eye, monkeypatch)
-    assert all(eye.detect([grey(level) for level in LEVELS], NO_DEADLINE)) and runs == [1, 1, 1]
-
-
 def test_only_a_model_that_leaves_the_number_open_takes_several(tmp_path: Path) -> None:
     def is_batched(path: Path) -> bool:
-        return model_format(read_onnx_header(path.read_bytes()), (), "auto").batched
+        return model_format(header_of(path), (), "auto").batched
 
     assert is_batched(several_model(tmp_path / "several.onnx", BOXES))
     assert not is_batched(brightness_model(tmp_path / "one.onnx", BOXES, [0, 1]))

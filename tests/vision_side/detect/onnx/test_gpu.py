@@ -13,7 +13,7 @@ from sightline.protocol.messages import FrameHeader
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder, Picture
 from sightline.vision_side.detect.onnx.detector import SHIPPED
-from sightline.vision_side.detect.onnx.engine import open_engine, read_onnx_header
+from sightline.vision_side.detect.onnx.engine import open_engine
 from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
 from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame
@@ -64,11 +64,11 @@ def test_it_sees_what_it_sees_on_the_cpu(on_gpu):
 
 
 def test_it_gives_there_what_it_gave_where_it_was_made():
-    header = read_onnx_header(SHIPPED.read_bytes())
-    form, picture = model_format(header, (), "auto"), Picture(golden_picture(), 1)
+    engine = open_engine(SHIPPED, GPU, 1)
+    form, picture = model_format(engine.header, (), "auto"), Picture(golden_picture(), 1)
     pixels, fitting = fit_picture(picture, form)
-    found = read_outputs(open_engine(SHIPPED, header, GPU, 1).run(pixels), form, fitting, picture, 0.5)
-    assert found and difference(read_golden(header.metadata[KEY]), found, 0.5) == ""
+    found = read_outputs(engine.run(pixels), form, fitting, picture, 0.5)
+    assert found and difference(read_golden(engine.header.metadata[KEY]), found, 0.5) == ""
 
 
 def test_auto_takes_it():

@@ -1,6 +1,7 @@
 """The detector `onnx`: a device that fails in the middle, golden outputs under other options, things on things."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,8 @@ from sightline.vision_side.detect.onnx import detector as onnx_detector
 from sightline.vision_side.detect.onnx.self_test import golden_picture, golden_text
 from sightline.vision_side.detect.port import NO_DEADLINE, Detection
 from tests.fixtures.vision.onnx import brightness_model, yolo_model
-from tests.vision_side.detect.onnx.test_detector import NEEDS_RUNTIME, detector, engine, frame
+from tests.vision_side.detect.onnx.test_detector import detector, frame
 
-__all__ = ["engine"]
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 300.0, 200.0]]
 GREY = np.full((240, 320, 3), 128, np.uint8)
 
@@ -36,6 +36,17 @@ class _Dying:
         def get_providers(self):
             return self.on
 
+        def get_inputs(self):
+            return [SimpleNamespace(name="image", type="tensor(uint8)", shape=[1, 240, 320, 3])]
+
+        def get_outputs(self):
+            kinds = {"boxes": ("tensor(float)", [1, 4]),
+                     "scores": ("tensor(float)", [1]), "labels": ("tensor(int64)", [1])}
+            return [SimpleNamespace(name=name, type=kind, shape=shape) for name, (kind, shape) in kinds.items()]
+
+        def get_modelmeta(self):
+            return SimpleNamespace(custom_metadata_map={"labels": '["ball", "legs"]'})
+
         def run(self, names, inputs):
             if self.lost and not self.falls_back:
                 raise RuntimeError("CUDA failure 719: unspecified launch failure")
@@ -55,13 +66,12 @@ def test_a_gpu_that_is_lost_is_no_answer_and_not_the_cpu_under_its_name(tmp_path
     assert "CUDA failure" in eye.news()[0]
 
 
-@NEEDS_RUNTIME
 def test_the_real_runtime_can_be_told_to_stay_where_it_is(tmp_path: Path) -> None:
     eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))
     assert eye._engine._session._enable_fallback is False
 
 
-def test_a_golden_output_is_of_the_models_own_labels_and_least_score(tmp_path: Path, engine: str) -> None:
+def test_a_golden_output_is_of_the_models_own_labels_and_least_score(tmp_path: Path) -> None:
     plain = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], min_score="0.1"), refine=())
     (found,) = plain._seen([Picture(golden_picture(), 1)])
     assert 0.3 < found[0].score < 0.6
@@ -90,7 +100,7 @@ def test_labels_of_the_metadata_and_of_the_options_are_made_sayable(tmp_path: Pa
     assert onnx_detector.read_onnx_model(named).form.labels == ("thing", "b")
 
 
-def test_a_cup_on_a_plate_is_there_beside_the_plate(tmp_path: Path, engine: str) -> None:
+def test_a_cup_on_a_plate_is_there_beside_the_plate(tmp_path: Path) -> None:
     columns = np.array([[32, 33, 32, 10], [32, 32, 33, 10], [20, 20, 22, 8], [20, 20, 22, 8],
                         [0.9, 0.8, 0.1, 0.7], [0.1, 0.2, 0.85, 0.1]])
     eye = detector(yolo_model(tmp_path / "yolo.onnx", columns, names="{0: 'cup', 1: 'plate'}"))

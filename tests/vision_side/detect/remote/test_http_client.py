@@ -238,7 +238,7 @@ def test_a_server_that_hangs_while_connecting_is_no_answer_by_the_deadline():
     ("http+jpeg://", "http+jpeg://127.0.0.1:8080/detect"), ("http+jpeg://host:0/x", "127.0.0.1:8080/detect"),
     ("http+jpeg://host:99999/", "8080"), ("http+jpeg://ho st/", "8080"), ("http+jpeg://h/a\r\nX: y", "8080"),
     ("oip+http://host", "names no model"), ("oip+http://host/a/b", "names no model"),
-    ("oip+http://host/a b", "8000/ball"), ("oip+grpc://host:x/ball", "8001/ball"),
+    ("oip+http://host/a b", "8000/ball"),
 ])
 def test_an_address_that_is_none_is_one_line_with_the_right_form(address, hint):
     with pytest.raises(ConfigError) as error:
@@ -248,5 +248,5 @@ def test_an_address_that_is_none_is_one_line_with_the_right_form(address, hint):
 
 def test_addresses_have_the_ports_that_servers_have():
     assert parse_address("oip+http://box/ball/3") == parse_address("oip+http://box:8000/ball/3")
-    assert parse_address("oip+grpc://[::1]/ball").host == "::1" and parse_address("oip+grpc://a/b").port == 8001
+    assert parse_address("oip+http://[::1]/ball").host == "::1"
     assert parse_address("http+jpeg://box").path == "/"

@@ -8,23 +8,18 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from sightline.vision_side.detect.protobuf import fields, put, put_integers, varint
 from sightline.vision_side.detect.remote.client import NoAnswerError, NoAnswerReason
 from sightline.vision_side.detect.remote.oip import (
     Inferred,
     OipModel,
     OutputOptions,
     Slot,
-    Tensor,
     detections_of,
     model_of,
     tensor_of,
 )
-from sightline.vision_side.detect.remote.oip_grpc import infer_request, metadata_request
-from sightline.vision_side.detect.remote.oip_grpc import read_infer as read_grpc
-from sightline.vision_side.detect.remote.oip_grpc import read_metadata as read_grpc_metadata
 from sightline.vision_side.detect.remote.oip_http import read_infer, read_metadata
-from tests.fixtures.vision.remote import ASKED, BALL_JPEG, COLUMNS, JPEG_INPUT, OUTPUTS, frame, grpc_answer
+from tests.fixtures.vision.remote import ASKED, BALL_JPEG, JPEG_INPUT, OUTPUTS, frame
 
 PIXELS = Slot("image", "UINT8", (-1, 240, 320, 3))
 SIZE = (320, 240)
@@ -172,63 +167,18 @@ def test_a_misshapen_tensor_is_refused(output):
         _found(read_infer(body, None, ASKED))
 
 
-# --- gRPC ------------------------------------------------------------------------------------------------------------
-
-
-def test_grpc_messages_say_what_json_says():
-    slots = [put(1, one.name) + put(2, one.datatype) + put_integers(3, one.shape) for one in (JPEG_INPUT, *OUTPUTS)]
-    said = put(1, "ball") + put(2, "1") + put(2, "3") + put(4, slots[0]) + b"".join(put(5, one) for one in slots[1:])
-    assert read_grpc_metadata(said) == read_metadata(_metadata([JPEG_INPUT], OUTPUTS))
-    assert read_grpc(grpc_answer(COLUMNS, version="7"), ASKED).version == "7"
-    assert _found(read_grpc(grpc_answer(COLUMNS), ASKED)) == _found(read_infer(*_binary(*COLUMNS.values()), ASKED))
-    assert dict(fields(metadata_request("ball", "3"))) == {1: b"ball", 2: b"3"}
-
-
-def test_a_grpc_request_names_frame_tensor_and_outputs():
-    model = model_of("ball", "", [JPEG_INPUT], OUTPUTS)
-    said = list(fields(infer_request(model, "", Tensor("image", "BYTES", (1, 1), b"data"), ASKED)))
-    assert (1, b"ball") in said and (3, ASKED.encode()) in said and (7, b"data") in said
-    assert [value for number, value in said if number == 6] == [put(1, name) for name in model.outputs]
-    (sent,) = (value for number, value in said if number == 5)
-    assert dict(fields(sent)) == {1: b"image", 2: b"BYTES", 3: b"\x01\x01"}
-
-
-@pytest.mark.parametrize("value", [0, 1, 127, 128, 300, 2**53, -1, -(2**63)])
-def test_integers_come_back_as_they_went(value):
-    from sightline.vision_side.detect.protobuf import integers
-
-    assert integers(varint(value)) == [value]
-
-
-@pytest.mark.parametrize("data", [
-    b"\xff", b"\xff" * 11, b"\x0a\x05abc", b"\x0b", b"\x0d\x00", put(6, b"x"), put(5, put(3, b"\xff")),
-    grpc_answer(COLUMNS) + put(6, b""), put_integers(5, [1]) + b"\x28\x01", b"\x28\x01" * 5000,
-    put(5, put(1, "boxes") + put(2, "FP32") + put_integers(3, [-1, 4])) + put(6, b""),
-])  # fmt: skip
-def test_what_is_no_answer_over_grpc_is_refused(data):
-    with pytest.raises(NoAnswerError):
-        _found(read_grpc(data, ASKED))
-
-
-def test_an_answer_to_something_else_over_grpc_is_refused():
-    with pytest.raises(NoAnswerError) as error:
-        read_grpc(grpc_answer(COLUMNS, "0000abcd-9"), ASKED)
-    assert error.value.reason is NoAnswerReason.OTHER_FRAME
-
-
 def _is_a_box(one):
     inside = 0 <= one.x1_px < one.x2_px <= SIZE[0] and 0 <= one.y1_px < one.y2_px <= SIZE[1]
     return inside and 0.25 <= one.score <= 1 and one.label.isprintable()
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
-@pytest.mark.parametrize("kind", ["json", "grpc", "metadata"])
+@pytest.mark.parametrize("kind", ["json", "metadata"])
 def test_bytes_at_random_raise_nothing_else(kind, seed):
     rng = random.Random(seed)
     body, length = _binary(BOXES, [0.9], [0])
     usual, read = {
         "json": (body, lambda data: _found(read_infer(data, length, ASKED))),
-        "grpc": (grpc_answer(COLUMNS), lambda data: _found(read_grpc(data, ASKED))),
         "metadata": (_metadata([PIXELS], OUTPUTS), lambda data: read_metadata(data) and ()),
     }[kind]
     for _ in range(600):
