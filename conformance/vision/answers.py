@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from sightline.conformance.case import Bench, Case, Level, Suite
-from sightline.conformance.vision.drawing import png
 from sightline.conformance.vision.fixture import Answer, RobotPlayed
+from sightline.conformance.vision.images import png
 from sightline.protocol.channels import MAX_HEADER_BYTES
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import MAX_INTEGER

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from typing import Any
 
 from sightline.conformance.case import Bench, Suite
-from sightline.conformance.vision.drawing import png
 from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, Answer, RobotPlayed, Sent
+from sightline.conformance.vision.images import png
 
 SUITE = Suite("V")
 _BURST = 20

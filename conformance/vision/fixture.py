@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any, Final, Self
 
 from sightline.conformance.case import Bench, Heard
-from sightline.conformance.vision.drawing import CAMERA as LENS
-from sightline.conformance.vision.drawing import picture
+from sightline.conformance.vision.images import CAMERA as LENS
+from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import ACK, CAMERA, FRAME, STATUS, TWIST, Channel
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import CameraModel, FrameHeader, Stamp, State, Status

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from typing import Final
 
 from sightline.conformance.case import Bench, Case, Level, Suite
-from sightline.conformance.vision.drawing import CAMERA as LENS
-from sightline.conformance.vision.drawing import HALF_CAMERA
 from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, RobotPlayed
+from sightline.conformance.vision.images import CAMERA as LENS
+from sightline.conformance.vision.images import HALF_CAMERA
 from sightline.protocol.channels import REQUEST
 from sightline.protocol.messages import Holder, LastRejection, State, Status
 from sightline.protocol.spec.message_cases import packed

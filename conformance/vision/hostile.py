@@ -5,10 +5,11 @@ from random import Random
 from typing import Any, Final
 
 from sightline.conformance.case import Bench, Case, Level, Suite
-from sightline.conformance.vision.drawing import (
+from sightline.conformance.vision.fixture import ANSWER_US, RobotPlayed
+from sightline.conformance.vision.images import (
     CAMERA as LENS,
 )
-from sightline.conformance.vision.drawing import (
+from sightline.conformance.vision.images import (
     HALF_CAMERA,
     claiming,
     commented,
@@ -16,7 +17,6 @@ from sightline.conformance.vision.drawing import (
     picture,
     png,
 )
-from sightline.conformance.vision.fixture import ANSWER_US, RobotPlayed
 from sightline.protocol.channels import CAMERA, FRAME, MAX_HEADER_BYTES, STATUS
 from sightline.protocol.codec import encode
 from sightline.protocol.spec.message_cases import packed

@@ -19,8 +19,8 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from sightline.conformance.case import Bench, Suite
-from sightline.conformance.vision.drawing import CAMERA as LENS
-from sightline.conformance.vision.drawing import picture
+from sightline.conformance.vision.images import CAMERA as LENS
+from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import CAMERA, FRAME, Channel
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError, WireError

@@ -4,7 +4,7 @@
 and no other. The steps that a broken one may change, in the order of a frame's way, are the methods of `BrokenVision`.
 """
 
-from sightline.conformance.vision.drawing import HALF_CAMERA
+from sightline.conformance.vision.images import HALF_CAMERA
 from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST, key_for
 from sightline.protocol.messages import STILL, FrameHeader
 from sightline.protocol.spec.message_cases import packed

@@ -1,6 +1,6 @@
 """Broken visions: wrong headers, wrong twists, wrong echoes, wrong counts. Pure."""
 
-from sightline.conformance.vision.drawing import picture
+from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import REQUEST, key_for
 from sightline.protocol.messages import Stamp
 from sightline.protocol.spec.message_cases import packed

@@ -3,8 +3,8 @@
 import json
 from contextlib import suppress
 
-from sightline.conformance.vision.drawing import CAMERA, picture
 from sightline.conformance.vision.hostile import CAMERAS, DOUBTED, READ, REFUSED
+from sightline.conformance.vision.images import CAMERA, picture
 from tests.conformance.vision.broken import STANDING, BrokenVision, breaks, frame_header, header_of
 
 

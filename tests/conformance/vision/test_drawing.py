@@ -7,20 +7,11 @@ import simplejpeg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sightline.conformance.vision import drawing as vision_pictures
-from sightline.conformance.vision.drawing import (
-    CAMERA,
-    DRAWINGS,
-    HALF_CAMERA,
-    claiming,
-    commented,
-    encode_jpeg,
-    many_scans,
-    picture,
-    png,
-)
+from sightline.conformance.vision.images import CAMERA, HALF_CAMERA, claiming, commented, many_scans, picture, png
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
+from tests.conformance.vision import drawing as vision_pictures
+from tests.conformance.vision.drawing import DRAWINGS, encode_jpeg
 
 
 def decoded(jpeg):
@@ -34,7 +25,7 @@ def test_the_files_are_what_the_code_draws():
 
 
 def test_verify_finds_what_was_changed_and_write_restores_it(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(vision_pictures, "HERE", tmp_path)
+    monkeypatch.setattr(vision_pictures, "FOLDER", tmp_path)
     assert vision_pictures.main(["--verify"]) == 5
     assert "absent, centre" in capsys.readouterr().err
     assert vision_pictures.main(["--write"]) == 0
@@ -51,7 +42,7 @@ def test_a_picture_is_seen_as_it_was_drawn(name):
     size = read_jpeg_size(picture(name))
     assert (size.width_px, size.height_px) == (drawing.width_px, drawing.height_px)
     seen = decoded(picture(name))
-    at = drawing._scene()
+    at = drawing.scene()
     drawn = np.array([[at(x, y) for x in range(drawing.width_px)] for y in range(drawing.height_px)])
     if not drawing.grey:
         assert np.abs(seen - drawn).mean() < 0.5

@@ -1,4 +1,7 @@
-"""The kit's pictures: how they are drawn with integers alone, and what is no picture. Pure.
+"""Draws the kit's images with integers alone, and compares the files with them. Shell (files).
+
+    python -m tests.conformance.vision.drawing --verify     the files are what this code draws
+    python -m tests.conformance.vision.drawing --write
 
 Baseline or progressive (spectral selection), every component at full size, 8 bits: ITU-T T.81. The Huffman tables give
 all symbols codes of one length: legal, a little larger than the usual ones, and nothing to look up.
@@ -6,14 +9,11 @@ all symbols codes of one length: legal, a little larger than the usual ones, and
 
 import struct
 import sys
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import Final
 
-from sightline.protocol.messages import CameraModel
+from sightline.conformance.vision.images import FOLDER
 
 Pixel = tuple[int, ...]
 """Y, Cb, Cr, each 0 to 255; or Y alone for a grey picture."""
@@ -171,19 +171,6 @@ def _put_ac(bits: _Bits, block: Sequence[int]) -> None:
         bits.put(_AC_SYMBOLS.index(0x00), _AC_LENGTH)
 
 
-# The pictures that the kit's robot sends: a yellow ball in a plain room, and what is no picture at all. Pure.
-# python -m sightline.conformance.vision.drawing --verify     the files are what this code draws     python -m
-# sightline.conformance.vision.drawing --write  They are made with integers alone and kept as files, so that a person
-# can look at them, and a peer in another language can be tried on them without the kit. `CAMERA` is the lens that they
-# were drawn for.
-
-
-HERE = Path(__file__).parent / "pictures"
-CAMERA: Final = CameraModel(width_px=320, height_px=240, fx_px=190.7, fy_px=190.7, cx_px=160.0, cy_px=120.0,
-                            x_m=0.055, z_m=0.06, calibrated=True)
-"""80 degrees wide. A ball of 0.1 m radius at one metre has a radius of 20 px."""
-HALF_CAMERA: Final = CAMERA.model_copy(update={"width_px": 160, "height_px": 120, "fx_px": 95.35, "fy_px": 95.35,
-                                               "cx_px": 80.0, "cy_px": 60.0})
 _YELLOW: Final[Pixel] = (191, 28, 165)
 """Y, Cb, Cr of the default target's colour: hue 49 degrees, well saturated."""
 _ROOM: Final[Pixel] = (150, 122, 131)
@@ -207,9 +194,9 @@ class Drawing:
     @property
     def jpeg(self) -> bytes:
         """Drawn anew."""
-        return encode_jpeg(self.width_px, self.height_px, self._scene(), progressive=self.progressive)
+        return encode_jpeg(self.width_px, self.height_px, self.scene(), progressive=self.progressive)
 
-    def _scene(self) -> Scene:
+    def scene(self) -> Scene:
         last = 1 if self.grey else 3
         ball, room, every = _YELLOW[:last], _ROOM[:last], _FINE * _FINE
         mixed = [tuple((one * share + other * (every - share) + every // 2) // every
@@ -238,59 +225,23 @@ DRAWINGS: Final = {
 }
 
 
-@cache
-def picture(name: str) -> bytes:
-    """The file's bytes. Raises KeyError for a name that is none."""
-    if name not in DRAWINGS:
-        raise KeyError(name)
-    return (HERE / f"{name}.jpg").read_bytes()
-
-
-# --- no pictures -----------------------------------------------------------------------------------------------------
-
-
-def claiming(width_px: int, height_px: int, *, bits: int = 8, components: int = 3, marker: int = 0xC0) -> bytes:
-    """A JPEG that claims a size, and has no pixels: 21 bytes for three components."""
-    body = bytes((bits, *height_px.to_bytes(2), *width_px.to_bytes(2), components)) + b"\x01\x11\x00" * components
-    return b"\xff\xd8\xff" + bytes((marker,)) + (len(body) + 2).to_bytes(2) + body
-
-
-def commented(jpeg: bytes, comments: int, size: int = 0) -> bytes:
-    """`jpeg` with so many comments of `size` bytes before its first segment."""
-    return jpeg[:2] + (b"\xff\xfe" + (size + 2).to_bytes(2) + bytes(size)) * comments + jpeg[2:]
-
-
-def many_scans(jpeg: bytes, scans: int) -> bytes:
-    """A progressive `jpeg` whose last scan comes over and over: each costs a decoder a pass over the whole picture."""
-    last = jpeg.rfind(b"\xff\xda")
-    empty = jpeg[last : last + 2 + int.from_bytes(jpeg[last + 2 : last + 4])]
-    return jpeg[:-2] + empty * scans + jpeg[-2:]
-
-
-def png() -> bytes:
-    """One grey pixel, in a format that is not the protocol's."""
-    parts = ((b"IHDR", (1).to_bytes(4) * 2 + b"\x08\0\0\0\0"), (b"IDAT", zlib.compress(b"\0\x80")), (b"IEND", b""))
-    chunks = (len(body).to_bytes(4) + kind + body + zlib.crc32(kind + body).to_bytes(4) for kind, body in parts)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
-
-
 # --- the files -------------------------------------------------------------------------------------------------------
 
 
 def differing() -> list[str]:
     """Names of files that are not what this code draws, are missing, or are left over."""
-    found = {path.stem: path.read_bytes() for path in HERE.glob("*.jpg")}
+    found = {path.stem: path.read_bytes() for path in FOLDER.glob("*.jpg")}
     drawn = {name: drawing.jpeg for name, drawing in DRAWINGS.items()}
     return sorted(name for name in found.keys() | drawn.keys() if found.get(name) != drawn.get(name))
 
 
 def write() -> None:
     """Make the files what this code draws."""
-    HERE.mkdir(exist_ok=True)
-    for path in HERE.glob("*.jpg"):
+    FOLDER.mkdir(exist_ok=True)
+    for path in FOLDER.glob("*.jpg"):
         path.unlink()
     for name, drawing in DRAWINGS.items():
-        (HERE / f"{name}.jpg").write_bytes(drawing.jpeg)
+        (FOLDER / f"{name}.jpg").write_bytes(drawing.jpeg)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -298,11 +249,11 @@ def main(arguments: Sequence[str]) -> int:
     if list(arguments) == ["--write"]:
         write()
     elif list(arguments) != ["--verify"]:
-        print("usage: python -m sightline.conformance.vision.drawing --write | --verify", file=sys.stderr)
+        print("usage: python -m tests.conformance.vision.drawing --write | --verify", file=sys.stderr)
         return 2
     names = differing()
     if names:
-        print(f"{HERE}: not what the code draws: {', '.join(names)}; run with --write", file=sys.stderr)
+        print(f"{FOLDER}: not what the code draws: {', '.join(names)}; run with --write", file=sys.stderr)
     return 5 if names else 0
 
 
