@@ -8,13 +8,11 @@ from pydantic import Field, field_validator
 
 from sightline.protocol.config import Config
 from sightline.protocol.messages import RobotId
-from sightline.protocol.transports.endpoints import with_allowed
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, with_allowed
 from sightline.robot_side.kinematics import DiffDriveConfig
 from sightline.robot_side.network.stream import StreamConfig
 from sightline.robot_side.safety.guard import GuardConfig
 from sightline.robot_side.safety.limits import SafetyConfig
-
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 
 class PluginChoice(Config):

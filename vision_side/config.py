@@ -7,6 +7,7 @@ from pydantic import BeforeValidator, Field
 from sightline.protocol.channels import FRAME
 from sightline.protocol.config import Config
 from sightline.protocol.messages import CameraModel, Source
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 HueDeg = Annotated[float, Field(ge=0, le=360)]
@@ -188,7 +189,7 @@ class VisionConfig(Config):
 
     robot: Annotated[str, Field(pattern=r"^[A-Za-z0-9*?][A-Za-z0-9_.*?-]{0,31}$")] = "r1"
     """A robot's id; with `*` or `?` every robot that fits, each with a pipeline of its own."""
-    connect: Annotated[tuple[str, ...], Field(max_length=16)] = ("tcp/127.0.0.1:7447",)
+    connect: Annotated[tuple[str, ...], Field(max_length=16)] = (DEFAULT_ENDPOINT,)
     listen: Annotated[tuple[str, ...], Field(max_length=16)] = ()
     secure: str = ""
     """A folder of `sightline keys`: mutual TLS and access rules; endpoints are then tls/... or quic/..."""

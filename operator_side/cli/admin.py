@@ -27,7 +27,7 @@ Days = Annotated[int, typer.Option(min=1, max=825, help="How long they are valid
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of keys.")]
 
 
-def register_keys(app: typer.Typer) -> None:
+def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(help="Make and look at the certificates that --secure uses.", no_args_is_help=False,
                         rich_markup_mode=None)
@@ -35,6 +35,8 @@ def register_keys(app: typer.Typer) -> None:
     group.command(epilog="Example: sightline keys add keys robot --host 10.0.0.7")(add)
     group.command(epilog="Example: sightline keys show keys")(show)
     app.add_typer(group, name="keys")
+    app.command(epilog="Example: sightline install robot --config robot.toml --user pi")(install)
+    app.command(epilog="Example: sightline doctor --peer tcp/192.168.1.20:7447")(doctor)
 
 
 def _keys() -> ModuleType:
@@ -79,11 +81,6 @@ def show(folder: Folder, as_json: Annotated[bool, typer.Option("--json", help="F
 
 
 # `sightline install robot|vision`: shows the systemd unit, and puts it in place with --yes. Shell.
-
-
-def register_install(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command(epilog="Example: sightline install robot --config robot.toml --user pi")(install)
 
 
 def install(
@@ -133,11 +130,6 @@ def _show(planned: units.Plan, beside: units.Plan | None) -> None:
 
 
 # `sightline doctor`: what is wrong here, or on the way to a robot, and the line that mends it. Shell.
-
-
-def register_doctor(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command(epilog="Example: sightline doctor --peer tcp/192.168.1.20:7447")(doctor)
 
 
 def doctor(

@@ -7,37 +7,66 @@ Whatever goes wrong is one line on stderr that says what, where and how to fix i
 import os
 import re
 import sys
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from importlib import import_module
+from typing import Any, Final
 
 import typer
+from typer.core import TyperGroup
 
-from sightline.operator_side.cli.admin import register_doctor, register_install, register_keys
-from sightline.operator_side.cli.bench import register_benches as register_bench
-from sightline.operator_side.cli.calibrate import register_calibrate, register_pick_color
-from sightline.operator_side.cli.conform import register_conform
-from sightline.operator_side.cli.detector import register_detector
-from sightline.operator_side.cli.evaluate import register_demo_and_score as register_judge
-from sightline.operator_side.cli.evaluate import register_faults, register_train
-from sightline.operator_side.cli.operate import register_missions as register_mission
-from sightline.operator_side.cli.operate import register_operator as register_people
-from sightline.operator_side.cli.operate import register_teleop
-from sightline.operator_side.cli.services import (
-    register_config,
-    register_metrics,
-    register_scenarios,
-    register_services,
-)
-from sightline.operator_side.cli.watch import register_capture, register_watch
 from sightline.operator_side.config.errors import no_such_name
 from sightline.protocol.errors import SightlineError
 
 INTERRUPTED: Final = 130
 UNEXPECTED: Final = 1
+_MODULES: Final = {
+    "sim": "services", "robot": "services", "vision": "services", "router": "services",
+    "demo": "evaluate",
+    "robots": "operate", "status": "operate", "arm": "operate", "disarm": "operate", "stop": "operate",
+    "reset": "operate",
+    "faults": "evaluate",
+    "install": "admin", "doctor": "admin",
+    "metrics": "services",
+    "teleop": "operate", "mission": "operate", "goto": "operate",
+    "scenarios": "services", "labels": "services",
+    "watch": "watch", "capture": "watch", "pick-color": "calibrate",
+    "train": "evaluate", "score": "evaluate", "bench": "bench",
+    "calibrate": "calibrate", "keys": "admin", "config": "services",
+    "conform": "conform", "detector": "detector",
+}
+"""Each command, in the order of the help, and the module beside this one that registers it."""
 _UNKNOWN_COMMAND = re.compile(r"No such command '([^']*)'")
+
+
+class _Commands(Mapping[str, Any]):
+    """The commands by name; a module is imported when one of its commands is looked up."""
+
+    def __getitem__(self, name: str) -> Any:
+        return _registered(_MODULES[name])[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_MODULES)
+
+    def __len__(self) -> int:
+        return len(_MODULES)
+
+
+@cache
+def _registered(module: str) -> Mapping[str, Any]:
+    group = typer.Typer(rich_markup_mode=None)
+    import_module(f"sightline.operator_side.cli.{module}").register(group)
+    return typer.main.get_group(group).commands
+
+
+class _Program(TyperGroup):
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings | {"commands": _Commands()})
+
 
 app = typer.Typer(
     name="sightline",
+    cls=_Program,
     help="Let a small robot use eyes and judgement that live on another machine, and never obey old sight.\n\n"
     "Begin with: sightline demo",
     add_completion=False,
@@ -45,30 +74,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for register in (
-    register_services,
-    register_judge,
-    register_people,
-    register_bench,
-    register_faults,
-    register_calibrate,
-    register_keys,
-    register_install,
-    register_doctor,
-    register_metrics,
-    register_config,
-    register_conform,
-    register_detector,
-    register_teleop,
-    register_mission,
-    register_scenarios,
-    register_watch,
-    register_capture,
-    register_pick_color,
-    register_train,
-):
-    register(app)
-
 
 @app.callback(invoke_without_command=True)
 def _help_by_default(context: typer.Context) -> None:
@@ -110,15 +115,10 @@ def _usage_line(text: str, context: typer.Context | None) -> str:
     if unknown is None:
         return f"{text.rstrip('.')}; see --help"
     path = context.command_path if context else "sightline"
-    here = _names_in(context.command if context else None)
-    if path != "sightline" and unknown[1] in _names_in(None):
+    here = list(getattr(context and context.command, "commands", _MODULES))
+    if path != "sightline" and unknown[1] in _MODULES:
         return f"no command called {unknown[1]!r} in {path}; did you mean 'sightline {unknown[1]}'?; see {path} --help"
     return no_such_name("command", unknown[1], here) + f"; see {path} --help"
-
-
-def _names_in(group: object) -> list[str]:
-    """Names of a group's commands; None is the program itself."""
-    return list(getattr(group or typer.main.get_command(app), "commands", ()))
 
 
 def _print_error(line: str, code: int) -> int:

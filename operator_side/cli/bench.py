@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sightline.evaluation.checks import Check
 
 
-def register_benches(app: typer.Typer) -> None:
+def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(help="Measure what things cost on this machine.", rich_markup_mode=None)
     group.command(epilog="Example: sightline bench codec --json")(codec)

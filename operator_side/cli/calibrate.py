@@ -34,8 +34,9 @@ from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import check_out_file, needs
 from sightline.protocol.channels import FRAME
 from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 from sightline.protocol.transports.open import open_link
-from sightline.robot_side.config import DEFAULT_ENDPOINT, RobotConfig
+from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.hardware.gpio import table_of, table_text
 
 if TYPE_CHECKING:
@@ -152,13 +153,14 @@ PluginSets = Annotated[
 Metres = Annotated[float | None, typer.Option(help="Where the lens is, from the axle's middle on the floor.")]
 
 
-def register_calibrate(app: typer.Typer) -> None:
+def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(help="Measure what a robot is made of.", rich_markup_mode=None)
     group.callback()(_calibrate)
     group.command(epilog="Example: sightline calibrate camera --camera v4l2 --board 9x6 --square-m 0.025")(camera)
     group.command(epilog="Example: sightline calibrate drive --config raspberry-car.toml")(drive)
     app.add_typer(group, name="calibrate")
+    app.command("pick-color", epilog="Example: sightline pick-color r1 --config vision.toml")(pick_color)
 
 
 def _calibrate() -> None:
@@ -325,11 +327,6 @@ def _quiet(_line: str) -> None:
 _MASK = Path("pick-color-mask.png")
 _WAIT_S = 0.2
 _LAST_WORD_S = 0.3  # for the page to hear what became of it
-
-
-def register_pick_color(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("pick-color", epilog="Example: sightline pick-color r1 --config vision.toml")(pick_color)
 
 
 def pick_color(

@@ -246,7 +246,7 @@ def with_run_options(command: Callable[..., int]) -> Callable[..., int]:
     return with_options
 
 
-def register_conform(app: typer.Typer) -> None:
+def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(
         help="Test any robot, vision or codec against the wire protocol, case by case.",

@@ -92,7 +92,7 @@ def serve(
 # The commands `detector list | check | promote`, and `detector --serve`. Shell; heavy imports inside the commands.
 
 
-def register_detector(app: typer.Typer) -> None:
+def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(
         help="Detectors: what there is, whether one keeps its promises, and one that serves many robots.",

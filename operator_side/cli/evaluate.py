@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sightline.training.network import Weights
 
 
-def register_demo_and_score(app: typer.Typer) -> None:
+def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline demo --scenario eight --latency-ms 100 --loss 0.1")(demo)
     group = typer.Typer(
@@ -37,6 +37,8 @@ def register_demo_and_score(app: typer.Typer) -> None:
     )
     group.command(epilog="Example: sightline score detectors hsv onnx --demand")(detectors)
     app.add_typer(group, name="score")
+    app.command(epilog="Example: sightline faults --only vision.kill --only wire")(faults)
+    app.command(epilog="Example: sightline train --out runs/eyes")(train)
 
 
 def demo(
@@ -266,11 +268,6 @@ JOBS = min(4, (os.cpu_count() or 1) + 1)
 SAFETY_PAGE = "safety.md"
 
 
-def register_faults(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command(epilog="Example: sightline faults --only vision.kill --only wire")(faults)
-
-
 def faults(
     *,
     only: Annotated[
@@ -361,11 +358,6 @@ _STEPS = "Of one round; say it again for one more, which starts the learning rat
 _START = "A model that this command made: train the last round alone, from there on."
 _LEAST_SHARE = 8
 """Of a batch for each process that trains: the normalisation needs a few pictures."""
-
-
-def register_train(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command(epilog="Example: sightline train --out runs/eyes")(train)
 
 
 def train(

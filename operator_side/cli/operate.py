@@ -41,7 +41,8 @@ from sightline.protocol.transports.open import open_link
 
 _REPORT_S = 0.8  # vision reports twice a second; where one drives, that is worth waiting for
 
-def register_operator(app: typer.Typer) -> None:
+
+def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline robots --connect tcp/192.168.1.20:7447")(robots)
     app.command(epilog="Example: sightline status r1 --watch")(status)
@@ -49,6 +50,12 @@ def register_operator(app: typer.Typer) -> None:
     app.command(epilog="Example: sightline disarm")(disarm)
     app.command(epilog="Example: sightline stop")(stop)
     app.command(epilog="Example: sightline reset && sightline arm")(reset)
+    app.command(epilog="Example: sightline mission r1 follow")(mission)
+    app.command(
+        epilog="Example: sightline goto r1 1.5 1.5 0 0 --wait",
+        context_settings={"ignore_unknown_options": True},  # so that -1.5 is a number
+    )(goto)
+    app.command(epilog="Example: sightline teleop r1 --connect tcp/192.168.1.20:7447 --linear 0.15")(teleop)
 
 
 def robots(
@@ -161,15 +168,6 @@ Sets = Annotated[
 ]
 
 
-def register_missions(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    app.command(epilog="Example: sightline mission r1 follow")(mission)
-    app.command(
-        epilog="Example: sightline goto r1 1.5 1.5 0 0 --wait",
-        context_settings={"ignore_unknown_options": True},  # so that -1.5 is a number
-    )(goto)
-
-
 def mission(
     robot: Robot = "r1",
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="What to begin; without it, tell.")] = None,
@@ -260,11 +258,6 @@ _Gamepad = Annotated[
         "--gamepad", metavar="DEVICE", help="A gamepad too: /dev/input/event5, or `auto` for the first one found."
     ),
 ]
-
-
-def register_teleop(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command(epilog="Example: sightline teleop r1 --connect tcp/192.168.1.20:7447 --linear 0.15")(teleop)
 
 
 def teleop(

@@ -7,7 +7,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from sightline.protocol.errors import ConfigError
-from sightline.robot_side.config import DEFAULT_ENDPOINT
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 
 REJECTED_EXIT = 5
 

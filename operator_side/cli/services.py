@@ -30,8 +30,9 @@ from sightline.operator_side.config.toml_text import toml_text
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import set_log_format
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 from sightline.protocol.transports.open import open_link
-from sightline.robot_side.config import DEFAULT_ENDPOINT, RobotConfig
+from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.plugins import load_device
 from sightline.sim.process import SimConfig
 from sightline.sim.robot import load_robot
@@ -39,12 +40,23 @@ from sightline.sim.scenario import load_scenario
 from sightline.vision_side.config import VisionConfig
 
 
-def register_services(app: typer.Typer) -> None:
+def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline sim --scenario eight --seed 3")(sim)
     app.command(epilog="Example: sightline robot --listen tcp/0.0.0.0:7447 --set safety.max_linear_mps=0.3")(robot)
     app.command(epilog="Example: sightline vision --connect tcp/192.168.1.20:7447")(vision)
     app.command(epilog="Example: sightline router --listen tcp/0.0.0.0:7447")(router)
+    app.command(epilog="Example: sightline scenarios thymio --out runs/thymio")(scenarios)
+    app.command(epilog="Example: sightline labels r1")(labels)
+    group = typer.Typer(
+        help="Check, show and describe a service's configuration: defaults < profile < file < environment < --set.",
+        no_args_is_help=False, rich_markup_mode=None,
+    )
+    group.command(epilog="Example: sightline config check robot robot.toml")(check)
+    group.command(epilog="Example: sightline config show robot robot.toml --origin")(show)
+    group.command(epilog="Example: sightline config schema vision")(schema)
+    app.add_typer(group, name="config")
+    app.command(epilog="Example: sightline metrics r1 --connect tcp/192.168.1.20:7447 --port 9464")(metrics)
 
 
 def sim(
@@ -220,12 +232,6 @@ def _ends(endpoints: list[str] | None) -> tuple[str, ...] | None:
 # Commands `scenarios`, which lists them and writes what each needs, and `labels`, which plays a detector. Shell.
 
 
-def register_scenarios(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    app.command(epilog="Example: sightline scenarios thymio --out runs/thymio")(scenarios)
-    app.command(epilog="Example: sightline labels r1")(labels)
-
-
 def scenarios(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="One of them, or a .toml file.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write sim, robot and vision.toml for it.")] = None,
@@ -326,18 +332,6 @@ File = Annotated[str | None, typer.Argument(metavar="[FILE]", help="The service'
 Profile = Annotated[str | None, typer.Option(help="Lay this profile under it, e.g. sim.")]
 
 
-def register_config(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    group = typer.Typer(
-        help="Check, show and describe a service's configuration: defaults < profile < file < environment < --set.",
-        no_args_is_help=False, rich_markup_mode=None,
-    )
-    group.command(epilog="Example: sightline config check robot robot.toml")(check)
-    group.command(epilog="Example: sightline config show robot robot.toml --origin")(show)
-    group.command(epilog="Example: sightline config schema vision")(schema)
-    app.add_typer(group, name="config")
-
-
 def check(service: ServiceName, file: File = None, profile: Profile = None, sets: Sets = None) -> None:
     """Say whether a configuration is good; exit 2 and name what is wrong if not."""
     loaded = load_service(service, profile=profile, file=file, sets=sets or (), environ=os.environ)
@@ -388,11 +382,6 @@ def schema(service: ServiceName) -> None:
 
 
 ROLE = "metrics"
-
-
-def register_metrics(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command(epilog="Example: sightline metrics r1 --connect tcp/192.168.1.20:7447 --port 9464")(metrics)
 
 
 def metrics(

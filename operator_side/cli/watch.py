@@ -33,9 +33,12 @@ _SILENCE_S = 3.0
 _EVER = float("inf")
 
 Seconds = Annotated[float | None, typer.Option("--seconds", min=0.1, help="End by itself after this long.")]
-def register_watch(app: typer.Typer) -> None:
-    """Add the command to `app`."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
     app.command(epilog="Example: sightline watch r1   or   sightline watch r1 scan --json")(watch)
+    app.command(epilog="Example: sightline capture r1 --overlay --seconds 10 --out run.mp4")(capture)
 
 
 def watch(
@@ -166,11 +169,6 @@ class LiveText:
 
 
 _SECONDS = 5.0
-
-
-def register_capture(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command(epilog="Example: sightline capture r1 --overlay --seconds 10 --out run.mp4")(capture)
 
 
 def capture(

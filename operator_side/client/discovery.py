@@ -11,12 +11,11 @@ from typing import Any, Final
 from sightline.operator_side.client.requests import read_report
 from sightline.operator_side.client.status import status_line
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError, WireError
-from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, parse_zenoh_endpoint
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.security import ROBOT_ROLE
 from sightline.protocol.transports.zenoh.discovery import Discovered, discover, find_listeners
 from sightline.protocol.transports.zenoh.presence import PeerInfo
-from sightline.robot_side.config import DEFAULT_ENDPOINT
 
 _ROLE_WIDTH = 9
 

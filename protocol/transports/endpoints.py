@@ -8,6 +8,9 @@ from typing import Final
 
 from sightline.protocol.errors import ConfigError
 
+DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
+"""Where a robot listens and its peers connect where no endpoint is given."""
+
 SEND_BUFFER_BYTES: Final = 262_144
 """A bounded socket buffer keeps frames young: what waits in the socket can no longer be dropped, and credit bounds it.
 It holds what is under way, 200 ms of the whole stream; with a quarter of it, pictures over such a distance had 16 kB in

@@ -279,7 +279,7 @@ def test_the_machine_is_described_without_naming_it():
 
 def test_the_command_lists_and_refuses(capsys, tmp_path):
     app = typer.Typer()
-    cli_faults.register_faults(app)
+    cli_faults.register(app)
     app.callback()(lambda: None)
     assert app(["faults", "--list", "--only", "stop"], standalone_mode=False) == 0
     assert len(capsys.readouterr().out.splitlines()) == sum(row.id.startswith("stop.") for row in CASES)

@@ -113,7 +113,7 @@ def test_the_command_writes_both_pages(tmp_path, monkeypatch):
     (tmp_path / "safety.md").write_text(PAGE)
     monkeypatch.setattr(parallel, "run_cases", lambda rows, *_: [[_measured(row)] for row in rows])
     app = typer.Typer()
-    cli_faults.register_faults(app)
+    cli_faults.register(app)
     app.callback()(lambda: None)
     assert app(["faults", "--only", "vision.kill", "--out", str(tmp_path / "faults.md")], standalone_mode=False) == 0
     assert "| vision | 1 |" in (tmp_path / "safety.md").read_text()

@@ -47,7 +47,7 @@ def found() -> tuple[np.ndarray, ...]:
 
 def run(*arguments):
     app = typer.Typer()
-    cli_calibrate.register_calibrate(app)
+    cli_calibrate.register(app)
     return app(["calibrate", "camera", *map(str, arguments)], standalone_mode=False)
 
 

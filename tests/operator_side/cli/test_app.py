@@ -200,6 +200,21 @@ def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.parametrize("arguments", [["stop"], ["status"], ["teleop"]], ids=" ".join)
+def test_operator_commands_import_their_own_group_and_no_image_library(arguments):
+    script = (
+        "import sys; from sightline.operator_side.cli import app as cli; cli.run(sys.argv[1:]);"
+        "group = 'sightline.operator_side.cli.';"
+        "print(*sorted(name[len(group):] for name in sys.modules if name.startswith(group)));"
+        "print(*{'numpy', 'cv2', 'pybullet', 'matplotlib'} & set(sys.modules))"
+    )
+    endpoint = ["--connect", "tcp/127.0.0.1:1"]
+    result = subprocess.run([sys.executable, "-P", "-c", script, *arguments, *endpoint], capture_output=True, text=True,
+                            check=True, stdin=subprocess.DEVNULL)
+    assert result.stderr.startswith("error: ")
+    assert result.stdout.splitlines() == ["app operate options", ""]
+
+
 @pytest.mark.parametrize(
     ("package", "version", "expected"),
     [
