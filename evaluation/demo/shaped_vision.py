@@ -11,13 +11,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from random import Random
-from types import TracebackType
 from typing import Any, Final, Self
 
 from sightline.protocol.channels import Channel, Direction
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.transports.link import Link, LinkWrapper, Message
 from sightline.protocol.transports.memory import Leg, split_legs
 from sightline.protocol.transports.open import open_link
 from sightline.vision_side.config import VisionConfig
@@ -69,15 +68,14 @@ class DelayLine:
         return self._waiting[0][0] if self._waiting else None
 
 
-class ShapedLink:
+class ShapedLink(LinkWrapper):
     """`link` with `latency_ms` added in all, half on each leg, and `loss` (0..1) on each leg by itself.
 
     Raises ValueError for a delay or loss that no network has. Closing it closes `link`.
     """
 
     def __init__(self, link: Link, latency_ms: float, loss: float, seed: int) -> None:
-        self.robot = link.robot
-        self._link = link
+        super().__init__(link)
         self._lines = {
             direction: DelayLine(leg, f"{seed} {direction.value}")
             for direction, leg in split_legs(round(latency_ms * 1000), 0, loss, 1.0).items()
@@ -103,20 +101,6 @@ class ShapedLink:
             channel, lambda message: self._put(Direction.FROM_ROBOT, lambda: callback(message))
         )
 
-    def latest(self, channel: Channel) -> LatestSlot[Message]:
-        """A slot at the far end of the delay."""
-        slot: LatestSlot[Message] = LatestSlot()
-        self.subscribe(channel, slot.put)
-        return slot
-
-    def ignore(self, channel: Channel) -> None:
-        """As the link does."""
-        self._link.ignore(channel)
-
-    def has_listener(self, channel: Channel) -> bool:
-        """As the link says."""
-        return self._link.has_listener(channel)
-
     def close(self) -> None:
         """End it; what is under way is lost."""
         with self._changed:
@@ -124,14 +108,6 @@ class ShapedLink:
             self._changed.notify()
         self._releasing.join(1.0)
         self._link.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _put(self, direction: Direction, deliver: Callable[[], Any]) -> None:
         with self._changed:

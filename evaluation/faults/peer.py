@@ -14,8 +14,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any, Final, Literal, Self
+from types import FrameType
+from typing import Any, Final, Literal
 
 from sightline.evaluation.faults.evidence import GOOD, INJECTED, REQUESTED, EventLog
 from sightline.operator_side.client.requests import SOURCE as OPERATOR_SOURCE
@@ -26,7 +26,7 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.config import Config
 from sightline.protocol.messages import MAX_INTEGER, AnswerHeader, Echo, FrameHeader, Twist, Verb
 from sightline.protocol.text import format_twist
-from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.transports.link import LatestSlot, Link, LinkWrapper, Message
 from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session
 from sightline.vision_side.config import VisionConfig
@@ -324,46 +324,18 @@ SLOW_S: Final = 0.33
 """Ten frame intervals at 30 fps."""
 
 
-class LoggingLink:
-    """A link that notes every twist before it leaves; a `Link` itself."""
+class LoggingLink(LinkWrapper):
+    """A link that notes every twist before it leaves."""
 
     def __init__(self, link: Link, ledger: EventLog) -> None:
-        self.robot = link.robot
-        self._link, self._ledger = link, ledger
+        super().__init__(link)
+        self._ledger = ledger
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """As `Link` says."""
+        """As `Link`."""
         if channel is TWIST:
             self._ledger.note(GOOD, decode(AnswerHeader, header).echo.t_us)
         return self._link.publish(channel, header, payload, source)
-
-    def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
-        """As `Link` says."""
-        self._link.subscribe(channel, callback)
-
-    def latest(self, channel: Channel) -> LatestSlot[Message]:
-        """As `Link` says."""
-        return self._link.latest(channel)
-
-    def ignore(self, channel: Channel) -> None:
-        """As `Link` says."""
-        self._link.ignore(channel)
-
-    def has_listener(self, channel: Channel) -> bool:
-        """As `Link` says."""
-        return self._link.has_listener(channel)
-
-    def close(self) -> None:
-        """As `Link` says."""
-        self._link.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _raise() -> None:

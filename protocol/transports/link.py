@@ -5,11 +5,12 @@ newest wins, memory is bounded, both ends may restart, nothing raised in a callb
 """
 
 import threading
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, Self, TypeVar
 
 from sightline.protocol.channels import FRAME, MAX_HEADER_BYTES, Channel, check_robot_id, key_for, parse_key
 from sightline.protocol.errors import ConfigError
@@ -58,43 +59,79 @@ class LatestSlot(Generic[Item]):
             return item
 
 
-class Link(Protocol):
+class Closing(ABC):
+    """Used in a `with`, whose end closes it."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End it; idempotent, returns within two seconds."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Link(Closing):
     """One robot's channels on one transport. Callbacks run on a transport thread: store and return, nothing more."""
 
     robot: str
 
+    @abstractmethod
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """Send now or drop; never block on a slow peer. False if it was dropped or nobody is connected.
+        """Send now or drop; never block on a slow peer. False if it was dropped or no peer is connected.
 
-        Raises ValueError for parts over the channel's bounds.
+        Towards the robot `source` defaults to the link's role. Raises ValueError for parts over the channel's bounds.
         """
-        ...
 
+    @abstractmethod
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
         """Call `callback` for every message of `channel` with the exact key and within its bounds."""
-        ...
+
+    @abstractmethod
+    def ignore(self, channel: Channel) -> None:
+        """End every subscription of this link to `channel`; the other ends see that it has none."""
+
+    @abstractmethod
+    def has_listener(self, channel: Channel) -> bool:
+        """Whether a peer subscribes to what this end publishes on `channel`; display and economy only."""
 
     def latest(self, channel: Channel) -> LatestSlot[Message]:
         """Subscribe with a slot that holds the newest message of `channel`."""
-        ...
+        slot: LatestSlot[Message] = LatestSlot()
+        self.subscribe(channel, slot.put)
+        return slot
+
+
+class LinkWrapper(Link):
+    """A link that forwards to `link`; a subclass overrides only what it changes."""
+
+    def __init__(self, link: Link) -> None:
+        self.robot = link.robot
+        self._link = link
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        """As `Link`."""
+        return self._link.publish(channel, header, payload, source)
+
+    def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
+        """As `Link`."""
+        self._link.subscribe(channel, callback)
 
     def ignore(self, channel: Channel) -> None:
-        """End every subscription of this link to `channel`; the other ends see that nobody listens here."""
-        ...
+        """As `Link`."""
+        self._link.ignore(channel)
 
     def has_listener(self, channel: Channel) -> bool:
-        """Whether somebody subscribes to what this end publishes on `channel`; display and economy only."""
-        ...
+        """As `Link`."""
+        return self._link.has_listener(channel)
 
     def close(self) -> None:
-        """End it; idempotent, returns within two seconds."""
-        ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+        """As `Link`."""
+        self._link.close()
 
 
 # What every link enforces, whatever carries it: exact keys, bounds, contained callbacks. Shell (a lock).
@@ -167,3 +204,27 @@ class LinkRules:
         except Exception:  # whatever a callback raises must not reach the transport's thread
             with self._counting:
                 self.callback_errors += 1
+
+
+class BaseLink(Link):
+    """A link of a transport: its rules and what they counted."""
+
+    def __init__(self, rules: LinkRules) -> None:
+        self.robot = rules.robot
+        self._rules = rules
+        self._closed = False
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Messages and peers turned away, by reason."""
+        return self._rules.refused
+
+    @property
+    def callback_errors(self) -> int:
+        """How often a subscriber's callback raised."""
+        return self._rules.callback_errors
+
+    @property
+    @abstractmethod
+    def connected(self) -> bool:
+        """Whether at least one peer is connected; never blocks."""

@@ -14,11 +14,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from random import Random
-from types import TracebackType
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 from sightline.protocol.channels import FRAME, Channel, Direction, parse_key, pattern_for
-from sightline.protocol.transports.link import LatestSlot, LinkRules, Message
+from sightline.protocol.transports.link import BaseLink, LinkRules, Message
 
 MAX_IN_FLIGHT: Final = 4096
 """Messages under way in one network; what would go over is dropped and counted as `overflow`."""
@@ -196,27 +195,15 @@ class MemoryNetwork:
         flight.to.receive(packet.key, packet.header, packet.payload)
 
 
-class MemoryLink:
+class MemoryLink(BaseLink):
     """A `Link` of a `MemoryNetwork`. It does not hear what it publishes itself."""
 
     def __init__(self, network: MemoryNetwork, number: int, rules: LinkRules) -> None:
         """Made by `MemoryNetwork.link`."""
-        self.robot = rules.robot
+        super().__init__(rules)
         self.number = number
-        self._rules = rules
         self._network = network
         self._callbacks: list[tuple[Channel, Callable[[Message], None]]] = []
-        self._closed = False
-
-    @property
-    def refused(self) -> Counter[str]:
-        """Messages turned away, by reason (see `sightline.protocol.transports.link`)."""
-        return self._rules.refused
-
-    @property
-    def callback_errors(self) -> int:
-        """How often a subscriber's callback raised."""
-        return self._rules.callback_errors
 
     @property
     def connected(self) -> bool:
@@ -224,7 +211,7 @@ class MemoryLink:
         return not self._closed and bool(self._network.peers_of(self))
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """As `Link` says; towards the robot `source` defaults to the link's role."""
+        """As `Link`."""
         self._rules.check(channel, header, payload)
         key = self._rules.key(channel, source)
         return self.connected and self._network.put(key, header, payload, self)
@@ -232,12 +219,6 @@ class MemoryLink:
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
         """Call `callback`, inside `MemoryNetwork.advance`, for every message with the exact key and within bounds."""
         self._callbacks.append((channel, callback))
-
-    def latest(self, channel: Channel) -> LatestSlot[Message]:
-        """Subscribe with a slot that holds the newest message of `channel`."""
-        slot: LatestSlot[Message] = LatestSlot()
-        self.subscribe(channel, slot.put)
-        return slot
 
     def ignore(self, channel: Channel) -> None:
         """End every subscription to `channel`."""
@@ -262,14 +243,6 @@ class MemoryLink:
         """Leave the network; what is under way to this end is lost. Idempotent."""
         self._closed = True
         self._network.leave(self)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _matches(robot: str, channel: Channel, key: str) -> bool:

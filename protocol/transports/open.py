@@ -9,14 +9,13 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from sightline.protocol.channels import CHANNELS, FRAME, Channel
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports import endpoints
 from sightline.protocol.transports import endpoints as websocket_endpoints
-from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.transports.link import Link, Message
 
 
 def check_endpoint(endpoint: str) -> None:
@@ -65,7 +64,7 @@ def _of_kind(ends: Sequence[str], is_web: bool) -> list[str]:
     return [endpoint for endpoint in ends if ("://" in endpoint) == is_web]
 
 
-class LinkGroup:
+class LinkGroup(Link):
     """Several links of one robot as one. They do not hear one another."""
 
     def __init__(self, links: Sequence[Link]) -> None:
@@ -84,12 +83,6 @@ class LinkGroup:
         """As `Link` says, on all of them."""
         for link in self.links:
             link.subscribe(channel, callback)
-
-    def latest(self, channel: Channel) -> LatestSlot[Message]:
-        """Subscribe with one slot for all of them."""
-        slot: LatestSlot[Message] = LatestSlot()
-        self.subscribe(channel, slot.put)
-        return slot
 
     def ignore(self, channel: Channel) -> None:
         """As `Link` says, on all of them."""
@@ -117,14 +110,6 @@ class LinkGroup:
         """Close all, the last opened first."""
         for link in reversed(self.links):
             link.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 # What a robot passes on between its transports: what its peers say to one another. Shell.

@@ -9,11 +9,10 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
 from sightline.protocol.channels import Channel
-from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.transports.link import Link, LinkWrapper, Message
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector
 from sightline.vision_side.detect.port import Detector
@@ -39,44 +38,19 @@ class FleetLink(Protocol):
         ...
 
 
-class _NotifyingLink:
-    """A link whose slots ring `bell` when something is put into them; all else is the link's own."""
+class _NotifyingLink(LinkWrapper):
+    """A link whose subscriptions set `bell` when a message has arrived."""
 
     def __init__(self, link: Link, bell: threading.Event) -> None:
-        self._link, self._bell = link, bell
-        self.robot = link.robot
-
-    def latest(self, channel: Channel) -> LatestSlot[Message]:
-        slot: LatestSlot[Message] = LatestSlot()
-        self.subscribe(channel, slot.put)
-        return slot
+        super().__init__(link)
+        self._bell = bell
 
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
         def ring(message: Message) -> None:
             callback(message)
             self._bell.set()
 
-        self._link.subscribe(channel, ring)
-
-    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        return self._link.publish(channel, header, payload, source)
-
-    def ignore(self, channel: Channel) -> None:
-        self._link.ignore(channel)
-
-    def has_listener(self, channel: Channel) -> bool:
-        return self._link.has_listener(channel)
-
-    def close(self) -> None:
-        self._link.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+        super().subscribe(channel, ring)
 
 
 class Fleet:

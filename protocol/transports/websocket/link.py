@@ -11,8 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Protocol
 
 from sightline.protocol.channels import CHANNELS, FRAME, TWIST, Channel, parse_key
 from sightline.protocol.clock import monotonic_us
@@ -20,7 +19,7 @@ from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.log import BurstLimiter, log_line
 from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_websocket_endpoint
-from sightline.protocol.transports.link import INEXACT_KEY, LatestSlot, LinkRules, Message
+from sightline.protocol.transports.link import INEXACT_KEY, BaseLink, LinkRules, Message
 from sightline.protocol.transports.websocket.client import Client as Dialer
 from sightline.protocol.transports.websocket.connection import Connection
 from sightline.protocol.transports.websocket.framing import Hello, IncomingMessage, PeerCodec, SightlineV1
@@ -144,13 +143,12 @@ def _listed(ends: str | Sequence[str]) -> Sequence[str]:
     return (ends,) if isinstance(ends, str) else ends
 
 
-class WebSocketLink:
+class WebSocketLink(BaseLink):
     """A `Link` over any number of WebSocket connections. A link does not hear what it publishes itself."""
 
     def __init__(self, rules: LinkRules) -> None:
         """Made by `open_websocket`."""
-        self.robot = rules.robot
-        self._rules = rules
+        super().__init__(rules)
         self._wants = Subscriptions(rules, secrets.token_hex(4))
         # Who drives comes first. Replaced, never changed, so that publishing needs no lock.
         self._peers: tuple[Peer, ...] = ()
@@ -158,21 +156,10 @@ class WebSocketLink:
         self._joined = threading.Event()
         self._listeners: list[Server] = []
         self._dialers: list[Dialer] = []
-        self._closed = False
         self._in_callback = threading.local()
         self._dropped: Counter[str] = Counter()
         self._seat = DriverSlot()
         self._log = BurstLimiter()
-
-    @property
-    def refused(self) -> Counter[str]:
-        """Messages and peers turned away, by reason (`sightline.protocol.transports.link`, `websocket_*`)."""
-        return self._rules.refused
-
-    @property
-    def callback_errors(self) -> int:
-        """How often a subscriber's callback raised."""
-        return self._rules.callback_errors
 
     @property
     def dropped(self) -> Counter[str]:
@@ -185,7 +172,7 @@ class WebSocketLink:
         return not self._closed and bool(self._peers)
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """As `Link` says; towards the robot `source` defaults to the link's role."""
+        """As `Link`."""
         self._rules.check(channel, header, payload)
         key = self._rules.key(channel, source)
         if not self.connected:
@@ -207,12 +194,6 @@ class WebSocketLink:
             self._wants.drop(channel)
             self._retell()
 
-    def latest(self, channel: Channel) -> LatestSlot[Message]:
-        """Subscribe with a slot that holds the newest message of `channel`."""
-        slot: LatestSlot[Message] = LatestSlot()
-        self.subscribe(channel, slot.put)
-        return slot
-
     def has_listener(self, channel: Channel) -> bool:
         """Whether a peer said that it wants `channel`; never blocks on the network."""
         return self.connected and any(peer.hears(channel) for peer in self._peers)
@@ -233,14 +214,6 @@ class WebSocketLink:
         deadline_s = time.monotonic() + CLOSE_S
         for peer in () if getattr(self._in_callback, "now", False) else peers:  # a callback's own peer waits for it
             peer.wait_gone(max(0.0, deadline_s - time.monotonic()))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     # --- opening -------------------------------------------------------------------------------------------------
 

@@ -10,17 +10,16 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from fnmatch import fnmatchcase
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 from sightline.protocol.channels import FRAME, KEY_PREFIX, STATUS, Channel, parse_key, pattern_for
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints
-from sightline.protocol.transports.link import NOT_A_PUT, LatestSlot, Link, LinkRules, Message
+from sightline.protocol.transports.link import NOT_A_PUT, BaseLink, Closing, Link, LinkRules, Message
 from sightline.protocol.transports.security import KNOWN_SOURCES, ROBOT_ROLE, load_role_keys
 from sightline.protocol.transports.zenoh.presence import PeerInfo, PresenceAnnouncer, query_presence
 from sightline.protocol.transports.zenoh.session import CLOSED_SESSION, open_session
@@ -73,14 +72,13 @@ def _parts(sample: zenoh.Sample) -> tuple[bytes, bytes]:
     return b"" if attachment is None else attachment.to_bytes(), sample.payload.to_bytes()
 
 
-class ZenohLink:
+class ZenohLink(BaseLink):
     """A `Link` over one Zenoh session. A link does not hear what it publishes itself."""
 
     def __init__(self, session: zenoh.Session, rules: LinkRules, shared: bool = False) -> None:
         """Use an open `session`; closing the link closes it unless it is `shared` with others."""
-        self.robot = rules.robot
+        super().__init__(rules)
         self._session = session
-        self._rules = rules
         self._outlets: dict[str, _MatchedPublisher] = {}
         self._subscribers: defaultdict[str, list[zenoh.Subscriber[None]]] = defaultdict(list)
         self._ending = ExitStack()
@@ -88,19 +86,8 @@ class ZenohLink:
             self._ending.callback(session.close)  # first in, so last to run
         self._ending.callback(lambda: self._undeclare([one for some in self._subscribers.values() for one in some]))
         self._declaring = threading.Lock()
-        self._closed = False
         self._in_callback = threading.local()
         self._peers = _ConnectedPeers(session, self._ending)
-
-    @property
-    def refused(self) -> Counter[str]:
-        """Messages turned away, by reason (see `sightline.protocol.transports.link`)."""
-        return self._rules.refused
-
-    @property
-    def callback_errors(self) -> int:
-        """How often a subscriber's callback raised."""
-        return self._rules.callback_errors
 
     @property
     def connected(self) -> bool:
@@ -108,7 +95,7 @@ class ZenohLink:
         return not self._closed and bool(self._peers.zids)
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """As `Link` says; towards the robot `source` defaults to the link's role."""
+        """As `Link`."""
         import zenoh
 
         self._rules.check(channel, header, payload)
@@ -140,12 +127,6 @@ class ZenohLink:
             if not self._closed:
                 subscriber = self._session.declare_subscriber(pattern_for(self.robot, channel), handler)
                 self._subscribers[channel.name].append(subscriber)
-
-    def latest(self, channel: Channel) -> LatestSlot[Message]:
-        """Subscribe with a slot that holds the newest message of `channel`."""
-        slot: LatestSlot[Message] = LatestSlot()
-        self.subscribe(channel, slot.put)
-        return slot
 
     def ignore(self, channel: Channel) -> None:
         """End every subscription to `channel`."""
@@ -188,14 +169,6 @@ class ZenohLink:
         ending.start()
         if not getattr(self._in_callback, "now", False):  # Zenoh's close waits for its callbacks, so one cannot wait
             ending.join(CLOSE_S)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _receive(self, channel: Channel, sample: zenoh.Sample, callback: Callable[[Message], None]) -> None:
         import zenoh
@@ -331,7 +304,7 @@ def open_fleet(
     return site
 
 
-class ZenohFleet:
+class ZenohFleet(Closing):
     """One session. Robots are noticed by their status; a link to one shares the session."""
 
     def __init__(self, session: zenoh.Session, pattern: str, role: str, max_frame_bytes: int) -> None:
@@ -364,14 +337,6 @@ class ZenohFleet:
         """Close all links and the session."""
         self._ending.close()
         self._session = CLOSED_SESSION
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _listen(self) -> None:
         import zenoh
