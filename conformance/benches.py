@@ -51,7 +51,7 @@ class LiveBench(Bench):
 
     @property
     def dropped_here(self) -> Counter[str]:
-        return sum(map(_refused, self._links.values()), self._dropped)
+        return sum((link.rejected for link in self._links.values()), self._dropped)
 
     def send(self, channel: Channel, header: bytes, payload: bytes, source: str) -> None:
         link = self._links.get(certificate_role(source)) or self._links.get(self._roles[0])
@@ -67,7 +67,7 @@ class LiveBench(Bench):
         for role in tuple(self._links):
             link = self._links.pop(role)
             link.close()
-            self._dropped += _refused(link)
+            self._dropped += link.rejected
 
     def join(self) -> None:
         for role in self._roles:
@@ -96,10 +96,6 @@ class LiveBench(Bench):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.leave()
-
-
-def _refused(link: Link) -> Counter[str]:
-    return Counter(getattr(link, "refused", Counter()))
 
 
 # A bench in virtual time: the peer is an object, the network is memory, a second takes milliseconds. Pure.
@@ -142,7 +138,7 @@ class VirtualBench(Bench):
 
     @property
     def dropped_here(self) -> Counter[str]:
-        return self._dropped + (self._link.refused if self._link else Counter())
+        return self._dropped + (self._link.rejected if self._link else Counter())
 
     def send(self, channel: Channel, header: bytes, payload: bytes, source: str) -> None:
         if self._link is not None:
@@ -153,7 +149,7 @@ class VirtualBench(Bench):
 
     def leave(self) -> None:
         if self._link is not None:
-            self._dropped += self._link.refused
+            self._dropped += self._link.rejected
             self._link.close()
             self._link = None
 

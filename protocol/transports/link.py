@@ -99,6 +99,16 @@ class Link(Closing):
     def has_listener(self, channel: Channel) -> bool:
         """Whether a peer subscribes to what this end publishes on `channel`; display and economy only."""
 
+    @property
+    def dropped(self) -> Counter[str]:
+        """Publications replaced by newer ones before they left, by channel, where the link counts them."""
+        return Counter()
+
+    @property
+    def rejected(self) -> Counter[str]:
+        """Messages and peers rejected, by reason."""
+        return Counter()
+
     def latest(self, channel: Channel) -> LatestSlot[Message]:
         """Subscribe with a slot that holds the newest message of `channel`."""
         slot: LatestSlot[Message] = LatestSlot()
@@ -129,6 +139,16 @@ class LinkWrapper(Link):
         """As `Link`."""
         return self._link.has_listener(channel)
 
+    @property
+    def dropped(self) -> Counter[str]:
+        """As `Link`."""
+        return self._link.dropped
+
+    @property
+    def rejected(self) -> Counter[str]:
+        """As `Link`."""
+        return self._link.rejected
+
     def close(self) -> None:
         """As `Link`."""
         self._link.close()
@@ -148,7 +168,7 @@ NOT_A_PUT = "NOT_A_PUT"
 
 
 class LinkRules:
-    """The rules of one link to `robot`, used by `role`. `refused` and `callback_errors` only grow."""
+    """The rules of one link to `robot`, used by `role`. `rejected` and `callback_errors` only grow."""
 
     def __init__(self, robot: str, role: str = "", max_frame_bytes: int = FRAME.max_payload_bytes) -> None:
         """Security limit: `max_frame_bytes` (1 up to the channel's bound) for the payload of a frame.
@@ -159,7 +179,7 @@ class LinkRules:
             raise ConfigError(f"max_frame_bytes {max_frame_bytes} is out of range: 1 to {FRAME.max_payload_bytes}")
         self.robot = check_robot_id(robot)
         self.role = role
-        self.refused: Counter[str] = Counter()
+        self.rejected: Counter[str] = Counter()
         self.callback_errors = 0
         self._max_frame_bytes = max_frame_bytes
         self._counting = threading.Lock()
@@ -187,16 +207,16 @@ class LinkRules:
         """Give the message to `callback` if its key is exactly right and it is within bounds; never raises."""
         parsed = parse_key(key)
         if parsed is None or parsed[0] != self.robot or parsed[1] is not channel:
-            self.refuse(INEXACT_KEY)
+            self.reject(INEXACT_KEY)
         elif len(header) > MAX_HEADER_BYTES or len(payload) > self.payload_bound(channel):
-            self.refuse(OVERSIZE)
+            self.reject(OVERSIZE)
         else:
             self._call(callback, Message(channel, parsed[2], header, payload))
 
-    def refuse(self, reason: str) -> None:
-        """Count one message turned away."""
+    def reject(self, reason: str) -> None:
+        """Count one rejected message."""
         with self._counting:
-            self.refused[reason] += 1
+            self.rejected[reason] += 1
 
     def _call(self, callback: Callable[[Message], None], message: Message) -> None:
         try:
@@ -215,9 +235,9 @@ class BaseLink(Link):
         self._closed = False
 
     @property
-    def refused(self) -> Counter[str]:
-        """Messages and peers turned away, by reason."""
-        return self._rules.refused
+    def rejected(self) -> Counter[str]:
+        """As `Link`."""
+        return self._rules.rejected
 
     @property
     def callback_errors(self) -> int:

@@ -95,16 +95,13 @@ class LinkGroup(Link):
 
     @property
     def dropped(self) -> Counter[str]:
-        """Publications that were replaced by newer ones before they left, by channel, of all that count them."""
-        return self._counted("dropped")
+        """As `Link`, of all of them."""
+        return sum((link.dropped for link in self.links), Counter())
 
     @property
-    def refused(self) -> Counter[str]:
-        """Messages and peers turned away, by reason, of all."""
-        return self._counted("refused")
-
-    def _counted(self, name: str) -> Counter[str]:
-        return sum((Counter(dict(getattr(link, name, {}))) for link in self.links), Counter())
+    def rejected(self) -> Counter[str]:
+        """As `Link`, of all of them."""
+        return sum((Counter(dict(link.rejected)) for link in self.links), Counter())
 
     def close(self) -> None:
         """Close all, the last opened first."""

@@ -172,7 +172,7 @@ class Network:
         """Tell the driver how the stream does, and everybody what the camera is."""
         with self._lock:
             status = self._sending.status(now_us, self._driver.dropped_commands)
-            status = self._adjusting.shown_in(status, getattr(self._link, "dropped", {}))
+            status = self._adjusting.shown_in(status, self._link.dropped)
             camera = self._sending.camera_message(self._adjusting.model, now_us)
         self._driver.tell(bytes([ipc.PacketKind.STREAM]) + encode(status))
         self._relay.look()
@@ -182,7 +182,7 @@ class Network:
 
     def _report_refused(self) -> None:
         """What never reached the driver is shown in `status` too."""
-        by_link: dict[str, int] = dict(getattr(self._link, "refused", {}))  # copied at once: other threads count in it
+        by_link: dict[str, int] = dict(self._link.rejected)  # copied at once: other threads count in it
         refused = Counter(dict(self._refused_acks)) + Counter(by_link)
         if refused != self._refused_told and self._driver.tell(ipc.pack_rejected(refused)):
             self._refused_told = refused

@@ -163,7 +163,7 @@ class WebSocketLink(BaseLink):
 
     @property
     def dropped(self) -> Counter[str]:
-        """Publications replaced by a newer one before a peer had room for them, by channel."""
+        """As `Link`."""
         return sum((peer.outbox.dropped for peer in self._peers), self._dropped)
 
     @property
@@ -219,7 +219,7 @@ class WebSocketLink(BaseLink):
 
     def open(self, doors: Sequence[WebSocketEndpoint], far: Sequence[WebSocketEndpoint], secure: str) -> None:
         """Listen on `doors` and begin to connect to `far`. Raises what `open_websocket` does."""
-        refuse, keys = self._rules.refuse, KeyFolder(secure, self._rules.role)
+        refuse, keys = self._rules.reject, KeyFolder(secure, self._rules.role)
         for end in doors:
             self._listeners.append(Server(end, partial(self._serve, end), refuse, self._tell, keys))
         for end in far:
@@ -255,7 +255,7 @@ class WebSocketLink(BaseLink):
             settle("")
         if self._join(peer, told):
             try:
-                peer.run(self._deliver, self._rules.refuse)
+                peer.run(self._deliver, self._rules.reject)
             finally:
                 self._leave(peer)
                 dialect.note_gone()
@@ -316,9 +316,9 @@ class WebSocketLink(BaseLink):
     def _deliver(self, peer: Peer, packet: IncomingMessage) -> None:
         parsed = parse_key(packet.key)
         if parsed is None:
-            self._rules.refuse(INEXACT_KEY)
+            self._rules.reject(INEXACT_KEY)
             return
-        if not peer.admits(packet.key, self._rules.refuse, self._tell):
+        if not peer.admits(packet.key, self._rules.reject, self._tell):
             return
         if parsed[1] is TWIST and self._peers[0] is not peer:
             self._put_first(peer)

@@ -174,7 +174,7 @@ class ZenohLink(BaseLink):
         import zenoh
 
         if sample.kind != zenoh.SampleKind.PUT:
-            self._rules.refuse(NOT_A_PUT)
+            self._rules.reject(NOT_A_PUT)
             return
         header, payload = _parts(sample)
         self._rules.deliver(channel, str(sample.key_expr), header, payload, callback)

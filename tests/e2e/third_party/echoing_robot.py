@@ -17,4 +17,4 @@ with open_websocket("r1", listen=sys.argv[1:3], role="robot") as link:
     print("up", flush=True)
     for _ in sys.stdin:
         kib = int(Path("/proc/self/statm").read_text().split()[1]) * 4
-        print(json.dumps({"refused": link.refused, "raised": link.callback_errors, "kib": kib}), flush=True)
+        print(json.dumps({"refused": link.rejected, "raised": link.callback_errors, "kib": kib}), flush=True)

@@ -137,7 +137,7 @@ def test_only_the_exact_key_reaches_anybody(rig):
     assert _take(rig, twists) == Message(TWIST, "guest", b"", b"0|0")
     assert twists.dropped == 0
     assert frames.take() is None
-    assert robot.refused[INEXACT_KEY] >= 5
+    assert robot.rejected[INEXACT_KEY] >= 5
 
 
 def test_oversize_is_refused_at_both_ends(rig):
@@ -146,7 +146,7 @@ def test_oversize_is_refused_at_both_ends(rig):
         with pytest.raises(ValueError, match="at most"):
             peer.publish(TWIST, header, payload)
         rig.stranger_puts("sightline/r1/twist/vision", header, payload)
-    assert rig.until(lambda: robot.refused[OVERSIZE] == 2)
+    assert rig.until(lambda: robot.rejected[OVERSIZE] == 2)
     assert twists.take() is None
 
 
@@ -266,5 +266,5 @@ def test_the_rules_refuse_a_key_that_is_not_of_the_robot_and_channel(key):
     rules, got = LinkRules("r1"), []
     rules.deliver(TWIST, key, b"", b"0|0", got.append)
     rules.deliver(TWIST, "sightline/r1/twist/vision", b"", b"0|0", got.append)
-    assert rules.refused == {INEXACT_KEY: 1}
+    assert rules.rejected == {INEXACT_KEY: 1}
     assert got == [Message(TWIST, "vision", b"", b"0|0")]

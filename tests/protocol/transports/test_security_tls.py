@@ -64,7 +64,7 @@ def test_a_hundred_frames_while_many_twists_come_in(secured):
                 vision.publish(TWIST, b"{}", b"%d|%d" % (number, part))
             assert until(lambda: (frame := frames.take(0.5)) and frame.payload[:4] == number.to_bytes(4))  # noqa: B023
         assert until(lambda: got[-1] == b"99|2")
-        assert robot.refused == vision.refused == {}
+        assert robot.rejected == vision.rejected == {}
 
 
 def test_who_reads_nothing_over_tls_stays_and_delays_nobody(secured):
@@ -94,7 +94,7 @@ def test_a_robot_whose_authority_is_not_trusted_is_refused_in_one_line(secured, 
         with pytest.raises(LinkError, match="no TLS with it: unable to get local issuer certificate; is the ca") as why:
             open_websocket("r1", connect=endpoint, role="vision", secure=folder)
         assert "\n" not in str(why.value)
-    assert until(lambda: robot.refused[NO_TLS] >= 2)
+    assert until(lambda: robot.rejected[NO_TLS] >= 2)
 
 
 def test_a_certificate_of_another_host_is_refused(tmp_path):
@@ -110,7 +110,7 @@ def test_who_speaks_no_tls_is_counted_and_gone(secured, capfd):
     robot, endpoint, folder = secured
     with socket.create_connection(address_of(endpoint)) as near:
         near.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-        assert until(lambda: robot.refused == {NO_TLS: 1})
+        assert until(lambda: robot.rejected == {NO_TLS: 1})
     assert "turned 127.0.0.1 away: no TLS: HTTP_REQUEST" in capfd.readouterr().err
     open_websocket("r1", connect=endpoint, role="vision", secure=folder).close()
 
@@ -124,11 +124,11 @@ def test_a_handshake_that_is_dripped_is_not_waited_for(secured):
     begin_s = time.monotonic()
     with socket.create_connection(address_of(endpoint)) as near:
         for byte in hello.read():
-            if robot.refused[NO_TLS]:
+            if robot.rejected[NO_TLS]:
                 break
             near.send(bytes([byte]))
             time.sleep(0.03)
-        assert until(lambda: robot.refused == {NO_TLS: 1}, 1)
+        assert until(lambda: robot.rejected == {NO_TLS: 1}, 1)
     assert 1.8 < time.monotonic() - begin_s < 3
     open_websocket("r1", connect=endpoint, role="vision", secure=folder).close()
 
@@ -172,4 +172,4 @@ def test_the_folder_of_sightline_keys_is_all_that_both_ends_need(tmp_path):
             assert until(lambda: vision.has_listener(TWIST))
             vision.publish(TWIST, b"{}", b"0.1|0")
             assert twists.take(2).source == "vision"
-        assert robot.refused == {}
+        assert robot.rejected == {}

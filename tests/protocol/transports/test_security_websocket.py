@@ -129,7 +129,7 @@ def test_who_is_not_listed_is_told_why_and_the_log_tells_of_few(capfd):
             b"127.0.0.1 is not listed in legacy.allow_from: the robot's owner lists who may come in here\n"
         )
         spent_s = time.monotonic() - begin_s
-        assert robot.refused == {NOT_LISTED: 40}
+        assert robot.rejected == {NOT_LISTED: 40}
     lines = capfd.readouterr().err.splitlines()
     assert 1 <= len(lines) <= 10 * (1 + int(spent_s))
     assert "turned 127.0.0.1 away: 127.0.0.1 is not listed" in lines[0]
@@ -207,7 +207,7 @@ def test_a_token_opens_the_door_and_nothing_else_does(keys, capfd):
         entries = ["sightline.v1", f"sightline.token.{TOKEN}"]
         with connect(here, subprotocols=entries, compression=None, legacy=True) as browser:
             assert browser.subprotocol == "sightline.v1"
-        assert robot.refused[NO_TOKEN] >= 3
+        assert robot.rejected[NO_TOKEN] >= 3
     told = capfd.readouterr().err
     assert "turned 127.0.0.1 away: show the token" in told
     assert TOKEN[:-1] not in told
@@ -241,7 +241,7 @@ def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role, capfd):
             for channel, source in sent:
                 client.send(claim(f"sightline/r1/{channel}/{source}", b"", b""))
             allowed = [pair for pair in sent if pair in grants_of_role(role)]
-            assert until(lambda: len(heard) == len(allowed) and robot.refused[NOT_GRANTED] == len(sent) - len(allowed))
+            assert until(lambda: len(heard) == len(allowed) and robot.rejected[NOT_GRANTED] == len(sent) - len(allowed))
             assert heard == allowed
             assert robot.has_listener(STATUS)  # everybody may watch
             # Told once each, at once, ten a second; an acknowledgement that returns no credit is not worth a word.
@@ -279,7 +279,7 @@ def test_one_client_drives_and_the_rest_only_watch(capfd):
             got.append(twists.take(2).payload)
             viewer.send(f"0.9|{number}")
         assert got == [b"0.1|%d" % number for number in range(5)]
-        assert until(lambda: robot.refused == {"NOT_HOLDER": 5})
+        assert until(lambda: robot.rejected == {"NOT_HOLDER": 5})
         assert twists.take() is None
         assert until(lambda: robot.publish(FRAME, b"", b"jpeg") and viewer.recv(1) == driver.recv(1))
         driver.close()

@@ -119,11 +119,11 @@ def test_boxes_come_in_as_a_guests_detections_of_the_picture_it_was_sent_and_go_
             assert (boxes.width_px, boxes.height_px, corners) == (16, 16, [(8, 4, 16, 12), (0, 0, 8, 16)])
             assert decode(AnswerHeader, acks.take(2).header).echo.seq == 8
             client.send("0.1,0,0.2,1")  # an answer to nothing
-            assert until(lambda: robot.refused == {RejectReason.UNKNOWN_FRAME: 1})
+            assert until(lambda: robot.rejected == {RejectReason.UNKNOWN_FRAME: 1})
             robot.publish(FRAME, encode(header_of(9)), SMALL_JPEG)
             client.recv(2)
             client.send("0.1,0,0.2,7")
-            assert until(lambda: robot.refused[RejectReason.MALFORMED] == 1)
+            assert until(lambda: robot.rejected[RejectReason.MALFORMED] == 1)
             robot.publish(FRAME, encode(header_of(10)), SMALL_JPEG)
             client.recv(2)
             client.send("")  # looked, and saw nothing
@@ -191,7 +191,7 @@ def test_what_is_no_short_text_ends_that_client_only(message, code, said, counte
             client.recv(2)
         if closed.value.rcvd is not None:
             assert (closed.value.rcvd.code, closed.value.rcvd.reason[: len(said)]) == (code, said)
-        assert until(lambda: robot.refused == {counted: 1})
+        assert until(lambda: robot.rejected == {counted: 1})
         other.send("0.3|0")
         assert twists.take(2).payload == b"0.3|0"
 
@@ -215,7 +215,7 @@ def test_a_twist_over_64_bytes_is_counted_and_the_client_stays():
         client.send("0" * 65)
         client.send("0|0")
         assert twists.take(2).payload == b"0|0"
-        assert robot.refused == {OVERSIZE: 1}
+        assert robot.rejected == {OVERSIZE: 1}
 
 
 def test_a_client_silent_for_its_first_second_gets_the_newest_picture():
@@ -234,7 +234,7 @@ def test_another_sites_page_cannot_drive_through_the_older_port():
     with open_websocket("r1", listen=endpoint) as robot:
         with pytest.raises(InvalidStatus):
             connect(plain(endpoint), origin="http://evil.example", **OLD)
-        assert robot.refused == {CROSS_SITE: 1}
+        assert robot.rejected == {CROSS_SITE: 1}
         # What `websocket-client` sends by itself is the robot's own site.
         connect(plain(endpoint), origin=plain(endpoint).replace("ws:", "http:"), **OLD).close()
 
@@ -327,7 +327,7 @@ def test_what_is_no_picture_ends_the_connection_which_comes_back_by_itself(messa
         frames = vision.latest(FRAME)
         with suppress(ConnectionClosed):  # 10 MB may break on a socket that is closed already
             robot.send(message)
-        assert until(lambda: vision.refused == {counted: 1})
+        assert until(lambda: vision.rejected == {counted: 1})
         assert until(lambda: robot.said in ([f"closed {code}"], ["closed 0"]) and robot.clients)
         assert until(lambda: robot.send(TEXT) or frames.take(0.05))
 
@@ -340,7 +340,7 @@ def test_a_text_that_is_no_picture_is_counted_and_skipped(text):
         robot.send(TEXT)
         assert frames.take(2).payload == JPEG
         assert frames.dropped == 0
-        assert vision.refused == {RejectReason.MALFORMED: 1}
+        assert vision.rejected == {RejectReason.MALFORMED: 1}
         assert robot.said == []
 
 

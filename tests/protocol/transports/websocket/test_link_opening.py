@@ -124,7 +124,7 @@ def _answer_with(door: socket.socket, text: bytes) -> None:
 def test_another_robots_listener_is_an_error_for_who_opens(robot):
     with pytest.raises(LinkError, match=f"{robot.endpoint} refused: this is robot r1, not r2"):
         open_websocket("r2", connect=robot.endpoint)
-    assert robot.refused == {OTHER_ROBOT: 1}
+    assert robot.rejected == {OTHER_ROBOT: 1}
     robot.still_serves()
 
 

@@ -30,7 +30,7 @@ def test_who_says_no_hello_is_sent_away_and_told_why(robot):
     stranger, begin_s = connect(robot.endpoint, **V1), time.monotonic()
     assert closed_with(stranger) == (1008, "no hello within 2 s")
     assert 1.5 < time.monotonic() - begin_s < 3
-    assert robot.refused == {BAD_HELLO: 1}
+    assert robot.rejected == {BAD_HELLO: 1}
 
 
 BAD_HELLOS = (
@@ -49,7 +49,7 @@ def test_a_bad_hello_is_refused_with_a_reason(robot, first, code, reason, counte
     stranger.send(first)
     got = closed_with(stranger)
     assert (got[0], got[1][: len(reason)]) == (code, reason)
-    assert until(lambda: robot.refused == {counted: 1})
+    assert until(lambda: robot.rejected == {counted: 1})
     robot.still_serves()
 
 
@@ -99,14 +99,14 @@ def test_a_bad_message_ends_its_own_connection_only(robot, message, code, reason
             stranger.recv(5)
     if closed.value.rcvd is not None:  # 10 MB may break on a socket that is closed already
         assert (closed.value.rcvd.code, closed.value.rcvd.reason[: len(reason)]) == (code, reason)
-    assert until(lambda: robot.refused == {counted: 1})
+    assert until(lambda: robot.rejected == {counted: 1})
     robot.still_serves()
 
 
 def test_a_twist_somewhat_too_long_is_counted_and_the_peer_stays(robot):
     stranger = hail(robot.endpoint)
     stranger.send(claim(TWIST_KEY, b"", bytes(TWIST.max_payload_bytes + 1)))
-    assert until(lambda: robot.refused == {OVERSIZE: 1})
+    assert until(lambda: robot.rejected == {OVERSIZE: 1})
     stranger.send(claim(TWIST_KEY, b"{}", b"0|0"))
     assert robot.twists.take(2) == Message(TWIST, "vision", b"{}", b"0|0")
     stranger.close()
@@ -125,7 +125,7 @@ def test_a_frame_over_a_smaller_bound_is_counted_and_the_peer_stays(robot):
         frames = peer.latest(FRAME)
         assert until(lambda: len(robot.link._peers) == 2 and all(each.hears(FRAME) for each in robot.link._peers))
         robot.link.publish(FRAME, b"", bytes(1000))
-        assert until(lambda: peer.refused == {OVERSIZE: 1})
+        assert until(lambda: peer.rejected == {OVERSIZE: 1})
         robot.link.publish(FRAME, b"", bytes(999))
         assert len(frames.take(2).payload) == 999
 

@@ -33,7 +33,7 @@ def test_without_the_sub_protocol_nobody_comes_in(robot, offer):
         connect(robot.endpoint, subprotocols=offer, legacy=True)
     assert refusal.value.response.status_code == 400
     assert b"offer the sub-protocol sightline.v1" in refusal.value.response.body
-    assert robot.refused == {WRONG_SUBPROTOCOL: 1}
+    assert robot.rejected == {WRONG_SUBPROTOCOL: 1}
     robot.still_serves()
 
 
@@ -43,14 +43,14 @@ def test_a_page_of_another_site_does_not_come_in(robot, origin):
         connect(robot.endpoint, origin=origin, **V1)
     assert refusal.value.response.status_code == 403
     assert b"is another site than Host" in refusal.value.response.body
-    assert robot.refused == {CROSS_SITE: 1}
+    assert robot.rejected == {CROSS_SITE: 1}
     robot.still_serves()
 
 
 def test_a_page_of_the_robots_own_address_comes_in(robot):
     hailed = connect(robot.endpoint, origin=robot.endpoint.replace("ws://", "http://"), **V1)
     hailed.close()
-    assert robot.refused == {}
+    assert robot.rejected == {}
 
 
 def test_a_foreign_name_that_points_here_does_not_come_in(robot):
@@ -59,7 +59,7 @@ def test_a_foreign_name_that_points_here_does_not_come_in(robot):
         answer = near.recv(4096)
     assert answer.startswith(b"HTTP/1.1 403 ")
     assert b"connect by its address or .local name" in answer
-    assert robot.refused == {CROSS_SITE: 1}
+    assert robot.rejected == {CROSS_SITE: 1}
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:9090", "[::1]:9090", "10.0.0.7", "robot:9090", "Robot.local", "r.example"])
@@ -80,7 +80,7 @@ def test_more_clients_than_the_limit_are_sent_away(robot):
         connect(robot.endpoint, **V1)
     assert refusal.value.response.status_code == 503
     assert b"16 clients are connected" in refusal.value.response.body
-    assert robot.refused == {TOO_MANY_CLIENTS: 1}
+    assert robot.rejected == {TOO_MANY_CLIENTS: 1}
     robot.still_serves()
     guests.pop().close()
     assert until(lambda: _comes_in(robot))
@@ -99,7 +99,7 @@ def _comes_in(robot: Robot) -> bool:
 def test_connections_that_say_nothing_are_few_and_short_lived(robot):
     silent = [socket.create_connection(robot.address) for _ in range(MAX_CLIENTS + MAX_HANDSHAKES + 8)]
     robot.still_serves()
-    assert until(lambda: robot.refused[TOO_MANY_CLIENTS] >= 8)
+    assert until(lambda: robot.rejected[TOO_MANY_CLIENTS] >= 8)
     silent[-1].settimeout(3)
     assert silent[-1].recv(1) == b""  # unheard, at once
     silent[0].settimeout(3)
@@ -126,6 +126,6 @@ def test_nonsense_right_behind_the_request_is_turned_away(robot, request_host, c
         near.settimeout(3)
         while near.recv(4096):
             pass
-    assert until(lambda: robot.refused == {BAD_FRAMING: 1})
+    assert until(lambda: robot.rejected == {BAD_FRAMING: 1})
     assert "Traceback" not in capfd.readouterr().err
     robot.still_serves()

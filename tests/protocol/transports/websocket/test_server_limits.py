@@ -108,7 +108,7 @@ def test_viewers_without_number_leave_room_for_who_says_stop(robot):
             late.send(str(HELLO).replace("'", '"'))
             code, reason = closed_with(late)
         assert (code, reason.partition(":")[0]) == (1013, "12 clients watch, which is the limit")
-        assert robot.refused == {TOO_MANY_CLIENTS: 1}
+        assert robot.rejected == {TOO_MANY_CLIENTS: 1}
         with open_websocket("r1", connect=robot.endpoint, role="operator") as person:
             person.publish(REQUEST, b"", encode(Request(id=1, verb="stop")))
             assert b'"stop"' in asked.take(2).payload
@@ -147,7 +147,7 @@ def test_a_log_that_nobody_reads_shuts_nobody_out(robot, monkeypatch):
         monkeypatch.setattr(sys, "stderr", os.fdopen(writer, "w"))
         for _ in range(MAX_HANDSHAKES_PER_ADDRESS + 1):
             ending.enter_context(socket.create_connection(address))
-        assert until(lambda: robot.refused[TOO_MANY_CLIENTS])
+        assert until(lambda: robot.rejected[TOO_MANY_CLIENTS])
         ending.close()
         open_websocket("r1", connect=robot.endpoint, role="operator", timeout_s=5).close()
 
@@ -157,7 +157,7 @@ def test_a_viewer_for_whom_there_is_no_place_is_told_and_tries_again(robot):
         viewers = [ending.enter_context(hail(robot.endpoint)) for _ in range(WATCHERS)]
         with pytest.raises(LinkError, match="refused: 12 clients watch, which is the limit"):
             open_websocket("r1", connect=robot.endpoint, role="viewer", timeout_s=0.5)
-        assert robot.refused[TOO_MANY_CLIENTS] >= 2
+        assert robot.rejected[TOO_MANY_CLIENTS] >= 2
         viewers.pop().close()
         open_websocket("r1", connect=robot.endpoint, role="viewer").close()
 
@@ -174,7 +174,7 @@ def test_where_tokens_are_shown_a_viewer_too_many_is_told_by_http(keys):
             connect(endpoint, additional_headers=shown["viewer"], **V1)
         assert refusal.value.response.status_code == 503
         assert b"12 clients watch, which is the limit" in refusal.value.response.body
-        assert robot.refused == {TOO_MANY_CLIENTS: 1}
+        assert robot.rejected == {TOO_MANY_CLIENTS: 1}
         open_websocket("r1", connect=endpoint, role="operator", secure=keys).close()
 
 
@@ -183,7 +183,7 @@ def test_idle_strangers_take_only_the_places_of_their_own_address(robot):
         for _ in range(MAX_CLIENTS + MAX_HANDSHAKES):
             ending.enter_context(socket.create_connection(robot.address, source_address=("127.0.0.2", 0)))
         expected = MAX_CLIENTS + MAX_HANDSHAKES - MAX_HANDSHAKES_PER_ADDRESS
-        assert until(lambda: robot.refused == {TOO_MANY_CLIENTS: expected}, 1)
+        assert until(lambda: robot.rejected == {TOO_MANY_CLIENTS: expected}, 1)
         hail(robot.endpoint, role="operator").close()
         robot.still_serves()
 
@@ -201,6 +201,6 @@ def test_a_thread_that_cannot_start_costs_one_client_and_no_place(robot, monkeyp
     for _ in range(2 * MAX_HANDSHAKES_PER_ADDRESS):
         with socket.create_connection(robot.address, 3) as near:
             assert near.recv(1) == b""  # closed, not left to wait
-    assert robot.refused == {TOO_MANY_CLIENTS: 2 * MAX_HANDSHAKES_PER_ADDRESS}
+    assert robot.rejected == {TOO_MANY_CLIENTS: 2 * MAX_HANDSHAKES_PER_ADDRESS}
     hail(robot.endpoint).close()
     robot.still_serves()

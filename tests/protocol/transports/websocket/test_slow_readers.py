@@ -39,7 +39,7 @@ def test_who_never_reads_delays_nobody_costs_little_and_is_heard(robot):
         assert heard == 5 * FPS
         assert robot.link.dropped["frame"] >= 4 * FPS
         assert len(robot.link._peers) == 2
-        assert robot.refused == {}
+        assert robot.rejected == {}
     assert statistics.median(took_s) < 0.02
     assert resident_kib() - before_kib < 5_000
     robot.still_serves()
@@ -63,8 +63,8 @@ def test_who_reads_a_picture_a_second_stays_and_is_never_far_behind_what_fits_it
             robot.publish(FRAME, b"", b"%04d" % number + bytes(picture_bytes - 4))
             pause_until(begin_s, 1 / FPS)
         assert robot._peers == (peer,)  # the connection that it had
-        assert robot.refused == {}
-        assert viewer.refused == {}
+        assert robot.rejected == {}
+        assert viewer.rejected == {}
         assert len(got) >= 7
         assert got == sorted(set(got))
         assert resident_kib() - before_kib < 5_000
@@ -81,7 +81,7 @@ def test_an_end_that_stands_still_is_noticed_within_three_seconds():
             robot.publish(STATUS, b"{}", bytes(500))  # its machine takes these, but nobody reads
             time.sleep(0.1)
         assert 1.5 < time.monotonic() - begin_s < 3
-        assert robot.refused == {SILENT: 1}
+        assert robot.rejected == {SILENT: 1}
 
 
 def test_a_flood_of_pings_that_nobody_reads_the_answers_to_costs_little(robot):
@@ -98,5 +98,5 @@ def test_a_flood_of_pings_that_nobody_reads_the_answers_to_costs_little(robot):
 def test_a_flood_of_empty_fragments_ends_with_a_reason(robot):
     with bare_client(robot.endpoint) as near:
         near.sendall(b"\x02\x80" + bytes(4) + (b"\x00\x80" + bytes(4)) * 3000)
-        assert until(lambda: robot.refused == {OVERSIZE: 1})
+        assert until(lambda: robot.rejected == {OVERSIZE: 1})
     robot.still_serves()

@@ -58,7 +58,7 @@ def test_large_messages_are_taken_only_while_somebody_wants_them(site):
     with pytest.raises(ConnectionClosed):
         stranger.send(large)
         stranger.recv(5)
-    assert until(lambda: robot.refused["OVERSIZE"] == 1)
+    assert until(lambda: robot.rejected["OVERSIZE"] == 1)
     viewer = opened("viewer")
     seen = viewer.latest(OVERLAY)
     stranger = hail(end, role="vision", wants=["status"])

@@ -96,7 +96,7 @@ def test_a_smaller_bound_on_frames_holds_at_both_ends():
         robot.publish(FRAME, b"", bytes(100))
         robot.publish(FRAME, b"", bytes(99))
         assert len(frames.take(2).payload) == 99
-        assert peer.refused["OVERSIZE"] == 1
+        assert peer.rejected["OVERSIZE"] == 1
 
 
 class _Counting:
@@ -147,7 +147,7 @@ def test_a_delete_is_no_message():
     with open_zenoh("r1", listen=[endpoint]) as robot, open_session((), [endpoint], 5.0) as stranger:
         twists = robot.latest(TWIST)
         stranger.delete("sightline/r1/twist/vision")
-        assert until(lambda: robot.refused[NOT_A_PUT] == 1)
+        assert until(lambda: robot.rejected[NOT_A_PUT] == 1)
         assert twists.take() is None
 
 
