@@ -10,7 +10,7 @@ import socket
 import ssl
 import time
 from base64 import b64encode
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import Final, NamedTuple, Self
@@ -23,110 +23,132 @@ from sightline.protocol.transports.zenoh.session import open_session
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 CONTINUED: Final = 0
 LOST: Final = (1006, "")
-"""The end of a connection that nobody closed, in the words of RFC 6455, 7.1.5."""
+"""The end of a connection without a close frame: RFC 6455, 7.1.5."""
 _SIZES: Final = {126: 2, 127: 8}
-_MAX_HEAD_BYTES: Final = 8192
+_MAX_HEAD_BYTES: Final = 16_384
+_MAX_BUFFERED_BYTES: Final = 2_000_000
+"""Security limit: the largest message of the protocol is a frame of a million bytes."""
 _PATIENCE_S: Final = 3.0
 
 
 class Frame(NamedTuple):
-    """One WebSocket frame as it came."""
+    """One WebSocket frame as it came, unmasked."""
 
     fin: bool
     opcode: int
     data: bytes
 
 
-class RawWebSocket:
-    """An opened connection, or the refusal in `status`. It answers pings unless told otherwise."""
+def frame_bytes(opcode: int, data: bytes, *, fin: bool = True, masked: bool = True) -> bytes:
+    """Return one frame as RFC 6455, 5.2 lays it out."""
+    size = len(data)
+    short = size if size < 126 else 126 if size < 65_536 else 127
+    head = bytes([(0x80 if fin else 0) | opcode, (0x80 if masked else 0) | short])
+    head += size.to_bytes(_SIZES[short]) if short in _SIZES else b""
+    mask = os.urandom(4)
+    return head + (mask + xor(data, mask) if masked else data)
 
-    def __init__(
-        self,
-        url: str,
-        protocols: Sequence[str] = (SUBPROTOCOL,),
-        headers: Sequence[tuple[str, str]] = (),
-        *,
-        host: str = "",
-        answers_pings: bool = True,
-        path: str = "/",
-    ) -> None:
-        """Connect and shake hands; `host` replaces the Host header. Raises LinkError where nobody answers."""
-        secure, address, port = split_url(url)
-        self._answers_pings = answers_pings
-        self._data = b""
+
+def take_frame(data: bytes) -> tuple[Frame, bytes] | None:
+    """Return the first frame in `data` and the rest; None while the frame is not complete."""
+    if len(data) < 2:
+        return None
+    size, at = data[1] & 0x7F, 2
+    if size in _SIZES:
+        at += _SIZES[size]
+        size = int.from_bytes(data[2:at]) if len(data) >= at else len(data)
+    masked = 4 if data[1] & 0x80 else 0
+    end = at + masked + size
+    if len(data) < end:
+        return None
+    body = data[at + masked : end]
+    return Frame(bool(data[0] & 0x80), data[0] & 0x0F, xor(body, data[at : at + 4]) if masked else body), data[end:]
+
+
+def xor(data: bytes, mask: bytes) -> bytes:
+    """Mask or unmask `data` by RFC 6455, 5.3."""
+    pad = mask * (len(data) // 4 + 1)
+    return (int.from_bytes(data) ^ int.from_bytes(pad[: len(data)])).to_bytes(len(data))
+
+
+class RawConnection:
+    """Either end of a WebSocket; use it in a `with`. It answers pings unless `answers_pings` is false."""
+
+    masks = True
+
+    def __init__(self, connection: socket.socket, *, answers_pings: bool = True) -> None:
+        self._socket = connection
+        self.answers_pings = answers_pings
         self.pings = 0
-        try:
-            self._socket = socket.create_connection((address, port), _PATIENCE_S)
-            if secure:
-                self._socket = _unverified().wrap_socket(self._socket, server_hostname=address)
-        except OSError as error:
-            raise LinkError(f"nobody answers at {url}: {error}") from None
-        lines = [("Host", host or f"{address}:{port}"), ("Upgrade", "websocket"), ("Connection", "Upgrade"),
-                 ("Sec-WebSocket-Key", b64encode(os.urandom(16)).decode()), ("Sec-WebSocket-Version", "13"),
-                 *headers]  # fmt: skip
-        if protocols:
-            lines.append(("Sec-WebSocket-Protocol", ", ".join(protocols)))
-        head = "".join(f"{name}: {value}\r\n" for name, value in lines)
-        self.write(f"GET {path} HTTP/1.1\r\n{head}\r\n".encode())
-        self.status, self.headers = self._answer()
+        self._data = b""
+        self._ended = False
 
-    def _answer(self) -> tuple[int, dict[str, str]]:
+    def read_head(self) -> tuple[str, list[tuple[str, str]]]:
+        """Read the other end's HTTP head: its first line, and its headers with names in lower case; "" without one."""
         deadline_s = time.monotonic() + _PATIENCE_S
-        while b"\r\n\r\n" not in self._data and len(self._data) < _MAX_HEAD_BYTES:
-            if not self._read(deadline_s - time.monotonic()):
-                return 0, {}
+        while b"\r\n\r\n" not in self._data:
+            if len(self._data) > _MAX_HEAD_BYTES or not self._read(deadline_s - time.monotonic()):
+                return "", []
         head, _, self._data = self._data.partition(b"\r\n\r\n")
         first, *lines = head.decode("latin-1").split("\r\n")
         pairs = (line.partition(":") for line in lines)
-        status = first.split(" ")[1] if first.count(" ") else ""
-        return int(status) if status.isdigit() else 0, {name.lower(): value.strip() for name, _, value in pairs}
+        return first, [(name.lower(), value.strip()) for name, _, value in pairs]
 
     # --- sending -------------------------------------------------------------------------------------------------
 
-    def send(self, opcode: int, data: bytes, *, fin: bool = True, masked: bool = True, reserved: int = 0) -> None:
-        """One frame; what the other end has closed meanwhile is no error here."""
-        size, mask = len(data), os.urandom(4)
-        first = (0x80 if fin else 0) | reserved << 4 | opcode
-        short = size if size < 126 else 126 if size < 65_536 else 127
-        head = bytes([first, (0x80 if masked else 0) | short])
-        head += size.to_bytes(_SIZES[short]) if short in _SIZES else b""
-        body = mask + xor(data, mask) if masked else data
-        self.write(head + body)
+    def send(self, opcode: int, data: bytes, *, fin: bool = True, masked: bool | None = None) -> None:
+        """Send one frame; the end of the connection is not an error here."""
+        self.write(frame_bytes(opcode, data, fin=fin, masked=self.masks if masked is None else masked))
 
     def write(self, data: bytes) -> None:
-        """Bytes as they are."""
+        """Send bytes as they are."""
         with suppress(OSError):
+            self._socket.settimeout(_PATIENCE_S)
             self._socket.sendall(data)
 
     # --- receiving -----------------------------------------------------------------------------------------------
 
     def frame(self, within_s: float) -> Frame | None:
-        """The next frame that is no ping; None when none comes, or the connection has ended."""
+        """Return the next frame except pings; None when none comes, or the connection has ended."""
         deadline_s = time.monotonic() + within_s
         while True:
-            frame = self._take()
-            if frame is None:
+            taken = take_frame(self._data)
+            if taken is None:
                 if not self._read(deadline_s - time.monotonic()):
                     return None
-            elif frame.opcode == PING:
-                self.pings += 1
-                if self._answers_pings:
-                    self.send(PONG, frame.data)
-            else:
+                continue
+            frame, self._data = taken
+            if frame.opcode != PING:
                 return frame
+            self.pings += 1
+            if self.answers_pings:
+                self.send(PONG, frame.data)
 
-    def end(self, within_s: float) -> tuple[int, str] | None:
-        """How the other end closes: code and reason, LOST for an end without a word; None if it stays open."""
+    def frame_that(self, wanted: Callable[[Frame], bool], within_s: float) -> Frame | None:
+        """Return the next frame for which `wanted` holds; None when none comes."""
         deadline_s = time.monotonic() + within_s
-        while (left_s := deadline_s - time.monotonic()) > 0:
+        while (left_s := deadline_s - time.monotonic()) > 0 and not self._ended:
             frame = self.frame(left_s)
-            if frame is not None and frame.opcode == CLOSE:
-                return int.from_bytes(frame.data[:2]), frame.data[2:].decode("utf-8", "replace")
-            if frame is None and self._ended:
-                return LOST
+            if frame is not None and wanted(frame):
+                return frame
         return None
 
-    _ended = False
+    def messages(self, for_s: float) -> Iterator[tuple[int, bytes]]:
+        """Yield the opcode and data of each whole message within `for_s`."""
+        whole, opcode = b"", 0
+        deadline_s = time.monotonic() + for_s
+        while frame := self.frame_that(lambda one: one.opcode <= BINARY, deadline_s - time.monotonic()):
+            whole, opcode = whole + frame.data, frame.opcode or opcode
+            if frame.fin:
+                yield opcode, whole
+                whole = b""
+
+    def end(self, within_s: float) -> tuple[int, str] | None:
+        """Return close code and reason, LOST without a close frame; None if the connection stays open."""
+        frame = self.frame_that(lambda one: one.opcode == CLOSE, within_s)
+        if frame is not None:
+            return int.from_bytes(frame.data[:2]), frame.data[2:].decode("utf-8", "replace")
+        return LOST if self._ended else None
 
     def _read(self, within_s: float) -> bool:
         try:
@@ -137,24 +159,11 @@ class RawWebSocket:
         except OSError:
             data = b""
         self._data += data
-        self._ended = not data
-        return bool(data)
-
-    def _take(self) -> Frame | None:
-        data = self._data
-        if len(data) < 2:
-            return None
-        size, at = data[1] & 0x7F, 2
-        if size in _SIZES:
-            at += _SIZES[size]
-            size = int.from_bytes(data[2:at]) if len(data) >= at else len(data)
-        if len(data) < at + size:
-            return None
-        self._data = data[at + size :]
-        return Frame(bool(data[0] & 0x80), data[0] & 0x0F, data[at : at + size])
+        self._ended = not data or len(self._data) > _MAX_BUFFERED_BYTES
+        return not self._ended
 
     def close(self) -> None:
-        """Hang up without a word."""
+        """Close the socket without a close frame."""
         self._socket.close()
 
     def __enter__(self) -> Self:
@@ -166,6 +175,40 @@ class RawWebSocket:
         self.close()
 
 
+class RawWebSocket(RawConnection):
+    """The client's end: an opened connection, or the rejection in `status`."""
+
+    def __init__(
+        self,
+        url: str,
+        protocols: Sequence[str] = (SUBPROTOCOL,),
+        headers: Sequence[tuple[str, str]] = (),
+        *,
+        host: str = "",
+        answers_pings: bool = True,
+        path: str = "/",
+    ) -> None:
+        """Connect and shake hands; `host` replaces the Host header. Raises LinkError without an answer."""
+        secure, address, port = split_url(url)
+        try:
+            connection = socket.create_connection((address, port), _PATIENCE_S)
+            if secure:
+                connection = _unverified().wrap_socket(connection, server_hostname=address)
+        except OSError as error:
+            raise LinkError(f"no answer from {url}: {error}; start the peer or check the address") from None
+        super().__init__(connection, answers_pings=answers_pings)
+        lines = [("Host", host or f"{address}:{port}"), ("Upgrade", "websocket"), ("Connection", "Upgrade"),
+                 ("Sec-WebSocket-Key", b64encode(os.urandom(16)).decode()), ("Sec-WebSocket-Version", "13"),
+                 *headers]  # fmt: skip
+        if protocols:
+            lines.append(("Sec-WebSocket-Protocol", ", ".join(protocols)))
+        head = "".join(f"{name}: {value}\r\n" for name, value in lines)
+        self.write(f"GET {path} HTTP/1.1\r\n{head}\r\n".encode())
+        first, answered = self.read_head()
+        status = first.split(" ")[1] if first.count(" ") else ""
+        self.status, self.headers = int(status) if status.isdigit() else 0, dict(answered)
+
+
 def split_url(url: str) -> tuple[bool, str, int]:
     """(TLS, address, port) of `ws://`, `wss://` or the older dialect's endpoint. Raises ConfigError."""
     scheme, _, rest = url.partition("://")
@@ -173,12 +216,6 @@ def split_url(url: str) -> tuple[bool, str, int]:
     if scheme.split("-")[0] not in ("ws", "wss") or not port.isdigit():
         raise ConfigError(f"endpoint {url!r} is none of WebSocket, e.g. ws://127.0.0.1:9090")
     return scheme.startswith("wss"), address.strip("[]"), int(port)
-
-
-def xor(data: bytes, mask: bytes) -> bytes:
-    """`data` masked as RFC 6455, 5.3 says."""
-    pad = mask * (len(data) // 4 + 1)
-    return (int.from_bytes(data) ^ int.from_bytes(pad[: len(data)])).to_bytes(len(data))
 
 
 def _unverified() -> ssl.SSLContext:

@@ -26,20 +26,6 @@ def _older(bench: Bench, **options: Any) -> Iterator[RawWebSocket]:
         yield raw
 
 
-def _pictures(raw: RawWebSocket, for_s: float) -> list[tuple[int, bytes]]:
-    """(opcode, data) of each message within `for_s`."""
-    until_s, found = time.monotonic() + for_s, []
-    whole, opcode = b"", 0
-    while (left_s := until_s - time.monotonic()) > 0:
-        frame = raw.frame(left_s)
-        if frame is not None and frame.opcode <= BINARY:
-            whole, opcode = whole + frame.data, frame.opcode or opcode
-            if frame.fin:
-                found.append((opcode, whole))
-                whole = b""
-    return found
-
-
 def _picture(text: bytes) -> bytes:
     """The JPEG in a message, empty if it is none."""
     try:
@@ -55,7 +41,7 @@ def pictures_as_text(bench: Bench) -> None:
     """Who connects without a sub-protocol gets pictures: text, base64, a JPEG."""
     with _older(bench) as raw:
         bench.expect(raw.status == _SWITCHED, f"HTTP {raw.status}")
-        pictures = _pictures(raw, 1.5)
+        pictures = list(raw.messages(1.5))
         bench.expect(pictures, "no picture within 1.5 s")
         good = [opcode == TEXT and _picture(text) for opcode, text in pictures]
         bench.expect(all(good), f"{len(good) - sum(map(bool, good))} of {len(good)} messages are no picture as text")
@@ -65,7 +51,7 @@ def pictures_as_text(bench: Bench) -> None:
 def newlines(bench: Bench) -> None:
     """The base64 has a newline after every 76 characters and at the end (robots with `?oneline` have none)."""
     with _older(bench) as raw:
-        texts = [text for opcode, text in _pictures(raw, 1.5) if opcode == TEXT and _picture(text)]
+        texts = [text for opcode, text in raw.messages(1.5) if opcode == TEXT and _picture(text)]
         bench.need(texts, "no picture as text (R-DIAL-11)")
         for text in texts:
             *lines, last = text.split(b"\n")
@@ -124,13 +110,11 @@ def silent_clients_stay(bench: Bench) -> None:
 def twists_return_credit(bench: Bench) -> None:
     """Its twist after a frame returns the credit: who answers gets picture after picture."""
     with _older(bench) as raw:
-        silent = len(_pictures(raw, _COMPARED_S))
-        answered, until_s = 0, time.monotonic() + _COMPARED_S
-        while (left_s := until_s - time.monotonic()) > 0:
-            frame = raw.frame(left_s)
-            if frame is not None and frame.opcode <= BINARY and frame.fin:
-                answered += 1
-                raw.send(TEXT, b"0|0")
+        silent = len(list(raw.messages(_COMPARED_S)))
+        answered = 0
+        for _ in raw.messages(_COMPARED_S):
+            answered += 1
+            raw.send(TEXT, b"0|0")
         bench.need(silent, "no picture (R-DIAL-11)")
         said = f"{answered} pictures in {_COMPARED_S} s to a client that answers each at once, {silent} to a silent one"
         bench.expect(answered >= 1.5 * silent, said)
@@ -150,7 +134,7 @@ def origins(bench: Bench) -> None:
 def several_clients(bench: Bench) -> None:
     """Several clients each get pictures."""
     with _older(bench) as first, _older(bench) as second:
-        first_came, second_came = _pictures(first, 1.2), _pictures(second, 0.8)
+        first_came, second_came = list(first.messages(1.2)), list(second.messages(0.8))
         bench.need(first_came or second_came, "no pictures (R-DIAL-11)")
         bench.expect(first_came and second_came, f"{len(first_came)} to the first, {len(second_came)} to the second")
 

@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 
 from sightline.conformance.case import Bench, NotApplicableError, Suite
-from sightline.conformance.raw_peers import BINARY, CONTINUED, PING, PONG, TEXT, Frame, RawWebSocket, split_url
+from sightline.conformance.raw_peers import BINARY, CONTINUED, PING, PONG, TEXT, RawWebSocket, split_url
 from sightline.conformance.robot.fixture import GOOD, Robot, Sender, as_json
 from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, REPLY, STATUS
 from sightline.protocol.errors import WireError
@@ -83,15 +83,7 @@ def disarm_request(bench: Bench) -> bytes:
 
 def packets_of(raw: RawWebSocket, bench: Bench, for_s: float) -> list[IncomingMessage]:
     """What comes in whole messages, taken apart; what cannot be taken apart has an empty key."""
-    until_s, whole, packets = time.monotonic() + for_s, b"", []
-    while (left_s := until_s - time.monotonic()) > 0:
-        frame = raw.frame(left_s)
-        if frame is not None and frame.opcode in (BINARY, CONTINUED):
-            whole += frame.data
-            if frame.fin:
-                packets.append(_packet(whole, bench))
-                whole = b""
-    return packets
+    return [_packet(data, bench) for opcode, data in raw.messages(for_s) if opcode == BINARY]
 
 
 def _packet(message: bytes, bench: Bench) -> IncomingMessage:
@@ -282,17 +274,8 @@ def pings_are_answered(bench: Bench) -> None:
     """A ping is answered with its own data."""
     with spoken(bench) as raw:
         raw.send(PING, b"\0marco")
-        frame = _next(raw, PONG)
+        frame = raw.frame_that(lambda one: one.opcode == PONG, SOON_S)
         bench.expect(frame is not None and frame.data == b"\0marco", f"the answer is {frame}")
-
-
-def _next(raw: RawWebSocket, opcode: int) -> Frame | None:
-    until_s = time.monotonic() + SOON_S
-    while (left_s := until_s - time.monotonic()) > 0:
-        frame = raw.frame(left_s)
-        if frame is not None and frame.opcode == opcode:
-            return frame
-    return None
 
 
 def _breaks(

@@ -4,10 +4,8 @@ It knows just enough of RFC 6455 to accept one client at a time, and leaves ever
 """
 
 import base64
-import contextlib
 import hashlib
 import json
-import re
 import secrets
 import socket
 import ssl
@@ -19,6 +17,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from sightline.conformance.case import Bench, Suite
+from sightline.conformance.raw_peers import BINARY, CLOSE, CONTINUED, PING, PONG, TEXT, Frame, RawConnection
 from sightline.conformance.vision.images import CAMERA as LENS
 from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import CAMERA, FRAME, Channel
@@ -29,19 +28,10 @@ from sightline.protocol.transports.endpoints import parse_websocket_endpoint
 from sightline.protocol.transports.security import server_tls_context
 from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL, pack, parse_hello
 
-TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 SESSION_BEGINS: Final = "5ca1"
 """So the tests' broken visions tell this server from the kit's own link."""
 _GUID: Final = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 _SEND_S: Final = 2.0
-_MAX_REQUEST_BYTES: Final = 16_384
-_MAX_MESSAGE_BYTES: Final = 65_536
-"""Security limit: no answer of a vision is near it."""
-_HEADER: Final = re.compile(rb"^([!-9;-~]+):[ \t]*(.*?)[ \t]*$", re.MULTILINE)
-
-
-class GoneError(Exception):
-    """The client closed or lost the connection."""
 
 
 class RawServer:
@@ -58,9 +48,9 @@ class RawServer:
             self._socket.close()
             raise LinkError(f"ws://{host}:{port} cannot be listened on: {error.strerror}") from None
         self._socket.listen(4)
-        self._clients: list[RawClient] = []
+        self._clients: list[AcceptedClient] = []
 
-    def accept(self, within_s: float) -> "RawClient | None":
+    def accept(self, within_s: float) -> "AcceptedClient | None":
         """The next client, after the opening handshake; None if none came in time."""
         deadline_s = time.monotonic() + within_s
         while (left_s := deadline_s - time.monotonic()) > 0:
@@ -72,9 +62,9 @@ class RawServer:
             try:
                 connection.settimeout(_SEND_S)
                 secured = connection if self._tls is None else self._tls.wrap_socket(connection, server_side=True)
-                self._clients.append(RawClient(secured))
+                self._clients.append(AcceptedClient(secured))
                 return self._clients[-1]
-            except (OSError, GoneError):
+            except (OSError, LinkError):
                 connection.close()
         return None
 
@@ -89,109 +79,41 @@ class RawServer:
             client.close()
 
 
-class RawClient:
-    """One connection. `offered` are the sub-protocols that the client offered; `session` is of the robot played on it.
+class AcceptedClient(RawConnection):
+    """The server's end. `offered` are the client's sub-protocols; `session` is of the robot played on it.
 
-    `request` is the first line of what it asked, `headers` all that it said beside, names in lower case.
-    Each connection is to a robot started anew: a vision may take an earlier session for over.
+    `request` is the first line of the client's head, `headers` are the others.
+    Each connection is to a robot started again: a vision service may treat an earlier session as ended.
     """
 
+    masks = False
+
     def __init__(self, connection: socket.socket) -> None:
-        """Do the opening handshake. Raises OSError or GoneError for a client that does not."""
-        self._socket = connection
-        self._buffer = b""
+        """Complete the opening handshake. Raises LinkError for a client that sends no request."""
+        super().__init__(connection)
         self.session = SESSION_BEGINS + secrets.token_hex(2)
-        self.pings = 0
-        self.answers_pings = True
-        connection.settimeout(_SEND_S)
-        while b"\r\n\r\n" not in self._buffer:
-            self._more()
-            if len(self._buffer) > _MAX_REQUEST_BYTES:
-                raise GoneError("its request has no end")
-        request, _, self._buffer = self._buffer.partition(b"\r\n\r\n")
-        said = request.replace(b"\r", b"")
-        self.request = said.partition(b"\n")[0].decode("latin-1")
-        self.headers = [(name.lower().decode(), value.decode("latin-1")) for name, value in _HEADER.findall(said)]
-        fields = {name.lower(): value for name, value in _HEADER.findall(said)}
-        self.offered = [one.strip().decode("latin-1") for one in fields.get(b"sec-websocket-protocol", b"").split(b",")]
-        token = base64.b64encode(hashlib.sha1(fields.get(b"sec-websocket-key", b"") + _GUID).digest())
-        chosen = b"Sec-WebSocket-Protocol: sightline.v1\r\n" if "sightline.v1" in self.offered else b""
-        connection.sendall(b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-                           b"Sec-WebSocket-Accept: " + token + b"\r\n" + chosen + b"\r\n")
+        self.request, self.headers = self.read_head()
+        if not self.request:
+            raise LinkError("the client sent no request")
+        fields = dict(self.headers)
+        self.offered = [one.strip() for one in fields.get("sec-websocket-protocol", "").split(",")]
+        token = base64.b64encode(hashlib.sha1(fields.get("sec-websocket-key", "").encode("latin-1") + _GUID).digest())
+        chosen = b"Sec-WebSocket-Protocol: sightline.v1\r\n" if SUBPROTOCOL in self.offered else b""
+        self.write(b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                   b"Sec-WebSocket-Accept: " + token + b"\r\n" + chosen + b"\r\n")
 
-    def send(self, kind: int, payload: bytes, *, last: bool = True) -> None:
-        """One frame; a message in fragments continues with kind 0. A client that is gone is noticed in `receive`."""
-        size = len(payload)
-        length = (bytes((size,)) if size < 126
-                  else struct.pack(">BH", 126, size) if size < 65_536 else struct.pack(">BQ", 127, size))
-        with contextlib.suppress(OSError):
-            self._socket.settimeout(_SEND_S)
-            self._socket.sendall(bytes((kind | (0x80 if last else 0),)) + length + payload)
-
-    def receive(self, within_s: float) -> tuple[int, bytes] | None:
-        """The next frame but pings, which are answered and counted; None if none came. Raises GoneError at the end."""
-        deadline_s = time.monotonic() + within_s
-        while (left_s := deadline_s - time.monotonic()) > 0:
-            try:
-                self._socket.settimeout(left_s)
-                kind, payload = self._frame()
-            except TimeoutError:
-                return None
-            except OSError as error:
-                raise GoneError(str(error)) from None
-            if kind == CLOSE:
-                self.send(CLOSE, payload[:2])
-                self.close()  # RFC 6455, 7.1.1: the server ends the TCP connection first
-                raise GoneError("it closed the connection")
-            if kind != PING:
-                return kind, payload
-            self.pings += 1
-            if self.answers_pings:
-                self.send(PONG, payload)
-        return None
-
-    def close(self) -> None:
-        """End the connection."""
-        self._socket.close()
+    def frame(self, within_s: float) -> Frame | None:
+        """Return the next frame except pings; a close frame is answered and ends the connection."""
+        frame = super().frame(within_s)
+        if frame is not None and frame.opcode == CLOSE:
+            self.send(CLOSE, frame.data[:2])
+            self.close()  # RFC 6455, 7.1.1: the server ends the TCP connection first
+        return frame
 
     def drop(self) -> None:
         """End the connection as a lost one: without a close frame, with a reset."""
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._socket.close()
-
-    def _frame(self) -> tuple[int, bytes]:
-        while True:
-            taken = _take(self._buffer)
-            if taken is not None:
-                kind, payload, self._buffer = taken
-                return kind, payload
-            if len(self._buffer) > _MAX_MESSAGE_BYTES:
-                raise GoneError(f"it sent more than {_MAX_MESSAGE_BYTES} bytes at once")
-            self._more()
-
-    def _more(self) -> None:
-        data = self._socket.recv(65_536)
-        if not data:
-            raise GoneError("it ended the connection")
-        self._buffer += data
-
-
-def _take(data: bytes) -> tuple[int, bytes, bytes] | None:
-    """A client's first frame in `data`, unmasked, and what follows it; None while it is not complete."""
-    if len(data) < 2:
-        return None
-    size, at = data[1] & 0x7F, 2
-    if size > 125:
-        at = 4 if size == 126 else 10
-        size = int.from_bytes(data[2:at])
-    mask = data[at : at + 4] if data[1] & 0x80 else b""
-    at += len(mask)
-    if len(data) < at + size or (data[1] & 0x80 and len(mask) < 4):
-        return None
-    payload = data[at : at + size]
-    if mask:
-        payload = bytes(one ^ mask[place % 4] for place, one in enumerate(payload))
-    return data[0] & 0x0F, payload, data[at + size :]
 
 
 # Cases about a vision's WebSocket itself: opening, hello, liveness, ends; with a server that can misbehave. Shell.
@@ -227,19 +149,17 @@ def server_of(bench: Bench) -> Iterator[RawServer]:
         bench.join()
 
 
-def client_of(bench: Bench, server: RawServer) -> RawClient:
+def client_of(bench: Bench, server: RawServer) -> AcceptedClient:
     client = server.accept(BACK_S)
     bench.expect(client is not None, f"it did not connect within {BACK_S:g} s")
     assert client is not None
     return client
 
 
-def _hello(client: RawClient) -> tuple[int, bytes]:
+def _hello(client: AcceptedClient) -> tuple[int, bytes]:
     """Its first message; (0, b"") if there was none."""
-    try:
-        return client.receive(_HELLO_S) or (0, b"")
-    except GoneError:
-        return 0, b""
+    frame = client.frame(_HELLO_S)
+    return (frame.opcode, frame.data) if frame else (0, b"")
 
 
 def _fields(text: bytes) -> dict[str, Any]:
@@ -250,7 +170,7 @@ def _fields(text: bytes) -> dict[str, Any]:
     return fields if isinstance(fields, dict) else {}
 
 
-def _greet(client: RawClient, robot: str) -> None:
+def _greet(client: AcceptedClient, robot: str) -> None:
     hello = {"v": 1, "robot": robot, "role": "robot", "session": client.session, "wants": ["twist", "ack"]}
     client.send(TEXT, json.dumps(hello).encode())
 
@@ -259,11 +179,11 @@ def _message(channel: Channel, header: Stamp, payload: bytes) -> bytes:
     return pack(channel, "", "robot", encode(header), payload)
 
 
-def _frame(client: RawClient, seq: int) -> bytes:
+def _frame(client: AcceptedClient, seq: int) -> bytes:
     return _message(FRAME, FrameHeader(session=client.session, seq=seq, t_us=seq * 40_000), picture("left"))
 
 
-def met(bench: Bench, server: RawServer) -> RawClient:
+def met(bench: Bench, server: RawServer) -> AcceptedClient:
     """A client that has said hello, was greeted, and knows the camera."""
     client = client_of(bench, server)
     _hello(client)
@@ -272,28 +192,10 @@ def met(bench: Bench, server: RawServer) -> RawClient:
     return client
 
 
-def _answer(client: RawClient, within_s: float = _ANSWER_S) -> bytes | None:
-    """The next binary message; None if there is none, or nobody."""
-    deadline_s = time.monotonic() + within_s
-    while (left_s := deadline_s - time.monotonic()) > 0:
-        try:
-            got = client.receive(left_s)
-        except GoneError:
-            return None
-        if got is not None and got[0] == BINARY:
-            return got[1]
-    return None
-
-
-def ends(client: RawClient, within_s: float = _END_S) -> bool:
-    """Whether it ends the connection in time."""
-    deadline_s = time.monotonic() + within_s
-    while (left_s := deadline_s - time.monotonic()) > 0:
-        try:
-            client.receive(left_s)
-        except GoneError:
-            return True
-    return False
+def _answer(client: AcceptedClient) -> bytes | None:
+    """The next binary message; None if none comes."""
+    frame = client.frame_that(lambda one: one.opcode == BINARY, _ANSWER_S)
+    return frame.data if frame else None
 
 
 # --- opening ---------------------------------------------------------------------------------------------------------
@@ -347,7 +249,7 @@ def leaves_another_robot(bench: Bench) -> None:
         client.send(BINARY, _message(CAMERA, Stamp(session=client.session, seq=1, t_us=1), encode(LENS)))
         client.send(BINARY, _frame(client, 1))
         bench.expect(_answer(client) is None, "it answered another robot's frame")
-        bench.expect(ends(client), "it stayed with another robot")
+        bench.expect(client.end(_END_S), "it stayed with another robot")
 
 
 # --- messages --------------------------------------------------------------------------------------------------------
@@ -373,10 +275,10 @@ def reads_fragments(bench: Bench) -> None:
     with server_of(bench) as server:
         client = met(bench, server)
         whole = _frame(client, 1)
-        client.send(BINARY, whole[:100], last=False)
+        client.send(BINARY, whole[:100], fin=False)
         client.send(PING, b"between")
-        client.send(0, whole[100:2_000], last=False)
-        client.send(0, whole[2_000:])
+        client.send(CONTINUED, whole[100:2_000], fin=False)
+        client.send(CONTINUED, whole[2_000:])
         bench.expect(_answer(client) is not None, "it did not answer")
 
 
@@ -389,14 +291,8 @@ def answers_pings(bench: Bench) -> None:
     with server_of(bench) as server:
         client = met(bench, server)
         client.send(PING, b"are you there")
-        deadline_s = time.monotonic() + _ANSWER_S
-        got: tuple[int, bytes] | None = None
-        while got != (PONG, b"are you there") and time.monotonic() < deadline_s:
-            try:
-                got = client.receive(deadline_s - time.monotonic())
-            except GoneError:
-                break
-        bench.expect(got == (PONG, b"are you there"), "no pong came")
+        pong = Frame(True, PONG, b"are you there")
+        bench.expect(client.frame_that(lambda one: one == pong, _ANSWER_S), "no pong came")
 
 
 @SUITE.must("V-SOCK-09", "14.8 Liveness", real=True)
@@ -406,18 +302,15 @@ def pings(bench: Bench) -> None:
         client = met(bench, server)
         deadline_s = time.monotonic() + 2.5
         while not client.pings and time.monotonic() < deadline_s:
-            try:
-                client.receive(0.1)
-            except GoneError:
-                break
+            client.frame(0.1)
         bench.expect(client.pings, "no ping came")
 
 
-def _ends_and_comes_back(bench: Bench, spoil: Callable[[RawClient], None], what: str) -> None:
+def _ends_and_comes_back(bench: Bench, spoil: Callable[[AcceptedClient], None], what: str) -> None:
     with server_of(bench) as server:
         client = met(bench, server)
         spoil(client)
-        bench.expect(ends(client), f"it stayed after {what}")
+        bench.expect(client.end(_END_S), f"it stayed after {what}")
         bench.expect(server.accept(BACK_S), f"it did not connect again after {what}")
 
 
@@ -440,7 +333,7 @@ def no_hello(bench: Bench) -> None:
         client = client_of(bench, server)
         _hello(client)
         client.send(BINARY, _frame(client, 1))
-        bench.expect(ends(client), "it stayed with a robot that said no hello")
+        bench.expect(client.end(_END_S), "it stayed with a robot that said no hello")
 
 
 @SUITE.must("V-SOCK-13", "14.8 Liveness", real=True)
@@ -465,7 +358,7 @@ def _token(bench: Bench) -> str:
     return token
 
 
-def _shown(client: RawClient) -> list[str]:
+def _shown(client: AcceptedClient) -> list[str]:
     """Every token that the client showed, in either way."""
     bearers = (value for name, value in client.headers if name == "authorization")
     shown = [text[len(_BEARER) :].strip() for text in bearers if text.lower().startswith(_BEARER)]
@@ -508,5 +401,5 @@ def leaves_the_silent(bench: Bench) -> None:
     with server_of(bench) as server:
         client = met(bench, server)
         client.answers_pings = False
-        bench.expect(ends(client, BACK_S), f"after {BACK_S:g} s without a word it is still connected")
+        bench.expect(client.end(BACK_S), f"after {BACK_S:g} s without a word it is still connected")
         bench.expect(server.accept(BACK_S), f"it did not connect again within {BACK_S:g} s")

@@ -114,8 +114,8 @@ def test_endpoints_are_taken_apart():
             split_url(none)
 
 
-def test_nobody_there_is_one_clear_line():
-    with pytest.raises(LinkError, match="nobody answers at ws"):
+def test_no_answer_is_one_clear_line():
+    with pytest.raises(LinkError, match="no answer from ws"):
         RawWebSocket("ws://127.0.0.1:1")
 
 

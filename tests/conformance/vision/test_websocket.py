@@ -10,9 +10,9 @@ import pytest
 
 from sightline.conformance.benches import TO_ROBOT, LiveBench
 from sightline.conformance.case import Access
+from sightline.conformance.raw_peers import Frame, take_frame
 from sightline.conformance.runner import Outcome, run_case
 from sightline.conformance.vision.cases import CASES
-from sightline.conformance.vision.websocket import _take
 from sightline.protocol.transports.open import open_link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.process import serve
@@ -104,7 +104,7 @@ def test_over_zenoh_they_are_not_applicable():
 
 
 @pytest.mark.parametrize("size", [0, 5, 125, 126, 300, 65_535, 65_536])
-def test_the_little_server_reads_frames_of_any_length_at_any_cut(size):
+def test_the_raw_codec_reads_frames_of_any_length_at_any_cut(size):
     payload = bytes(number * 7 % 256 for number in range(size))
     mask = bytes((1, 2, 3, 4))
     masked = bytes(one ^ mask[place % 4] for place, one in enumerate(payload))
@@ -112,5 +112,5 @@ def test_the_little_server_reads_frames_of_any_length_at_any_cut(size):
         b"\xfe" + size.to_bytes(2) if size < 65_536 else b"\xff" + size.to_bytes(8))
     whole = b"\x82" + length + mask + masked
     for cut in {0, 1, 2, 3, 5, 9, 13, len(whole) // 2, len(whole) - 1} & set(range(len(whole))):
-        assert _take(whole[:cut]) is None
-    assert _take(whole + b"next") == (2, payload, b"next")
+        assert take_frame(whole[:cut]) is None
+    assert take_frame(whole + b"next") == (Frame(True, 2, payload), b"next")
