@@ -5,6 +5,7 @@ simulation and a vision service of this environment. Memory is the kernel's own 
     .venv/bin/python .ci/light_robot.py [SECONDS]
 """
 
+import os
 import signal
 import subprocess
 import sys
@@ -67,7 +68,10 @@ def _bare_environment(folder: Path) -> str:
     venv.create(folder, with_pip=True)
     python = str(folder / "bin" / "python")
     pins = _pins(folder)
-    subprocess.run([python, "-m", "pip", "install", "--quiet", "-c", pins, f"{ROOT}[zenoh]"], check=True)
+    elsewhere = folder / "build.cfg"  # what is left in a checkout would later be taken for its state
+    elsewhere.write_text(f"[build]\nbuild_base = {folder / 'build'}\n[egg_info]\negg_base = {folder}\n")
+    subprocess.run([python, "-m", "pip", "install", "--quiet", "-c", pins, f"{ROOT}[zenoh]"], check=True,
+                   env=os.environ | {"DIST_EXTRA_CONFIG": str(elsewhere)})
     return python
 
 

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from sightline.protocol.config import first_problem
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.ports import Ranges
@@ -119,6 +120,4 @@ def _checked(kind: type[Model], table: Table, whose: str) -> Model:
     try:
         return kind.model_validate(table)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{whose} {where}: {first['msg']}"[:400]) from None
+        raise ConfigError(f"{whose} {first_problem(error, known=kind.model_fields)}"[:400]) from None

@@ -1,9 +1,168 @@
-"""The base of every configuration model. Pure."""
+"""The base of configuration models, the loader of plug-ins, a validation error as one line. Shell (imports plug-ins).
 
-from pydantic import BaseModel, ConfigDict
+A plug-in is named by an entry point of a group, or, from a configuration or a command line only, as
+`package.module:Name`. A message never names code.
+"""
+
+import difflib
+import linecache
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from importlib.machinery import PathFinder
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from sightline.protocol.errors import ConfigError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+PLUGIN_ERRORS: Final = (Exception, SystemExit)
+"""What a plug-in's own code may raise: `sys.exit` in it is to end itself, not the service around it."""
+_LONGEST_DETAIL: Final = 160
+_HERE: Final = Path(__file__).resolve().parent
+_CLASS: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
+_OLD_PACKAGES: Final = ("protocol", "robot_side", "vision_side", "sim", "operator_side", "benchmarks")
+"""Those that stood at the top until they moved below `sightline`."""
+_OLD_MODULE: Final = re.compile(rf"(?<![\w.])((?:{'|'.join(_OLD_PACKAGES)})(?:\.\w+)*)")
 
 
 class Config(BaseModel):
     """Frozen; unknown keys, nan and inf are errors. Units are in the names, bounds in the fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def first_problem(error: ValidationError, noun: str = "", known: Iterable[str] = (), whole: str = "") -> str:
+    """The first problem of a validation as one line.
+
+    Args:
+        noun: what a field is called, e.g. "option"; without one the line begins with the field's place and a colon.
+        known: the names that an unknown field should have been one of.
+        whole: the place of a problem that has none of its own.
+    """
+    # A misspelt field before a missing one: it is usually both.
+    problems = error.errors(include_url=False, include_context=False)
+    first = min(problems, key=lambda one: one["type"] != "extra_forbidden")
+    place = ".".join(str(part) for part in first["loc"]) or whole
+    if first["type"] == "extra_forbidden":
+        return f"unknown {noun or 'key'} {place!r}; it takes {', '.join(known) or 'none'}"
+    if first["type"] == "missing":
+        return f"{noun or 'key'} {place!r} is missing"
+    what = first["msg"].removeprefix("Value error, ")
+    if not place:
+        return what
+    return f"{noun} {place!r}: {what}" if noun else f"{place}: {what}"
+
+
+@cache
+def _entries(group: str) -> "dict[str, EntryPoint]":
+    from importlib.metadata import entry_points  # slow to import, and the operator's STOP needs no plug-in
+
+    return {entry.name: entry for entry in entry_points(group=group)}
+
+
+@dataclass(frozen=True, slots=True)
+class PluginRegistry:
+    """One kind of plug-in: what it is called, and the group of entry points that name it."""
+
+    noun: str
+    group: str
+
+    def names(self) -> list[str]:
+        """Every name that `load` knows here."""
+        return sorted(_entries(self.group))
+
+    def load(self, kind: str) -> Any:
+        """Import what is called `kind`. Raises ConfigError, one line, for an unknown one and for a broken one."""
+        entry = _entries(self.group).get(kind)
+        try:
+            with _old_packages_missing():
+                if entry is not None:
+                    return entry.load()
+                if _CLASS.fullmatch(kind):
+                    return _imported(kind)
+        except PLUGIN_ERRORS as error:  # in a plug-in's own import
+            hint = "" if entry is not None else self._hint(kind)
+            raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {_why(error, kind)}{hint}") from None
+        there = f"there are {', '.join(self.names())}, or package.module:Name"
+        raise ConfigError(f"no {self.noun} called {kind!r}{self._hint(kind)}; {there}")
+
+    def _hint(self, kind: str) -> str:
+        """The nearest name; what stands after a name, behind a colon, is not part of it."""
+        nearest = difflib.get_close_matches(kind.partition(":")[0], self.names(), n=1)
+        return f"; did you mean {nearest[0]!r}?" if nearest else ""
+
+    def settings(self, kind: str, plugin: Any, options: Mapping[str, Any]) -> Any:
+        """The checked `Config` of `plugin`. Raises ConfigError, one line, for a wrong option."""
+        settings = config_model(plugin)
+        if settings is None:
+            raise ConfigError(f"{self.noun} {kind!r}: {plugin!r} has no pydantic model called Config")
+        try:
+            return settings.model_validate(options)
+        except ValidationError as error:
+            problem = first_problem(error, "option", settings.model_fields)
+            raise ConfigError(f"{self.noun} {kind!r}: {problem}"[:_LONGEST_DETAIL]) from None
+
+
+def config_model(plugin: Any) -> type[BaseModel] | None:
+    """The class's own `Config`."""
+    settings = getattr(plugin, "Config", None)
+    return settings if isinstance(settings, type) and issubclass(settings, BaseModel) else None
+
+
+def _imported(path: str) -> Any:
+    import importlib
+
+    if str(Path.cwd()) not in sys.path:  # a class of one's own lies where the service is started
+        sys.path.append(str(Path.cwd()))  # last: a file there is not to stand in for what is installed
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+class _OldPackages:
+    """Finds none of our packages under its old name, which in a checkout would be a second copy of it."""
+
+    @staticmethod
+    def find_spec(name: str, _path: object = None, _target: object = None) -> None:
+        """Raises ModuleNotFoundError for an old name, unless another project's package has it."""
+        if name not in _OLD_PACKAGES:
+            return
+        found = PathFinder.find_spec(name)
+        if found is None or found.origin is None or Path(found.origin).parent.resolve() == _HERE.parent / name:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+@contextmanager
+def _old_packages_missing() -> Iterator[None]:
+    sys.meta_path.insert(0, _OldPackages)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(_OldPackages)
+
+
+def _why(error: BaseException, kind: str) -> str:
+    """What failed; for a module that moved, its new name."""
+    if isinstance(error, ModuleNotFoundError) and error.name and _OLD_MODULE.fullmatch(error.name):
+        named = next(filter(None, map(_OLD_MODULE.search, (*_lines(error.__traceback__), kind))), None)
+        if named is not None:
+            return f"{named[1]} is now sightline.{named[1]}; change the import"
+    return (str(error) or type(error).__name__)[:_LONGEST_DETAIL]
+
+
+def _lines(trace: TracebackType | None) -> list[str]:
+    """The source lines of a traceback, innermost first."""
+    lines: list[str] = []
+    while trace is not None:
+        code = trace.tb_frame.f_code
+        lines.insert(0, "" if code.co_filename == __file__ else linecache.getline(code.co_filename, trace.tb_lineno))
+        trace = trace.tb_next
+    return lines

@@ -22,6 +22,7 @@ from typing import Final
 from pydantic import ValidationError
 
 from sightline.protocol.clock import monotonic_us
+from sightline.protocol.config import first_problem
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.sim.network_emulator import EmulatedLink, Leg, LinkShapes
 
@@ -135,7 +136,7 @@ def _read_shapes(line: str) -> LinkShapes:
     try:
         return LinkShapes.model_validate_json(line)
     except ValidationError as error:
-        raise ConfigError(f"wire: {line.strip()[:80]!r}: {error.errors(include_url=False)[0]['msg']}") from None
+        raise ConfigError(f"wire: {line.strip()[:80]!r}: {first_problem(error)}") from None
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Final, Literal, Protocol, Self
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.config import Config
+from sightline.protocol.config import Config, first_problem
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.robot_side.hardware.gpio_low import import_lgpio, leave_low
 from sightline.robot_side.ports import WheelAngles
@@ -87,9 +87,8 @@ def table_of(text: str, where: str) -> tuple[tuple[float, float], ...]:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{where}: is no TOML: {error}") from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{where}: {place}: {first['msg']}; rows are [duty, m/s], e.g. [0.4, 0.08]") from None
+        problem = first_problem(error, known=TableConfig.model_fields)
+        raise ConfigError(f"{where}: {problem}; rows are [duty, m/s], e.g. [0.4, 0.08]") from None
 
 
 def table_text(rows: Sequence[tuple[float, float]], head: str) -> str:

@@ -69,7 +69,7 @@ def test_another_mission_keeps_the_waypoints_and_none_of_the_options():
 
 @pytest.mark.parametrize(("old", "new", "expected"), [
     ("hue_low_deg = 40", "hue_low_deg = 400", "scenario mine: [vision] hsv.ranges.0.hue_low_deg"),
-    ("[[vision.hsv.ranges]]", "[vision.hsw]\n[[vision.hsv.ranges]]", "scenario mine: [vision] hsw"),
+    ("[[vision.hsv.ranges]]", "[vision.hsw]\n[[vision.hsv.ranges]]", "scenario mine: [vision] unknown key 'hsw'"),
 ])
 def test_a_scenario_with_a_wrong_setting_is_one_line(tmp_path, old, new, expected):
     text = (load_scenario.__globals__["SCENARIOS"] / "ball.toml").read_text()

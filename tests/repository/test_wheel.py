@@ -22,8 +22,8 @@ def run(*command: str, cwd: Path, **environ: str) -> str:
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
-    build_elsewhere = folder / "build.cfg"  # a build/ folder in the checkout would add modules that are gone
-    build_elsewhere.write_text(f"[build]\nbuild_base = {folder / 'build'}\n")
+    build_elsewhere = folder / "build.cfg"  # what an earlier build left in the checkout would be taken for its state
+    build_elsewhere.write_text(f"[build]\nbuild_base = {folder / 'build'}\n[egg_info]\negg_base = {folder}\n")
     run(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation",
         "--wheel-dir", str(folder), str(ROOT), cwd=folder, DIST_EXTRA_CONFIG=str(build_elsewhere))
     (found,) = folder.glob("sightline_robot-*.whl")

@@ -15,10 +15,11 @@ from typing import Final
 import cv2
 import numpy as np
 
+from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.messages import MAX_DETECTED_BOXES, FrameHeader
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.onnx.self_test import difference
-from sightline.vision_side.detect.plugin_calls import PLUGIN_ERRORS, annotation_problem, close_detector
+from sightline.vision_side.detect.plugin_calls import annotation_problem, close_detector
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, DetectionResult, Detector
 
 SIZES: Final = ((320, 240), (640, 480), (97, 61), (16, 16), (1280, 720), (641, 481))

@@ -8,6 +8,7 @@ from dataclasses import replace
 from numbers import Real
 from typing import Any, Final
 
+from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import ConfigError, SightlineError
 from sightline.protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER
 from sightline.protocol.transports.link import Link
@@ -48,8 +49,6 @@ class Notices:
 # What a detector may have besides `detect`, asked for through whatever is around it. Pure.
 
 
-PLUGIN_ERRORS: Final = (Exception, SystemExit)
-"""What a plug-in's own code may raise: `sys.exit` in it is to end itself, not the service around it."""
 _LONGEST: Final = 160
 
 

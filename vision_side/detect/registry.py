@@ -1,6 +1,6 @@
 """Finds a detector by name and builds it with its wrappers. Shell (imports plug-ins).
 
-Names are those below, those of the entry points `sightline.detectors`, or, from a configuration or a command line only,
+Names are those of the entry points `sightline.detectors`, or, from a configuration or a command line only,
 `package.module:Name`. What stands after the name is the option `address`: `onnx:ball.onnx` gives "ball.onnx",
 `oip+http://box/ball` all of it. A `Config` is filled in from vision's where it has sections or fields of the same name.
 """
@@ -9,6 +9,7 @@ import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from sightline.protocol.config import PluginRegistry, config_model
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
@@ -16,21 +17,11 @@ from sightline.vision_side.detect.plugin_calls import plugin_guard
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.remote.client import EXAMPLES
 from sightline.vision_side.missions.registry import check_missions, configured_mission
-from sightline.vision_side.plugins import PluginRegistry, config_model
+from sightline.vision_side.plugins import shared_options
 
-BUILT_IN: Final = {
-    "hsv": "sightline.vision_side.detect.color.detectors:Hsv",
-    "adaptive": "sightline.vision_side.detect.color.detectors:Adaptive",
-    "onnx": "sightline.vision_side.detect.onnx.detector:OnnxDetector",
-    "zenoh": "sightline.vision_side.detect.remote.zenoh_detector:ZenohDetector",
-    "oip+http": "sightline.vision_side.detect.remote.oip_http:OipHttp",
-    "http+jpeg": "sightline.vision_side.detect.remote.http_client:HttpJpeg",
-}
-"""Here and not as entry points, so that a checkout that nobody installed has them too."""
-GROUP: Final = "sightline.detectors"
 BOXES: Final = "boxes"
 """No detector here: boxes that somebody else publishes, see vision_side/serving/service.py."""
-REGISTRY: Final = PluginRegistry("detector", BUILT_IN, GROUP)
+REGISTRY: Final = PluginRegistry("detector", "sightline.detectors")
 _FILLED: Final = ("robot", "connect", "listen", "secure", "max_frame_bytes", "max_pixels")
 _MOST_NAMED: Final = 12
 _OF_DETECTOR: Final = ("device", "deadline_s")
@@ -195,7 +186,7 @@ def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tup
     given |= {"address": address} if address else {}
     if name in EXAMPLES and "address" not in {**given, **options}:
         raise ConfigError(f"detector {name!r}: say where and what, e.g. {EXAMPLES[name]}")
-    own = REGISTRY.settings(name, plugin, given | dict(options), config)
+    own = REGISTRY.settings(name, plugin, shared_options(plugin, given | dict(options), config))
     if not callable(getattr(plugin, "detect", None)):
         raise ConfigError(f"detector {kind!r}: the class has no method detect; see docs/detectors.md")
     return plugin, own

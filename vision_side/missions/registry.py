@@ -1,6 +1,6 @@
 """Finds a mission by name and builds it with its configuration. Shell (imports plug-ins).
 
-Names are those below, those of the entry points `sightline.missions`, or, from a configuration or a command line only,
+Names are those of the entry points `sightline.missions`, or, from a configuration or a command line only,
 `package.module:Name`. A mission whose `Config` has a section of vision's configuration by name and type (`target`,
 `track`, `steer`, `latency`, `search`, `boxes`) begins with that section; its options lie over it.
 """
@@ -9,28 +9,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from sightline.protocol.config import PluginRegistry, config_model
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import CameraModel, MissionRequest
 from sightline.vision_side.config import TargetConfig, VisionConfig
 from sightline.vision_side.detect.port import is_followable
 from sightline.vision_side.missions.port import Mission
-from sightline.vision_side.plugins import PluginRegistry, config_model
+from sightline.vision_side.plugins import shared_options
 
-BUILT_IN: Final = {
-    "follow": "sightline.vision_side.missions.follow:Follow",
-    "band": "sightline.evaluation.baselines.pixels:Band",
-    "pixel-pi": "sightline.evaluation.baselines.pixels:PixelPi",
-    "pixel-p": "sightline.evaluation.baselines.pixels:PixelP",
-    "legs": "sightline.vision_side.missions.legs:Legs",
-    "legs-baseline": "sightline.evaluation.baselines.legs:LegsBaseline",
-    "traffic-light": "sightline.vision_side.missions.traffic_light:TrafficLight",
-    "traffic-light-boxes": "sightline.vision_side.missions.traffic_light:TrafficLightBoxes",
-    "goto": "sightline.vision_side.missions.goto:Goto",
-    "goto-baseline": "sightline.evaluation.baselines.goto:GotoBaseline",
-}
-"""Here and not as entry points, so that a checkout that nobody installed has them too."""
-GROUP: Final = "sightline.missions"
-REGISTRY: Final = PluginRegistry("mission", BUILT_IN, GROUP)
+REGISTRY: Final = PluginRegistry("mission", "sightline.missions")
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,4 +101,4 @@ def mission_spec(kind: str, options: Mapping[str, Any], config: VisionConfig) ->
     Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option.
     """
     plugin = REGISTRY.load(kind)
-    return MissionSpec(kind, plugin, REGISTRY.settings(kind, plugin, options, config))
+    return MissionSpec(kind, plugin, REGISTRY.settings(kind, plugin, shared_options(plugin, options, config)))

@@ -6,8 +6,8 @@ A mission is somebody's plug-in: one that raises, or asks for what no robot does
 from dataclasses import replace
 from typing import Final
 
+from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.messages import STILL, CameraModel
-from sightline.vision_side.detect.plugin_calls import PLUGIN_ERRORS
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.registry import MissionSpec
 

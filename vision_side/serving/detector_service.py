@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from sightline.protocol.channels import DETECTIONS, FRAME
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
+from sightline.protocol.config import first_problem
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import (
@@ -337,10 +338,7 @@ def _payload(result: DetectionResult) -> bytes:
 
 def _first_line(error: ValueError) -> str:
     """What is wrong with which field."""
-    if not isinstance(error, ValidationError):
-        return str(error)
-    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-    return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
+    return first_problem(error) if isinstance(error, ValidationError) else str(error)
 
 
 def _box(one: Detection) -> DetectedBox:

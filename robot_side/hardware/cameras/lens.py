@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
-from sightline.protocol.config import Config
+from sightline.protocol.config import Config, first_problem
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import CameraModel
@@ -78,8 +78,7 @@ def _checked(table: dict[str, Any], where: str) -> CameraModel:
     try:
         return CameraModel.model_validate_json(json.dumps(table, default=str))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise ConfigError(f"{where}: {'.'.join(str(part) for part in first['loc'])}: {first['msg']}") from None
+        raise ConfigError(f"{where}: {first_problem(error)}") from None
 
 
 def _fitting(model: CameraModel, size: JpegSize, where: str) -> CameraModel:

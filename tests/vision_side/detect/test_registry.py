@@ -11,7 +11,6 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import FrameHeader
-from sightline.vision_side import plugins as plugin_choice
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.detectors import Adaptive, Hsv
@@ -19,7 +18,6 @@ from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, Track
 from sightline.vision_side.detect.onnx.detector import OnnxDetector
 from sightline.vision_side.detect.port import DetectFrame, result_of
 from sightline.vision_side.detect.registry import (
-    GROUP,
     REGISTRY,
     build_detector,
     configured_detector,
@@ -27,6 +25,7 @@ from sightline.vision_side.detect.registry import (
     split_kind,
 )
 from sightline.vision_side.detect.shadow import ShadowDetector
+from tests.fixtures.plugins import with_entries
 from tests.fixtures.vision.onnx import brightness_model, without_gpu
 
 
@@ -65,7 +64,7 @@ def config(**detector: object) -> VisionConfig:
 
 def test_every_built_in_name_can_be_imported() -> None:
     assert {"hsv", "adaptive", "onnx", "zenoh", "oip+http", "http+jpeg"} <= set(REGISTRY.names())
-    for name in REGISTRY.built_in:
+    for name in REGISTRY.names():
         assert hasattr(REGISTRY.load(name), "detect") and hasattr(REGISTRY.load(name), "Config")
 
 
@@ -162,7 +161,7 @@ class Entry:
 
 def test_an_installed_package_brings_its_detectors_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     installed = [Entry("lens", Mine), Entry("broken", ImportError("no module named lens"))]
-    monkeypatch.setattr(plugin_choice, "entry_points", lambda group: installed if group == GROUP else [])
+    with_entries(monkeypatch, REGISTRY.group, *installed)
     made = build_detector("lens:/dev/lens0", {"sure": True}, config())
     assert isinstance(made, Mine) and made.config == Mine.Config(address="/dev/lens0", robot="r7", deadline_s=0.1,
                                                                  sure=True)

@@ -10,13 +10,12 @@ import pytest
 
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, CameraModel, FrameHeader, MissionRequest
-from sightline.vision_side import plugins as plugin_choice
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.port import Circle, Detection
-from sightline.vision_side.missions import registry as choice
 from sightline.vision_side.missions.port import Plan, View
-from sightline.vision_side.missions.registry import BUILT_IN, configured_mission, mission_spec, requested_mission
+from sightline.vision_side.missions.registry import REGISTRY, configured_mission, mission_spec, requested_mission
 from tests.contracts.missions import CAMERA, check_mission
+from tests.fixtures.plugins import with_entries
 
 CONFIG = VisionConfig()
 ROOT = Path(__file__).parent.parent.parent.parent
@@ -28,7 +27,7 @@ def options_of(name: str) -> dict:
 
 
 @pytest.mark.parametrize("seed", [7, 19])
-@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("name", REGISTRY.names())
 def test_every_mission_keeps_the_contract(name, seed):
     check_mission(mission_spec(name, options_of(name), CONFIG), frames=120, seed=seed)
 
@@ -36,7 +35,7 @@ def test_every_mission_keeps_the_contract(name, seed):
 class Raising:
     """A mission that breaks the contract."""
 
-    Config = BUILT_IN and mission_spec("band", {}, CONFIG).plugin.Config
+    Config = mission_spec("band", {}, CONFIG).plugin.Config
 
     def __init__(self, config, camera):
         self.count = 0
@@ -73,9 +72,9 @@ def test_what_cannot_be_chosen_is_one_line_that_says_why(kind, options, words):
 
 
 def test_an_entry_point_gives_a_mission_its_name(monkeypatch):
-    shy = EntryPoint("shy", "examples.my_mission:Shy", choice.GROUP)
-    broken = EntryPoint("broken", "examples.nothing:There", choice.GROUP)
-    monkeypatch.setattr(plugin_choice, "entry_points", lambda group: [shy, broken] if group == choice.GROUP else [])
+    shy = EntryPoint("shy", "examples.my_mission:Shy", REGISTRY.group)
+    broken = EntryPoint("broken", "examples.nothing:There", REGISTRY.group)
+    with_entries(monkeypatch, REGISTRY.group, shy, broken)
     monkeypatch.chdir(ROOT)
     assert requested_mission(MissionRequest(id=1, name="shy", options={"near_px": 12}), CONFIG).config.near_px == 12
     with pytest.raises(ConfigError, match="'broken' cannot be loaded"):
@@ -201,7 +200,7 @@ PAGE = (ROOT / "docs" / "missions.md").read_text("utf-8")
 
 def test_the_page_names_every_mission_and_shows_its_example_as_it_is(monkeypatch):
     table = PAGE.partition("## Choose one")[0]
-    assert set(re.findall(r"`([a-z-]+)`", table)) >= set(BUILT_IN)
+    assert set(re.findall(r"`([a-z-]+)`", table)) >= set(REGISTRY.names())
     shown = re.search(r"```python\n(class Shy:.*?)```", PAGE, re.DOTALL)[1]
     assert shown.strip() in (ROOT / "examples" / "my_mission.py").read_text("utf-8") and shown.count("\n") <= 30
     monkeypatch.chdir(ROOT)

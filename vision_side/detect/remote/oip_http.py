@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from sightline.protocol.config import first_problem
 from sightline.vision_side.detect.port import DetectFrame, Maker
 from sightline.vision_side.detect.remote.client import (
     REMOTE,
@@ -146,9 +147,7 @@ def _validated(model: type[Said], data: bytes) -> Said:
     try:
         return model.model_validate_json(data)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        where = ".".join(str(part) for part in first["loc"]) or "answer"
-        raise NoAnswerError(NoAnswerReason.MALFORMED, f"{where}: {first['msg']}") from None
+        raise NoAnswerError(NoAnswerReason.MALFORMED, first_problem(error, whole="answer")) from None
 
 
 # `oip+http://HOST/MODEL`: a model of an inference server (Triton, OpenVINO Model Server) over HTTP. Shell.
