@@ -27,7 +27,13 @@ HERE: Final = Path(__file__).parent.parent
 _BLOCK = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- /generated -->)", re.DOTALL)
 _UNITS: Final = {
     "_mps": "m/s",
+    "_mps2": "m/s²",
+    "_mps3": "m/s³",
     "_rad_s": "rad/s",
+    "_rad_s2": "rad/s²",
+    "_rad_s3": "rad/s³",
+    "_s": "s",
+    "_ms": "ms",
     "_rad": "rad",
     "_us": "µs",
     "_px": "px",

@@ -9,7 +9,6 @@ A stale sensor counts as an obstacle all around.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated
 
 from pydantic import Field
 
@@ -26,16 +25,25 @@ _PASSES = 3
 class GuardConfig(Config):
     """Outline of the robot from its axle's midpoint, and the zones around it."""
 
-    front_m: Annotated[float, Field(ge=0, le=2)] = 0.07
-    rear_m: Annotated[float, Field(ge=0, le=2)] = 0.10
-    half_width_m: Annotated[float, Field(gt=0.01, le=2)] = 0.09
-    sensor_x_m: Annotated[float, Field(ge=-2, le=2)] = 0.055
-    """Where the sensor sits, forward of the axle."""
-    stop_m: Annotated[float, Field(ge=0.02, le=5)] = 0.08
-    """Clearance at which no motion towards a point is left. Keep it well below every stand-off."""
-    brake_mps2: Annotated[float, Field(gt=0, le=20)] = 0.5
-    """Braking the slow zone counts on; well below the robot's own, so that motor lag and scan age fit in."""
-    max_scan_age_ms: Annotated[int, Field(ge=50, le=5_000)] = 400
+    front_m: float = Field(default=0.07, ge=0, le=2, description="outline ahead of the axle")
+    rear_m: float = Field(default=0.10, ge=0, le=2, description="outline behind the axle")
+    half_width_m: float = Field(default=0.09, gt=0.01, le=2, description="outline to each side")
+    sensor_x_m: float = Field(default=0.055, ge=-2, le=2, description="position of the sensor, ahead of the axle")
+    stop_m: float = Field(
+        default=0.08,
+        ge=0.02,
+        le=5,
+        description="clearance at which no motion towards a point is left; keep it well below every stand-off",
+    )
+    brake_mps2: float = Field(
+        default=0.5,
+        gt=0,
+        le=20,
+        description="braking that the slow zone assumes; well below what the robot can, for motor lag and scan age",
+    )
+    max_scan_age_ms: int = Field(
+        default=400, ge=50, le=5_000, description="an older scan counts as an obstacle all around"
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,34 +25,34 @@ Millis = Annotated[int, Field(ge=20, le=5_000)]
 
 
 class SafetyConfig(Config):
-    """Limits and times of the gate. Refused where the stop they imply breaks 700 ms or 0.25 m."""
+    """Limits and times of the gate. Rejected where the stop they imply breaks 700 ms or 0.25 m."""
 
-    max_linear_mps: Annotated[float, Field(gt=0, le=3.0)] = 0.5
-    max_angular_rad_s: Annotated[float, Field(gt=0, le=10.0)] = 2.5
-    max_acceleration_mps2: Annotated[float, Field(gt=0, le=20.0)] = 2.0
-    max_acceleration_rad_s2: Annotated[float, Field(gt=0, le=100.0)] = 12.0
-    max_jerk_mps3: Annotated[float, Field(gt=0, le=500.0)] = 20.0
-    max_jerk_rad_s3: Annotated[float, Field(gt=0, le=2000.0)] = 200.0
-    motor_lag_ms: Annotated[int, Field(ge=0, le=500)] = 50
-    """First-order lag of the motors, for the bound only."""
+    max_linear_mps: float = Field(default=0.5, gt=0, le=3.0, description="forward speed, at most")
+    max_angular_rad_s: float = Field(default=2.5, gt=0, le=10.0, description="turn rate, at most")
+    max_acceleration_mps2: float = Field(default=2.0, gt=0, le=20.0, description="change of speed, also when braking")
+    max_acceleration_rad_s2: float = Field(default=12.0, gt=0, le=100.0, description="change of turn rate")
+    max_jerk_mps3: float = Field(default=20.0, gt=0, le=500.0, description="change of acceleration")
+    max_jerk_rad_s3: float = Field(default=200.0, gt=0, le=2000.0, description="change of angular acceleration")
+    motor_lag_ms: int = Field(
+        default=50, ge=0, le=500, description="first-order lag of the motors, for the stopping bound only"
+    )
 
-    full_speed_age_ms: Millis = 150
-    """Frame age up to which the full limit holds ..."""
-    zero_speed_age_ms: Millis = 400
-    """... falling linearly to zero here; older is refused."""
-    silence_ms: Millis = 300
-    """No accepted command for this long: HOLD."""
-    lease_ms: Millis = 1_000
-    disarm_after_hold_s: Annotated[float, Field(ge=1, le=600)] = 10.0
-    live_commands_to_arm: Annotated[int, Field(ge=1, le=100)] = 5
-    auto_arm: bool = False
-    """Arm without a person once the live commands are there. For simulation."""
+    full_speed_age_ms: Millis = Field(default=150, description="frame age up to which the full speed limit holds")
+    zero_speed_age_ms: Millis = Field(
+        default=400, description="the limit falls linearly to zero at this frame age; older is rejected as `STALE`"
+    )
+    silence_ms: Millis = Field(default=300, description="no accepted command for this long: HOLD")
+    lease_ms: Millis = Field(default=1_000, description="the driver loses the lease after this long without a command")
+    disarm_after_hold_s: float = Field(default=10.0, ge=1, le=600, description="from HOLD to DISARMED")
+    live_commands_to_arm: int = Field(
+        default=5, ge=1, le=100, description="valid commands in a row that the driver needs before arming"
+    )
+    auto_arm: bool = Field(default=False, description="arm without an operator after these commands; for simulation")
 
-    guests: bool = False
-    """Whether header-less commands on `twist/guest` are heard at all."""
-    guest_life_ms: Millis = 250
-    guest_max_linear_mps: Annotated[float, Field(gt=0, le=3.0)] = 0.2
-    guest_max_angular_rad_s: Annotated[float, Field(gt=0, le=10.0)] = 1.0
+    guests: bool = Field(default=False, description="accept commands without a header, on `twist/guest`")
+    guest_life_ms: Millis = Field(default=250, description="a guest's command ends this long after its arrival")
+    guest_max_linear_mps: float = Field(default=0.2, gt=0, le=3.0, description="forward speed of a guest, at most")
+    guest_max_angular_rad_s: float = Field(default=1.0, gt=0, le=10.0, description="turn rate of a guest, at most")
 
     @model_validator(mode="after")
     def _stops_in_time(self) -> Self:
