@@ -23,12 +23,12 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final, TypeVar
 
-from sightline.protocol.channels import Channel
+from sightline.protocol.channels import SOURCES_OF_ROLE, Channel
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import WireModel
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
+from sightline.protocol.transports.security import certificate_role
 
 GROUPS: Final = {
     "FRAM": "framing",

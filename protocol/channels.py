@@ -82,6 +82,16 @@ _JSON = "application/json"
 JPEG: Final = "image/jpeg"
 """Encoding of every channel whose payload is a picture."""
 DRIVERS: Final = ("vision", "operator", "teleop")
+SOURCES_OF_ROLE: Final[dict[str, tuple[str, ...]]] = {
+    "vision": ("vision",),
+    "operator": ("operator", "teleop"),
+    "detector": ("detector",),
+    "viewer": (),
+}
+"""Role of a certificate -> the sources it may speak as towards a robot. A detector says what it sees and no more, a
+viewer nothing, not even `ack`."""
+KNOWN_SOURCES: Final = frozenset(source for sources in SOURCES_OF_ROLE.values() for source in sources)
+"""The sources that a role speaks as; any other is made up by its peer, and possible only on a link without keys."""
 
 FRAME = Channel("frame", _OUT, FrameHeader, None, JPEG, Priority.DATA, "camera rate, by credit", 1_000_000,
                 "a picture, JPEG and nothing else", "none is taken without credit; a newer one takes its place")

@@ -10,9 +10,9 @@ from typing import TypeVar, cast
 from pydantic import ValidationError
 
 from sightline.protocol import VERSION
-from sightline.protocol.channels import MAX_HEADER_BYTES, SCAN, Channel
+from sightline.protocol.channels import MAX_HEADER_BYTES, REQUEST, SCAN, Channel
 from sightline.protocol.errors import RejectReason, WireError
-from sightline.protocol.messages import WireModel
+from sightline.protocol.messages import Request, Verb, WireModel
 
 Model = TypeVar("Model", bound=WireModel)
 
@@ -52,6 +52,14 @@ def check_sizes(channel: Channel, header: bytes, payload: bytes) -> None:
             RejectReason.MALFORMED,
             f"{channel.name} payload is {len(payload)} bytes, at most {channel.max_payload_bytes}",
         )
+
+
+def request_verb(payload: bytes) -> Verb | None:
+    """Read the verb of a `request` payload; None if it is invalid."""
+    try:
+        return decode(Request, payload, REQUEST.max_payload_bytes).verb
+    except WireError:
+        return None
 
 
 def encode_ranges(ranges_m: array.array[float]) -> bytes:

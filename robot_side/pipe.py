@@ -28,11 +28,10 @@ from enum import IntEnum
 from typing import Final
 
 from sightline.protocol.channels import CHANNELS, REQUEST
-from sightline.protocol.codec import decode
+from sightline.protocol.codec import request_verb
 from sightline.protocol.config import Config
-from sightline.protocol.errors import WireError
-from sightline.protocol.messages import Holder, Planar, Pose, Request, SessionId, Verb
-from sightline.protocol.transports.link import Message
+from sightline.protocol.messages import Holder, Planar, Pose, SessionId
+from sightline.protocol.transports.link import Message, OutgoingQueue
 from sightline.robot_side.config import RobotConfig
 
 MAX_PACKET_BYTES = 65_536
@@ -161,45 +160,7 @@ def unpack_message(packet: bytes) -> Message:
 
 
 MAX_PENDING: Final = 32
-
-
-class PendingRequests:
-    """The newest request per (source, verb), at most 32; a STOP always finds a place."""
-
-    def __init__(self) -> None:
-        self._waiting: dict[tuple[str, Verb], Message] = {}
-
-    def __len__(self) -> int:
-        """How many wait."""
-        return len(self._waiting)
-
-    def hold(self, message: Message) -> bool:
-        """Keep a request; False for what is none, and when there is no room."""
-        try:
-            verb = decode(Request, message.payload).verb
-        except WireError:
-            return False
-        name = (message.source, verb)
-        if len(self._waiting) >= MAX_PENDING and name not in self._waiting and not self._gives_way(verb):
-            return False
-        self._waiting[name] = message
-        return True
-
-    def _gives_way(self, verb: Verb) -> bool:
-        """Make room for a STOP: it may cost anything but itself."""
-        if verb is not Verb.STOP:
-            return False
-        others = [name for name in self._waiting if name[1] is not Verb.STOP]
-        del self._waiting[others[0] if others else next(iter(self._waiting))]  # STOP is a level: one of 32 is as good
-        return True
-
-    def flush(self, send: Callable[[Message], bool]) -> bool:
-        """Send what waits, STOP first, until there is no room; whether nothing waits any more."""
-        for name in sorted(self._waiting, key=lambda name: name[1] is not Verb.STOP):
-            if not send(self._waiting[name]):
-                return False
-            del self._waiting[name]
-        return True
+"""Security limit: requests that wait for room in the socket to the driver."""
 
 
 # The network process's hold on its driver: both sockets, and the requests that found no room. Shell.
@@ -210,7 +171,7 @@ class NetworkEnd:
 
     def __init__(self, waited: socket.socket, aside: socket.socket) -> None:
         self._waited, self._aside = waited, aside
-        self._held = PendingRequests()
+        self._pending_requests: OutgoingQueue[Message] = OutgoingQueue(MAX_PENDING)
         self._order = threading.Lock()
         self.dropped_commands = 0
 
@@ -239,16 +200,17 @@ class NetworkEnd:
     def forward(self, message: Message) -> None:
         """A command goes on at once, undecoded. Without room a request waits; a twist is dropped and counted."""
         with self._order:
-            if self._held.flush(self._pass) and self._pass(message):
+            if self._pending_requests.flush(self._pass) and self._pass(message):
                 return
-            if message.channel is not REQUEST or not self._held.hold(message):
+            is_request = message.channel is REQUEST and request_verb(message.payload) is not None
+            if not is_request or not self._pending_requests.put(message, message):
                 self.dropped_commands += 1
 
     def retry(self) -> None:
         """Hand over the requests that wait, as far as there is room now."""
-        if len(self._held):
+        if len(self._pending_requests):
             with self._order:
-                self._held.flush(self._pass)
+                self._pending_requests.flush(self._pass)
 
     def _pass(self, message: Message) -> bool:
         return self.tell(pack_message(PacketKind.RAW, message))

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Final
 
 from sightline.operator_side.client.requests import SOURCE as OPERATOR
-from sightline.protocol.channels import ACK, FRAME, OVERLAY, STATUS, Channel
+from sightline.protocol.channels import ACK, FRAME, OVERLAY, SOURCES_OF_ROLE, STATUS, Channel
 from sightline.protocol.clock import RobotClock, monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader, Stamp
 from sightline.protocol.transports.link import Link, Message
-from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
+from sightline.protocol.transports.security import certificate_role
 
 
 class Viewer:

@@ -1,19 +1,33 @@
-"""The transport interface: `Link`, `Message`, `LatestSlot`, and the rules that every link enforces. Shell (locks).
+"""The transport interface: `Link`, `Message`, slots and queues, and the rules that every link enforces. Shell (locks).
 
 A `Link` belongs to one robot id. It promises what `tests/protocol/transports/test_link.py` checks on every transport:
 newest wins, memory is bounded, both ends may restart, nothing raised in a callback ends anything, `close` never hangs.
 """
 
+import sys
 import threading
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Generic, Self, TypeVar
+from typing import Final, Generic, NamedTuple, Self, TypeVar
 
-from sightline.protocol.channels import FRAME, MAX_HEADER_BYTES, Channel, check_robot_id, key_for, parse_key
+from sightline.protocol.channels import (
+    CHANNELS,
+    FRAME,
+    KNOWN_SOURCES,
+    MAX_HEADER_BYTES,
+    REQUEST,
+    Channel,
+    Priority,
+    check_robot_id,
+    key_for,
+    parse_key,
+)
+from sightline.protocol.codec import request_verb
 from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import Verb
 
 Item = TypeVar("Item")
 
@@ -57,6 +71,96 @@ class LatestSlot(Generic[Item]):
         with self._guard:
             item, self._item = self._item, None
             return item
+
+
+MAX_UNKNOWN_SOURCES: Final = 16
+"""Security limit: items of one channel in a queue from sources that no role has."""
+_RANKS: Final = {priority: rank for rank, priority in enumerate(Priority, start=1)}
+_FIRST_RANK: Final = -1
+
+
+def rank(channel: Channel, verb: Verb | None) -> int:
+    """Order of sending, the lowest first: a STOP, then by the channel's priority."""
+    return 0 if verb is Verb.STOP else _RANKS[channel.priority]
+
+
+class _Place(NamedTuple):
+    """Where an item of a queue waits."""
+
+    rank: int
+    channel: str = ""
+    source: str = ""
+    verb: Verb | None = None
+
+
+class OutgoingQueue(Generic[Item]):
+    """The newest item per channel and source, for requests also per verb; the most urgent leaves first.
+
+    Only a newer item of its own place replaces one, so a STOP yields to nothing but another STOP. Of sources that no
+    role has, few fit at a time on channels that are passed on; more are dropped. A role's source always fits.
+    """
+
+    def __init__(self, max_items: int = sys.maxsize) -> None:
+        """Security limit: `max_items`; in a full queue a STOP takes the place of another request."""
+        self._max_items = max_items
+        self._lock = threading.Lock()
+        self._items: dict[_Place, Item] = {}
+        self.dropped = Counter(dict.fromkeys(CHANNELS, 0))  # never grows, so that other threads may read it
+        """Items replaced by a newer one before they were sent, or without a place, by channel."""
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def put(self, message: Message, item: Item) -> bool:
+        """Put `item`, which sends `message`; False if it was dropped. Never blocks."""
+        channel = message.channel
+        verb = request_verb(message.payload) if channel is REQUEST else None
+        place = _Place(rank(channel, verb), channel.name, message.source, verb)
+        with self._lock:
+            is_newer = place in self._items
+            fits = is_newer or self._make_room(place, channel)
+            self.dropped[channel.name] += is_newer or not fits
+            if fits:
+                self._items[place] = item
+        return fits
+
+    def put_first(self, item: Item) -> None:
+        """Put `item` before everything else; only a newer one replaces it."""
+        with self._lock:
+            self._items[_Place(_FIRST_RANK)] = item
+
+    def take(self) -> Item | None:
+        """Remove and return the most urgent; None if there is nothing."""
+        with self._lock:
+            return self._items.pop(self._next()) if self._items else None
+
+    def flush(self, send: Callable[[Item], bool]) -> bool:
+        """Hand items to `send`, the most urgent first, until it returns False; whether nothing is left."""
+        with self._lock:
+            while self._items:
+                place = self._next()
+                if not send(self._items[place]):
+                    return False
+                del self._items[place]
+        return True
+
+    def _next(self) -> _Place:
+        return min(self._items, key=lambda place: place.rank) if len(self._items) > 1 else next(iter(self._items))
+
+    def _make_room(self, place: _Place, channel: Channel) -> bool:
+        if len(self._items) >= self._max_items:
+            return place.verb is Verb.STOP and self._drop_one()
+        if not channel.passed_on or place.source in KNOWN_SOURCES:
+            return True
+        unknown = (one for one in self._items if one.channel == place.channel and one.source not in KNOWN_SOURCES)
+        return sum(1 for _ in unknown) < MAX_UNKNOWN_SOURCES
+
+    def _drop_one(self) -> bool:
+        """Drop what is no STOP, else the oldest STOP: of many, one stops as well."""
+        oldest = next((place for place in self._items if place.verb is not Verb.STOP), next(iter(self._items)))
+        self.dropped[oldest.channel] += 1
+        del self._items[oldest]
+        return True
 
 
 class Closing(ABC):

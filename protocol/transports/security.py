@@ -18,21 +18,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from sightline.protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REQUEST, Channel, Direction
+from sightline.protocol.channels import (
+    CHANNELS,
+    KEY_PREFIX,
+    MAX_HEADER_BYTES,
+    REQUEST,
+    SOURCES_OF_ROLE,
+    Channel,
+    Direction,
+)
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_zenoh_endpoint, with_allowed
 
 ROBOT_ROLE: Final = "robot"
-SOURCES_OF_ROLE: Final[dict[str, tuple[str, ...]]] = {
-    "vision": ("vision",),
-    "operator": ("operator", "teleop"),
-    "detector": ("detector",),
-    "viewer": (),
-}
-"""Role of a certificate -> the sources it may speak as towards a robot. A detector says what it sees and no more, a
-viewer nothing, not even `ack`."""
-KNOWN_SOURCES: Final = frozenset(source for sources in SOURCES_OF_ROLE.values() for source in sources)
-"""The sources that a role speaks as; any other is made up by its peer, and possible only on a link without keys."""
 ROLES: Final = (ROBOT_ROLE, *SOURCES_OF_ROLE)
 PRESENCE_PREFIX: Final = "sightline-presence"
 """Where peers say that they are there (`transports/zenoh/presence.py`): beside `sightline/`, the keys of channels."""

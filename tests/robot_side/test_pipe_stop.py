@@ -9,10 +9,10 @@ import pytest
 from sightline.protocol.channels import REQUEST, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import Request, RequestHeader, Verb
-from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.link import Message, OutgoingQueue
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.pipe import MAX_PENDING, DriverEnd, PendingRequests
+from sightline.robot_side.pipe import MAX_PENDING, DriverEnd, NetworkEnd
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
@@ -20,6 +20,10 @@ from tests.fixtures.robot_process import RobotProcess, Vision, driving
 def request(verb, source="operator", number=1):
     header = RequestHeader(source=source, session="0a0a0a0a", seq=number)
     return Message(REQUEST, source, encode(header), encode(Request(id=number, verb=verb)))
+
+
+def put(waiting, message):
+    return waiting.put(message, message)
 
 
 class Room:
@@ -36,36 +40,44 @@ class Room:
 
 
 def test_what_waits_is_sent_once_there_is_room_and_stop_first():
-    held = PendingRequests()
+    waiting = OutgoingQueue(MAX_PENDING)
     arm, stop = request(Verb.ARM), request(Verb.STOP)
-    assert held.hold(arm) and held.hold(stop) and len(held) == 2
+    assert put(waiting, arm) and put(waiting, stop) and len(waiting) == 2
     room = Room(1)
-    assert not held.flush(room.send) and room.sent == [stop] and len(held) == 1
+    assert not waiting.flush(room.send) and room.sent == [stop] and len(waiting) == 1
     room = Room(5)
-    assert held.flush(room.send) and room.sent == [arm] and held.flush(room.send) and room.sent == [arm]
+    assert waiting.flush(room.send) and room.sent == [arm] and waiting.flush(room.send) and room.sent == [arm]
 
 
 def test_the_newest_of_one_source_and_verb_waits():
-    held, room = PendingRequests(), Room(9)
+    waiting, room = OutgoingQueue(MAX_PENDING), Room(9)
     old, new = request(Verb.RESET, number=1), request(Verb.RESET, number=2)
-    assert held.hold(old) and held.hold(new) and held.flush(room.send)
+    assert put(waiting, old) and put(waiting, new) and waiting.flush(room.send)
     assert room.sent == [new]
 
 
 @pytest.mark.parametrize("first", [Verb.ARM, Verb.STOP])
 def test_it_is_bounded_and_a_stop_still_finds_a_place(first):
-    held, room = PendingRequests(), Room(99)
+    waiting, room = OutgoingQueue(MAX_PENDING), Room(99)
     for number in range(MAX_PENDING):
-        assert held.hold(request(first, f"source{number}"))
-    assert not held.hold(request(Verb.ARM, "another")) and len(held) == MAX_PENDING
-    assert held.hold(request(Verb.STOP, "another")) and len(held) == MAX_PENDING
-    assert held.flush(room.send) and room.sent[0].payload == request(Verb.STOP).payload
+        assert put(waiting, request(first, f"source{number}"))
+    assert not put(waiting, request(Verb.ARM, "another")) and len(waiting) == MAX_PENDING
+    assert put(waiting, request(Verb.STOP, "another")) and len(waiting) == MAX_PENDING
+    assert waiting.flush(room.send) and room.sent[0].payload == request(Verb.STOP).payload
     assert request(Verb.STOP, "another") in room.sent
 
 
-def test_what_is_no_request_is_not_kept():
-    held = PendingRequests()
-    assert not held.hold(Message(REQUEST, "operator", b"", b"{")) and len(held) == 0
+def test_invalid_requests_are_dropped_when_there_is_no_room():
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    end = NetworkEnd(ours, theirs)
+    while end.tell(b"full"):
+        pass
+    end.forward(Message(REQUEST, "operator", b"", b"{"))
+    assert end.dropped_commands == 1
+    end.forward(request(Verb.ARM))
+    assert end.dropped_commands == 1
+    ours.close()
+    theirs.close()
 
 
 # --- the driver's end --------------------------------------------------------------------------------------------
@@ -123,7 +135,7 @@ def test_a_dead_process_whose_descendant_holds_the_socket_is_started_again_all_t
 
 @pytest.fixture
 def stopped(tmp_path):
-    """A robot at speed, its driver process held up, and somebody who may say something to it."""
+    """A robot at speed, its driver process waiting up, and somebody who may say something to it."""
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
         assert driving(robot)
         with open_zenoh("r1", connect=[robot.endpoint], role="operator", timeout_s=10) as link:
@@ -135,7 +147,7 @@ def stopped(tmp_path):
 def say_stop_once(link):
     stop = request(Verb.STOP)
     link.publish(REQUEST, stop.header, stop.payload)
-    time.sleep(0.3)  # until it has arrived: nothing that could be waited for says so while the driver is held up
+    time.sleep(0.3)  # until it has arrived: nothing that could be waited for says so while the driver is waiting up
 
 
 def test_a_stop_said_once_arrives_though_the_drivers_socket_is_full(stopped):

@@ -164,7 +164,7 @@ class WebSocketLink(BaseLink):
     @property
     def dropped(self) -> Counter[str]:
         """As `Link`."""
-        return sum((peer.outbox.dropped for peer in self._peers), self._dropped)
+        return sum((peer.queue.dropped for peer in self._peers), self._dropped)
 
     @property
     def connected(self) -> bool:
@@ -274,7 +274,7 @@ class WebSocketLink(BaseLink):
     def _leave(self, peer: Peer) -> None:
         with self._joining:
             self._peers = tuple(other for other in self._peers if other is not peer)
-            self._dropped += peer.outbox.dropped
+            self._dropped += peer.queue.dropped
             self._retell()
 
     def _heed(self) -> None:

@@ -1,22 +1,18 @@
-"""One connected peer: its outbox of newest messages, STOP first, and the thread that reads. Shell."""
+"""One connected peer: its queue of newest messages, STOP first, and the thread that reads. Shell."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from sightline.protocol.channels import ACK, CHANNELS, REQUEST, Channel, Priority
+from sightline.protocol.channels import ACK, Channel
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.codec import decode
 from sightline.protocol.errors import WireError
 from sightline.protocol.log import RepeatLimiter
-from sightline.protocol.messages import Request
-from sightline.protocol.transports.link import OVERSIZE, Message
-from sightline.protocol.transports.security import KNOWN_SOURCES
+from sightline.protocol.transports.link import OVERSIZE, Message, OutgoingQueue
 from sightline.protocol.transports.websocket.connection import CLOSE_S, Connection, Keepalive
 from sightline.protocol.transports.websocket.framing import (
     BAD_FRAMING,
@@ -29,15 +25,6 @@ from sightline.protocol.transports.websocket.framing import (
 
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed
-
-
-MAX_UNKNOWN_SOURCES: Final = 16
-"""Security limit: places of one channel for sources that are no role's."""
-
-_RANKS: Final = {priority: rank for rank, priority in enumerate(Priority, start=2)}
-_HELLO_RANK: Final = 0
-_STOP_RANK: Final = 1
-_STOP: Final = "stop"
 
 
 class WireFormat(Protocol):
@@ -70,71 +57,6 @@ class Publication:
         return data
 
 
-class Outbox:
-    """A place for each channel and source, one for a hello, and for requests one for each verb.
-
-    Where others choose the source, on what is passed on, few of those that are no role's have a place at a time; more
-    are left out. None gives way to another made-up one, and a role's source always has its own: nobody is starved by
-    who makes up names. Requests are never left out.
-    Only a newer message of its own place replaces one: a STOP makes room for nothing but another STOP. The most urgent
-    is taken first, a STOP before everything but the hello.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._places: dict[tuple[str, str, str], Publication | str] = {}
-        self.dropped = Counter(dict.fromkeys(CHANNELS, 0))  # never grows, so that others may read it meanwhile
-        """Publications replaced by a newer one before they were sent, or left out, by channel."""
-
-    def put(self, post: Publication) -> None:
-        """Replace what is in the message's place, if it has one; never blocks."""
-        message = post.message
-        place = (message.channel.name, message.source, _verb(message) if message.channel is REQUEST else "")
-        with self._lock:
-            has_place = self._has_place(place, message.channel)
-            self.dropped[place[0]] += place in self._places or not has_place
-            if has_place:
-                self._places[place] = post
-
-    def _has_place(self, place: tuple[str, str, str], channel: Channel) -> bool:
-        if not channel.passed_on or place[1] in KNOWN_SOURCES or place in self._places:
-            return True
-        made_up = (name == channel.name and source not in KNOWN_SOURCES for name, source, _ in self._places)
-        return sum(made_up) < MAX_UNKNOWN_SOURCES
-
-    def put_hello(self, text: str) -> None:
-        """A hello goes before everything else."""
-        with self._lock:
-            self._places["", "", ""] = text
-
-    @property
-    def waiting(self) -> bool:
-        """Whether something is there."""
-        return bool(self._places)
-
-    def take(self) -> Publication | str | None:
-        """Remove and return the most urgent; None if there is nothing."""
-        with self._lock:
-            if len(self._places) < 2:  # the usual: nothing to choose from
-                return self._places.popitem()[1] if self._places else None
-            return self._places.pop(min(self._places, key=_rank))
-
-
-def _verb(request: Message) -> str:
-    """Which request it is; one that cannot be read shares a place with others of its kind."""
-    try:
-        return decode(Request, request.payload, REQUEST.max_payload_bytes).verb
-    except WireError:
-        return ""
-
-
-def _rank(place: tuple[str, str, str]) -> int:
-    name, _, verb = place
-    if not name:
-        return _HELLO_RANK
-    return _STOP_RANK if verb == _STOP else _RANKS[CHANNELS[name].priority]
-
-
 # One WebSocket peer: what waits for it is sent by whoever has something new; a thread of its own reads. Shell.
 
 
@@ -162,7 +84,7 @@ class Peer:
 
     def __init__(self, wire: Connection, dialect: PeerCodec, heed: Callable[[], None] = lambda: None) -> None:
         """`heed` is called on the reading thread when the peer says that it wants something else."""
-        self.outbox = Outbox()
+        self.queue: OutgoingQueue[Publication | str] = OutgoingQueue()
         self._heed = heed
         self._wire, self._dialect = wire, dialect
         self._reader = threading.current_thread()
@@ -191,13 +113,13 @@ class Peer:
     def offer(self, post: Publication) -> None:
         """Send it if the peer wants it, now or when there is room and nothing newer; never blocks."""
         if self._dialect.hears(post.message.channel):
-            self.outbox.put(post)
+            self.queue.put(post.message, post)
             self._send()
 
     def tell(self, hello: str) -> None:
         """Say who this end is and what it wants now, in a dialect that has words for it."""
         if isinstance(self._dialect, SightlineV1):
-            self.outbox.put_hello(hello)
+            self.queue.put_first(hello)
             self._send()
 
     def limit(self, wanted_bytes: int) -> None:
@@ -269,7 +191,7 @@ class Peer:
     def _send(self) -> None:
         """Send while there is room. Who finds another thread at it leaves the rest to that one."""
         lock = self._wire.lock
-        while self.outbox.waiting and lock.acquire(blocking=False):
+        while len(self.queue) and lock.acquire(blocking=False):
             try:
                 has_room = self._wire.fill(self._take)
             finally:
@@ -278,7 +200,7 @@ class Peer:
                 return
 
     def _take(self) -> tuple[Sequence[bytes], bool] | None:
-        item = self.outbox.take()
+        item = self.queue.take()
         if item is None:
             return None
         if isinstance(item, str):

@@ -16,11 +16,11 @@ from contextlib import ExitStack, suppress
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any, Final
 
-from sightline.protocol.channels import FRAME, KEY_PREFIX, STATUS, Channel, parse_key, pattern_for
+from sightline.protocol.channels import FRAME, KEY_PREFIX, KNOWN_SOURCES, STATUS, Channel, parse_key, pattern_for
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints
 from sightline.protocol.transports.link import NOT_A_PUT, BaseLink, Closing, Link, LinkRules, Message
-from sightline.protocol.transports.security import KNOWN_SOURCES, ROBOT_ROLE, load_role_keys
+from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
 from sightline.protocol.transports.zenoh.presence import PeerInfo, PresenceAnnouncer, query_presence
 from sightline.protocol.transports.zenoh.session import CLOSED_SESSION, open_session
 

@@ -16,6 +16,7 @@ from sightline.protocol.channels import (
     MISSION,
     REPORT,
     REQUEST,
+    SOURCES_OF_ROLE,
     STATUS,
     TWIST,
     Direction,
@@ -23,7 +24,6 @@ from sightline.protocol.channels import (
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.security import (
     ROLES,
-    SOURCES_OF_ROLE,
     certificate_role,
     load_role_keys,
     may_publish,

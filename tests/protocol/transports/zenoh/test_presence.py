@@ -7,12 +7,12 @@ import pytest
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.client.discovery import as_object, lines
 from sightline.operator_side.setup import keys
-from sightline.protocol.channels import STATUS
+from sightline.protocol.channels import SOURCES_OF_ROLE, STATUS
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.messages import Stamp, State, Status
 from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.security import SOURCES_OF_ROLE, certificate_role
+from sightline.protocol.transports.security import certificate_role
 from sightline.protocol.transports.zenoh.discovery import discover, peers_at
 from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.protocol.transports.zenoh.presence import (
