@@ -220,6 +220,22 @@ class Link(Closing):
         return slot
 
 
+class FleetLink(Closing):
+    """Links to all robots that one session receives."""
+
+    @abstractmethod
+    def robots(self) -> list[str]:
+        """Ids of all robots received so far, in the order of their first message."""
+
+    @abstractmethod
+    def on_new_robot(self, callback: Callable[[], None]) -> None:
+        """Call `callback`, on a transport thread, at the first message of each robot."""
+
+    @abstractmethod
+    def link(self, robot: str) -> Link:
+        """A link to `robot`, closed with this one."""
+
+
 class LinkWrapper(Link):
     """A link that forwards to `link`; a subclass overrides only what it changes."""
 

@@ -6,7 +6,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, TypeVar
 
 from pydantic import ValidationError
 
@@ -26,7 +26,7 @@ from sightline.protocol.messages import (
     Echo,
     FrameHeader,
 )
-from sightline.protocol.transports.link import LatestSlot, Link, Message
+from sightline.protocol.transports.link import FleetLink, LatestSlot, Link, Message
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.per_robot import DecoderPool
 from sightline.vision_side.detect.plugin_calls import checked_results, maker_of, notices_of
@@ -140,24 +140,8 @@ class ServingOptions:
     max_pixels: int = 1920 * 1080
 
 
-class FleetLink(Protocol):
-    """Where robots are met."""
-
-    def robots(self) -> list[str]:
-        """Ids of all heard so far."""
-        ...
-
-    def on_news(self, callback: Callable[[], None]) -> None:
-        """Call `callback` when another one is heard."""
-        ...
-
-    def link(self, robot: str) -> Link:
-        """A link to one of them."""
-        ...
-
-
 def run(config: VisionConfig, detector: Detector, serving: ServingOptions) -> int:
-    """Serve until SIGTERM or SIGINT; returns the exit code 0. Raises ConfigError, LinkError as `open_site` does."""
+    """Serve until SIGTERM or SIGINT; returns the exit code 0. Raises ConfigError, LinkError as `open_fleet` does."""
     from sightline.protocol.transports.zenoh.link import open_fleet
     from sightline.protocol.transports.zenoh.session import report_floods
 
@@ -168,8 +152,8 @@ def run(config: VisionConfig, detector: Detector, serving: ServingOptions) -> in
             max_frame_bytes=config.max_frame_bytes,
             about=lambda: services[0].about() if services else f"{serving.name}: starts",
         )
-        with opened as site, ends_on_signal(ending):
-            services.append(DetectorService(site, detector, serving, _say))
+        with opened as fleet_link, ends_on_signal(ending):
+            services.append(DetectorService(fleet_link, detector, serving, _say))
             where = ", ".join([*config.connect, *(f"{one} (listening)" for one in config.listen)])
             _say(f"detector: {serving.name} for robots {config.robot} at {where}")
             services[0].serve(ending)
@@ -177,10 +161,10 @@ def run(config: VisionConfig, detector: Detector, serving: ServingOptions) -> in
 
 
 class DetectorService:
-    """One detector, a place for the newest frame of each robot, and turns. Frames arrive on the site's threads."""
+    """One detector, a place for the newest frame of each robot, and turns. Frames arrive on the link's threads."""
 
-    def __init__(self, site: FleetLink, detector: Detector, serving: ServingOptions, say: LogLine) -> None:
-        self._site, self._detector, self._serving, self._say = site, detector, serving, say
+    def __init__(self, fleet_link: FleetLink, detector: Detector, serving: ServingOptions, say: LogLine) -> None:
+        self._fleet_link, self._detector, self._serving, self._say = fleet_link, detector, serving, say
         self._turns: FairQueue[Message] = FairQueue(serving.max_batch, serving.deadline_us)
         self._guard = threading.Lock()
         self._bell: LatestSlot[bool] = LatestSlot()
@@ -196,7 +180,7 @@ class DetectorService:
         self._load_before = (0, 0)
         self._overloaded = False
         self._whys: set[str] = set()
-        site.on_news(lambda: self._bell.put(True))
+        fleet_link.on_new_robot(lambda: self._bell.put(True))
 
     def serve(self, ending: threading.Event) -> None:
         """Until `ending` is set."""
@@ -210,7 +194,7 @@ class DetectorService:
         """Tell the detector's news, welcome who is new, then look at one batch; False if nothing waited."""
         for line in notices_of(self._detector):
             self._say(f"detector: {line}")
-        for robot in self._site.robots():
+        for robot in self._fleet_link.robots():
             if robot not in self._links:
                 self._welcome(robot)
         with self._guard:
@@ -239,7 +223,7 @@ class DetectorService:
         return sum(one.served for one in tallies), sum(one.dropped for one in tallies)
 
     def _welcome(self, robot: str) -> None:
-        link = self._links[robot] = self._site.link(robot)
+        link = self._links[robot] = self._fleet_link.link(robot)
 
         def heard(message: Message) -> None:
             with self._guard:

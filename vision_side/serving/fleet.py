@@ -9,10 +9,9 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Protocol
 
 from sightline.protocol.channels import Channel
-from sightline.protocol.transports.link import Link, LinkWrapper, Message
+from sightline.protocol.transports.link import FleetLink, Link, LinkWrapper, Message
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector
 from sightline.vision_side.detect.port import Detector
@@ -20,22 +19,6 @@ from sightline.vision_side.detect.registry import configured_detector, waits_for
 from sightline.vision_side.serving.service import Counts, LogLine, Service, open_service
 
 _LONGEST_WAIT_S = 0.2
-
-
-class FleetLink(Protocol):
-    """Where robots are met."""
-
-    def robots(self) -> list[str]:
-        """Ids of all heard so far."""
-        ...
-
-    def on_news(self, callback: Callable[[], None]) -> None:
-        """Call `callback` when another one is heard."""
-        ...
-
-    def link(self, robot: str) -> Link:
-        """A link to one of them."""
-        ...
 
 
 class _NotifyingLink(LinkWrapper):
@@ -60,16 +43,16 @@ class Fleet:
     waits for keeps no other waiting.
     """
 
-    def __init__(self, config: VisionConfig, site: FleetLink, say: LogLine, eyes: Detector | None = None) -> None:
+    def __init__(self, config: VisionConfig, fleet_link: FleetLink, say: LogLine, eyes: Detector | None = None) -> None:
         """`eyes` look for every robot, or for the first of those with their own; None for those of `config`."""
-        self._config, self._site, self._say = config, site, say
+        self._config, self._fleet_link, self._say = config, fleet_link, say
         self._apart = waits_for_service(config)
         self._eyes = eyes or configured_detector(config)
         self._bell, self._ending = threading.Event(), threading.Event()
         self._threads: list[threading.Thread] = []
         self._failed: Exception | None = None
         self.services: dict[str, Service] = {}
-        site.on_news(self._bell.set)
+        fleet_link.on_new_robot(self._bell.set)
 
     def serve(self, ending: threading.Event) -> None:
         """Until `ending` is set."""
@@ -93,7 +76,7 @@ class Fleet:
     def turn(self) -> None:
         """Welcome who is new, and answer at most one frame of each robot that has no thread of its own: whatever came
         meanwhile waits one round, whoever sends more."""
-        for robot in self._site.robots():
+        for robot in self._fleet_link.robots():
             if robot not in self.services:
                 self._welcome(robot)
             if not self._apart:
@@ -103,7 +86,7 @@ class Fleet:
 
     def _welcome(self, robot: str) -> None:
         config = self._config.model_copy(update={"robot": robot})
-        link = self._site.link(robot)
+        link = self._fleet_link.link(robot)
         if not self._apart:
             self.services[robot] = open_service(config, _NotifyingLink(link, self._bell), self._of(robot), self._eyes)
             return

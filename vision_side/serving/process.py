@@ -72,9 +72,9 @@ def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe |
 
     opened = open_fleet(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                        max_frame_bytes=config.max_frame_bytes, secure=config.secure)
-    with opened as site, ends_on_signal(ending):
+    with opened as fleet_link, ends_on_signal(ending):
         _say(f"vision: looking for robots {config.robot} at {endpoints_text(config)}")
-        fleet = Fleet(config, site, _say, eyes)
+        fleet = Fleet(config, fleet_link, _say, eyes)
         if observe is not None:
             observe(fleet.counts)
         fleet.serve(ending)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sightline.protocol.channels import FRAME, KEY_PREFIX, KNOWN_SOURCES, STATUS, Channel, parse_key, pattern_for
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints
-from sightline.protocol.transports.link import NOT_A_PUT, BaseLink, Closing, Link, LinkRules, Message
+from sightline.protocol.transports.link import NOT_A_PUT, BaseLink, FleetLink, Link, LinkRules, Message
 from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
 from sightline.protocol.transports.zenoh.presence import PeerInfo, PresenceAnnouncer, query_presence
 from sightline.protocol.transports.zenoh.session import CLOSED_SESSION, open_session
@@ -268,8 +268,8 @@ class _ConnectedPeers:
 
 # Many robots over one Zenoh session: who is there, and a `Link` to each. Shell.
 #
-# with open_site("r*", connect=["tcp/127.0.0.1:7447"], role="vision") as site:
-#     link = site.link("r1")
+# with open_fleet("r*", connect=["tcp/127.0.0.1:7447"], role="vision") as fleet_link:
+#     link = fleet_link.link("r1")
 
 
 MAX_ROBOTS: Final = 256
@@ -298,13 +298,13 @@ def open_fleet(
     check_zenoh_endpoints(listen, connect)
     here = PresenceAnnouncer(role, pattern, secrets.token_hex(4), about) if role else None
     session = open_session(listen, connect, timeout_s, load_role_keys(secure, role))
-    site = ZenohFleet(session, pattern, role, max_frame_bytes)
+    fleet_link = ZenohFleet(session, pattern, role, max_frame_bytes)
     if here is not None:
-        site.announce(here)
-    return site
+        fleet_link.announce(here)
+    return fleet_link
 
 
-class ZenohFleet(Closing):
+class ZenohFleet(FleetLink):
     """One session. Robots are noticed by their status; a link to one shares the session."""
 
     def __init__(self, session: zenoh.Session, pattern: str, role: str, max_frame_bytes: int) -> None:
@@ -313,7 +313,7 @@ class ZenohFleet(Closing):
         self._ending = ExitStack()
         self._ending.callback(session.close)
         self._seen: dict[str, None] = {}
-        self._news: Callable[[], None] = lambda: None
+        self._on_new_robot: Callable[[], None] = lambda: None
         self._listen()
 
     def announce(self, here: PresenceAnnouncer) -> None:
@@ -321,15 +321,15 @@ class ZenohFleet(Closing):
         self._ending.callback(here.answer_in(self._session))
 
     def robots(self) -> list[str]:
-        """Ids of all that were heard so far, in the order of their first word."""
+        """As `FleetLink`."""
         return list(self._seen)
 
-    def on_news(self, callback: Callable[[], None]) -> None:
-        """Call `callback`, on Zenoh's thread, when a robot is heard for the first time."""
-        self._news = callback
+    def on_new_robot(self, callback: Callable[[], None]) -> None:
+        """As `FleetLink`."""
+        self._on_new_robot = callback
 
     def link(self, robot: str) -> Link:
-        """A link to `robot` over the shared session, closed with the site."""
+        """A link to `robot` over the shared session."""
         rules = LinkRules(robot, self._role, self._max_frame_bytes)
         return self._ending.enter_context(ZenohLink(self._session, rules, shared=True))
 
@@ -351,4 +351,4 @@ class ZenohFleet(Closing):
             return
         if fnmatchcase(parsed[0], self._pattern):
             self._seen[parsed[0]] = None
-            self._news()
+            self._on_new_robot()

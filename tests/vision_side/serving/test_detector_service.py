@@ -51,7 +51,7 @@ class Bench:
     def robots(self):
         return ["r1"]
 
-    def on_news(self, callback):
+    def on_new_robot(self, callback):
         self.ring = callback
 
     def link(self, robot):

@@ -99,13 +99,13 @@ class _NoRobots:
     """A site where nobody is, until `arrive`."""
 
     def __init__(self):
-        self._names, self._news = [], lambda: None
+        self._names = []
 
     def robots(self):
         return self._names
 
-    def on_news(self, callback):
-        self._news = callback
+    def on_new_robot(self, callback):
+        pass
 
     def link(self, robot):
         return _Silent(robot)

@@ -136,7 +136,7 @@ class Quiet:
     def robots(self):
         return self._robots
 
-    def on_news(self, callback):
+    def on_new_robot(self, callback):
         pass
 
     def link(self, robot):
