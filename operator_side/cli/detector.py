@@ -202,7 +202,7 @@ def check(
 
 def own_options(texts: Sequence[str]) -> dict[str, Any]:
     """What `--set KEY=VALUE` gives a detector's own `Config`; a dot is for a section. Raises ConfigError."""
-    from sightline.operator_side.cli.options import options_of
+    from sightline.operator_side.config.toml_text import options_of
 
     return _nested(options_of(texts))
 

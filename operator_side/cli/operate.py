@@ -18,7 +18,6 @@ from sightline.operator_side.cli.options import (
     MaybeConnect,
     Robot,
     Secure,
-    options_of,
 )
 from sightline.operator_side.client.discovery import discover_all
 from sightline.operator_side.client.missions import (
@@ -35,6 +34,7 @@ from sightline.operator_side.client.missions import (
 from sightline.operator_side.client.pictures import viewer_role
 from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.operator_side.client.status import status_line, status_lines
+from sightline.operator_side.config.toml_text import options_of
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import MissionReport, Reply, Status, Verb
 from sightline.protocol.transports.open import open_link

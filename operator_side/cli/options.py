@@ -1,8 +1,7 @@
 """Options and exit codes that several command groups share. Shell (typer)."""
 
-import tomllib
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any, TypeVar
+from collections.abc import Callable
+from typing import Annotated, TypeVar
 
 import typer
 
@@ -71,17 +70,3 @@ def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Numbe
         return [kind(part) for part in text.split(",")]
     except ValueError:
         raise ConfigError(f"{option} {text!r}: numbers separated by commas, e.g. {option} 1,2,3") from None
-
-
-def options_of(texts: Sequence[str]) -> dict[str, Any]:
-    """The options of `--set KEY=VALUE`, values read as TOML, as text if they are none. Raises ConfigError."""
-    options: dict[str, Any] = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals or not name.strip():
-            raise ConfigError(f"--set {text!r} is no setting: write key=value, e.g. --set linear_mps=0.2")
-        try:
-            options[name.strip()] = tomllib.loads(f"value = {value}")["value"]
-        except tomllib.TOMLDecodeError:
-            options[name.strip()] = value
-    return options

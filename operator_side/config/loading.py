@@ -15,6 +15,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from sightline.operator_side.config.errors import explain, is_known, known_keys, no_such_name
+from sightline.operator_side.config.toml_text import key_and_text, toml_value
 from sightline.protocol.channels import check_robot_id
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
@@ -147,7 +148,7 @@ def _from_environment(service: str, environ: Mapping[str, str]) -> Iterable[Give
         if owner not in SERVICES or not key or not is_known(model_of(owner), tuple(key)):
             raise ConfigError(no_such_name("environment variable", name, _environment_names()))
         if owner == service:
-            yield Given(tuple(key), _value(environ[name]), name, environ[name])
+            yield Given(tuple(key), toml_value(environ[name]), name, environ[name])
 
 
 def _environment_names() -> list[str]:
@@ -156,10 +157,8 @@ def _environment_names() -> list[str]:
 
 
 def _from_set(text: str) -> Given:
-    name, equals, value = text.partition("=")
-    if not equals or not name.strip():
-        raise ConfigError(f"--set {text!r} is no setting: write key=value, e.g. --set safety.max_linear_mps=0.3")
-    return Given(tuple(name.strip().split(".")), _value(value), "--set", value)
+    name, value = key_and_text(text, "--set", "safety.max_linear_mps=0.3")
+    return Given(tuple(name.split(".")), toml_value(value), "--set", value)
 
 
 def _from_options(options: Mapping[str, Any]) -> Iterable[Given]:
@@ -167,15 +166,6 @@ def _from_options(options: Mapping[str, Any]) -> Iterable[Given]:
         if value is not None:
             name = key.rpartition(".")[2].replace("_", "-")
             yield Given(tuple(key.split(".")), value, f"--{name}")
-
-
-def _value(text: str) -> Any:
-    """`text` read as a TOML value; as a string if it is none."""
-    try:
-        table = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
-        return text
-    return table["value"] if len(table) == 1 else text
 
 
 # --- merging and checking ----------------------------------------------------------------------------------------

@@ -1,10 +1,35 @@
-"""A configuration as TOML text, with the origin of each value as a comment. Pure."""
+"""TOML for configuration: one value from an option's text, and a table with the origin of each value as text. Pure."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
+from sightline.protocol.errors import ConfigError
+
 Key = tuple[str, ...]
+
+
+def options_of(texts: Iterable[str], option: str = "--set", example: str = "linear_mps=0.2") -> dict[str, Any]:
+    """Several KEY=VALUE of one option. Raises ConfigError that shows `example`."""
+    return {key: toml_value(value) for key, value in (key_and_text(text, option, example) for text in texts)}
+
+
+def key_and_text(text: str, option: str, example: str) -> tuple[str, str]:
+    """Split KEY=VALUE. Raises ConfigError that shows `example`."""
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError(f"invalid {option} {text!r}: write key=value, e.g. {option} {example}")
+    return key.strip(), value
+
+
+def toml_value(text: str) -> Any:
+    """Read `text` as one TOML value; text that TOML does not accept is itself the value."""
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    return table["value"] if len(table) == 1 else text
 
 
 def toml_text(table: Mapping[str, Any], comment: Callable[[Key], str] = lambda _key: "") -> str:

@@ -213,7 +213,7 @@ def test_a_file_that_cannot_be_is_told_before_anything_is_looked_at(tmp_path):
         (("--pictures", ".", "--board", "9"), "is no board"),
         (("--pictures", ".", "--board", "2x9"), "is no board"),
         (("--pictures", ".", "--ball-radius-m", "0.1"), "both --ball-radius-m and --distance-m"),
-        (("--camera", "still", "--camera-set", "path"), "is no option"),
+        (("--camera", "still", "--camera-set", "path"), "invalid --camera-set"),
         (("--camera", "v4l3"), "did you mean 'v4l2'"),
     ],
 )

@@ -2,7 +2,6 @@
 
 import pytest
 
-from sightline.operator_side.cli.options import options_of
 from sightline.operator_side.client.missions import (
     cannot,
     mission_line,
@@ -11,6 +10,7 @@ from sightline.operator_side.client.missions import (
     waypoints_of,
     waypoints_of_file,
 )
+from sightline.operator_side.config.toml_text import options_of
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import MissionReport
 
@@ -56,7 +56,7 @@ def test_options_are_read_as_they_are_meant():
     assert options_of(["a=1", "b.c=0.5", "d=true", "e=left", 'f="2"', "g="]) == {
         "a": 1, "b.c": 0.5, "d": True, "e": "left", "f": "2", "g": ""}
     for wrong in ("a", "=1"):
-        with pytest.raises(ConfigError, match="is no setting"):
+        with pytest.raises(ConfigError, match="invalid --set"):
             options_of([wrong])
 
 
