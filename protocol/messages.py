@@ -217,8 +217,8 @@ class StreamStatus(WireModel):
         description="by channel: what a newer one replaced before a peer had room for it",
     )
     missed_captures: Counter = Field(default=0, description="images of the camera that were not requested in time")
-    quality_percent: Percent = Field(default=100, description="of the configured JPEG quality, to fit the link")
-    scale_percent: Percent = Field(default=100, description="of the configured side lengths, to fit the link")
+    quality_percent: Percent = Field(default=100, description="share of the configured JPEG quality, to fit the link")
+    scale_percent: Percent = Field(default=100, description="share of the configured side lengths, to fit the link")
 
 
 class Status(WireModel):
@@ -231,7 +231,7 @@ class Status(WireModel):
         default=(0.0, 0.0), description="last given to the wheels, after every limit: linear, angular"
     )
     frame_age_us: Microseconds | None = Field(
-        default=None, description="of the frame behind the command in force; null without one"
+        default=None, description="age of the frame behind the command in force; null without one"
     )
     latency_us: Microseconds | None = Field(
         default=None, description="capture to accepted command, the robot's own measure, of the last accepted command"
@@ -241,7 +241,7 @@ class Status(WireModel):
     last_refusal: LastRejection | None = Field(default=None, description="the newest rejection")
     stream: StreamStatus = Field(default=StreamStatus(), description="the flow of frames")
     auto_arm: bool = Field(default=False, description="whether the robot arms without an operator")
-    tick_late_max_us: Microseconds = Field(default=0, description="the latest that a tick of the driver's loop was")
+    tick_late_max_us: Microseconds = Field(default=0, description="the latest tick of the driver's loop")
     network_restarts: Counter = Field(default=0, description="how often the network process was started again")
     max_linear_mps: Number = Field(default=0.0, description="limit of speed")
     max_angular_rad_s: Number = Field(default=0.0, description="limit of turning")

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, Protocol
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
@@ -127,6 +127,23 @@ FRESH_S: Final = 2.0
 """A robot that was not heard for longer is down."""
 
 
+_COUNTERS: Final = {
+    "accepted": "commands_accepted",
+    "refused": "commands_refused",
+    "network_restarts": "network_restarts",
+    "sent": "frames_sent",
+    "credit_timeouts": "frames_unanswered",
+    "dropped_commands": "commands_dropped",
+    "missed_captures": "captures_missed",
+    "overtaken": "frames_overtaken",
+    "refused_pictures": "pictures_refused",
+    "dropped": "messages_dropped",
+}
+"""Fields of a status that only count up -> names of their metrics. Every other number is a gauge of its own name."""
+_LABELS: Final = {"refused": "reason", "dropped": "channel"}
+_GAUGES: Final = {"fps": "stream_fps", "window": "stream_window"}
+
+
 class Watched:
     """The newest status of one robot, and when it came. A Prometheus collector."""
 
@@ -161,43 +178,32 @@ class Watched:
         yield self._gauge("up", "whether the robot is heard", float(status is not None))
         if status is not None:
             yield from self._of(status)
-            yield from self._drops(status.stream)
             yield from self._round_trip()
 
     def _of(self, status: Status) -> Iterator[Family]:
-        stream = status.stream
         yield gauge("state", "1 for the state it is in",
                     {(self._robot, one.value): float(one is status.state) for one in State}, "robot", "state")
         yield self._gauge("linear_mps", "forward speed applied", status.applied[0])
         yield self._gauge("angular_rad_s", "turning speed applied, left positive", status.applied[1])
-        yield from self._times(status)
-        yield self._gauge("stream_fps", "frames sent in the last second", stream.fps)
-        yield self._gauge("stream_window", "frames that may be in flight", stream.window)
-        yield self._counter("frames_sent", "frames sent", stream.sent)
-        yield self._counter("frames_unanswered", "frames whose answer never came", stream.credit_timeouts)
-        yield self._counter("commands_accepted", "commands accepted", status.accepted)
-        yield self._by("commands_refused", "commands refused", "reason", status.refused)
-        yield self._counter("network_restarts", "restarts of the network process", status.network_restarts)
+        yield from self._fields(status)
         yield self._counter("holds", "times it was seen to begin to hold, at ten looks a second",
-                            self._entered[State.HOLD.value])
+                            {(): self._entered[State.HOLD.value]})
 
-    def _times(self, status: Status) -> Iterator[Family]:
-        for name, about, value_us in (
-            ("frame_age_seconds", "age of the frame behind the applied command", status.frame_age_us),
-            ("latency_seconds", "capture to command, as the robot measures it", status.latency_us),
-            ("tick_late_max_seconds", "latest tick of the driver's loop", status.tick_late_max_us),
-        ):
-            if value_us is not None:
-                yield self._gauge(name, about, value_us / 1e6)
-
-    def _drops(self, stream: StreamStatus) -> Iterator[Family]:
-        """What was replaced by something newer, slot by slot."""
-        yield self._counter("commands_dropped", "commands the driver had no room for", stream.dropped_commands)
-        yield self._counter("captures_missed", "captures that the stream asked for too late", stream.missed_captures)
-        yield self._counter("frames_overtaken", "frames that a newer one replaced on the way", stream.overtaken)
-        yield self._counter("pictures_refused", "pictures of the camera that were no usable JPEG",
-                            stream.refused_pictures)
-        yield self._by("messages_dropped", "messages replaced on the way out", "channel", stream.dropped)
+    def _fields(self, part: Status | StreamStatus) -> Iterator[Family]:
+        """Every number in `part`, explained as its field is; times in seconds."""
+        for field, info in type(part).model_fields.items():
+            value, about = getattr(part, field), info.description or ""
+            if isinstance(value, StreamStatus):
+                yield from self._fields(value)
+            elif isinstance(value, dict):
+                yield self._counter(_COUNTERS[field], about, {(key,): count for key, count in value.items()},
+                                    _LABELS[field])
+            elif field in _COUNTERS:
+                yield self._counter(_COUNTERS[field], about, {(): value})
+            elif field.endswith("_us") and value is not None:
+                yield self._gauge(field.removesuffix("_us") + "_seconds", about, value / 1e6)
+            elif isinstance(value, int | float):
+                yield self._gauge(_GAUGES.get(field, field), about, float(value))
 
     def _round_trip(self) -> Iterator[Family]:
         """Asked of the robot's network process at every look; nothing where that cannot be asked."""
@@ -209,8 +215,6 @@ class Watched:
     def _gauge(self, name: str, about: str, value: float) -> Family:
         return gauge(name, about, {(self._robot,): value}, "robot")
 
-    def _counter(self, name: str, about: str, value: float) -> Family:
-        return counter(name, about, {(self._robot,): value}, "robot")
-
-    def _by(self, name: str, about: str, label: str, counts: dict[str, int]) -> Family:
-        return counter(name, about, {(self._robot, key): value for key, value in counts.items()}, "robot", label)
+    def _counter(self, name: str, about: str, counts: Mapping[tuple[str, ...], int], *labels: str) -> Family:
+        values = {(self._robot, *of): float(count) for of, count in counts.items()}
+        return counter(name, about, values, "robot", *labels)
