@@ -2,13 +2,17 @@
 
     SUITE = Suite("R")
 
-    @SUITE.must("R-CAUS-02", "How a robot judges")
-    def unknown_frame(bench: Bench) -> None:
-        '''A twist that cites a frame never issued is refused as UNKNOWN_FRAME.'''
-        ...
-        bench.expect(reason == "UNKNOWN_FRAME", f"it was {reason}")
+    @SUITE.must("R-CAUS-02", "5.1 Order", ready)
+    def unknown_frame(bench: Bench, sender: Sender) -> None:
+        '''A twist that cites a frame never issued is rejected as UNKNOWN_FRAME.'''
+        sender.expect("UNKNOWN_FRAME", echo_seq=MAX_INTEGER)
+
+    SUITE.must_all(ready, {
+        "R-SEQ-07": ("5.1 Order", "A `seq` below the last ...", lambda sender: sender.expect("OUT_OF_ORDER", seq=0)),
+    })
 
 The id is side, group and number; the first docstring line is the title; the clause is a heading of the specification.
+`begin` brings the peer to where the case begins; the case gets what it returns. Cases of one shape are rows of a table.
 A case returns when the peer conforms and raises `ConformanceError` (through `bench.expect`) when it does not. It
 raises `NotApplicableError` (through `bench.need`) when what it builds on is missing: that has a case of its own, or is
 a choice.
@@ -21,7 +25,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from sightline.protocol.channels import SOURCES_OF_ROLE, Channel
 from sightline.protocol.codec import decode, encode
@@ -87,6 +91,11 @@ class Case:
         return GROUPS[self.id.split("-")[1]]
 
 
+Run = Callable[..., None]
+Adding = Callable[[Run], Run]
+Subject = TypeVar("Subject")
+
+
 class Suite:
     """The cases of one file. `side` is the letter their ids begin with: R robot, V vision, C codec."""
 
@@ -94,13 +103,21 @@ class Suite:
         self.side = side
         self.cases: list[Case] = []
 
-    def must(self, number: str, clause: str, *, real: bool = False) -> "Callable[[Run], Run]":
-        """Decorator: a case that every peer has to pass."""
-        return self._adding(number, Level.MUST, clause, real)
+    def must(self, number: str, clause: str, begin: "Begin | None" = None, *, real: bool = False) -> Adding:
+        """Decorator: a case that every peer has to pass: `run(bench, begin(bench))`, `run(bench)` without `begin`."""
+        return self._adding(number, Level.MUST, clause, begin, real)
 
-    def should(self, number: str, clause: str, *, real: bool = False) -> "Callable[[Run], Run]":
+    def should(self, number: str, clause: str, begin: "Begin | None" = None, *, real: bool = False) -> Adding:
         """Decorator: a case that a peer may fail for a good reason."""
-        return self._adding(number, Level.SHOULD, clause, real)
+        return self._adding(number, Level.SHOULD, clause, begin, real)
+
+    def must_all(
+        self, begin: "Callable[[Bench], Subject]", rows: Mapping[str, tuple[str, str, Callable[[Subject], None]]],
+        *, level: Level = Level.MUST, real: bool = False,
+    ) -> None:
+        """Add a case for each row: id -> clause, title, and what is done with what `begin` returns."""
+        for number, (clause, title, check) in rows.items():
+            self.add(Case(number, level, clause, title, _joined(begin, check), real))
 
     def add(self, case: Case) -> None:
         """Add a case made otherwise, e.g. from a table. Raises ValueError for a bad or double id."""
@@ -111,15 +128,25 @@ class Suite:
             raise ValueError(f"{case.id} is there twice")
         self.cases.append(case)
 
-    def _adding(self, number: str, level: Level, clause: str, real: bool) -> "Callable[[Run], Run]":
+    def _adding(self, number: str, level: Level, clause: str, begin: "Begin | None", real: bool) -> Adding:
         def add(run: Run) -> Run:
-            self.add(Case(number, level, clause, (run.__doc__ or "").split("\n")[0], run, real))
+            whole = run if begin is None else lambda bench: run(bench, begin(bench))
+            self.add(Case(number, level, clause, (run.__doc__ or "").split("\n")[0], whole, real))
             return run
 
         return add
 
 
-Run = Callable[["Bench"], None]
+def _joined(begin: "Callable[[Bench], Subject]", check: Callable[[Subject], None]) -> "Callable[[Bench], None]":
+    return lambda bench: check(begin(bench))
+
+
+def itself(bench: "Bench") -> "Bench":
+    """Begin rows that need nothing but the bench."""
+    return bench
+
+
+Begin = Callable[["Bench"], Any]
 
 
 # What a case sees of the world: messages, time, and words for what it expects. Pure; two files bring it to life.

@@ -24,6 +24,7 @@ FRAME_US: Final = 1_500_000
 """Until a frame comes to a peer that answers; without an answer credit comes back within 500 ms."""
 REPLY_US: Final = 1_000_000
 """After which a peer may ask again."""
+DRIVEN: Final = (State.ACTIVE, State.DEGRADED)
 _SENT_AGAIN: Final = 2
 
 
@@ -64,6 +65,23 @@ class Robot:
             return status is not None and bool(holds(status))
 
         return self.bench.wait(seen, within_us)
+
+    def becomes(self, *states: State, within_us: int = 500_000) -> bool:
+        """Whether a status with one of `states` comes in time."""
+        return self.reaches(lambda status: status.state in states, within_us)
+
+    def expect_state(self, *states: State, within_us: int = 500_000, what: str = "then") -> None:
+        """Fail the case unless a status with one of `states` comes in time."""
+        reached = self.becomes(*states, within_us=within_us)
+        self.bench.expect(reached, f"{what} it is {self.status().state}: {self.status().reason}")
+
+    def stops(self, within_us: int) -> bool:
+        """Whether a status with the wheels at zero comes in time."""
+        return self.reaches(lambda status: status.applied == (0.0, 0.0), within_us)
+
+    def counts(self, reason: str, before: int, within_us: int = 400_000) -> bool:
+        """Whether more than `before` rejections for `reason` are counted in time."""
+        return self.reaches(lambda status: status.refused.get(reason, 0) > before, within_us)
 
     def stamp(self) -> Stamp:
         """The header of the newest status that can be read. Raises ConformanceError as `status` does."""
@@ -177,6 +195,17 @@ class Sender:
         names = [GOOD if name in (RejectReason.DISARMED, GOOD) else name for name in news]
         return "+".join(sorted(names))
 
+    def expect_result(self, expected: str, send: Callable[[], None], what: str = "it") -> None:
+        """Fail the case unless the one command that `send` sends gets the result `expected`."""
+        self._compare(expected, self.verdict(send), what)
+
+    def expect(self, expected: str, text: bytes = CRAWL, what: str = "the twist", **changes: Any) -> None:
+        """Fail the case unless a twist that answers the next frame gets the result `expected`."""
+        self._compare(expected, self.judged(text, **changes), what)
+
+    def _compare(self, expected: str, result: str, what: str) -> None:
+        self.bench.expect(result == expected, f"{what}: {result or 'not counted'}, expected {expected}")
+
     def judged(self, text: bytes = CRAWL, **changes: Any) -> str:
         """The verdict on a twist that answers the next frame."""
         return self.verdict_on_next(lambda frame: self.twist(frame, text, **changes))
@@ -238,6 +267,26 @@ class Sender:
         payload = {"id": changes.pop("id", self.request_id), "verb": verb, **changes.pop("extra", {})}
         self.bench.publish(REQUEST, as_json({**fields, **changes}), as_json(payload), self.source)
 
+    def reply(self, verb: str, **changes: Any) -> Reply:
+        """Send a request and return its reply; the case is not applicable without one: R-REQ-01 tests that."""
+        reply = self.ask(verb, **changes)
+        self.bench.need(reply is not None, f"no reply to {verb} (R-REQ-01)")
+        assert reply is not None
+        return reply
+
+    def expect_granted(self, verb: str, what: str, **changes: Any) -> None:
+        """Fail the case unless the request is granted."""
+        reply = self.ask(verb, **changes)
+        self.bench.expect(reply is not None and reply.ok, f"{what}: {reply}")
+
+    def expect_rejected(self, verb: str, reason: str, what: str, **changes: Any) -> None:
+        """Fail the case unless the request is rejected and, unless `reason` is empty, counted under it."""
+        before = self.robot.next_status().refused.get(reason, 0)
+        reply = self.reply(verb, **changes)
+        self.bench.expect(not reply.ok, f"{verb} was granted: {what}")
+        counted = not reason or self.robot.counts(reason, before)
+        self.bench.expect(counted, f"{what}: rejected with {reply.detail!r}, expected {reason}")
+
     def granted(self, verb: str, **changes: Any) -> bool:
         """Ask, and whether it was done."""
         reply = self.ask(verb, **changes)
@@ -258,15 +307,46 @@ def as_json(fields: dict[str, Any]) -> bytes:
     return json.dumps(fields, separators=(",", ":")).encode()
 
 
-def armed(bench: Bench, source: str = "vision", text: bytes = CRAWL) -> tuple[Robot, Sender]:
-    """A robot that obeys a driver of ours, driving with `text`; R-ARM-03 says that this can be had."""
-    robot = Robot(bench)
-    driver = Sender(robot, source)
+# --- how a case begins -----------------------------------------------------------------------------------------------
+
+
+def vision(bench: Bench) -> Sender:
+    """A sender that acknowledges frames as `vision`."""
+    return Sender(Robot(bench))
+
+
+def ready(bench: Bench) -> Sender:
+    """A sender whose first twist was good, so that it holds the lease."""
+    sender = vision(bench)
+    sender.need_good()
+    return sender
+
+
+def operator(bench: Bench) -> Sender:
+    """An operator that has received a status."""
+    operator = Sender(Robot(bench), "operator")
+    operator.robot.status()
+    return operator
+
+
+def teleop(bench: Bench) -> Sender:
+    """A human driver that acknowledges frames."""
+    return Sender(Robot(bench), "teleop")
+
+
+def watcher(bench: Bench) -> Sender:
+    """A peer of a role that may not drive."""
+    return Sender(Robot(bench), bench.access.watcher)
+
+
+def armed(bench: Bench, source: str = "vision", text: bytes = CRAWL) -> Sender:
+    """A driver that the robot follows, driving with `text`; R-ARM-03 tests that this is possible."""
+    driver = Sender(Robot(bench), source)
     driver.drive(text)
     if not bench.wait(lambda: driver.seq >= 8, 3_000_000):
         bench.need(False, "too few frames to arm with")
     arm(driver)
-    return robot, driver
+    return driver
 
 
 def arm(driver: Sender) -> None:
@@ -276,5 +356,5 @@ def arm(driver: Sender) -> None:
         if driver.granted("arm"):
             break
         bench.rest(200_000)
-    reached = driver.robot.reaches(lambda status: status.state in (State.ACTIVE, State.DEGRADED), 1_500_000)
+    reached = driver.robot.becomes(*DRIVEN, within_us=1_500_000)
     bench.need(reached, "the robot could not be armed and driven (R-ARM-03)")

@@ -1,11 +1,12 @@
 """Cases on what a robot publishes and on credit: frames, status, odometry, rates. Pure."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from itertools import pairwise
 from typing import Final
 
 from sightline.conformance.case import Bench, Heard, Suite
-from sightline.conformance.robot.fixture import Robot, Sender, armed
+from sightline.conformance.robot.fixture import Robot, Sender, armed, ready, vision
 from sightline.protocol.channels import (
     CAMERA,
     CHANNELS,
@@ -15,12 +16,13 @@ from sightline.protocol.channels import (
     ODOMETRY,
     SCAN,
     STATUS,
+    Channel,
     Direction,
 )
 from sightline.protocol.codec import decode_ranges
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.messages import CameraModel, FrameHeader, Odometry, ScanHeader, Stamp, Status
+from sightline.protocol.messages import CameraModel, FrameHeader, Odometry, ScanHeader, Stamp, Status, WireModel
 from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE
 
 SUITE: Final = Suite("R")
@@ -37,25 +39,13 @@ def watched(bench: Bench) -> Robot:
     return robot
 
 
-def _all_frames(bench: Bench, good: Callable[[Heard], object], what: str) -> None:
-    watched(bench)
+def _all_frames(robot: Robot, good: Callable[[Heard], object], what: str) -> None:
+    bench = robot.bench
     frames = bench.heard(FRAME)
     bench.expect(frames, "no frame came within 2 s, though frames were wanted and acknowledged")
     bad = [one for one in frames if not good(one)]
     if bad:
         bench.expect(False, f"{len(bad)} of {len(frames)} frames: {what}; first {bad[0].message.header[:120]!r}")
-
-
-@SUITE.must("R-FRAM-01", "2.8 Fields")
-def frame_headers_can_be_read(bench: Bench) -> None:
-    """Every frame has a header with all that FrameHeader demands, in its bounds."""
-    _all_frames(bench, lambda one: one.header(FrameHeader), "no FrameHeader")
-
-
-@SUITE.must("R-FRAM-02", "3.1 Payload")
-def payload_is_a_jpeg(bench: Bench) -> None:
-    """The payload of every frame is a baseline or progressive JPEG of at most 1920 x 1080 pixels and nothing else."""
-    _all_frames(bench, _is_jpeg, "no JPEG within bounds")
 
 
 def _is_jpeg(one: Heard) -> bool:
@@ -66,10 +56,9 @@ def _is_jpeg(one: Heard) -> bool:
     return one.message.payload.rstrip(b"\0")[-2:] == b"\xff\xd9"
 
 
-@SUITE.must("R-FRAM-03", "2.5 Session and sequence")
-def one_session(bench: Bench) -> None:
+@SUITE.must("R-FRAM-03", "2.5 Session and sequence", watched)
+def one_session(bench: Bench, _robot: Robot) -> None:
     """All channels carry the same session for as long as the robot runs."""
-    watched(bench)
     sessions: dict[str, set[str]] = {}
     for channel in (FRAME, STATUS, CAMERA, ODOMETRY):
         stamps = [one.header(Stamp) for one in bench.heard(channel)]
@@ -83,7 +72,7 @@ def small_overhead(bench: Bench) -> None:
     """What is around a frame's JPEG (header and key) takes at most 320 bytes."""
     key_bytes = len(f"{KEY_PREFIX}/{bench.robot}/{FRAME.name}")
     most = _MAX_OVERHEAD_BYTES - key_bytes
-    _all_frames(bench, lambda one: len(one.message.header) <= most, f"over {_MAX_OVERHEAD_BYTES} bytes")
+    _all_frames(watched(bench), lambda one: len(one.message.header) <= most, f"over {_MAX_OVERHEAD_BYTES} bytes")
 
 
 @SUITE.must("R-FRAM-05", "1.4 Sizes")
@@ -104,17 +93,9 @@ def exact_keys(bench: Bench) -> None:
     bench.expect(not other, f"{other} messages came under another key than their channel's")
 
 
-@SUITE.must("R-FRAM-07", "10.1 Camera, odometry, scan")
-def camera_model(bench: Bench) -> None:
-    """The camera model is published twice a second and can be read."""
-    watched(bench)
-    _rate(bench, CAMERA.name, CameraModel, 2)
-
-
-@SUITE.must("R-FRAM-08", "10.1 Camera, odometry, scan")
-def camera_model_is_of_the_picture(bench: Bench) -> None:
+@SUITE.must("R-FRAM-08", "10.1 Camera, odometry, scan", watched)
+def camera_model_is_of_the_picture(bench: Bench, robot: Robot) -> None:
     """The camera model's width and height are those of the encoded picture."""
-    robot = watched(bench)
     model, frames = robot.camera(), [one for one in bench.heard(FRAME) if _is_jpeg(one)]
     bench.need(model is not None and frames, "no camera model or no picture to compare")
     assert model is not None
@@ -125,33 +106,24 @@ def camera_model_is_of_the_picture(bench: Bench) -> None:
     )
 
 
-@SUITE.must("R-FRAM-09", "9. Status")
-def status_rate(bench: Bench) -> None:
-    """`status` is published at 10 Hz and can be read."""
-    watched(bench)
-    _rate(bench, STATUS.name, Status, 10)
-
-
-@SUITE.should("R-FRAM-10", "10.2 Camera, odometry, scan")
-def odometry_rate(bench: Bench) -> None:
+@SUITE.should("R-FRAM-10", "10.2 Camera, odometry, scan", watched)
+def odometry_rate(bench: Bench, _robot: Robot) -> None:
     """Odometry, where the robot has it, comes at 20 Hz and can be read."""
-    watched(bench)
     bench.need(bench.heard(ODOMETRY), "this robot publishes no odometry")
-    _rate(bench, ODOMETRY.name, Odometry, 20)
+    _rate(bench, ODOMETRY, Odometry, 20)
 
 
-def _rate(bench: Bench, name: str, model: type[CameraModel] | type[Status] | type[Odometry], rate_hz: int) -> None:
-    heard = bench.heard(CHANNELS[name])
+def _rate(bench: Bench, channel: Channel, model: type[WireModel], rate_hz: int) -> None:
+    name, heard = channel.name, bench.heard(channel)
     unread = [one for one in heard if one.header(Stamp) is None or one.payload(model) is None]
     bench.expect(not unread, f"{len(unread)} of {len(heard)} `{name}` cannot be read")
     least = int(_SLACK * rate_hz * _WATCHED_US / 1e6)
     bench.expect(len(heard) >= least, f"{len(heard)} `{name}` in 2 s, at least {least} belong to {rate_hz} Hz")
 
 
-@SUITE.must("R-FRAM-11", "10.3 Camera, odometry, scan")
-def scans_can_be_read(bench: Bench) -> None:
+@SUITE.must("R-FRAM-11", "10.3 Camera, odometry, scan", watched)
+def scans_can_be_read(bench: Bench, _robot: Robot) -> None:
     """A scan, where the robot has them, has a ScanHeader and whole, non-negative float32 ranges."""
-    watched(bench)
     scans = bench.heard(SCAN)
     bench.need(scans, "this robot publishes no scans")
     for one in scans:
@@ -162,70 +134,74 @@ def scans_can_be_read(bench: Bench) -> None:
             bench.expect(False, f"ranges: {error.detail}")
 
 
-@SUITE.must("R-FRAM-12", "2.8 Fields")
-def applied_in_frames(bench: Bench) -> None:
+@SUITE.must("R-FRAM-12", "2.8 Fields", armed)
+def applied_in_frames(bench: Bench, driver: Sender) -> None:
     """While the robot drives, `applied` in the frames is what was last given to the wheels."""
-    robot, _driver = armed(bench)
-    bench.need(robot.reaches(lambda status: status.applied[0] > 0.05, 1_500_000), "the robot does not drive (R-LIM-01)")
+    moves = driver.robot.reaches(lambda status: status.applied[0] > 0.05, 1_500_000)
+    bench.need(moves, "the robot does not drive (R-LIM-01)")
     bench.rest(300_000)
     mark = bench.mark()
     bench.rest(300_000)
-    told = [header.applied[0] for _, header in robot.frames(mark)]
+    told = [header.applied[0] for _, header in driver.robot.frames(mark)]
     bench.need(told, "no frame while driving")
-    bench.expect(max(told) > 0.05, f"status says {robot.status().applied}, the frames {told[-1]}")
+    bench.expect(max(told) > 0.05, f"status says {driver.robot.status().applied}, the frames {told[-1]}")
+
+
+def _grows(robot: Robot, channel: Channel, what: str, values: Iterable[int], least_step: int = 1) -> None:
+    """Fail the case unless `values` grow by `least_step` each."""
+    falls = (f"{was} is followed by {then}" for was, then in pairwise(values) if then - was < least_step)
+    fall = next(falls, "")
+    robot.bench.expect(not fall, f"{channel.name}: {what} {fall}")
+
+
+def _stamps(robot: Robot, channel: Channel) -> list[Stamp]:
+    return [stamp for one in robot.bench.heard(channel) if (stamp := one.header(Stamp)) is not None]
+
+
+def _counts_up(robot: Robot, channel: Channel) -> None:
+    _grows(robot, channel, "seq", [stamp.seq for stamp in _stamps(robot, channel)])
+
+
+def _times_grow(robot: Robot, channel: Channel, least_step: int) -> None:
+    _grows(robot, channel, "t_us", [stamp.t_us for stamp in _stamps(robot, channel)], least_step)
+
+
+def _status_counts(robot: Robot) -> None:
+    _counts_up(robot, STATUS)
+    _times_grow(robot, STATUS, 0)
+
+
+SUITE.must_all(watched, {
+    "R-FRAM-01": ("2.8 Fields", "Every frame has a header with all that FrameHeader demands, in its bounds.",
+                  lambda it: _all_frames(it, lambda one: one.header(FrameHeader), "no FrameHeader")),
+    "R-FRAM-02": ("3.1 Payload", "The payload of every frame is a baseline or progressive JPEG of at most 1920 x "
+                  "1080 pixels and nothing else.", lambda it: _all_frames(it, _is_jpeg, "no JPEG within bounds")),
+    "R-FRAM-07": ("10.1 Camera, odometry, scan", "The camera model is published twice a second and can be read.",
+                  lambda it: _rate(it.bench, CAMERA, CameraModel, 2)),
+    "R-FRAM-09": ("9. Status", "`status` is published at 10 Hz and can be read.",
+                  lambda it: _rate(it.bench, STATUS, Status, 10)),
+    "R-SEQ-01": ("2.5 Session and sequence", "`seq` of the frames counts up by at least one.",
+                 lambda it: _counts_up(it, FRAME)),
+    "R-SEQ-02": ("2.6 Clock", "`t_us` of the frames, the time of capture, always grows.",
+                 lambda it: _times_grow(it, FRAME, 1)),
+    "R-SEQ-03": ("2.6 Clock", "`seq` of `status` counts up and its `t_us` never goes back.", _status_counts),
+})
 
 
 # --- sequence --------------------------------------------------------------------------------------------------------
 
 
-def _stamps(bench: Bench, name: str) -> list[Stamp]:
-    return [stamp for one in bench.heard(CHANNELS[name]) if (stamp := one.header(Stamp)) is not None]
-
-
-def _falls(values: list[int], least_step: int) -> str:
-    falls = (f"{was} is followed by {then}" for was, then in pairwise(values) if then - was < least_step)
-    return next(falls, "")
-
-
-@SUITE.must("R-SEQ-01", "2.5 Session and sequence")
-def frame_seq_counts_up(bench: Bench) -> None:
-    """`seq` of the frames counts up by at least one."""
-    watched(bench)
-    fall = _falls([stamp.seq for stamp in _stamps(bench, FRAME.name)], 1)
-    bench.expect(not fall, f"seq {fall}")
-
-
-@SUITE.must("R-SEQ-02", "2.6 Clock")
-def frame_time_goes_forward(bench: Bench) -> None:
-    """`t_us` of the frames, the time of capture, always grows."""
-    watched(bench)
-    fall = _falls([stamp.t_us for stamp in _stamps(bench, FRAME.name)], 1)
-    bench.expect(not fall, f"t_us {fall}")
-
-
-@SUITE.must("R-SEQ-03", "2.6 Clock")
-def status_seq_and_time(bench: Bench) -> None:
-    """`seq` of `status` counts up and its `t_us` never goes back."""
-    watched(bench)
-    stamps = _stamps(bench, STATUS.name)
-    fall = _falls([stamp.seq for stamp in stamps], 1) or _falls([stamp.t_us for stamp in stamps], 0)
-    bench.expect(not fall, fall)
-
-
-@SUITE.must("R-SEQ-04", "2.5 Session and sequence")
-def each_channel_counts(bench: Bench) -> None:
+@SUITE.must("R-SEQ-04", "2.5 Session and sequence", watched)
+def each_channel_counts(_bench: Bench, robot: Robot) -> None:
     """Every other channel has a `seq` of its own that counts up."""
-    watched(bench)
     rest = [one.name for one in CHANNELS.values() if one.direction is Direction.FROM_ROBOT]
     for name in set(rest) - {FRAME.name, STATUS.name}:
-        fall = _falls([stamp.seq for stamp in _stamps(bench, name)], 1)
-        bench.expect(not fall, f"{name}: seq {fall}")
+        _counts_up(robot, CHANNELS[name])
 
 
-@SUITE.must("R-SEQ-05", "2.6 Clock")
-def one_clock(bench: Bench) -> None:
+@SUITE.must("R-SEQ-05", "2.6 Clock", watched)
+def one_clock(bench: Bench, robot: Robot) -> None:
     """All channels are stamped by one clock: a frame is captured before the status that follows it is published."""
-    robot = watched(bench)
     offsets = {name: [] for name in (FRAME.name, STATUS.name)}  # type: dict[str, list[int]]
     for channel in (FRAME, STATUS):
         for one in bench.heard(channel):
@@ -266,6 +242,13 @@ def taught(bench: Bench, answers: int = TAUGHT) -> Sender:
     return watcher
 
 
+def _quick_fps(bench: Bench, what: str = "to a quick peer") -> float:
+    """Frames a second, which must be more than the camera alone could explain."""
+    fps = fps_of(bench)
+    bench.need(fps >= QUICK_FPS, f"only {fps:.0f} fps {what}")
+    return fps
+
+
 def _gaps_us(bench: Bench, since: int) -> list[int]:
     times = [one.at_us for one in bench.heard(FRAME, since)]
     return [then - was for was, then in pairwise(times)]
@@ -277,18 +260,11 @@ def fps_of(bench: Bench, for_us: int = 1_000_000) -> float:
     return len(bench.heard(FRAME, mark)) * 1e6 / for_us
 
 
-def silent_fps(bench: Bench, watcher: Sender) -> float:
-    """How many frames a second come to somebody who has been slow and answers no more."""
-    watcher.fall_silent()
-    return fps_of(bench, 600_000)
-
-
 def _rates(bench: Bench) -> tuple[Sender, float, float]:
     """A watcher that answered quickly, then slowly, then not at all: it, and frames a second at first and at last."""
     watcher = Sender(Robot(bench))
     bench.rest(OWNED_US)
-    quick = fps_of(bench)
-    bench.need(quick >= QUICK_FPS, f"only {quick:.0f} fps to a quick peer")
+    quick = _quick_fps(bench)
     watcher.delay_us = watcher.compute_us = SLOW_US
     bench.rest(1_300_000)
     watcher.fall_silent()
@@ -313,26 +289,21 @@ def slow_detector_widens_nothing(bench: Bench) -> None:
     bench.expect(fps <= 1.25e6 / SLOW_US, f"{fps:.0f} fps to a peer that computes {SLOW_US // 1000} ms for each")
 
 
-@SUITE.must("R-FLOW-03", "7.2 Credit")
-def acks_return_credit(bench: Bench) -> None:
+@SUITE.must("R-FLOW-03", "7.2 Credit", vision)
+def acks_return_credit(bench: Bench, sender: Sender) -> None:
     """An ack returns credit as a twist does: the frame rate is the same."""
-    sender = Sender(Robot(bench))
     sender.drive()
     bench.rest(OWNED_US)
-    by_twists = fps_of(bench)
-    bench.need(by_twists >= QUICK_FPS, f"only {by_twists:.0f} fps with twists")
+    by_twists = _quick_fps(bench, "with twists")
     sender.drive(None)
     by_acks = fps_of(bench)
     bench.expect(by_acks >= 0.7 * by_twists, f"{by_acks:.0f} fps with acks, {by_twists:.0f} with twists")
 
 
-@SUITE.must("R-FLOW-04", "7.2 Credit")
-def refused_twists_return_credit(bench: Bench) -> None:
+@SUITE.must("R-FLOW-04", "7.2 Credit", ready)
+def refused_twists_return_credit(bench: Bench, watcher: Sender) -> None:
     """A refused twist that cites a frame returns its credit."""
-    watcher = Sender(Robot(bench))
-    watcher.need_good()
-    by_acks = fps_of(bench)
-    bench.need(by_acks >= QUICK_FPS, f"only {by_acks:.0f} fps with acks")
+    by_acks = _quick_fps(bench, "with acks")
     refused = Sender(watcher.robot, acks=False)
     refused.session = watcher.session
     watcher.fall_silent()
@@ -353,38 +324,30 @@ def lost_credit_times_out(bench: Bench) -> None:
     bench.expect(max(gaps_us) <= 650_000, f"without an answer {max(gaps_us) / 1e3:.0f} ms passed between two frames")
 
 
-@SUITE.must("R-FLOW-06", "7.3 Owner")
-def credit_is_the_drivers(bench: Bench) -> None:
+@SUITE.must("R-FLOW-06", "7.3 Owner", Robot)
+def credit_is_the_drivers(bench: Bench, robot: Robot) -> None:
     """Acks of others do not return the credit of who drives: frames come at the driver's pace."""
-    robot = Robot(bench)
     driver = Sender(robot)
     driver.delay_us = driver.compute_us = SLOW_US
     driver.drive()
     bench.need(bench.wait(lambda: driver.seq >= TAUGHT, 6_000_000), "too few frames")
-    alone = fps_of(bench)
-    Sender(robot, bench.access.watcher)
-    beside = fps_of(bench)
-    bench.need(alone <= 1.5e6 / SLOW_US, f"{alone:.0f} fps to a slow driver alone (R-FLOW-02)")
-    bench.expect(beside <= 1.5 * alone, f"{alone:.0f} fps to a slow driver, {beside:.0f} beside a quick watcher")
+    _second_hastens_nothing(driver)
 
 
-@SUITE.should("R-FLOW-07", "7.4 Window")
-def long_link_widens(bench: Bench) -> None:
+@SUITE.should("R-FLOW-07", "7.4 Window", vision)
+def long_link_widens(bench: Bench, watcher: Sender) -> None:
     """On a link that takes 100 ms, more than one frame is in flight."""
-    watcher = Sender(Robot(bench))
     bench.rest(OWNED_US)
-    quick = fps_of(bench)
-    bench.need(quick >= QUICK_FPS, f"only {quick:.0f} fps to a quick peer")
+    quick = _quick_fps(bench)
     watcher.delay_us = 110_000
     bench.rest(2_500_000)
     fps = fps_of(bench)
     bench.expect(fps >= 1.5e6 / 110_000, f"{fps:.0f} fps over 110 ms, {quick:.0f} without delay")
 
 
-@SUITE.must("R-FLOW-08", "7.2 Credit")
-def answers_count_for_older(bench: Bench) -> None:
+@SUITE.must("R-FLOW-08", "7.2 Credit", vision)
+def answers_count_for_older(bench: Bench, watcher: Sender) -> None:
     """An answer returns the credit of its frame and of all older ones."""
-    watcher = Sender(Robot(bench))
     watcher.delay_us = 300_000
     bench.rest(5_000_000)
     fps = fps_of(bench)
@@ -404,30 +367,6 @@ def _silent_for(bench: Bench, for_us: int) -> bool:
     return newest is None or bench.now_us - newest.at_us >= for_us
 
 
-@SUITE.must("R-FLOW-09", "7.2 Credit")
-def other_session_returns_nothing(bench: Bench) -> None:
-    """An ack that cites another session of the robot returns no credit."""
-    watcher = taught(bench)
-    silent = silent_fps(bench, watcher)
-    bench.need(silent < QUICK_FPS, f"{silent:.0f} fps without any answer (R-FLOW-01)")
-    forger = again(watcher)
-    watcher.robot.each_frame(lambda frame: forger.ack(frame, echo_session="fffffff0"))
-    fps = fps_of(bench, 600_000)
-    bench.expect(fps < 1.5 * silent, f"{fps:.0f} fps with acks for another session, {silent:.0f} without")
-
-
-@SUITE.must("R-FLOW-10", "7.2 Credit")
-def unknown_frame_returns_nothing(bench: Bench) -> None:
-    """An ack that cites a frame not yet sent returns no credit."""
-    watcher = taught(bench)
-    silent = silent_fps(bench, watcher)
-    bench.need(silent < QUICK_FPS, f"{silent:.0f} fps without any answer (R-FLOW-01)")
-    forger = again(watcher)
-    watcher.robot.each_frame(lambda frame: forger.ack(frame, echo_seq=frame.seq + 1000))
-    fps = fps_of(bench, 600_000)
-    bench.expect(fps < 1.5 * silent, f"{fps:.0f} fps with acks for frames to come, {silent:.0f} without")
-
-
 def again(watcher: Sender) -> Sender:
     """The same peer, answering by hand."""
     again = Sender(watcher.robot, acks=False)
@@ -436,10 +375,9 @@ def again(watcher: Sender) -> Sender:
     return again
 
 
-@SUITE.must("R-FLOW-11", "7.2 Credit")
-def never_stored(bench: Bench) -> None:
+@SUITE.must("R-FLOW-11", "7.2 Credit", Robot)
+def never_stored(bench: Bench, robot: Robot) -> None:
     """A frame is sent at its capture: one that waited for credit is not sent later."""
-    robot = Robot(bench)
     watcher = Sender(robot)
     watcher.delay_us = watcher.compute_us = _LATE_US
     bench.rest(3_000_000)
@@ -454,29 +392,9 @@ def never_stored(bench: Bench) -> None:
 # Cases on whose answers return credit, and on frames while nobody listens. Pure.
 
 
-_ALONE_US: Final = 6_000_000
-_AT_THE_EDGES: Final = 8
-"""Frames that are sent before the robot knows that the kit has gone, or has come."""
-
-
-@SUITE.must("R-FLOW-12", "7.2 Credit")
-def malformed_returns_nothing(bench: Bench) -> None:
-    """A twist that is MALFORMED returns no credit, though its header cites a frame."""
-    watcher = taught(bench)
-    silent = silent_fps(bench, watcher)
-    bench.need(silent < QUICK_FPS, f"{silent:.0f} fps without any answer (R-FLOW-01)")
-    forger = again(watcher)
-    watcher.robot.each_frame(lambda frame: forger.twist(frame, b"x"))
-    fps = fps_of(bench, 600_000)
-    bench.expect(fps < 1.5 * silent, f"{fps:.0f} fps with twists that are MALFORMED, {silent:.0f} without")
-
-
-@SUITE.must("R-FLOW-13", "7.3 Owner")
-def credit_is_the_firsts(bench: Bench) -> None:
-    """While nobody drives credit is the first's who answers: a second, quicker one does not hasten the frames."""
-    first = Sender(Robot(bench))
-    first.delay_us = first.compute_us = SLOW_US
-    bench.need(bench.wait(lambda: first.ack_seq >= TAUGHT, 6_000_000), "too few frames")
+def _second_hastens_nothing(first: Sender) -> None:
+    """Fail the case if a quick second peer makes frames come faster than the slow `first` answers."""
+    bench = first.bench
     alone = fps_of(bench)
     Sender(first.robot, bench.access.watcher)
     beside = fps_of(bench)
@@ -484,13 +402,48 @@ def credit_is_the_firsts(bench: Bench) -> None:
     bench.expect(beside <= 1.5 * alone, f"{alone:.0f} fps to a slow peer, {beside:.0f} beside a quick one")
 
 
-@SUITE.must("R-FLOW-14", "7.3 Owner")
-def credit_passes_on(bench: Bench) -> None:
+def _returns_nothing(watcher: Sender, what: str, forge: Callable[[Sender, FrameHeader], None]) -> None:
+    """Fail the case if what `forge` sends about each frame returns credit to a peer that has been slow."""
+    bench = watcher.bench
+    silent = fps_of(bench, 600_000)
+    bench.need(silent < QUICK_FPS, f"{silent:.0f} fps without any answer (R-FLOW-01)")
+    forger = again(watcher)
+    watcher.robot.each_frame(partial(forge, forger))
+    fps = fps_of(bench, 600_000)
+    bench.expect(fps < 1.5 * silent, f"{fps:.0f} fps with {what}, {silent:.0f} without")
+
+
+SUITE.must_all(taught, {
+    "R-FLOW-09": ("7.2 Credit", "An ack that cites another session of the robot returns no credit.",
+                  lambda it: _returns_nothing(it, "acks for another session",
+                                              lambda by, frame: by.ack(frame, echo_session="fffffff0"))),
+    "R-FLOW-10": ("7.2 Credit", "An ack that cites a frame not yet sent returns no credit.",
+                  lambda it: _returns_nothing(it, "acks for frames to come",
+                                              lambda by, frame: by.ack(frame, echo_seq=frame.seq + 1000))),
+    "R-FLOW-12": ("7.2 Credit", "A twist that is MALFORMED returns no credit, though its header cites a frame.",
+                  lambda it: _returns_nothing(it, "twists that are MALFORMED",
+                                              lambda by, frame: by.twist(frame, b"x"))),
+})
+
+
+_ALONE_US: Final = 6_000_000
+_AT_THE_EDGES: Final = 8
+"""Frames that are sent before the robot knows that the kit has gone, or has come."""
+
+
+@SUITE.must("R-FLOW-13", "7.3 Owner", vision)
+def credit_is_the_firsts(bench: Bench, first: Sender) -> None:
+    """While nobody drives credit is the first's who answers: a second, quicker one does not hasten the frames."""
+    first.delay_us = first.compute_us = SLOW_US
+    bench.need(bench.wait(lambda: first.ack_seq >= TAUGHT, 6_000_000), "too few frames")
+    _second_hastens_nothing(first)
+
+
+@SUITE.must("R-FLOW-14", "7.3 Owner", vision)
+def credit_passes_on(bench: Bench, first: Sender) -> None:
     """Once the first has been silent for a second the answers of another return credit."""
-    first = Sender(Robot(bench))
     bench.rest(OWNED_US)
-    quick = fps_of(bench)
-    bench.need(quick >= QUICK_FPS, f"only {quick:.0f} fps to a quick peer")
+    quick = _quick_fps(bench)
     first.fall_silent()
     bench.rest(OWNED_US)
     Sender(first.robot, bench.access.watcher)
@@ -499,13 +452,11 @@ def credit_passes_on(bench: Bench) -> None:
     bench.expect(fps >= 0.7 * quick, f"{quick:.0f} fps to the first, {fps:.0f} to the second")
 
 
-@SUITE.must("R-FLOW-15", "7.1 Answers")
-def seq_of_acks(bench: Bench) -> None:
+@SUITE.must("R-FLOW-15", "7.1 Answers", vision)
+def seq_of_acks(bench: Bench, watcher: Sender) -> None:
     """The `seq` of an ack is not judged: acks that all have the same return credit."""
-    watcher = Sender(Robot(bench))
     bench.rest(OWNED_US)
-    quick = fps_of(bench)
-    bench.need(quick >= QUICK_FPS, f"only {quick:.0f} fps to a quick peer")
+    quick = _quick_fps(bench)
     watcher.fall_silent()
     acking = again(watcher)
     acking.compute_us = 0
@@ -514,10 +465,9 @@ def seq_of_acks(bench: Bench) -> None:
     bench.expect(fps >= 0.7 * quick, f"{fps:.0f} fps with acks of one `seq`, {quick:.0f} with a rising one")
 
 
-@SUITE.should("R-FLOW-16", "3.4 Rate")
-def nobody_listens(bench: Bench) -> None:
+@SUITE.should("R-FLOW-16", "3.4 Rate", vision)
+def nobody_listens(bench: Bench, watcher: Sender) -> None:
     """While nobody listens no frame is captured: `stream.sent` stands still."""
-    watcher = Sender(Robot(bench))
     watcher.robot.frame()
     watcher.fall_silent()
     before = watcher.robot.next_status(4).stream.sent

@@ -3,7 +3,18 @@
 from typing import Final
 
 from sightline.conformance.case import Bench, Suite
-from sightline.conformance.robot.fixture import CRAWL, GOOD, Robot, Sender, arm, armed, as_json
+from sightline.conformance.robot.fixture import (
+    CRAWL,
+    GOOD,
+    Robot,
+    Sender,
+    arm,
+    armed,
+    as_json,
+    ready,
+    vision,
+    watcher,
+)
 from sightline.protocol.channels import FRAME, REQUEST, STATUS, TWIST, key_for
 from sightline.protocol.messages import Holder, Stamp, State
 
@@ -33,10 +44,9 @@ def guests(bench: Bench) -> None:
     bench.expect(verdict in (GOOD, "UNKNOWN_SOURCE"), f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-DIAL-02", "4.6 Guests")
-def guests_crawl(bench: Bench) -> None:
+@SUITE.must("R-DIAL-02", "4.6 Guests", _guest)
+def guests_crawl(bench: Bench, watcher: Sender) -> None:
     """A guest's twist is limited to 0.2 m/s and 1 rad/s."""
-    watcher = _guest(bench)
     bench.on(FRAME, lambda _one: _bare(bench, b"3.0000|0.0000"))
     _arm_guest(watcher)
     bench.rest(1_000_000)
@@ -53,10 +63,9 @@ def _arm_guest(watcher: Sender) -> None:
     arm(watcher)
 
 
-@SUITE.must("R-DIAL-03", "6.1 Lease")
-def guests_yield(bench: Bench) -> None:
+@SUITE.must("R-DIAL-03", "6.1 Lease", _guest)
+def guests_yield(bench: Bench, watcher: Sender) -> None:
     """`vision` takes the lease from a guest."""
-    watcher = _guest(bench)
     verdict = Sender(watcher.robot).judged()
     bench.need(verdict in (GOOD, "NOT_HOLDER"), f"a twist of vision is {verdict or 'not counted'} (R-CAUS-01)")
     bench.expect(verdict == GOOD, f"a twist of vision is {verdict}")
@@ -69,14 +78,12 @@ def guests_with_header(bench: Bench) -> None:
     foreign = Sender(Robot(bench)).judged(echo_session="fffffff0")
     bench.need(foreign == "OTHER_SESSION", f"another session is {foreign or 'not counted'} (R-CAUS-06)")
     sender = Sender(Robot(bench), "guest")
-    verdict = sender.judged(echo_session="fffffff0")
-    bench.expect(verdict == "OTHER_SESSION", f"one that cites another session is {verdict or 'not counted'}")
+    sender.expect("OTHER_SESSION", echo_session="fffffff0", what="one that cites another session")
 
 
-@SUITE.must("R-DIAL-05", "4.6 Guests")
-def guests_are_silent_soon(bench: Bench) -> None:
+@SUITE.must("R-DIAL-05", "4.6 Guests", _guest)
+def guests_are_silent_soon(bench: Bench, watcher: Sender) -> None:
     """A guest's twist lives 250 ms."""
-    watcher = _guest(bench)
     until_us = bench.now_us + 4_000_000
     bench.on(FRAME, lambda _one: _bare(bench) if bench.now_us < until_us else None)
     _arm_guest(watcher)
@@ -85,10 +92,9 @@ def guests_are_silent_soon(bench: Bench) -> None:
     bench.expect(held, f"silence left it {watcher.robot.status().state}")
 
 
-@SUITE.must("R-DIAL-06", "4.6 Guests")
-def guests_are_one(bench: Bench) -> None:
+@SUITE.must("R-DIAL-06", "4.6 Guests", _guest)
+def guests_are_one(bench: Bench, watcher: Sender) -> None:
     """All who send without a header are one driver, `guest` of session 00000000."""
-    watcher = _guest(bench)
     _bare(bench)
     told = watcher.robot.reaches(lambda status: status.holder is not None, 500_000)
     bench.need(told, "`status` names no holder (R-LEASE-01)")
@@ -99,30 +105,9 @@ def guests_are_one(bench: Bench) -> None:
 # --- roles and keys --------------------------------------------------------------------------------------------------
 
 
-@SUITE.must("R-HOST-01", "5.1 Order")
-def watchers_do_not_drive(bench: Bench) -> None:
-    """A twist of a role that may not drive is refused as UNKNOWN_SOURCE."""
-    sender = Sender(Robot(bench), bench.access.watcher)
-    verdict = sender.judged()
-    bench.expect(verdict == "UNKNOWN_SOURCE", f"it was {verdict or 'not counted'}")
-
-
-@SUITE.must("R-HOST-02", "1.3 Keys")
-def wildcard_keys(bench: Bench) -> None:
-    """A twist under a wildcard key is dropped."""
-    _dropped(bench, f"sightline/{bench.robot}/twist/*", "sightline/**")
-
-
-@SUITE.must("R-HOST-03", "1.3 Keys")
-def other_robots_keys(bench: Bench) -> None:
-    """A twist for another robot, or under a key with more parts, is dropped."""
-    _dropped(bench, "sightline/other/twist/vision", f"sightline/{bench.robot}/twist/vision/more")
-
-
-def _dropped(bench: Bench, *keys: str) -> None:
-    sender = Sender(Robot(bench))
-    sender.need_good()
-    for key in keys:
+def _dropped(sender: Sender, *keys: str) -> None:
+    bench = sender.bench
+    for key in (one.format(robot=bench.robot) for one in keys):
         frame = sender.robot.frame()
         sender.seq += 1
         header = as_json(sender.header(frame))
@@ -130,87 +115,72 @@ def _dropped(bench: Bench, *keys: str) -> None:
         bench.expect(verdict != GOOD, f"a twist under {key} was judged good")
 
 
-@SUITE.must("R-HOST-04", "1.4 Sizes")
-def long_twists(bench: Bench) -> None:
-    """A twist of more than 64 bytes is not obeyed, though its number is one."""
-    _oversize(bench, b"", b"0.1" + b"0" * 80 + b"|0")
-
-
-@SUITE.must("R-HOST-05", "1.4 Sizes")
-def long_headers(bench: Bench) -> None:
-    """A header of more than 512 bytes is not obeyed, though all its fields are right."""
-    _oversize(bench, b'"note":"' + b"x" * 600 + b'",', CRAWL)
-
-
-def _oversize(bench: Bench, extra: bytes, text: bytes) -> None:
-    sender = Sender(Robot(bench))
-    sender.need_good()
-    frame = sender.robot.frame()
+def _oversize(sender: Sender, extra: bytes, text: bytes) -> None:
+    bench, frame = sender.bench, sender.robot.frame()
     sender.seq += 1
     header = b"{" + extra + as_json(sender.header(frame))[1:]
     verdict = sender.verdict(lambda: bench.put(key_for(bench.robot, TWIST, sender.source), header, text))
     bench.expect(GOOD not in verdict, "it was judged good")
-    verdict = sender.judged()
-    bench.expect(verdict == GOOD, f"after it an ordinary twist is {verdict or 'not counted'}")
+    sender.expect(GOOD, what="after it an ordinary twist")
 
 
 # --- nonsense and floods ---------------------------------------------------------------------------------------------
 
 
-def _survives(bench: Bench, send: list[tuple[bytes, bytes]], source: str = "vision") -> None:
-    """After each (header, payload) as a twist and as a request the robot still speaks and judges."""
-    sender = Sender(Robot(bench))
-    sender.need_good()
-    for header, payload in send:
+def _survives(sender: Sender, *messages: tuple[bytes, bytes]) -> None:
+    """After each (header, payload) as a twist and as a request the robot still publishes and validates."""
+    bench = sender.bench
+    for header, payload in messages:
         for channel in (TWIST, REQUEST):
-            bench.publish(channel, header, payload, source)
+            bench.publish(channel, header, payload, sender.source)
             bench.rest(30_000)
     mark = bench.mark()
     bench.expect_within(lambda: len(bench.heard(STATUS, mark)) >= 3, 1_500_000, "after it the robot is silent")
-    verdict = sender.judged()
-    bench.expect(verdict == GOOD, f"after it an ordinary twist is {verdict or 'not counted'}")
+    sender.expect(GOOD, what="after it an ordinary twist")
 
 
-@SUITE.must("R-HOST-06", "13.2 Bounds")
-def noise(bench: Bench) -> None:
-    """Bytes that are no protocol at all end nothing."""
-    parts = [(bytes(range(200, 256)), bytes(range(60))), (b"\0" * 40, b"\xff" * 60), (b"{", b"{"), (b'"', b"|")]
-    _survives(bench, parts)
+SUITE.must_all(watcher, {
+    "R-HOST-01": ("5.1 Order", "A twist of a role that may not drive is refused as UNKNOWN_SOURCE.",
+                  lambda it: it.expect("UNKNOWN_SOURCE")),
+})
+SUITE.must_all(ready, {
+    "R-HOST-02": ("1.3 Keys", "A twist under a wildcard key is dropped.",
+                  lambda it: _dropped(it, "sightline/{robot}/twist/*", "sightline/**")),
+    "R-HOST-03": ("1.3 Keys", "A twist for another robot, or under a key with more parts, is dropped.",
+                  lambda it: _dropped(it, "sightline/other/twist/vision", "sightline/{robot}/twist/vision/more")),
+    "R-HOST-04": ("1.4 Sizes", "A twist of more than 64 bytes is not obeyed, though its number is one.",
+                  lambda it: _oversize(it, b"", b"0.1" + b"0" * 80 + b"|0")),
+    "R-HOST-05": ("1.4 Sizes", "A header of more than 512 bytes is not obeyed, though all its fields are right.",
+                  lambda it: _oversize(it, b'"note":"' + b"x" * 600 + b'",', CRAWL)),
+    "R-HOST-06": ("13.2 Bounds", "Bytes that are no protocol at all end nothing.",
+                  lambda it: _survives(it, (bytes(range(200, 256)), bytes(range(60))), (b"\0" * 40, b"\xff" * 60),
+                                       (b"{", b"{"), (b'"', b"|"))),
+    "R-HOST-07": ("13.2 Bounds", "A header nested as deep as its size allows ends nothing.",
+                  lambda it: _survives(it, (b"[" * 512, b"1|1"), (b'{"a":' * 90 + b"1" + b"}" * 30, b"1|1"))),
+    "R-HOST-08": ("2.3 Text", "Text that is no Unicode ends nothing.",
+                  lambda it: _survives(it, (b'{"v":1,"source":"\\ud800"}', b"1|1"),
+                                       (b'{"session":"\\udfff\\u0000"}', b'{"verb":"\\ud800"}'))),
+})
 
 
-@SUITE.must("R-HOST-07", "13.2 Bounds")
-def deep_nesting(bench: Bench) -> None:
-    """A header nested as deep as its size allows ends nothing."""
-    _survives(bench, [(b"[" * 512, b"1|1"), (b'{"a":' * 90 + b"1" + b"}" * 30, b"1|1")])
-
-
-@SUITE.must("R-HOST-08", "2.3 Text")
-def surrogates(bench: Bench) -> None:
-    """Text that is no Unicode ends nothing."""
-    headers = b'{"v":1,"source":"\\ud800"}', b'{"session":"\\udfff\\u0000"}'
-    _survives(bench, [(headers[0], b"1|1"), (headers[1], b'{"verb":"\\ud800"}')])
-
-
-@SUITE.must("R-HOST-09", "13.2 Bounds")
-def flood(bench: Bench) -> None:
+@SUITE.must("R-HOST-09", "13.2 Bounds", armed)
+def flood(bench: Bench, driver: Sender) -> None:
     """A flood of 500 refused twists a second keeps neither status nor the driver back."""
-    robot, driver = armed(bench)
-    cited = robot.frame()
-    before, mark, sent = robot.next_status(), bench.mark(), driver.seq
-    hostile = Sender(robot, acks=False)
+    cited = driver.robot.frame()
+    before, mark, sent = driver.robot.next_status(), bench.mark(), driver.seq
+    hostile = Sender(driver.robot, acks=False)
     for number in range(750):
         bench.after(number * 2_000, lambda: hostile.twist(cited, b"9|9|9"))
     bench.rest(1_500_000)
     came = len(bench.heard(STATUS, mark))
     bench.expect(came >= 8, f"{came} status in 1.5 s")
-    accepted, wanted = robot.next_status().accepted - before.accepted, driver.seq - sent
+    accepted, wanted = driver.robot.next_status().accepted - before.accepted, driver.seq - sent
     bench.expect(accepted >= 0.7 * wanted, f"{accepted} of the driver's {wanted} twists were accepted")
 
 
-@SUITE.must("R-HOST-10", "13.2 Bounds")
-def many_peers(bench: Bench) -> None:
+@SUITE.must("R-HOST-10", "13.2 Bounds", Robot)
+def many_peers(bench: Bench, robot: Robot) -> None:
     """A hundred sessions that send twists leave the lease where it was."""
-    robot = Robot(bench)
     driver, second = Sender(robot), Sender(robot)
     driver.need_good()
     bench.need(second.judged() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
@@ -222,8 +192,7 @@ def many_peers(bench: Bench) -> None:
         )
     driver.drive(None)
     robot.next_status(2)
-    verdict = second.judged()
-    bench.expect(verdict == "NOT_HOLDER", f"then the twist of a second driver is {verdict or 'not counted'}")
+    second.expect("NOT_HOLDER", what="then the twist of a second driver")
 
 
 # --- coming and going ------------------------------------------------------------------------------------------------
@@ -235,10 +204,9 @@ def _away(bench: Bench, for_us: int) -> None:
     bench.join()
 
 
-@SUITE.must("R-RECO-01", "1.2 Messages")
-def serves_again(bench: Bench) -> None:
+@SUITE.must("R-RECO-01", "1.2 Messages", vision)
+def serves_again(bench: Bench, sender: Sender) -> None:
     """Who connects again gets status and frames again."""
-    sender = Sender(Robot(bench))
     sender.robot.frame()
     _away(bench, 500_000)
     mark = bench.mark()
@@ -246,10 +214,9 @@ def serves_again(bench: Bench) -> None:
     bench.expect_within(lambda: bench.heard(FRAME, mark), 5_000_000, "no frame after a reconnect")
 
 
-@SUITE.must("R-RECO-02", "2.5 Session and sequence")
-def session_goes_on(bench: Bench) -> None:
+@SUITE.must("R-RECO-02", "2.5 Session and sequence", vision)
+def session_goes_on(bench: Bench, sender: Sender) -> None:
     """Over a reconnect of the peer the robot's session is the same and its `seq` goes on."""
-    sender = Sender(Robot(bench))
     sender.robot.frame()
     before = sender.robot.stamp()
     _away(bench, 500_000)
@@ -262,27 +229,23 @@ def session_goes_on(bench: Bench) -> None:
     bench.expect(after.seq > before.seq, f"seq {after.seq}, before {before.seq}")
 
 
-@SUITE.must("R-RECO-03", "5.4 Silence")
-def stays_still(bench: Bench) -> None:
+@SUITE.must("R-RECO-03", "5.4 Silence", armed)
+def stays_still(bench: Bench, driver: Sender) -> None:
     """A driver that is cut off stops the robot, and its coming back moves nothing until it sends again."""
-    robot, driver = armed(bench)
     driver.fall_silent()
     _away(bench, 1_500_000)
     mark = bench.mark()
     bench.need(bench.wait(lambda: bench.heard(STATUS, mark), 5_000_000), "no status again (R-RECO-01)")
-    moving = robot.reaches(lambda status: status.applied != (0.0, 0.0), 700_000)
-    bench.expect(not moving, f"it moves: {robot.status().applied}, {robot.status().state}")
+    moving = driver.robot.reaches(lambda status: status.applied != (0.0, 0.0), 700_000)
+    bench.expect(not moving, f"it moves: {driver.robot.status().applied}, {driver.robot.status().state}")
 
 
-@SUITE.must("R-RECO-04", "6.1 Lease")
-def lease_is_not_the_connection(bench: Bench) -> None:
+@SUITE.must("R-RECO-04", "6.1 Lease", ready)
+def lease_is_not_the_connection(bench: Bench, sender: Sender) -> None:
     """The lease is not the connection: within its second it holds though the driver was cut off."""
-    sender = Sender(Robot(bench))
-    sender.need_good()
     second = Sender(sender.robot)
     bench.need(second.judged() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
     sender.twist(sender.robot.frame())
     sender.robot.next_status()
     _away(bench, 100_000)
-    verdict = second.judged()
-    bench.expect(verdict == "NOT_HOLDER", f"then a twist of another is {verdict or 'not counted'}")
+    second.expect("NOT_HOLDER", what="then a twist of another")

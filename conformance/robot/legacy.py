@@ -148,8 +148,7 @@ def first_client_drives(bench: Bench) -> None:
         bench.need(verdict == GOOD, f"guests are not heard here: {verdict or 'not counted'}")
         first.send(TEXT, b"0.1|0")
         watcher.robot.next_status(2)
-        verdict = watcher.verdict(lambda: second.send(TEXT, b"0.1|0"))
-        bench.expect(verdict == "NOT_HOLDER", f"a second client's twist is {verdict or 'not counted'}")
+        watcher.expect_result("NOT_HOLDER", lambda: second.send(TEXT, b"0.1|0"), what="a second client's twist")
 
 
 @SUITE.must("R-DIAL-22", "15.2 On WebSocket: the older dialect", real=True)

@@ -7,7 +7,7 @@ import math
 from typing import Final
 
 from sightline.conformance.case import Bench, Suite
-from sightline.conformance.robot.fixture import CRAWL, Robot, Sender, armed
+from sightline.conformance.robot.fixture import CRAWL, DRIVEN, Robot, Sender, armed
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import CLAMPED
 from sightline.protocol.messages import FrameHeader, Planar, State, Status
@@ -28,7 +28,7 @@ def _settled(robot: Robot) -> Planar:
 
 
 def _driven(bench: Bench, text: bytes) -> tuple[Status, Planar]:
-    robot, _driver = armed(bench, text=text)
+    robot = armed(bench, text=text).robot
     applied = _settled(robot)
     return robot.status(), applied
 
@@ -73,22 +73,20 @@ def angular_is_clamped(bench: Bench) -> None:
     bench.expect(applied[1] >= least, f"{applied[1]} rad/s of {status.max_angular_rad_s}")
 
 
-@SUITE.must("R-LIM-05", "4.3 Limits")
-def clamped_is_counted(bench: Bench) -> None:
+@SUITE.must("R-LIM-05", "4.3 Limits", armed)
+def clamped_is_counted(bench: Bench, driver: Sender) -> None:
     """A value beyond the limits is counted as CLAMPED, one within them is not."""
-    robot, driver = armed(bench)
-    before = robot.next_status().refused.get(CLAMPED, 0)
-    within = robot.next_status(2).refused.get(CLAMPED, 0)
+    before = driver.robot.next_status().refused.get(CLAMPED, 0)
+    within = driver.robot.next_status(2).refused.get(CLAMPED, 0)
     bench.expect(within == before, f"{within - before} twists within the limits were counted as CLAMPED")
     driver.drive(b"48.0000|0.0000")
-    grows = robot.reaches(lambda status: status.refused.get(CLAMPED, 0) > within, 600_000)
-    bench.expect(grows, f"48 m/s was not counted as CLAMPED: {robot.status().refused}")
+    grows = driver.robot.counts(CLAMPED, within, 600_000)
+    bench.expect(grows, f"48 m/s was not counted as CLAMPED: {driver.robot.status().refused}")
 
 
-@SUITE.should("R-LIM-06", "4.3 Limits")
-def the_curve_stays(bench: Bench) -> None:
+@SUITE.should("R-LIM-06", "4.3 Limits", Robot)
+def the_curve_stays(bench: Bench, robot: Robot) -> None:
     """Both axes are cut by one factor, so that the robot drives the curve it was told."""
-    robot = Robot(bench)
     told = robot.status()
     bench.need(min(told.max_linear_mps, told.max_angular_rad_s) > 0, "the robot tells no limits (R-LIM-02)")
     asked = 4 * told.max_linear_mps, told.max_angular_rad_s
@@ -98,10 +96,9 @@ def the_curve_stays(bench: Bench) -> None:
     bench.expect(math.isclose(wanted, seen, rel_tol=0.1), f"curvature {seen:.2f} instead of {wanted:.2f} 1/m")
 
 
-@SUITE.should("R-LIM-07", "6.4 Arming")
-def ramps_up(bench: Bench) -> None:
+@SUITE.should("R-LIM-07", "6.4 Arming", Robot)
+def ramps_up(bench: Bench, robot: Robot) -> None:
     """Speed builds up in a ramp: the frames show values on the way to the limit."""
-    robot = Robot(bench)
     goal = _limits(robot.status())[0]
     bench.need(goal < math.inf, "the robot tells no limit (R-LIM-02)")
     mark = bench.mark()
@@ -129,33 +126,34 @@ def _zero_us(bench: Bench, since: int) -> int | None:
     return told[last_moving + 1][0] if last_moving + 1 < len(told) else None
 
 
-def _driving(bench: Bench) -> tuple[Robot, Sender]:
-    """A robot that drives as fast as it may."""
+def _driving(bench: Bench) -> Sender:
+    """The driver of a robot that drives as fast as it may."""
     limit = _limits(Robot(bench).status())[0]
-    robot, driver = armed(bench, text=f"{min(limit, 10.0):.4f}|0.0000".encode())
+    driver = armed(bench, text=f"{min(limit, 10.0):.4f}|0.0000".encode())
     bench.rest(700_000)
-    bench.need(robot.next_status().applied[0] > 0, "it does not drive (R-LIM-01)")
-    return robot, driver
+    bench.need(driver.robot.next_status().applied[0] > 0, "it does not drive (R-LIM-01)")
+    return driver
 
 
-def _stopping(bench: Bench) -> tuple[Robot, Sender]:
-    """A robot that drives as fast as it may, and has been seen to stop by silence."""
-    robot, driver = _driving(bench)
+def _stopping(bench: Bench) -> Sender:
+    """The driver of a robot that drives as fast as it may, and has stopped once by silence."""
+    driver = _driving(bench)
+    robot = driver.robot
     text, driver.driving, driver.acks = driver.driving, None, False
     rests = robot.reaches(lambda status: status.applied == _ZERO and status.state is State.HOLD, 1_000_000)
     bench.need(rests, "silence alone does not stop it (R-SIL-01)")
     driver.acks, driver.driving = True, text
-    again = robot.reaches(lambda status: status.state in (State.ACTIVE, State.DEGRADED), 1_500_000)
+    again = robot.becomes(*DRIVEN, within_us=1_500_000)
     bench.need(again, "it does not go on from HOLD (R-SIL-08)")
     bench.rest(700_000)
-    return robot, driver
+    return driver
 
 
-def _silent(robot: Robot, driver: Sender) -> tuple[int, FrameHeader]:
+def _silent(driver: Sender) -> tuple[int, FrameHeader]:
     """The driver answers nothing any more: a mark when the first frame came that was not answered, and that frame."""
     driver.fall_silent()
-    cited = robot.frame()
-    return robot.bench.mark(), cited
+    cited = driver.robot.frame()
+    return driver.bench.mark(), cited
 
 
 def _expect_stop(bench: Bench, mark: int, what: str) -> None:
@@ -169,110 +167,99 @@ def _expect_stop(bench: Bench, mark: int, what: str) -> None:
     bench.expect(took_us <= _STOPS_WITHIN_US + _RESOLUTION_US, said)
 
 
-@SUITE.must("R-SIL-01", "5.4 Silence")
-def silence_stops(bench: Bench) -> None:
+@SUITE.must("R-SIL-01", "5.4 Silence", _driving)
+def silence_stops(bench: Bench, driver: Sender) -> None:
     """When twists cease the robot holds, with the wheels at zero within 700 ms."""
-    robot, driver = _driving(bench)
-    _expect_stop(bench, _silent(robot, driver)[0], "silence")
+    _expect_stop(bench, _silent(driver)[0], "silence")
 
 
 @SUITE.must("R-SIL-02", "5.4 Silence")
 def refused_twists_keep_nothing_alive(bench: Bench) -> None:
     """Refused twists do not keep the wheels turning."""
     Sender(Robot(bench)).need_unknown()
-    robot, driver = _stopping(bench)
-    mark, cited = _silent(robot, driver)
+    driver = _stopping(bench)
+    mark, cited = _silent(driver)
     for number in range(10):
         bench.after(number * 90_000, lambda: driver.twist(cited, echo_seq=cited.seq + 5000))
     _expect_stop(bench, mark, "refused twists")
 
 
-@SUITE.must("R-SIL-03", "5.4 Silence")
-def others_keep_nothing_alive(bench: Bench) -> None:
+@SUITE.must("R-SIL-03", "5.4 Silence", _stopping)
+def others_keep_nothing_alive(bench: Bench, driver: Sender) -> None:
     """Good twists of somebody who does not hold the lease do not keep the wheels turning."""
-    robot, driver = _stopping(bench)
-    other = Sender(robot, acks=False)
-    refused = robot.status().refused.get("NOT_HOLDER", 0)
+    other = Sender(driver.robot, acks=False)
+    refused = driver.robot.status().refused.get("NOT_HOLDER", 0)
     other.drive()
-    kept_out = robot.reaches(lambda status: status.refused.get("NOT_HOLDER", 0) > refused, 1_000_000)
+    kept_out = driver.robot.counts("NOT_HOLDER", refused, 1_000_000)
     bench.need(kept_out, "a second driver is not kept out (R-LEASE-02)")
-    mark, _cited = _silent(robot, driver)
+    mark, _cited = _silent(driver)
     for number in range(20):  # until before the lease of the first could end
-        bench.after(number * 20_000, lambda: other.twist(robot.frames()[-1][1]))
+        bench.after(number * 20_000, lambda: other.twist(driver.robot.frames()[-1][1]))
     other.fall_silent()
     _expect_stop(bench, mark, "another's twists")
 
 
-@SUITE.must("R-SIL-04", "5.3 Age")
-def old_sight_stops(bench: Bench) -> None:
+@SUITE.must("R-SIL-04", "5.3 Age", _stopping)
+def old_sight_stops(bench: Bench, driver: Sender) -> None:
     """Twists that go on citing one old frame do not keep the wheels turning: age is judged at every tick."""
-    robot, driver = _stopping(bench)
-    mark, cited = _silent(robot, driver)
+    mark, cited = _silent(driver)
     for number in range(38):
         bench.after(number * 10_000, lambda: driver.twist(cited, b"10.0000|0.0000"))
     _expect_stop(bench, mark, "twists on one frame")
 
 
-@SUITE.must("R-SIL-05", "5.3 Age")
-def ageing_sight_slows(bench: Bench) -> None:
+@SUITE.must("R-SIL-05", "5.3 Age", armed)
+def ageing_sight_slows(bench: Bench, driver: Sender) -> None:
     """On frames between 150 and 400 ms old the robot drives, DEGRADED, at a lower speed."""
-    robot, driver = armed(bench)
-    limit = _limits(robot.status())[0]
+    limit = _limits(driver.robot.status())[0]
     bench.need(limit < math.inf, "the robot tells no limit (R-LIM-02)")
     driver.drive(f"{limit:.4f}|0.0000".encode())
     bench.rest(1_000_000)
-    full = robot.next_status().applied[0]
+    full = driver.robot.next_status().applied[0]
     driver.delay_us = driver.compute_us = 250_000
     bench.rest(1_500_000)
-    mark, accepted = bench.mark(), robot.status()
+    mark, accepted = bench.mark(), driver.robot.status()
     bench.rest(1_000_000)
     seen = _reports(bench, mark)
     bench.need(full > 0, "it does not drive (R-LIM-01)")
-    bench.need(robot.status().accepted > accepted.accepted, "answers 250 ms late are not accepted (R-CAUS-10)")
+    bench.need(driver.robot.status().accepted > accepted.accepted, "answers 250 ms late are not accepted (R-CAUS-10)")
     slow = [applied[0] for _, applied, state in seen if state is State.DEGRADED]
     bench.expect(slow, f"answers 250 ms late leave it {sorted({state.value for _, _, state in seen})}")
     bench.expect(min(slow) < 0.9 * full, f"it still drives at {min(slow)} of {full} m/s")
 
 
-@SUITE.must("R-SIL-06", "5.4 Silence")
-def hold_is_said(bench: Bench) -> None:
+@SUITE.must("R-SIL-06", "5.4 Silence", armed)
+def hold_is_said(_bench: Bench, driver: Sender) -> None:
     """HOLD is said within 300 ms of the last good twist, give or take a status."""
-    robot, driver = armed(bench)
     driver.fall_silent()
-    held = robot.reaches(lambda status: status.state is State.HOLD, 600_000)
-    bench.expect(held, f"600 ms after the last twist it is {robot.status().state}")
+    driver.robot.expect_state(State.HOLD, within_us=600_000, what="600 ms after the last twist")
 
 
-@SUITE.must("R-SIL-07", "6.3 States")
-def long_hold_disarms(bench: Bench) -> None:
+@SUITE.must("R-SIL-07", "6.3 States", armed)
+def long_hold_disarms(bench: Bench, driver: Sender) -> None:
     """Ten seconds of HOLD disarm."""
-    robot, driver = armed(bench)
     driver.fall_silent()
-    bench.need(robot.reaches(lambda status: status.state is State.HOLD, 2_000_000), "it does not hold (R-SIL-06)")
-    early = robot.reaches(lambda status: status.state is State.DISARMED, 8_500_000)
+    bench.need(driver.robot.becomes(State.HOLD, within_us=2_000_000), "it does not hold (R-SIL-06)")
+    early = driver.robot.becomes(State.DISARMED, within_us=8_500_000)
     bench.expect(not early, "it disarmed before ten seconds were over")
-    reached = robot.reaches(lambda status: status.state is State.DISARMED, 2_500_000)
-    bench.expect(reached, f"after 11 s it is {robot.status().state}")
+    driver.robot.expect_state(State.DISARMED, within_us=2_500_000, what="after 11 s")
 
 
-@SUITE.must("R-SIL-08", "6.3 States")
-def hold_goes_on(bench: Bench) -> None:
+@SUITE.must("R-SIL-08", "6.3 States", armed)
+def hold_goes_on(bench: Bench, driver: Sender) -> None:
     """From HOLD the same driver's next twists drive on without arming again."""
-    robot, driver = armed(bench)
     driver.fall_silent()
-    bench.need(robot.reaches(lambda status: status.state is State.HOLD, 2_000_000), "it does not hold (R-SIL-06)")
+    bench.need(driver.robot.becomes(State.HOLD, within_us=2_000_000), "it does not hold (R-SIL-06)")
     bench.rest(700_000)
     driver.acks = True
     driver.drive(CRAWL)
-    on = robot.reaches(lambda status: status.state in (State.ACTIVE, State.DEGRADED), 1_000_000)
-    bench.expect(on, f"then it is {robot.status().state}")
+    driver.robot.expect_state(*DRIVEN, within_us=1_000_000)
 
 
-@SUITE.must("R-SIL-09", "5.4 Silence")
-def acks_keep_nothing_alive(bench: Bench) -> None:
+@SUITE.must("R-SIL-09", "5.4 Silence", _stopping)
+def acks_keep_nothing_alive(bench: Bench, driver: Sender) -> None:
     """Many acks of the driver do not keep the wheels turning."""
-    robot, driver = _stopping(bench)
-    mark, cited = _silent(robot, driver)
+    mark, cited = _silent(driver)
     for number in range(100):
         bench.after(number * 10_000, lambda: driver.ack(cited))
     _expect_stop(bench, mark, "acks")

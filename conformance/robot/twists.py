@@ -7,7 +7,15 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from sightline.conformance.case import Bench, Case, Level, Suite
-from sightline.conformance.robot.fixture import CRAWL, GOOD, Robot, Sender, as_json
+from sightline.conformance.robot.fixture import (
+    CRAWL,
+    GOOD,
+    Robot,
+    Sender,
+    as_json,
+    ready,
+    vision,
+)
 from sightline.protocol.channels import MAX_HEADER_BYTES, TWIST
 from sightline.protocol.messages import MAX_INTEGER, FrameHeader, Status
 
@@ -110,7 +118,7 @@ def _row_case(row: Row) -> Case:
     number, level, clause, title, expected, makings = row
 
     def run(bench: Bench) -> None:
-        sender = _ready(bench)
+        sender = ready(bench)
         for making in makings:
             sent = b""
 
@@ -124,12 +132,6 @@ def _row_case(row: Row) -> Case:
             bench.expect(verdict == expected, f"{sent[:160]!r}: {verdict or 'not counted'}, expected {expected}")
 
     return Case(number, level, clause, title, run)
-
-
-def _ready(bench: Bench) -> Sender:
-    sender = Sender(Robot(bench))
-    sender.need_good()
-    return sender
 
 
 TEXTS: Final[Sequence[tuple[str, str, str, Sequence[bytes]]]] = (
@@ -155,10 +157,9 @@ TEXTS: Final[Sequence[tuple[str, str, str, Sequence[bytes]]]] = (
 
 def _text_case(number: str, title: str, expected: str, texts: Sequence[bytes]) -> Case:
     def run(bench: Bench) -> None:
-        sender = _ready(bench)
+        sender = ready(bench)
         for text in texts:
-            verdict = sender.judged(text)
-            bench.expect(verdict == expected, f"{text!r}: {verdict or 'not counted'}, expected {expected}")
+            sender.expect(expected, text, what=f"{text!r}")
 
     return Case(number, Level.MUST, "4.1 Grammar", title, run)
 
@@ -169,10 +170,9 @@ for _text in TEXTS:
     SUITE.add(_text_case(*_text))
 
 
-@SUITE.must("R-HEAD-17", "1.3 Keys")
-def source_disagrees(bench: Bench) -> None:
+@SUITE.must("R-HEAD-17", "1.3 Keys", ready)
+def source_disagrees(bench: Bench, sender: Sender) -> None:
     """A source in the header other than the key's is refused as UNKNOWN_SOURCE."""
-    sender = _ready(bench)
 
     def send(frame: FrameHeader) -> None:
         sender.seq += 1
@@ -185,28 +185,18 @@ def source_disagrees(bench: Bench) -> None:
 # --- what a twist cites, over time -----------------------------------------------------------------------------------
 
 
-@SUITE.must("R-CAUS-01", "5.2 Record")
-def newest_frame(bench: Bench) -> None:
-    """A twist that answers the newest frame at once is judged good."""
-    sender = Sender(Robot(bench))
-    verdict = sender.judged()
-    bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
-
-
-@SUITE.must("R-CAUS-04", "5.3 Age")
-def stale_frame(bench: Bench) -> None:
+@SUITE.must("R-CAUS-04", "5.3 Age", ready)
+def stale_frame(bench: Bench, sender: Sender) -> None:
     """A twist that cites a frame more than a second old is refused as STALE, or UNKNOWN_FRAME if that is forgotten."""
-    sender = _ready(bench)
     frame = sender.robot.frame()
     bench.rest(1_200_000)
     verdict = sender.verdict(lambda: sender.twist(frame))
     bench.expect(verdict in ("STALE", "UNKNOWN_FRAME"), f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-CAUS-07", "4.5 Echo")
-def cites_a_status(bench: Bench) -> None:
+@SUITE.must("R-CAUS-07", "4.5 Echo", ready)
+def cites_a_status(bench: Bench, sender: Sender) -> None:
     """A twist that cites a `status` is refused as UNKNOWN_FRAME."""
-    sender = _ready(bench)
     frame, stamp = sender.robot.frame(), sender.robot.stamp()
     assert stamp is not None
     verdict = sender.verdict(
@@ -215,15 +205,13 @@ def cites_a_status(bench: Bench) -> None:
     bench.expect(verdict == "UNKNOWN_FRAME", f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-CAUS-10", "5.1 Order")
-def earlier_frame(bench: Bench) -> None:
+@SUITE.must("R-CAUS-10", "5.1 Order", ready)
+def earlier_frame(bench: Bench, sender: Sender) -> None:
     """A twist that answers the frame before the newest is judged good while that is young."""
-    sender = _ready(bench)
     earlier = sender.robot.frame()
     bench.wait(lambda: _newest_seq(sender.robot) > earlier.seq, 300_000)
     bench.need(_newest_seq(sender.robot) > earlier.seq, "no second frame within 300 ms")
-    verdict = sender.verdict(lambda: sender.twist(earlier))
-    bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
+    sender.expect_result(GOOD, lambda: sender.twist(earlier))
 
 
 def _newest_seq(robot: Robot) -> int:
@@ -231,50 +219,28 @@ def _newest_seq(robot: Robot) -> int:
     return heard[-1][1].seq if heard else -1
 
 
-@SUITE.must("R-CAUS-11", "5.1 Order")
-def reasons_in_order(bench: Bench) -> None:
+@SUITE.must("R-CAUS-11", "5.1 Order", ready)
+def reasons_in_order(bench: Bench, sender: Sender) -> None:
     """Of several faults the first in the order of judging is the reason: session before `seq`."""
-    sender = _ready(bench)
     foreign = sender.judged(echo_session="fffffff0")
     bench.need(foreign == "OTHER_SESSION", f"another session is {foreign or 'not counted'} (R-CAUS-06)")
-    verdict = sender.judged(echo_session="fffffff0", seq=0)
-    bench.expect(verdict == "OTHER_SESSION", f"it was {verdict or 'not counted'}")
+    sender.expect("OTHER_SESSION", echo_session="fffffff0", seq=0)
 
 
 # --- a sender's own seq ----------------------------------------------------------------------------------------------
 
 
-@SUITE.must("R-SEQ-06", "5.1 Order")
-def replayed_seq(bench: Bench) -> None:
-    """A twist with the `seq` of the one before is refused as OUT_OF_ORDER."""
-    sender = _ready(bench)
-    verdict = sender.judged(seq=sender.seq)
-    bench.expect(verdict == "OUT_OF_ORDER", f"it was {verdict or 'not counted'}")
-
-
-@SUITE.must("R-SEQ-07", "5.1 Order")
-def earlier_seq(bench: Bench) -> None:
+@SUITE.must("R-SEQ-07", "5.1 Order", ready)
+def earlier_seq(bench: Bench, sender: Sender) -> None:
     """A twist with a `seq` below the last is refused as OUT_OF_ORDER."""
-    sender = _ready(bench)
     sender.seq = 50
     bench.need(sender.judged() == GOOD, "an ordinary twist is not judged good")
-    verdict = sender.judged(seq=20)
-    bench.expect(verdict == "OUT_OF_ORDER", f"it was {verdict or 'not counted'}")
+    sender.expect("OUT_OF_ORDER", seq=20)
 
 
-@SUITE.must("R-SEQ-08", "2.5 Session and sequence")
-def gaps(bench: Bench) -> None:
-    """A `seq` that jumps forward is taken."""
-    sender = _ready(bench)
-    sender.seq += 1000
-    verdict = sender.judged()
-    bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
-
-
-@SUITE.must("R-SEQ-09", "5.1 Order")
-def new_session_counts_anew(bench: Bench) -> None:
+@SUITE.must("R-SEQ-09", "5.1 Order", ready)
+def new_session_counts_anew(bench: Bench, first: Sender) -> None:
     """Another session of the same role counts from its own beginning."""
-    first = _ready(bench)
     first.seq = 5000
     bench.need(first.judged() == GOOD, "an ordinary twist is not judged good")
     first.fall_silent()
@@ -284,14 +250,12 @@ def new_session_counts_anew(bench: Bench) -> None:
     bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
 
 
-@SUITE.must("R-SEQ-10", "5.1 Order")
-def refused_seq_bars_nobody(bench: Bench) -> None:
+@SUITE.must("R-SEQ-10", "5.1 Order", ready)
+def refused_seq_bars_nobody(bench: Bench, sender: Sender) -> None:
     """The `seq` of a twist refused for what it cites is not remembered: the next ordinary one is good."""
-    sender = _ready(bench)
     refused = sender.judged(echo_seq=MAX_INTEGER, seq=MAX_INTEGER)
     bench.need(refused == "UNKNOWN_FRAME", f"an unknown frame is {refused or 'not counted'} (R-CAUS-02)")
-    verdict = sender.judged()
-    bench.expect(verdict == GOOD, f"it was {verdict or 'not counted'}")
+    sender.expect(GOOD)
 
 
 # Cases on the order in which a twist is judged, and on how much a robot remembers for it. Pure.
@@ -317,35 +281,35 @@ def _good(status: Status) -> int:
     return status.accepted + status.refused.get("DISARMED", 0)
 
 
-def _expect(bench: Bench, verdict: str, expected: str) -> None:
-    bench.expect(verdict == expected, f"it was {verdict or 'not counted'}, expected {expected}")
+SUITE.must_all(vision, {
+    "R-CAUS-01": ("5.2 Record", "A twist that answers the newest frame at once is judged good.",
+                  lambda it: it.expect(GOOD)),
+})
+SUITE.must_all(ready, {
+    "R-SEQ-06": ("5.1 Order", "A twist with the `seq` of the one before is refused as OUT_OF_ORDER.",
+                 lambda it: it.expect("OUT_OF_ORDER", seq=it.seq)),
+    "R-SEQ-08": ("2.5 Session and sequence", "A `seq` that jumps forward is taken.",
+                 lambda it: it.expect(GOOD, seq=it.seq + 1001)),
+})
+SUITE.must_all(_watcher, {
+    "R-CAUS-12": ("5.1 Order", "The grammar is judged before the role: nonsense of who may not drive is MALFORMED.",
+                  lambda it: it.expect("MALFORMED", b"x")),
+    "R-CAUS-13": ("5.1 Order", "The role is judged before the session: who may not drive and cites another session is "
+                  "UNKNOWN_SOURCE.", lambda it: it.expect("UNKNOWN_SOURCE", echo_session="fffffff0")),
+})
 
 
-@SUITE.must("R-CAUS-12", "5.1 Order")
-def grammar_before_role(bench: Bench) -> None:
-    """The grammar is judged before the role: nonsense of who may not drive is MALFORMED."""
-    _expect(bench, _watcher(bench).judged(b"x"), "MALFORMED")
-
-
-@SUITE.must("R-CAUS-13", "5.1 Order")
-def role_before_session(bench: Bench) -> None:
-    """The role is judged before the session: who may not drive and cites another session is UNKNOWN_SOURCE."""
-    _expect(bench, _watcher(bench).judged(echo_session="fffffff0"), "UNKNOWN_SOURCE")
-
-
-@SUITE.must("R-CAUS-14", "5.1 Order")
-def record_before_count(bench: Bench) -> None:
+@SUITE.must("R-CAUS-14", "5.1 Order", ready)
+def record_before_count(_bench: Bench, sender: Sender) -> None:
     """The record is judged before the count: a replayed `seq` that cites an unknown frame is UNKNOWN_FRAME."""
-    sender = _ready(bench)
     sender.need_unknown()
     sender.need_good()
-    _expect(bench, sender.judged(echo_seq=MAX_INTEGER, seq=sender.seq), "UNKNOWN_FRAME")
+    sender.expect("UNKNOWN_FRAME", echo_seq=MAX_INTEGER, seq=sender.seq)
 
 
-@SUITE.must("R-CAUS-15", "4.5 Echo")
-def several_on_one_frame(bench: Bench) -> None:
+@SUITE.must("R-CAUS-15", "4.5 Echo", ready)
+def several_on_one_frame(bench: Bench, sender: Sender) -> None:
     """Several twists may cite one frame, with rising `seq`: all are judged."""
-    sender = _ready(bench)
     before = _good(sender.robot.next_status())
     sender.acks = False
     frame = sender.robot.frame()
@@ -356,32 +320,29 @@ def several_on_one_frame(bench: Bench) -> None:
     bench.expect(judged == 3, f"of three twists on one frame {judged} were judged good")
 
 
-@SUITE.must("R-CAUS-16", "5.1 Order")
-def remembers_frames(bench: Bench) -> None:
+@SUITE.must("R-CAUS-16", "5.1 Order", ready)
+def remembers_frames(bench: Bench, sender: Sender) -> None:
     """A robot remembers 256 frames: one of three seconds ago is STALE and not UNKNOWN_FRAME."""
-    sender = _ready(bench)
     frame = sender.robot.frame()
     bench.rest(3_000_000)
     issued = sender.robot.frames()[-1][1].seq - frame.seq
     bench.need(issued < _REMEMBERED_FRAMES - 20, f"{issued} frames came meanwhile")
     verdict = sender.verdict(lambda: sender.twist(frame))
     bench.need(verdict in ("STALE", "UNKNOWN_FRAME"), f"it was {verdict or 'not counted'} (R-CAUS-04)")
-    _expect(bench, verdict, "STALE")
+    bench.expect(verdict == "STALE", f"it was {verdict}")
 
 
-@SUITE.must("R-SEQ-11", "5.1 Order")
-def refused_for_the_lease_counts(bench: Bench) -> None:
+@SUITE.must("R-SEQ-11", "5.1 Order", ready)
+def refused_for_the_lease_counts(bench: Bench, first: Sender) -> None:
     """A `seq` is used up though the lease refuses its twist: one below it is OUT_OF_ORDER then."""
-    first = _ready(bench)
     second = Sender(first.robot)
     bench.need(second.judged(seq=5000) == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
-    _expect(bench, second.judged(seq=100), "OUT_OF_ORDER")
+    second.expect("OUT_OF_ORDER", seq=100)
 
 
-@SUITE.must("R-SEQ-12", "5.1 Order")
-def remembers_senders(bench: Bench) -> None:
+@SUITE.must("R-SEQ-12", "5.1 Order", ready)
+def remembers_senders(bench: Bench, sender: Sender) -> None:
     """A robot remembers 64 senders: a replay is OUT_OF_ORDER after sixty others have sent."""
-    sender = _ready(bench)
     replayed = sender.judged(seq=sender.seq)
     bench.need(replayed == "OUT_OF_ORDER", f"a replay is {replayed or 'not counted'} (R-SEQ-06)")
     sender.need_good()
@@ -389,4 +350,4 @@ def remembers_senders(bench: Bench) -> None:
         header = {**sender.header(sender.robot.frame()), "session": f"{0xA0000000 + number:08x}", "seq": 1 << 40}
         bench.publish(TWIST, as_json(header), CRAWL, sender.source)
     sender.robot.next_status(2)
-    _expect(bench, sender.judged(seq=sender.seq), "OUT_OF_ORDER")
+    sender.expect("OUT_OF_ORDER", seq=sender.seq)

@@ -4,9 +4,10 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import Any, Final
 
-from sightline.conformance.case import Bench, NotApplicableError, Suite
+from sightline.conformance.case import Bench, NotApplicableError, Suite, itself
 from sightline.conformance.raw_peers import BINARY, CONTINUED, PING, PONG, TEXT, RawWebSocket, split_url
 from sightline.conformance.robot.fixture import GOOD, Robot, Sender, as_json
 from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, REPLY, STATUS
@@ -109,7 +110,8 @@ def ends_with(raw: RawWebSocket, bench: Bench, codes: tuple[int, ...], what: str
     return end[1]
 
 
-def _refused(bench: Bench, status: int, what: str, **options: Any) -> None:
+def _answers(bench: Bench, status: int, what: str, **options: Any) -> None:
+    """Fail the case unless a client that connects so gets `status`."""
     with RawWebSocket(endpoint_of(bench), **{"protocols": offered(bench), **options}) as raw:
         bench.expect(raw.status == status, f"{what}: HTTP {raw.status or 'nothing'}, expected {status}")
 
@@ -131,8 +133,8 @@ def demands_the_sub_protocol(bench: Bench) -> None:
     """Without the sub-protocol the handshake fails with 400."""
     token = bench.access.token_of(bench.access.watcher)
     shown = (("Authorization", f"Bearer {token}"),) if token else ()
-    _refused(bench, 400, "no sub-protocol", protocols=(), headers=shown)
-    _refused(bench, 400, "another sub-protocol", protocols=("chat", "sightline.v9"), headers=shown)
+    _answers(bench, 400, "no sub-protocol", protocols=(), headers=shown)
+    _answers(bench, 400, "another sub-protocol", protocols=("chat", "sightline.v9"), headers=shown)
 
 
 @SUITE.must("R-SOCK-03", "14.1 Opening", real=True)
@@ -148,14 +150,14 @@ def no_compression(bench: Bench) -> None:
 def foreign_host(bench: Bench) -> None:
     """A Host that a foreign site could own fails with 403."""
     port = split_url(endpoint_of(bench))[2]
-    _refused(bench, 403, "Host: evil.example.com", host=f"evil.example.com:{port}")
+    _answers(bench, 403, "Host: evil.example.com", host=f"evil.example.com:{port}")
 
 
 @SUITE.must("R-SOCK-05", "14.2 Host and Origin", real=True)
 def foreign_origin(bench: Bench) -> None:
     """A browser's Origin of another site fails with 403."""
-    _refused(bench, 403, "Origin: http://evil.example.com", headers=(("Origin", "http://evil.example.com"),))
-    _refused(bench, 403, "Origin: null", headers=(("Origin", "null"),))
+    _answers(bench, 403, "Origin: http://evil.example.com", headers=(("Origin", "http://evil.example.com"),))
+    _answers(bench, 403, "Origin: null", headers=(("Origin", "null"),))
 
 
 @SUITE.must("R-SOCK-06", "14.2 Host and Origin", real=True)
@@ -163,7 +165,7 @@ def own_origin(bench: Bench) -> None:
     """An Origin that is the Host itself is let in."""
     tls, address, port = split_url(endpoint_of(bench))
     origin = f"http{'s' if tls else ''}://{address}:{port}"
-    _refused(bench, SWITCHED, "Origin as the Host", headers=(("Origin", origin),))
+    _answers(bench, SWITCHED, "Origin as the Host", headers=(("Origin", origin),))
 
 
 # --- hello -----------------------------------------------------------------------------------------------------------
@@ -184,28 +186,30 @@ def answers_hello(bench: Bench) -> None:
         bench.expect(robot == bench.robot, f"it names {robot}")
 
 
-def _no_hello(number: str, title: str, codes: tuple[int, ...], send: Callable[[RawWebSocket, Bench], None]) -> None:
-    def run(bench: Bench) -> None:
-        with RawWebSocket(endpoint_of(bench), offered(bench)) as raw:
-            bench.need(raw.status == SWITCHED, f"the handshake fails with {raw.status} (R-SOCK-01)")
-            send(raw, bench)
-            reason = ends_with(raw, bench, codes, title, 4.0)
-            bench.expect(reason, "the close frame gives no reason")
-
-    run.__doc__ = title
-    SUITE.must(number, "14.5 Hello", real=True)(run)
+def _ends_at(send: Callable[[RawWebSocket, Bench], None], codes: tuple[int, ...], title: str, bench: Bench) -> None:
+    with RawWebSocket(endpoint_of(bench), offered(bench)) as raw:
+        bench.need(raw.status == SWITCHED, f"the handshake fails with {raw.status} (R-SOCK-01)")
+        send(raw, bench)
+        reason = ends_with(raw, bench, codes, title, 4.0)
+        bench.expect(reason, "the close frame gives no reason")
 
 
-_no_hello("R-SOCK-08", "A hello for another robot ends with 1008 and the reason.", (1008,),
-          lambda raw, bench: raw.send(TEXT, hello(bench, robot="other")))  # fmt: skip
-_no_hello("R-SOCK-09", "A first message that is not text ends with 1003 and the reason.", (1003,),
-          lambda raw, bench: raw.send(BINARY, disarm_request(bench)))  # fmt: skip
-_no_hello("R-SOCK-10", "A text that is no hello ends with 1008 and the reason.", (1008,),
-          lambda raw, _bench: raw.send(TEXT, b'{"let": "me in"}'))  # fmt: skip
-_no_hello("R-SOCK-11", "A hello of another version ends with 1008 and the reason.", (1008,),
-          lambda raw, bench: raw.send(TEXT, hello(bench, v=2)))  # fmt: skip
-_no_hello("R-SOCK-12", "Who says no hello within two seconds is dropped with 1008 and the reason.", (1008,),
-          lambda _raw, _bench: None)  # fmt: skip
+_NO_HELLO: Final[dict[str, tuple[str, tuple[int, ...], Callable[[RawWebSocket, Bench], None]]]] = {
+    "R-SOCK-08": ("A hello for another robot ends with 1008 and the reason.", (1008,),
+                  lambda raw, bench: raw.send(TEXT, hello(bench, robot="other"))),
+    "R-SOCK-09": ("A first message that is not text ends with 1003 and the reason.", (1003,),
+                  lambda raw, bench: raw.send(BINARY, disarm_request(bench))),
+    "R-SOCK-10": ("A text that is no hello ends with 1008 and the reason.", (1008,),
+                  lambda raw, _bench: raw.send(TEXT, b'{"let": "me in"}')),
+    "R-SOCK-11": ("A hello of another version ends with 1008 and the reason.", (1008,),
+                  lambda raw, bench: raw.send(TEXT, hello(bench, v=2))),
+    "R-SOCK-12": ("Who says no hello within two seconds is dropped with 1008 and the reason.", (1008,),
+                  lambda _raw, _bench: None),
+}
+SUITE.must_all(itself, {
+    number: ("14.5 Hello", title, partial(_ends_at, send, codes, title))
+    for number, (title, codes, send) in _NO_HELLO.items()
+}, real=True)
 
 
 @SUITE.must("R-SOCK-13", "14.5 Hello", real=True)
@@ -278,34 +282,38 @@ def pings_are_answered(bench: Bench) -> None:
         bench.expect(frame is not None and frame.data == b"\0marco", f"the answer is {frame}")
 
 
-def _breaks(
-    number: str, title: str, codes: tuple[int, ...], message: Callable[[RawWebSocket], None], within_s: float = SOON_S
-) -> None:
-    def run(bench: Bench) -> None:
-        with spoken(bench) as raw:
-            message(raw)
-            ends_with(raw, bench, codes, title, within_s)
-
-    run.__doc__ = title
-    SUITE.must(number, "14.9 Ends", real=True)(run)
+def _breaks(send: Callable[[RawWebSocket], None], codes: tuple[int, ...], title: str, bench: Bench) -> None:
+    with spoken(bench) as raw:
+        send(raw)
+        ends_with(raw, bench, codes, title)
 
 
-_breaks("R-SOCK-20", "A header block that is cut ends with 1007 or 1002.", (1002, 1007),
-        lambda raw: raw.send(BINARY, b"\x02\x00" + b'{"channel":"twist"}'))  # fmt: skip
-_breaks("R-SOCK-21", "A header block over 576 bytes ends with 1007, 1002 or 1009.", (1002, 1007, 1009),
-        lambda raw: raw.send(BINARY, block(b'{"channel":"ack","x":"' + b"x" * MAX_BLOCK_BYTES + b'"}')))  # fmt: skip
-_breaks("R-SOCK-22", "A header block that names no channel ends with 1007 or 1002.", (1002, 1007),
-        lambda raw: raw.send(BINARY, block(b'{"v":1,"source":"viewer"}')))  # fmt: skip
-_breaks("R-SOCK-23", "Text that is not UTF-8 ends with 1007.", (1007,),
-        lambda raw: raw.send(TEXT, b'{"v":1,"robot":"\xff\xfe"}'))  # fmt: skip
-_breaks("R-SOCK-24", "A message larger than the robot can want, 10 MB, ends with 1009.", (1009,),
-        lambda raw: raw.send(BINARY, b"\0" * 10_000_000), 5.0)  # fmt: skip
-_breaks("R-SOCK-25", "A frame of a client that is not masked ends with 1002.", (1002,),
-        lambda raw: raw.send(PING, b"bare", masked=False))  # fmt: skip
-_breaks("R-SOCK-26", "A reserved bit or opcode ends with 1002.", (1002,),
-        lambda raw: raw.send(5, b"?"))  # fmt: skip
-_breaks("R-SOCK-27", "A control frame over 125 bytes ends with 1002.", (1002,),
-        lambda raw: raw.send(PING, b"x" * 200))  # fmt: skip
+_BREAKS: Final[dict[str, tuple[str, tuple[int, ...], Callable[[RawWebSocket], None]]]] = {
+    "R-SOCK-20": ("A header block that is cut ends with 1007 or 1002.", (1002, 1007),
+                  lambda raw: raw.send(BINARY, b"\x02\x00" + b'{"channel":"twist"}')),
+    "R-SOCK-21": ("A header block over 576 bytes ends with 1007, 1002 or 1009.", (1002, 1007, 1009),
+                  lambda raw: raw.send(BINARY, block(b'{"channel":"ack","x":"' + b"x" * MAX_BLOCK_BYTES + b'"}'))),
+    "R-SOCK-22": ("A header block that names no channel ends with 1007 or 1002.", (1002, 1007),
+                  lambda raw: raw.send(BINARY, block(b'{"v":1,"source":"viewer"}'))),
+    "R-SOCK-23": ("Text that is not UTF-8 ends with 1007.", (1007,),
+                  lambda raw: raw.send(TEXT, b'{"v":1,"robot":"\xff\xfe"}')),
+    "R-SOCK-25": ("A frame of a client that is not masked ends with 1002.", (1002,),
+                  lambda raw: raw.send(PING, b"bare", masked=False)),
+    "R-SOCK-26": ("A reserved bit or opcode ends with 1002.", (1002,), lambda raw: raw.send(5, b"?")),
+    "R-SOCK-27": ("A control frame over 125 bytes ends with 1002.", (1002,), lambda raw: raw.send(PING, b"x" * 200)),
+}
+SUITE.must_all(itself, {
+    number: ("14.9 Ends", title, partial(_breaks, send, codes, title))
+    for number, (title, codes, send) in _BREAKS.items()
+}, real=True)
+
+
+@SUITE.must("R-SOCK-24", "14.9 Ends", real=True)
+def large_message(bench: Bench) -> None:
+    """A message larger than the robot can want, 10 MB, ends with 1009."""
+    with spoken(bench) as raw:
+        raw.send(BINARY, b"\0" * 10_000_000)
+        ends_with(raw, bench, (1009,), "10 MB", 2 * SOON_S)
 
 
 @SUITE.must("R-SOCK-28", "14.9 Ends", real=True)
@@ -508,17 +516,11 @@ def _token(bench: Bench) -> str:
     return token
 
 
-def _answers(bench: Bench, status: int, what: str, **options: Any) -> None:
-    """Fail the case unless a client who comes so gets `status`."""
-    with RawWebSocket(endpoint_of(bench), **{"protocols": (SUBPROTOCOL,), **options}) as raw:
-        bench.expect(raw.status == status, f"{what}: HTTP {raw.status or 'nothing'}, expected {status}")
-
-
 @SUITE.must("R-SOCK-34", _CLAUSE, real=True)
 def no_token(bench: Bench) -> None:
     """Who shows no token is refused with 401."""
     _token(bench)
-    _answers(bench, 401, "no token")
+    _answers(bench, 401, "no token", protocols=(SUBPROTOCOL,))
 
 
 @SUITE.must("R-SOCK-35", _CLAUSE, real=True)
@@ -546,7 +548,7 @@ def two_tokens(bench: Bench) -> None:
 def token_in_the_url(bench: Bench) -> None:
     """A token in the URL, which is logged, opens nothing: 401."""
     token = _token(bench)
-    _answers(bench, 401, "a token in the URL", path=f"/?token={token}")
+    _answers(bench, 401, "a token in the URL", protocols=(SUBPROTOCOL,), path=f"/?token={token}")
 
 
 @SUITE.must("R-SOCK-38", _CLAUSE, real=True)
@@ -554,7 +556,8 @@ def token_as_bearer(bench: Bench) -> None:
     """The token is taken as `Authorization: Bearer` too, and HTTP has that word in any case."""
     token = _token(bench)
     for word in ("Bearer", "bearer"):
-        _answers(bench, SWITCHED, f"the token as {word}", headers=(("Authorization", f"{word} {token}"),))
+        shown = (("Authorization", f"{word} {token}"),)
+        _answers(bench, SWITCHED, f"the token as {word}", protocols=(SUBPROTOCOL,), headers=shown)
 
 
 @SUITE.must("R-SOCK-39", _CLAUSE, real=True)

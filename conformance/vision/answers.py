@@ -4,10 +4,11 @@ import json
 import math
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
-from sightline.conformance.case import Bench, Case, Level, Suite
-from sightline.conformance.vision.fixture import Answer, RobotPlayed
+from sightline.conformance.case import Bench, Level, Suite, itself
+from sightline.conformance.vision.fixture import Answer, RobotPlayed, met
 from sightline.conformance.vision.images import png
 from sightline.protocol.channels import MAX_HEADER_BYTES
 from sightline.protocol.errors import RejectReason, WireError
@@ -18,6 +19,7 @@ from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE
 
 SUITE = Suite("V")
 _SESSION: Final = re.compile(r"[0-9a-f]{8}")
+_ECHO: Final = {"channel", "session", "seq", "t_us"}
 _FOUR_DECIMALS: Final = re.compile(rb"[+-]?[0-9]+\.[0-9]{4}\|[+-]?[0-9]+\.[0-9]{4}")
 
 
@@ -50,18 +52,16 @@ def _integer(value: object, least: int = 0) -> bool:
 # --- framing ---------------------------------------------------------------------------------------------------------
 
 
-@SUITE.must("V-FRAM-01", "7.1 Answers")
-def every_frame_is_answered(bench: Bench) -> None:
+@SUITE.must("V-FRAM-01", "7.1 Answers", RobotPlayed)
+def every_frame_is_answered(_bench: Bench, robot: RobotPlayed) -> None:
     """A frame that nothing replaces is answered, by a twist or an ack, within half a second."""
-    robot = RobotPlayed(bench)
     for name in ("centre", "left", "absent", "right", "centre"):
         robot.answer_to(robot.frame(name))
 
 
-@SUITE.should("V-FRAM-02", "7.1 Answers")
-def one_answer(bench: Bench) -> None:
+@SUITE.should("V-FRAM-02", "7.1 Answers", met)
+def one_answer(bench: Bench, robot: RobotPlayed) -> None:
     """A frame is answered by a twist or by an ack, not by both."""
-    robot = RobotPlayed(bench).met()
     for sent in robot.film("centre", 5, 100_000):
         kinds = {one.is_twist for one in robot.answers_to(sent)}
         bench.expect(len(kinds) < 2, f"frame {sent.seq} got a twist and an ack")
@@ -122,21 +122,16 @@ _READS: Final[dict[str, tuple[str, str, Callable[[dict[str, Any]], bytes]]]] = {
 }
 
 
-def _reads(write: Callable[[dict[str, Any]], bytes]) -> Callable[[Bench], None]:
-    def run(bench: Bench) -> None:
-        robot = RobotPlayed(bench).met()
-        for _ in range(2):
-            fields = robot.next_fields()
-            stamp = {name: fields[name] for name in ("session", "seq", "t_us")}
-            sent = robot.frame(header=write(fields), **stamp)
-            answer = robot.answer_to(sent)
-            bench.expect(answer.is_twist, f"it came to {answer.words()}, not to a twist")
-
-    return run
+def _reads(write: Callable[[dict[str, Any]], bytes], robot: RobotPlayed) -> None:
+    for _ in range(2):
+        fields = robot.next_fields()
+        stamp = {name: fields[name] for name in ("session", "seq", "t_us")}
+        robot.expect_twist(robot.frame(header=write(fields), **stamp))
 
 
-for _id, (_clause, _title, _write) in _READS.items():
-    SUITE.add(Case(_id, Level.MUST, _clause, _title, _reads(_write)))
+SUITE.must_all(met, {
+    number: (clause, title, partial(_reads, write)) for number, (clause, title, write) in _READS.items()
+})
 
 
 @SUITE.must("V-FRAM-19", "2.2 Numbers")
@@ -175,41 +170,25 @@ def header_size(bench: Bench) -> None:
     bench.expect(bench.dropped_here[OVERSIZE] == before, "a header or a payload was over its bound")
 
 
-@SUITE.must("V-HEAD-03", "2.4 Version")
-def version(bench: Bench) -> None:
-    """`v` is 1, or absent."""
-    _every(bench, lambda it: _integer(it.get("v", 1)) and it.get("v", 1) == 1, "`v` is not 1")
-
-
-@SUITE.must("V-HEAD-04", "2.5 Session and sequence")
-def session_form(bench: Bench) -> None:
-    """`session` is 8 lower-case hex digits."""
-    _every(bench, lambda it: not it or _SESSION.fullmatch(str(it.get("session"))), "no 8 lower-case hex digits")
-
-
-@SUITE.must("V-HEAD-05", "2.2 Numbers")
-def seq_form(bench: Bench) -> None:
-    """`seq` is an integer from 0 to 2^53 - 1."""
-    _every(bench, lambda it: not it or _integer(it.get("seq")), "`seq` is no integer within bounds")
-
-
-@SUITE.must("V-HEAD-06", "2.8 Fields")
-def source_form(bench: Bench) -> None:
-    """`source` is given."""
-    _every(bench, lambda it: not it or isinstance(it.get("source"), str), "no `source`")
-
-
-@SUITE.must("V-HEAD-07", "2.7 Echo")
-def echo_form(bench: Bench) -> None:
-    """`echo` has all of its four fields."""
-    wanted = {"channel", "session", "seq", "t_us"}
-    _every(bench, lambda it: not it or wanted <= set(it.get("echo") or ()), "the echo is not complete")
-
-
-@SUITE.must("V-HEAD-08", "2.2 Numbers")
-def compute_form(bench: Bench) -> None:
-    """`compute_us` is an integer from 0 on, or absent."""
-    _every(bench, lambda it: _integer(it.get("compute_us", 0)), "`compute_us` is no integer within bounds")
+SUITE.must_all(itself, {
+    "V-HEAD-03": ("2.4 Version", "`v` is 1, or absent.",
+                  lambda bench: _every(bench, lambda it: _integer(it.get("v", 1)) and it.get("v", 1) == 1,
+                                       "`v` is not 1")),
+    "V-HEAD-04": ("2.5 Session and sequence", "`session` is 8 lower-case hex digits.",
+                  lambda bench: _every(bench, lambda it: not it or _SESSION.fullmatch(str(it.get("session"))),
+                                       "no 8 lower-case hex digits")),
+    "V-HEAD-05": ("2.2 Numbers", "`seq` is an integer from 0 to 2^53 - 1.",
+                  lambda bench: _every(bench, lambda it: not it or _integer(it.get("seq")),
+                                       "`seq` is no integer within bounds")),
+    "V-HEAD-06": ("2.8 Fields", "`source` is given.",
+                  lambda bench: _every(bench, lambda it: not it or isinstance(it.get("source"), str), "no `source`")),
+    "V-HEAD-07": ("2.7 Echo", "`echo` has all of its four fields.",
+                  lambda bench: _every(bench, lambda it: not it or set(it.get("echo") or ()) >= _ECHO,
+                                       "the echo is not complete")),
+    "V-HEAD-08": ("2.2 Numbers", "`compute_us` is an integer from 0 on, or absent.",
+                  lambda bench: _every(bench, lambda it: _integer(it.get("compute_us", 0)),
+                                       "`compute_us` is no integer within bounds")),
+})
 
 
 @SUITE.should("V-HEAD-09", "7.4 Window")
@@ -299,50 +278,41 @@ def _last_twist(bench: Bench, robot: RobotPlayed, name: str, frames: int = _SECO
     return twists[-1]
 
 
-@SUITE.should("V-STEER-01", "4.4 Signs")
-def turns_left(bench: Bench) -> None:
-    """A target to the left is turned to: angular velocity above zero, counter-clockwise."""
-    angular = _last_twist(bench, RobotPlayed(bench).met(), "left").speeds[1]
-    bench.expect(angular > 0, f"it turns at {angular:g} rad/s")
+def _turns(name: str, good: Callable[[float], bool], robot: RobotPlayed) -> None:
+    angular = _last_twist(robot.bench, robot, name).speeds[1]
+    robot.bench.expect(good(angular), f"it turns at {angular:g} rad/s")
 
 
-@SUITE.should("V-STEER-02", "4.4 Signs")
-def turns_right(bench: Bench) -> None:
-    """A target to the right is turned to: angular velocity below zero."""
-    angular = _last_twist(bench, RobotPlayed(bench).met(), "right").speeds[1]
-    bench.expect(angular < 0, f"it turns at {angular:g} rad/s")
+SUITE.must_all(met, {
+    "V-STEER-01": ("4.4 Signs", "A target to the left is turned to: angular velocity above zero, counter-clockwise.",
+                   partial(_turns, "left", lambda it: it > 0)),
+    "V-STEER-02": ("4.4 Signs", "A target to the right is turned to: angular velocity below zero.",
+                   partial(_turns, "right", lambda it: it < 0)),
+    "V-STEER-03": ("4.4 Signs", "A target straight ahead is no reason to turn.",
+                   partial(_turns, "centre", lambda it: abs(it) < _AHEAD_RAD_S)),
+}, level=Level.SHOULD)
 
 
-@SUITE.should("V-STEER-03", "4.4 Signs")
-def goes_straight(bench: Bench) -> None:
-    """A target straight ahead is no reason to turn."""
-    angular = _last_twist(bench, RobotPlayed(bench).met(), "centre").speeds[1]
-    bench.expect(abs(angular) < _AHEAD_RAD_S, f"it turns at {angular:g} rad/s")
-
-
-@SUITE.should("V-STEER-04", "4.4 Signs")
-def stays_without_target(bench: Bench) -> None:
+@SUITE.should("V-STEER-04", "4.4 Signs", RobotPlayed)
+def stays_without_target(bench: Bench, robot: RobotPlayed) -> None:
     """Without ever a target it drives nowhere; it may turn to look for one."""
-    robot = RobotPlayed(bench)
     mark = bench.mark()
     robot.film("absent", 2 * _SECOND, _EVERY_US)
     fastest = max((abs(one.speeds[0]) for one in robot.twists(mark)), default=0.0)
     bench.expect(fastest < _STILL_MPS, f"it drives at {fastest:g} m/s")
 
 
-@SUITE.should("V-STEER-05", "12.2 Saw nothing, no answer")
-def stops_for_a_lost_target(bench: Bench) -> None:
+@SUITE.should("V-STEER-05", "12.2 Saw nothing, no answer", met)
+def stops_for_a_lost_target(bench: Bench, robot: RobotPlayed) -> None:
     """Three seconds after the target was last seen it drives nowhere."""
-    robot = RobotPlayed(bench).met()
     robot.film("centre", _SECOND // 2, _EVERY_US)
     linear = _last_twist(bench, robot, "absent", 3 * _SECOND).speeds[0]
     bench.expect(abs(linear) < _STILL_MPS, f"it still drives at {linear:g} m/s")
 
 
-@SUITE.should("V-STEER-06", "4.4 Signs")
-def follows_to_the_other_side(bench: Bench) -> None:
+@SUITE.should("V-STEER-06", "4.4 Signs", met)
+def follows_to_the_other_side(bench: Bench, robot: RobotPlayed) -> None:
     """A target that was on the left and is on the right now is turned to within two seconds."""
-    robot = RobotPlayed(bench).met()
     _last_twist(bench, robot, "left")
     angular = _last_twist(bench, robot, "right", 2 * _SECOND).speeds[1]
     bench.expect(angular < 0, f"it turns at {angular:g} rad/s")
@@ -372,10 +342,9 @@ def _replayed(bench: Bench, every_us: int) -> list[bytes]:
     return texts
 
 
-@SUITE.must("V-STEER-08", "2.5 Session and sequence")
-def new_start_new_memory(bench: Bench) -> None:
+@SUITE.must("V-STEER-08", "2.5 Session and sequence", met)
+def new_start_new_memory(bench: Bench, robot: RobotPlayed) -> None:
     """A robot that starts anew is not driven by what its last start saw."""
-    robot = RobotPlayed(bench).met()
     robot.film("centre", _SECOND // 2, _EVERY_US)
     robot.stop()
     robot = RobotPlayed(bench)

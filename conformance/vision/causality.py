@@ -4,8 +4,8 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
-from sightline.conformance.case import Bench, Suite
-from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, Answer, RobotPlayed, Sent
+from sightline.conformance.case import Bench, Level, Suite, itself
+from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, Answer, RobotPlayed, Sent, met
 from sightline.conformance.vision.images import png
 
 SUITE = Suite("V")
@@ -28,53 +28,38 @@ def _echoes(bench: Bench, field: str, right: Callable[[Sent], Any]) -> None:
         bench.expect(got == right(sent) and type(got) is type(right(sent)), f"{field} was {right(sent)!r}, not {got!r}")
 
 
-@SUITE.must("V-CAUS-01", "2.7 Echo")
-def echo_channel(bench: Bench) -> None:
-    """An echo's channel is that of frames."""
-    _echoes(bench, "channel", lambda _: "frame")
+SUITE.must_all(itself, {
+    "V-CAUS-01": ("2.7 Echo", "An echo's channel is that of frames.",
+                  lambda it: _echoes(it, "channel", lambda _: "frame")),
+    "V-CAUS-02": ("2.7 Echo", "An echo's session is the frame's.",
+                  lambda it: _echoes(it, "session", lambda sent: sent.session)),
+    "V-CAUS-03": ("2.7 Echo", "An echo's `seq` is the frame's, as an integer.",
+                  lambda it: _echoes(it, "seq", lambda sent: sent.seq)),
+    "V-CAUS-04": ("2.7 Echo", "An echo's `t_us` is the frame's, to the microsecond.",
+                  lambda it: _echoes(it, "t_us", lambda sent: sent.t_us)),
+})
 
 
-@SUITE.must("V-CAUS-02", "2.7 Echo")
-def echo_session(bench: Bench) -> None:
-    """An echo's session is the frame's."""
-    _echoes(bench, "session", lambda sent: sent.session)
-
-
-@SUITE.must("V-CAUS-03", "2.7 Echo")
-def echo_seq(bench: Bench) -> None:
-    """An echo's `seq` is the frame's, as an integer."""
-    _echoes(bench, "seq", lambda sent: sent.seq)
-
-
-@SUITE.must("V-CAUS-04", "2.7 Echo")
-def echo_time(bench: Bench) -> None:
-    """An echo's `t_us` is the frame's, to the microsecond."""
-    _echoes(bench, "t_us", lambda sent: sent.t_us)
-
-
-@SUITE.must("V-CAUS-05", "4.5 Echo")
-def nothing_before_a_frame(bench: Bench) -> None:
+@SUITE.must("V-CAUS-05", "4.5 Echo", RobotPlayed)
+def nothing_before_a_frame(bench: Bench, robot: RobotPlayed) -> None:
     """Before a frame came there is nothing to answer: camera and status alone drive nothing."""
-    robot = RobotPlayed(bench)
     bench.rest(1_500_000)
     bench.expect(not robot.answers(), "it answered before it was sent a frame")
 
 
-@SUITE.should("V-CAUS-06", "7.1 Answers")
-def no_frame_twice(bench: Bench) -> None:
+@SUITE.should("V-CAUS-06", "7.1 Answers", met)
+def no_frame_twice(bench: Bench, robot: RobotPlayed) -> None:
     """No frame is cited by two twists."""
-    robot = RobotPlayed(bench).met()
     sent = robot.film("left", 5, 100_000)
     bench.rest(700_000)
     for one in sent:
-        twists = [answer for answer in robot.answers_to(one) if answer.is_twist]
+        twists = robot.twists_to(one)
         bench.expect(len(twists) < 2, f"frame {one.seq} is cited by {len(twists)} twists")
 
 
-@SUITE.must("V-CAUS-07", "1.5 Delivery")
-def newest_wins(bench: Bench) -> None:
+@SUITE.must("V-CAUS-07", "1.5 Delivery", met)
+def newest_wins(bench: Bench, robot: RobotPlayed) -> None:
     """Of a burst of 20 frames no older one is answered after a newer one."""
-    robot = RobotPlayed(bench).met()
     mark = bench.mark()
     for _ in range(_BURST):
         robot.frame("left")
@@ -87,14 +72,12 @@ def newest_wins(bench: Bench) -> None:
 def _no_twist_for(bench: Bench, robot: RobotPlayed, sent: Sent, what: str) -> None:
     """Nothing that drives cites `sent`, alone in its seq and its time, within the time of an answer."""
     bench.rest(ANSWER_US)
-    twists = [one for one in robot.answers_to(sent) if one.is_twist]
-    bench.expect(not twists, f"it drove by {what}")
+    bench.expect(not robot.twists_to(sent), f"it drove by {what}")
 
 
-@SUITE.must("V-CAUS-08", "1.5 Delivery")
-def older_frame(bench: Bench) -> None:
+@SUITE.must("V-CAUS-08", "1.5 Delivery", met)
+def older_frame(bench: Bench, robot: RobotPlayed) -> None:
     """A frame that arrives after a newer one drives nothing."""
-    robot = RobotPlayed(bench).met()
     first = robot.next_fields()
     bench.rest(FRAME_US)
     robot.answer_to(robot.frame())
@@ -102,42 +85,34 @@ def older_frame(bench: Bench) -> None:
     _no_twist_for(bench, robot, late, "a frame older than the last")
 
 
-@SUITE.should("V-CAUS-09", "7.1 Answers")
-def repeated_frame(bench: Bench) -> None:
+@SUITE.should("V-CAUS-09", "7.1 Answers", met)
+def repeated_frame(bench: Bench, robot: RobotPlayed) -> None:
     """A frame that arrives a second time gets no second twist."""
-    robot = RobotPlayed(bench).met()
     sent = robot.frame()
     robot.answer_to(sent)
-    before = len([one for one in robot.answers_to(sent) if one.is_twist])
+    before = len(robot.twists_to(sent))
     for _ in range(3):
         robot.frame(seq=sent.seq, t_us=sent.t_us)
         bench.rest(100_000)
-    twists = [one for one in robot.answers_to(sent) if one.is_twist]
+    twists = robot.twists_to(sent)
     bench.expect(len(twists) <= before, f"one frame got {len(twists)} twists")
 
 
-@SUITE.should("V-CAUS-10", "2.6 Clock")
-def time_goes_back(bench: Bench) -> None:
-    """A frame whose `seq` rises and whose time goes back drives nothing."""
-    robot = RobotPlayed(bench).met()
+def _no_twist_later(robot: RobotPlayed, later_us: int, what: str) -> None:
+    """Fail the case if a frame of a higher `seq` whose time is `later_us` after the last one's drives."""
     sent = robot.frame()
     robot.answer_to(sent)
-    _no_twist_at(bench, robot, sent.seq + 50, sent.t_us - 3_000, "a frame from before the last")
+    robot.frame("left", seq=sent.seq + 50, t_us=sent.t_us + later_us)
+    robot.bench.rest(ANSWER_US)
+    robot.bench.expect(not any(one.echo.get("seq") == sent.seq + 50 for one in robot.twists()), f"it drove by {what}")
 
 
-@SUITE.should("V-CAUS-11", "2.6 Clock")
-def time_stands_still(bench: Bench) -> None:
-    """A frame whose time does not advance drives nothing: that camera is frozen."""
-    robot = RobotPlayed(bench).met()
-    sent = robot.frame()
-    robot.answer_to(sent)
-    _no_twist_at(bench, robot, sent.seq + 50, sent.t_us, "a frame of the same time as the last")
-
-
-def _no_twist_at(bench: Bench, robot: RobotPlayed, seq: int, t_us: int, what: str) -> None:
-    robot.frame("left", seq=seq, t_us=t_us)
-    bench.rest(ANSWER_US)
-    bench.expect(not any(one.echo.get("seq") == seq for one in robot.twists()), f"it drove by {what}")
+SUITE.must_all(met, {
+    "V-CAUS-10": ("2.6 Clock", "A frame whose `seq` rises and whose time goes back drives nothing.",
+                  lambda it: _no_twist_later(it, -3_000, "a frame from before the last")),
+    "V-CAUS-11": ("2.6 Clock", "A frame whose time does not advance drives nothing: that camera is frozen.",
+                  lambda it: _no_twist_later(it, 0, "a frame of the same time as the last")),
+}, level=Level.SHOULD)
 
 
 @SUITE.must("V-CAUS-12", "7.4 Window")
@@ -150,24 +125,21 @@ def compute_time_is_true(bench: Bench) -> None:
                      f"it says {compute_us} us, and its answer took {took_us} us in all")
 
 
-@SUITE.must("V-CAUS-13", "2.5 Session and sequence")
-def gaps_are_fine(bench: Bench) -> None:
+@SUITE.must("V-CAUS-13", "2.5 Session and sequence", met)
+def gaps_are_fine(_bench: Bench, robot: RobotPlayed) -> None:
     """`seq` may leap: frames that were never sent are missed by nobody."""
-    robot = RobotPlayed(bench).met()
     for leap in (100, 10_000, 1_000_000):
         fields = robot.next_fields()
         robot.answer_to(robot.frame(seq=fields["seq"] + leap * leap, t_us=fields["t_us"]))
 
 
-@SUITE.must("V-CAUS-14", "2.6 Clock")
-def an_hour_is_fine(bench: Bench) -> None:
+@SUITE.must("V-CAUS-14", "2.6 Clock", met)
+def an_hour_is_fine(_bench: Bench, robot: RobotPlayed) -> None:
     """The robot's clock may leap ahead by an hour: it is nobody else's."""
-    robot = RobotPlayed(bench).met()
     for hours in (1, 2):
         fields = robot.next_fields()
         sent = robot.frame(seq=fields["seq"], t_us=fields["t_us"] + hours * 3_600_000_000)
-        answer = robot.answer_to(sent)
-        bench.expect(answer.is_twist, f"it came to {answer.words()}, not to a twist")
+        robot.expect_twist(sent)
 
 
 # --- its own sequence ------------------------------------------------------------------------------------------------
@@ -179,27 +151,24 @@ def _rises(bench: Bench, answers: list[Answer], what: str) -> None:
     bench.expect(all(one < other for one, other in itertools.pairwise(told)), f"{what} came as {told}")
 
 
-@SUITE.must("V-SEQ-01", "2.5 Session and sequence")
-def session_stays(bench: Bench) -> None:
+@SUITE.must("V-SEQ-01", "2.5 Session and sequence", met)
+def session_stays(bench: Bench, robot: RobotPlayed) -> None:
     """Its session is one and the same from answer to answer."""
-    robot = RobotPlayed(bench).met()
     robot.film("left", 40)
     sessions = {str(one.fields.get("session")) for one in robot.answers() if one.fields}
     bench.expect(len(sessions) < 2, f"it answered as {', '.join(sorted(sessions)[:4])}")
 
 
-@SUITE.must("V-SEQ-02", "2.5 Session and sequence")
-def twists_count_up(bench: Bench) -> None:
+@SUITE.must("V-SEQ-02", "2.5 Session and sequence", met)
+def twists_count_up(bench: Bench, robot: RobotPlayed) -> None:
     """The `seq` of its twists rises by at least one each."""
-    robot = RobotPlayed(bench).met()
     robot.film("left", 40)
     _rises(bench, robot.twists(), "twists")
 
 
-@SUITE.must("V-SEQ-03", "2.5 Session and sequence")
-def acks_count_up(bench: Bench) -> None:
+@SUITE.must("V-SEQ-03", "2.5 Session and sequence", met)
+def acks_count_up(bench: Bench, robot: RobotPlayed) -> None:
     """The `seq` of its acks rises by at least one each, with twists between them."""
-    robot = RobotPlayed(bench).met()
     for _ in range(6):
         robot.frame(jpeg=png())
         bench.rest(50_000)
@@ -229,7 +198,7 @@ def robot_starts_anew(bench: Bench) -> None:
     old.stop()
     new = RobotPlayed(bench, first_seq=3, first_t_us=1_000)
     for sent in new.film("left", 3, 100_000):
-        bench.expect(any(one.is_twist for one in new.answers_to(sent)), f"no twist for the new frame {sent.seq}")
+        bench.expect(new.twists_to(sent), f"no twist for the new frame {sent.seq}")
 
 
 @SUITE.should("V-SEQ-06", "2.5 Session and sequence")

@@ -95,6 +95,11 @@ def read_answer(heard: Heard) -> Answer:
     return Answer(heard, fields if isinstance(fields, dict) else {})
 
 
+def met(bench: Bench) -> "RobotPlayed":
+    """How most cases begin: a robot that the vision service drives."""
+    return RobotPlayed(bench).met()
+
+
 class RobotPlayed:
     """One start of a robot: a session, a clock, a count. It announces itself until the next case, or `stop`."""
 
@@ -209,6 +214,20 @@ class RobotPlayed:
             self.bench.expect(False, f"no answer to frame {sent.seq} within {within_us / 1e6:g} s")
         return self.answers_to(sent)[0]
 
+    def expect_twist(self, sent: Sent) -> None:
+        """Fail the case unless the answer to `sent` is a twist."""
+        answer = self.answer_to(sent)
+        self.bench.expect(answer.is_twist, f"it came to {answer.words()}, not to a twist")
+
+    def expect_any_twist(self, sent: list[Sent]) -> None:
+        """Fail the case unless a twist cites one of `sent`."""
+        twist = any(one.is_twist for frame in sent for one in self.answers_to(frame))
+        self.bench.expect(twist, "no twist came")
+
+    def twists_to(self, sent: Sent) -> list[Answer]:
+        """Whatever cites `sent` and drives."""
+        return [one for one in self.answers_to(sent) if one.is_twist]
+
     def need_nothing_dropped(self) -> None:
         """Leave the case if this end's link turned something away: another case says what."""
         dropped = self.bench.dropped_here
@@ -226,7 +245,7 @@ class RobotPlayed:
 
     def _drives(self, sent: Sent) -> bool:
         """Whether a twist came; after an ack, it is not yet time for the next frame."""
-        if any(one.is_twist for one in self.answers_to(sent)):
+        if self.twists_to(sent):
             return True
         self.bench.rest(FRAME_US)
         return False
@@ -236,8 +255,7 @@ class RobotPlayed:
         for _ in range(3):
             sent = self.frame()
             self.is_answered(sent)
-            twists = [one for one in self.answers_to(sent) if one.is_twist]
-            if twists:
+            if twists := self.twists_to(sent):
                 return twists[0]
             self.bench.rest(FRAME_US)
         self.need_nothing_dropped()

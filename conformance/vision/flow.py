@@ -1,10 +1,10 @@
 """Cases on credit, silence, status and a robot that reconnects. Pure."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import Final
 
-from sightline.conformance.case import Bench, Case, Level, Suite
-from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, RobotPlayed
+from sightline.conformance.case import Bench, Level, Suite
+from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, RobotPlayed, met
 from sightline.conformance.vision.images import CAMERA as LENS
 from sightline.conformance.vision.images import HALF_CAMERA
 from sightline.protocol.channels import REQUEST
@@ -20,25 +20,22 @@ _STEADY_ANSWERED: Final = 0.9
 """Of frames at 30 fps, one at a time: a detector may take a frame's time, and a scheduler has bad moments."""
 
 
-@SUITE.should("V-FLOW-01", "3.3 A refused picture")
-def refused_picture_is_acknowledged(bench: Bench) -> None:
-    """What is no picture is acknowledged, so that its credit comes back."""
-    robot = RobotPlayed(bench).met()
-    robot.answer_to(robot.frame(jpeg=b"no picture at all"))
+SUITE.must_all(met, {
+    "V-FLOW-01": ("3.3 A refused picture", "What is no picture is acknowledged, so that its credit comes back.",
+                  lambda it: it.bench.expect(it.answer_to(it.frame(jpeg=b"no picture at all")), "no answer")),
+}, level=Level.SHOULD)
 
 
-@SUITE.must("V-FLOW-02", "7.1 Answers")
-def burst(bench: Bench) -> None:
+@SUITE.must("V-FLOW-02", "7.1 Answers", met)
+def burst(_bench: Bench, robot: RobotPlayed) -> None:
     """Of a burst of 20 frames the newest is answered within a second."""
-    robot = RobotPlayed(bench).met()
     sent = [robot.frame("left") for _ in range(_BURST)]
     robot.answer_to(sent[-1], _CATCH_UP_US)
 
 
-@SUITE.must("V-FLOW-03", "1.5 Delivery")
-def flood(bench: Bench) -> None:
+@SUITE.must("V-FLOW-03", "1.5 Delivery", met)
+def flood(bench: Bench, robot: RobotPlayed) -> None:
     """After a thousand frames without a pause, a plain frame is answered within a second: nothing queued up."""
-    robot = RobotPlayed(bench).met()
     for number in range(_FLOOD):
         robot.frame(jpeg=b"flood")
         if number % 50 == 49:
@@ -46,19 +43,17 @@ def flood(bench: Bench) -> None:
     robot.answer_to(robot.frame(), _CATCH_UP_US)
 
 
-@SUITE.must("V-FLOW-04", "7.1 Answers")
-def slow_robot(bench: Bench) -> None:
+@SUITE.must("V-FLOW-04", "7.1 Answers", met)
+def slow_robot(bench: Bench, robot: RobotPlayed) -> None:
     """A robot that sends a frame every second and a half is answered each time."""
-    robot = RobotPlayed(bench).met()
     for _ in range(3):
         bench.rest(1_500_000)
         robot.answer_to(robot.frame())
 
 
-@SUITE.must("V-FLOW-05", "7.1 Answers")
-def steady(bench: Bench) -> None:
+@SUITE.must("V-FLOW-05", "7.1 Answers", met)
+def steady(bench: Bench, robot: RobotPlayed) -> None:
     """Two seconds at 30 fps: nine frames of ten are answered before half a second is over."""
-    robot = RobotPlayed(bench).met()
     sent = robot.film("left", _STEADY)
     bench.rest(ANSWER_US)
     answered = sum(bool(robot.answers_to(one)) for one in sent)
@@ -82,23 +77,21 @@ def late_camera_model(bench: Bench) -> None:
     robot.show(LENS)
     sent = robot.film("left", 20, 50_000)
     robot.need_nothing_dropped()
-    bench.expect(any(one.is_twist for frame in sent for one in robot.answers_to(frame)), "no twist came")
+    robot.expect_any_twist(sent)
 
 
-@SUITE.should("V-FLOW-08", "10.1 Camera, odometry, scan")
-def other_camera_model(bench: Bench) -> None:
+@SUITE.should("V-FLOW-08", "10.1 Camera, odometry, scan", met)
+def other_camera_model(bench: Bench, robot: RobotPlayed) -> None:
     """A camera that changes its picture size is followed: twists within a second."""
-    robot = RobotPlayed(bench).met()
     robot.show(HALF_CAMERA)
     bench.rest(50_000)
     sent = robot.film("left_half", 20, 50_000)
-    bench.expect(any(one.is_twist for frame in sent for one in robot.answers_to(frame)), "no twist came")
+    robot.expect_any_twist(sent)
 
 
-@SUITE.should("V-FLOW-09", "7.1 Answers")
-def replaced_frames(bench: Bench) -> None:
+@SUITE.should("V-FLOW-09", "7.1 Answers", met)
+def replaced_frames(bench: Bench, robot: RobotPlayed) -> None:
     """Frames that a newer one replaced are not answered: of 20 at once, at most half."""
-    robot = RobotPlayed(bench).met()
     sent = [robot.frame("left") for _ in range(_BURST)]
     bench.rest(_CATCH_UP_US)
     answered = sum(bool(robot.answers_to(one)) for one in sent)
@@ -108,10 +101,9 @@ def replaced_frames(bench: Bench) -> None:
 # --- silence ---------------------------------------------------------------------------------------------------------
 
 
-@SUITE.should("V-SIL-01", "7.1 Answers")
-def silent_without_frames(bench: Bench) -> None:
+@SUITE.should("V-SIL-01", "7.1 Answers", met)
+def silent_without_frames(bench: Bench, robot: RobotPlayed) -> None:
     """When frames cease, so do twists: nothing is said twice to keep a robot going."""
-    robot = RobotPlayed(bench).met()
     robot.film("left", 10)
     bench.rest(_CATCH_UP_US)
     mark = bench.mark()
@@ -119,18 +111,16 @@ def silent_without_frames(bench: Bench) -> None:
     bench.expect(not robot.answers(mark), f"{len(robot.answers(mark))} answers came without a frame")
 
 
-@SUITE.must("V-SIL-02", "7.1 Answers")
-def back_after_silence(bench: Bench) -> None:
+@SUITE.must("V-SIL-02", "7.1 Answers", met)
+def back_after_silence(bench: Bench, robot: RobotPlayed) -> None:
     """After five seconds without a frame, the next one is answered."""
-    robot = RobotPlayed(bench).met()
     bench.rest(5_000_000)
     robot.answer_to(robot.frame())
 
 
-@SUITE.must("V-SIL-03", "3.3 A refused picture")
-def silent_about_no_pictures(bench: Bench) -> None:
+@SUITE.must("V-SIL-03", "3.3 A refused picture", met)
+def silent_about_no_pictures(bench: Bench, robot: RobotPlayed) -> None:
     """When pictures cease to be pictures, twists cease."""
-    robot = RobotPlayed(bench).met()
     robot.film("left", 5)
     bench.rest(_CATCH_UP_US)
     mark = bench.mark()
@@ -143,9 +133,9 @@ def silent_about_no_pictures(bench: Bench) -> None:
 # --- what the robot says of itself -----------------------------------------------------------------------------------
 
 
-def _goes_on(bench: Bench, status: Status | bytes | None, what: str, twists: bool = True) -> None:
-    """With `status` said at 10 Hz, frames go on being answered."""
-    robot = RobotPlayed(bench).met()
+def _goes_on(status: Status | bytes, what: str, robot: RobotPlayed, *, twists: bool = True) -> None:
+    """With `status` published at 10 Hz, frames continue to be answered."""
+    bench = robot.bench
     robot.status = status
     bench.rest(250_000)
     for sent in robot.film("left", 8, 100_000):
@@ -156,38 +146,24 @@ def _goes_on(bench: Bench, status: Status | bytes | None, what: str, twists: boo
         bench.expect(good, f"no {'twist' if twists else 'answer'} for frame {sent.seq} {what}")
 
 
-@SUITE.must("V-STAT-01", "6.4 Arming")
-def disarmed(bench: Bench) -> None:
-    """A disarmed robot is driven all the same: arming needs five good commands in a row."""
-    _goes_on(bench, Status(state=State.DISARMED, reason="not armed"), "while disarmed")
-
-
-@SUITE.must("V-STAT-02", "7.1 Answers")
-def stopped(bench: Bench) -> None:
-    """Frames of a stopped robot are answered: what people see through it needs credit."""
-    _goes_on(bench, Status(state=State.STOPPED, reason="stop was asked for"), "while stopped", twists=False)
-
-
-@SUITE.must("V-STAT-03", "7.1 Answers")
-def refused(bench: Bench) -> None:
-    """A robot that refuses every twist is answered on."""
-    last = LastRejection(source="vision", reason="STALE", detail="frame is 900 ms old")
-    _goes_on(bench, Status(state=State.HOLD, reason="no command", refused={"STALE": 99}, last_refusal=last),
-             "while refused")
-
-
-@SUITE.must("V-STAT-04", "7.1 Answers")
-def other_driver(bench: Bench) -> None:
-    """While somebody else drives, frames are answered."""
-    _goes_on(bench, Status(state=State.ACTIVE, reason="teleop drives",
-                           holder=Holder(source="teleop", session="99999999")), "while teleop drives", twists=False)
-
-
-@SUITE.must("V-STAT-05", "11. Versions")
-def newer_status(bench: Bench) -> None:
-    """Unknown fields and unknown reasons in `status` change nothing."""
-    _goes_on(bench, packed({"state": "HOLD", "reason": "x", "refused": {"TOO_PURPLE": 3}, "battery": {"volts": 11.1}}),
-             "after a status with unknown fields")
+_OTHER_HOLDER: Final = Status(state=State.ACTIVE, reason="teleop drives",
+                              holder=Holder(source="teleop", session="99999999"))
+_REJECTING: Final = Status(state=State.HOLD, reason="no command", refused={"STALE": 99},
+                           last_refusal=LastRejection(source="vision", reason="STALE", detail="frame is 900 ms old"))
+_NEWER: Final = packed({"state": "HOLD", "reason": "x", "refused": {"TOO_PURPLE": 3}, "battery": {"volts": 11.1}})
+SUITE.must_all(met, {
+    "V-STAT-01": ("6.4 Arming", "A disarmed robot is driven all the same: arming needs five good commands in a row.",
+                  partial(_goes_on, Status(state=State.DISARMED, reason="not armed"), "while disarmed")),
+    "V-STAT-02": ("7.1 Answers", "Frames of a stopped robot are answered: what people see through it needs credit.",
+                  partial(_goes_on, Status(state=State.STOPPED, reason="stop was requested"), "while stopped",
+                          twists=False)),
+    "V-STAT-03": ("7.1 Answers", "A robot that refuses every twist is answered on.",
+                  partial(_goes_on, _REJECTING, "while refused")),
+    "V-STAT-04": ("7.1 Answers", "While somebody else drives, frames are answered.",
+                  partial(_goes_on, _OTHER_HOLDER, "while teleop drives", twists=False)),
+    "V-STAT-05": ("11. Versions", "Unknown fields and unknown reasons in `status` change nothing.",
+                  partial(_goes_on, _NEWER, "after a status with unknown fields")),
+})
 
 
 @SUITE.must("V-STAT-06", "1.2 Messages")
@@ -208,12 +184,10 @@ BROKEN_STATUS: Final = {
 }
 
 
-def _status_is(payload: bytes) -> Callable[[Bench], None]:
-    return lambda bench: _goes_on(bench, payload, f"after the status {payload[:40]!r}")
-
-
-for _id, (_title, _payload) in BROKEN_STATUS.items():
-    SUITE.add(Case(_id, Level.MUST, "13.2 Bounds", _title, _status_is(_payload)))
+SUITE.must_all(met, {
+    number: ("13.2 Bounds", title, partial(_goes_on, payload, f"after the status {payload[:40]!r}"))
+    for number, (title, payload) in BROKEN_STATUS.items()
+})
 
 
 @SUITE.should("V-REQ-01", "6.4 Arming")
@@ -245,10 +219,9 @@ def _answered_again(bench: Bench, robot: RobotPlayed, what: str) -> None:
     bench.expect(robot.answers(mark), f"no frame was answered within {_BACK_US / 1e6:g} s {what}")
 
 
-@SUITE.must("V-RECO-01", "14.8 Liveness")
-def connection_lost(bench: Bench) -> None:
+@SUITE.must("V-RECO-01", "14.8 Liveness", met)
+def connection_lost(bench: Bench, robot: RobotPlayed) -> None:
     """When the connection is lost and comes back, the same robot is answered again within five seconds."""
-    robot = RobotPlayed(bench).met()
     bench.leave()
     bench.rest(300_000)
     bench.join()
@@ -265,10 +238,9 @@ def robot_restarted(bench: Bench) -> None:
     _answered_again(bench, RobotPlayed(bench, first_seq=0, first_t_us=500), "after the robot started anew")
 
 
-@SUITE.must("V-RECO-03", "14.8 Liveness")
-def connection_flaps(bench: Bench) -> None:
+@SUITE.must("V-RECO-03", "14.8 Liveness", met)
+def connection_flaps(bench: Bench, robot: RobotPlayed) -> None:
     """A connection lost three times in a row, in the middle of frames, is no reason to give up."""
-    robot = RobotPlayed(bench).met()
     for _ in range(3):
         robot.frame()
         bench.leave()
@@ -277,10 +249,9 @@ def connection_flaps(bench: Bench) -> None:
         _answered_again(bench, robot, "after the connection came back")
 
 
-@SUITE.must("V-RECO-04", "2.5 Session and sequence")
-def counts_on(bench: Bench) -> None:
+@SUITE.must("V-RECO-04", "2.5 Session and sequence", met)
+def counts_on(bench: Bench, robot: RobotPlayed) -> None:
     """Within a session of its own, its `seq` goes on over a reconnection."""
-    robot = RobotPlayed(bench).met()
     before = robot.answers()[-1]
     bench.leave()
     bench.rest(300_000)
@@ -300,10 +271,9 @@ def counts_on(bench: Bench) -> None:
                  f"`seq` was {numbers[0]} before and {numbers[1]} after, in one session")
 
 
-@SUITE.must("V-RECO-05", "1.5 Delivery")
-def nothing_kept_back(bench: Bench) -> None:
+@SUITE.must("V-RECO-05", "1.5 Delivery", met)
+def nothing_kept_back(bench: Bench, robot: RobotPlayed) -> None:
     """What it could not say while the robot was gone is not said later."""
-    robot = RobotPlayed(bench).met()
     sent = robot.film("left", 3, 0)
     bench.leave()
     bench.rest(1_000_000)

@@ -1,11 +1,12 @@
 """Cases on invalid headers, cameras, keys and pictures. Pure."""
 
 from collections.abc import Callable
+from functools import partial
 from random import Random
 from typing import Any, Final
 
-from sightline.conformance.case import Bench, Case, Level, Suite
-from sightline.conformance.vision.fixture import ANSWER_US, RobotPlayed
+from sightline.conformance.case import Bench, Level, Suite
+from sightline.conformance.vision.fixture import ANSWER_US, RobotPlayed, met
 from sightline.conformance.vision.images import (
     CAMERA as LENS,
 )
@@ -62,29 +63,26 @@ HEADERS: Final[dict[str, tuple[str, str, Callable[[Fields], bytes]]]] = {
 """What makes a frame no frame: title, clause, header."""
 
 
-def _refused(write: Callable[[Fields], bytes], title: str) -> Callable[[Bench], None]:
-    def run(bench: Bench) -> None:
-        robot = RobotPlayed(bench).met()
-        for _ in range(2):
-            fields = robot.next_fields()
-            mark = bench.mark()
-            header = write(fields)
-            bench.need(len(header) <= MAX_HEADER_BYTES, "this header is too long to be sent")
-            robot.frame("left", header=header)
-            bench.rest(ANSWER_US // 4)
-            bench.expect(not robot.twists(mark), f"it drove by this: {title}")
-
-    return run
+def _header_drives_nothing(write: Callable[[Fields], bytes], title: str, robot: RobotPlayed) -> None:
+    bench = robot.bench
+    for _ in range(2):
+        mark = bench.mark()
+        header = write(robot.next_fields())
+        bench.need(len(header) <= MAX_HEADER_BYTES, "this header is too long to be sent")
+        robot.frame("left", header=header)
+        bench.rest(ANSWER_US // 4)
+        bench.expect(not robot.twists(mark), f"it drove by this: {title}")
 
 
-for _id, (_title, _clause, _write) in HEADERS.items():
-    SUITE.add(Case(_id, Level.MUST, _clause, f"{_title} drives nothing.", _refused(_write, _title)))
+SUITE.must_all(met, {
+    number: (clause, f"{title} drives nothing.", partial(_header_drives_nothing, write, title))
+    for number, (title, clause, write) in HEADERS.items()
+})
 
 
-@SUITE.must("V-HOST-31", "13.2 Bounds")
-def all_headers_and_well(bench: Bench) -> None:
+@SUITE.must("V-HOST-31", "13.2 Bounds", met)
+def all_headers_and_well(bench: Bench, robot: RobotPlayed) -> None:
     """After every broken header, plain frames are answered as before."""
-    robot = RobotPlayed(bench).met()
     for _, _, write in HEADERS.values():
         robot.frame("left", header=write(robot.next_fields()))
         bench.rest(20_000)
@@ -121,10 +119,9 @@ def _damaged(random: Random, data: bytes) -> bytes:
     return bytes(changed)
 
 
-@SUITE.must("V-HOST-33", "13.2 Bounds")
-def absurd_odometry(bench: Bench) -> None:
+@SUITE.must("V-HOST-33", "13.2 Bounds", met)
+def absurd_odometry(_bench: Bench, robot: RobotPlayed) -> None:
     """Odometry at its bounds, a thousand kilometres away at a million metres a second, gets a finite answer."""
-    robot = RobotPlayed(bench).met()
     far: Fields = {"pose": (1e6, -1e6, 1e6), "moving": (1e6, -1e6), "applied": (-1e6, 1e6), "latency_us": 2**53 - 1}
     for _ in range(3):
         robot.answer_to(robot.frame("left", **far))
@@ -149,32 +146,29 @@ CAMERAS: Final[dict[str, tuple[str, str, bytes, Fields]]] = {
 """What must not be believed, or pictures would no longer fit: title, clause, payload, what differs in the header."""
 
 
-def _not_believed(payload: bytes, header: Fields, title: str) -> Callable[[Bench], None]:
-    def run(bench: Bench) -> None:
-        robot = RobotPlayed(bench).met()
-        robot.camera = None  # the good one is not repeated
-        robot.say(CAMERA, payload, packed(robot.stamp().model_dump() | header))
-        robot.film("centre", 4, 80_000)  # it may look at cameras between frames only
-        robot.expect_driven(title[0].lower() + title[1:])
-
-    return run
+def _not_believed(payload: bytes, header: Fields, title: str, robot: RobotPlayed) -> None:
+    robot.camera = None  # the good one is not repeated
+    robot.say(CAMERA, payload, packed(robot.stamp().model_dump() | header))
+    robot.film("centre", 4, 80_000)  # it may look at cameras between frames only
+    robot.expect_driven(title[0].lower() + title[1:])
 
 
-for _id, (_title, _clause, _payload, _header) in CAMERAS.items():
-    SUITE.add(Case(_id, Level.MUST, _clause, f"{_title} is not believed.", _not_believed(_payload, _header, _title)))
+SUITE.must_all(met, {
+    number: (clause, f"{title} is not believed.", partial(_not_believed, payload, header, title))
+    for number, (title, clause, payload, header) in CAMERAS.items()
+})
 
 
-@SUITE.must("V-HOST-51", "13.2 Bounds")
-def absurd_lens(bench: Bench) -> None:
+@SUITE.must("V-HOST-51", "13.2 Bounds", met)
+def absurd_lens(_bench: Bench, robot: RobotPlayed) -> None:
     """A lens within the bounds and beyond reason ends nothing: with a good one again, twists come within a second."""
-    robot = RobotPlayed(bench).met()
     for changes in ({"fx_px": 1e-3}, {"cx_px": 1e6, "cy_px": -1e6}, {"pitch_rad": 1e6}, {"distortion": (1e6,) * 8},
                     {"z_m": -1e6}):
         robot.show(LENS.model_copy(update=changes))
         robot.film("left", 3, 20_000)
     robot.show(LENS)
     sent = robot.film("left", 20, 50_000)
-    bench.expect(any(one.is_twist for frame in sent for one in robot.answers_to(frame)), "no twist came any more")
+    robot.expect_any_twist(sent)
 
 
 # --- keys ------------------------------------------------------------------------------------------------------------
@@ -186,19 +180,17 @@ KEYS: Final = {
 }
 
 
-def _not_heard(key: str, title: str) -> Callable[[Bench], None]:
-    def run(bench: Bench) -> None:
-        robot = RobotPlayed(bench).met()
-        mark = bench.mark()
-        bench.put(key.replace("another", f"x{bench.robot}"[:32]), packed(robot.next_fields()), picture("left"))
-        bench.rest(ANSWER_US)
-        bench.expect(not robot.answers(mark), f"it answered this: {title}")
-
-    return run
+def _not_received(key: str, title: str, robot: RobotPlayed) -> None:
+    bench, mark = robot.bench, robot.bench.mark()
+    bench.put(key.replace("another", f"x{bench.robot}"[:32]), packed(robot.next_fields()), picture("left"))
+    bench.rest(ANSWER_US)
+    bench.expect(not robot.answers(mark), f"it answered this: {title}")
 
 
-for _id, (_title, _key) in KEYS.items():
-    SUITE.add(Case(_id, Level.MUST, "1.3 Keys", f"{_title} is not this robot's.", _not_heard(_key, _title)))
+SUITE.must_all(met, {
+    number: ("1.3 Keys", f"{title} is not this robot's.", partial(_not_received, key, title))
+    for number, (title, key) in KEYS.items()
+})
 
 
 # Cases about pictures: those that must be refused before a decoder sees them, and odd ones that are good. Pure.
@@ -242,38 +234,32 @@ DOUBTED: Final[dict[str, tuple[str, Callable[[], bytes]]]] = {
 """The same, where a decoder may see it otherwise."""
 
 
-def _picture_rejected(jpeg: Callable[[], bytes], title: str) -> Callable[[Bench], None]:
-    def run(bench: Bench) -> None:
-        robot = RobotPlayed(bench).met()
-        for _ in range(2):
-            sent = robot.frame(jpeg=jpeg())
-            robot.is_answered(sent)
-            bench.expect(not any(one.is_twist for one in robot.answers_to(sent)), f"it drove by this: {title}")
-
-    return run
+def _image_drives_nothing(jpeg: Callable[[], bytes], title: str, robot: RobotPlayed) -> None:
+    for _ in range(2):
+        sent = robot.frame(jpeg=jpeg())
+        robot.is_answered(sent)
+        robot.bench.expect(not robot.twists_to(sent), f"it drove by this: {title}")
 
 
 for _level, _table in ((Level.MUST, REFUSED), (Level.SHOULD, DOUBTED)):
-    for _case_id, (_case_title, _jpeg) in _table.items():
-        SUITE.add(
-            Case(_case_id, _level, _CHECK, f"{_case_title} drives nothing.", _picture_rejected(_jpeg, _case_title))
-        )
+    SUITE.must_all(met, {
+        number: (_CHECK, f"{title} drives nothing.", partial(_image_drives_nothing, jpeg, title))
+        for number, (title, jpeg) in _table.items()
+    }, level=_level)
 
 
-@SUITE.must("V-LIM-31", "13.2 Bounds")
-def all_refused_and_well(bench: Bench) -> None:
+@SUITE.must("V-LIM-31", "13.2 Bounds", met)
+def all_refused_and_well(bench: Bench, robot: RobotPlayed) -> None:
     """After every picture that must be refused, plain frames are answered as before."""
-    robot = RobotPlayed(bench).met()
     for _, jpeg in (*REFUSED.values(), *DOUBTED.values()):
         robot.frame(jpeg=jpeg())
         bench.rest(20_000)
     robot.expect_driven("pictures that are none")
 
 
-@SUITE.must("V-LIM-32", "13.2 Bounds")
-def scan_bomb(bench: Bench) -> None:
+@SUITE.must("V-LIM-32", "13.2 Bounds", met)
+def scan_bomb(bench: Bench, robot: RobotPlayed) -> None:
     """A progressive JPEG of thousands of empty scans does not keep it busy: the next frame is answered in time."""
-    robot = RobotPlayed(bench).met()
     robot.frame(jpeg=many_scans(picture("left_progressive"), _SCANS))
     bench.rest(50_000)
     robot.answer_to(robot.frame())
@@ -289,15 +275,10 @@ READ: Final[dict[str, tuple[str, str, Level, Callable[[], bytes]]]] = {
 }
 
 
-def _read(jpeg: Callable[[], bytes]) -> Callable[[Bench], None]:
-    def run(bench: Bench) -> None:
-        robot = RobotPlayed(bench).met()
-        for _ in range(2):
-            answer = robot.answer_to(robot.frame(jpeg=jpeg()))
-            bench.expect(answer.is_twist, f"it came to {answer.words()}, not to a twist")
-
-    return run
+def _is_read(jpeg: Callable[[], bytes], robot: RobotPlayed) -> None:
+    for _ in range(2):
+        robot.expect_twist(robot.frame(jpeg=jpeg()))
 
 
-for _case_id, (_case_clause, _case_title, _level, _jpeg) in READ.items():
-    SUITE.add(Case(_case_id, _level, _case_clause, _case_title, _read(_jpeg)))
+for _number, (_clause, _title, _level, _jpeg) in READ.items():
+    SUITE.must_all(met, {_number: (_clause, _title, partial(_is_read, _jpeg))}, level=_level)
