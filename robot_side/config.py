@@ -68,6 +68,11 @@ class RobotConfig(Config):
         return tuple(with_allowed(endpoint, self.legacy.allow_from) for endpoint in self.listen)
 
     @property
+    def devices(self) -> dict[str, PluginChoice | None]:
+        """The device in use of each kind, by its key; None where there is none."""
+        return {"camera": self.camera, "drive": self.motors, "range_sensor": self.ranging}
+
+    @property
     def motors(self) -> PluginChoice:
         """The drive in use; `gpio`, whose calibration is in metres, is told the radius of the wheels."""
         if self.drive.kind != "gpio":

@@ -1,29 +1,43 @@
-"""Builds the robot's devices: each a plug-in, found by entry-point name or `package.module:Name`. Shell."""
+"""The robot's kinds of devices, each a plug-in found by entry-point name or `package.module:Name`. Shell."""
 
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any, Final, Generic, TypeVar
 
 from sightline.protocol.config import PluginRegistry
 from sightline.robot_side.config import PluginChoice
+from sightline.robot_side.ports import Camera, Drive, RangeSensor
 
-_REGISTRIES: Final = {
-    group: PluginRegistry(noun, f"sightline.{group}")
-    for group, noun in (("cameras", "camera"), ("drives", "drive"), ("range_sensors", "range sensor"))
-}
+Port = TypeVar("Port")
 
 
-def build_device(group: str, choice: PluginChoice) -> Any:
-    """The device `choice` names, from the entry points of `sightline.<group>`.
+@dataclass(frozen=True)
+class DeviceGroup(Generic[Port]):
+    """One kind of device: its key in the robot's configuration, what it must be able to do, its entry points."""
 
-    Raises:
-        ConfigError: for an unknown kind (nearest named), a missing package or a wrong option.
-        HardwareError: as the device itself does.
-    """
-    plugin, config = load_device(group, choice)
-    return plugin(config)
+    key: str
+    port: type[Any]
+    entry_points: str
+
+    def build(self, choice: PluginChoice) -> Port:
+        """The device `choice` names.
+
+        Raises:
+            ConfigError: for an unknown kind (nearest named), a missing package or a wrong option.
+            HardwareError: as the device itself does.
+        """
+        plugin, config = self.load(choice)
+        device: Port = plugin(config)
+        return device
+
+    def load(self, choice: PluginChoice) -> tuple[Any, Any]:
+        """The class and its checked `Config`, without touching the device. Raises ConfigError."""
+        registry = PluginRegistry(self.key.replace("_", " "), self.entry_points)
+        plugin = registry.load(choice.kind)
+        return plugin, registry.settings(choice.kind, plugin, choice.options)
 
 
-def load_device(group: str, choice: PluginChoice) -> tuple[Any, Any]:
-    """The class and its checked `Config`, without touching the device. Raises ConfigError."""
-    registry = _REGISTRIES[group]
-    plugin = registry.load(choice.kind)
-    return plugin, registry.settings(choice.kind, plugin, choice.options)
+CAMERAS: Final = DeviceGroup[Camera]("camera", Camera, "sightline.cameras")
+DRIVES: Final = DeviceGroup[Drive]("drive", Drive, "sightline.drives")
+RANGE_SENSORS: Final = DeviceGroup[RangeSensor]("range_sensor", RangeSensor, "sightline.range_sensors")
+
+DEVICE_GROUPS: Final[tuple[DeviceGroup[Any], ...]] = (CAMERAS, DRIVES, RANGE_SENSORS)

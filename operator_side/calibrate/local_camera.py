@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from sightline.operator_side.config.toml_text import options_of
 from sightline.robot_side.config import PluginChoice
-from sightline.robot_side.plugins import build_device
+from sightline.robot_side.plugins import CAMERAS
 from sightline.robot_side.ports import Camera
 
 
@@ -19,7 +19,7 @@ def local_camera(kind: str, sets: Sequence[str]) -> Iterator[Camera]:
     Raises ConfigError for a bad kind or option, HardwareError when there is no such camera.
     """
     options = options_of(sets, "--camera-set", "device=/dev/video2")
-    camera: Camera = build_device("cameras", PluginChoice(kind=kind, options=options))
+    camera = CAMERAS.build(PluginChoice(kind=kind, options=options))
     try:
         yield camera
     finally:

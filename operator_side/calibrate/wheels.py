@@ -15,7 +15,7 @@ from typing import Final
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS
-from sightline.robot_side.plugins import build_device, load_device
+from sightline.robot_side.plugins import DRIVES
 from sightline.robot_side.ports import Drive
 
 TURN_S: Final = 1.0
@@ -84,7 +84,7 @@ def opened_drive(config: RobotConfig) -> Iterator[Drive]:
 
     before = {number: signal.signal(number, end) for number in EXIT_SIGNALS}
     try:
-        drive: Drive = build_device("drives", config.motors)
+        drive = DRIVES.build(config.motors)
         try:
             yield drive
         finally:
@@ -119,7 +119,7 @@ def _what_instead(ask: Prompt) -> str:
 
 def _advice(drive: PluginChoice, turn: Turn, wrong: str) -> str:
     """What to change. A drive with options for it is told so; any other is wired differently."""
-    plugin, options = load_device("drives", drive)
+    plugin, options = DRIVES.load(drive)
     known = plugin.Config.model_fields
     if wrong == "w" and "left_reversed" in known:
         name = f"{_pins_of(options, turn.side)}_reversed"

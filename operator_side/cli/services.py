@@ -33,7 +33,7 @@ from sightline.protocol.log import set_log_format
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.plugins import load_device
+from sightline.robot_side.plugins import DEVICE_GROUPS
 from sightline.sim.process import SimConfig
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
@@ -342,10 +342,10 @@ def check(service: ServiceName, file: File = None, profile: Profile = None, sets
 def _check_names(config: BaseModel) -> None:
     """What the configuration names, with its options: devices, scenario, robot, detectors, missions. Opens none."""
     if isinstance(config, RobotConfig):
-        named = {"cameras": config.camera, "drives": config.motors, "range_sensors": config.ranging}
-        for group, choice in named.items():
+        for group in DEVICE_GROUPS:
+            choice = config.devices[group.key]
             if choice is not None:
-                load_device(group, choice)
+                group.load(choice)
     if isinstance(config, SimConfig):
         load_robot(config.robot or load_scenario(config.scenario).robot)
     if isinstance(config, VisionConfig):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.plugins import load_device
+from sightline.robot_side.plugins import DRIVES
 
 SERVICES = ("robot", "vision")
 UNIT_DIR = Path("/etc/systemd/system")
@@ -54,7 +54,7 @@ def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UN
     """
     if robot.motors.kind != "gpio":
         return None
-    _, options = load_device("drives", robot.motors)
+    _, options = DRIVES.load(robot.motors)
     pins = " ".join(str(number) for number in (*options.pins, *options.enable_pins))
     text = (
         files("sightline.robot_side")

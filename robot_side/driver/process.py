@@ -20,7 +20,7 @@ from sightline.robot_side.driver.core import DriverCore
 from sightline.robot_side.driver.persistence import BackgroundWriter, StopLatch
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS, SystemdNotifier, request_real_time
 from sightline.robot_side.pipe import DriverEnd
-from sightline.robot_side.plugins import build_device
+from sightline.robot_side.plugins import DRIVES, RANGE_SENSORS
 from sightline.robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
 from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
 from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
@@ -84,9 +84,9 @@ def run(config: RobotConfig) -> int:
     """
     check_robot_id(config.robot)
     with ExitStack() as ending:
-        drive: Drive = build_device("drives", config.motors)
+        drive = DRIVES.build(config.motors)
         ending.callback(drive.close)
-        ranges: RangeSensor | None = build_device("range_sensors", config.ranging) if config.ranging else None
+        ranges = RANGE_SENSORS.build(config.ranging) if config.ranging else None
         if ranges is not None:
             ending.callback(ranges.close)
         driver = Driver(config, drive, ranges)
@@ -103,7 +103,7 @@ def _zero(drive: Drive) -> None:
 
 def zero_motors(config: RobotConfig) -> int:
     """Tell the motors to stand still, without gate or network: for whoever cleans up after a dead driver."""
-    drive: Drive = build_device("drives", config.motors)
+    drive = DRIVES.build(config.motors)
     try:
         drive.set(0.0, 0.0)
     finally:

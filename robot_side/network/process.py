@@ -25,7 +25,7 @@ from sightline.protocol.transports.zenoh.session import report_floods
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.network.core import CameraAdaptation, NetworkCore
 from sightline.robot_side.pipe import NetworkEnd, NetworkSetup
-from sightline.robot_side.plugins import build_device
+from sightline.robot_side.plugins import CAMERAS
 from sightline.robot_side.ports import Camera, Picture
 
 _ASK_ADDRESS: Final = 0x8915  # SIOCGIFADDR of linux/sockios.h
@@ -205,7 +205,7 @@ def _run(driver: NetworkEnd) -> None:
     setup = NetworkSetup.model_validate_json(driver.receive())
     config = setup.config
     with ExitStack() as ending:
-        camera: Camera = build_device("cameras", config.camera)
+        camera = CAMERAS.build(config.camera)
         ending.callback(camera.close)
         ending.enter_context(report_floods(config.doors, lambda line: _say(config.robot, line)))
         link = ending.enter_context(

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from sightline.operator_side.config.loading import load_service
-from sightline.robot_side.plugins import build_device
+from sightline.robot_side.plugins import DRIVES
 from sightline.robot_side.ports import WheelAngles
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess, Vision
@@ -25,7 +25,7 @@ def test_the_robot_of_your_own_drives(tmp_path, monkeypatch):
 
 def test_the_drive_of_your_own_is_a_drive(tmp_path):
     config = load_service("robot", file=str(ROOT / "examples/my_robot.toml"), environ={}).config
-    drive = build_device("drives", config.drive)
+    drive = DRIVES.build(config.drive)
     drive.set(10.0, -10.0)
     first = drive.wheels()
     assert isinstance(first, WheelAngles)

@@ -59,8 +59,8 @@ def test_a_class_of_the_folder_comes_after_all_that_is_installed(folder, monkeyp
     before = list(sys.path)
     monkeypatch.setattr(sys, "path", list(before))
     choice = PluginChoice(kind="my_camera:MyCamera", options={"path": "pictures"})
-    plugins.load_device("cameras", choice)
-    plugins.load_device("cameras", choice)
+    plugins.CAMERAS.load(choice)
+    plugins.CAMERAS.load(choice)
     assert sys.path == [*before, str(folder)]
 
 

@@ -17,7 +17,7 @@ from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import Twist
 from sightline.robot_side.hardware.gpio import DutyTable, GpioDrive, table_of, table_text
 from sightline.robot_side.kinematics import DiffDriveConfig, wheel_speeds
-from sightline.robot_side.plugins import load_device
+from sightline.robot_side.plugins import DRIVES
 from tests.contracts.drives import check_drive
 from tests.fixtures.gpio import LEFT, RIGHT, NotingPin, both_ways, config
 
@@ -119,7 +119,7 @@ def test_the_radius_comes_from_the_robots_own_wheels():
 def test_the_cars_file_is_valid_and_drives_as_the_write_up_did(board):
     """60 % straight ahead and 40 % turning on the spot, at the limits of the file."""
     robot = load_service("robot", file=str(ROOT / "examples/raspberry-car.toml"), environ={}).config
-    plugin, options = load_device("drives", robot.motors)
+    plugin, options = DRIVES.load(robot.motors)
     assert options.pins == (10, 9, 8, 7) and options.pwm_hz == 2000
     drive, limits = plugin(options), robot.safety
     straight = Twist(linear_mps=limits.max_linear_mps, angular_rad_s=0.0)

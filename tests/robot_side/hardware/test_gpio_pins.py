@@ -17,7 +17,7 @@ from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.robot_side.hardware import gpio as gpio_pins
 from sightline.robot_side.hardware import gpio_low
 from sightline.robot_side.hardware.gpio import GpioDrive
-from sightline.robot_side.plugins import load_device
+from sightline.robot_side.plugins import DRIVES
 from tests.fixtures.gpio import NotingPin, config
 
 ROOT = Path(__file__).parent.parent.parent.parent
@@ -145,6 +145,6 @@ def test_the_drop_in_puts_the_examples_pins_low_first_and_keeps_the_units_own_co
     own = next(line for line in (systemd / "sightline-robot.service").read_text().splitlines() if "StopPost" in line)
     module, *numbers = lines[2].partition(" -m ")[2].split()
     car = load_service("robot", file=str(ROOT / "examples/raspberry-car.toml"), environ={}).config
-    _, options = load_device("drives", car.motors)
+    _, options = DRIVES.load(car.motors)
     assert lines[:2] == ["[Service]", "ExecStopPost="] and lines[3] == own
     assert module == gpio_low.__name__ and [int(text) for text in numbers] == [*options.pins, *options.enable_pins]

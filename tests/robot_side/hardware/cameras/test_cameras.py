@@ -6,7 +6,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice
 from sightline.robot_side.hardware.cameras.picamera import PiCamera
 from sightline.robot_side.hardware.cameras.v4l2 import V4l2Camera
-from sightline.robot_side.plugins import build_device
+from sightline.robot_side.plugins import CAMERAS
 from tests.contracts.cameras import check_camera
 from tests.fixtures.cameras import FakeDevice, install_fake_picamera2, jpeg, video
 
@@ -21,17 +21,17 @@ def folder_of_pictures(tmp_path):
 
 def test_folder(tmp_path):
     options = {"path": str(folder_of_pictures(tmp_path))}
-    check_camera(lambda: build_device("cameras", PluginChoice(kind="folder", options=options)))
+    check_camera(lambda: CAMERAS.build(PluginChoice(kind="folder", options=options)))
 
 
 def test_still(tmp_path):
     options = {"path": str(folder_of_pictures(tmp_path) / "010.jpg")}
-    check_camera(lambda: build_device("cameras", PluginChoice(kind="still", options=options)))
+    check_camera(lambda: CAMERAS.build(PluginChoice(kind="still", options=options)))
 
 
 def test_video(tmp_path):
     options = {"path": str(video(tmp_path / "film.avi"))}
-    check_camera(lambda: build_device("cameras", PluginChoice(kind="video", options=options)))
+    check_camera(lambda: CAMERAS.build(PluginChoice(kind="video", options=options)))
 
 
 @pytest.mark.parametrize("pixel_format", ["MJPG", "YUYV"])
@@ -65,7 +65,7 @@ def test_only_what_can_change_by_itself_is_live(tmp_path):
     folder = folder_of_pictures(tmp_path)
     film = video(tmp_path / "film.avi")
     for kind, path in (("folder", folder), ("still", folder / "010.jpg"), ("video", film)):
-        assert build_device("cameras", PluginChoice(kind=kind, options={"path": str(path)})).live is False
+        assert CAMERAS.build(PluginChoice(kind=kind, options={"path": str(path)})).live is False
     assert V4l2Camera.live is True
     assert PiCamera.live is True
 
@@ -73,5 +73,5 @@ def test_only_what_can_change_by_itself_is_live(tmp_path):
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_option_that_is_none_is_named(kind):
     with pytest.raises(ConfigError, match=r"option 'colour'"):
-        build_device("cameras", PluginChoice(kind=kind, options={"path": ".", "colour": "red"} if kind in KINDS[:3]
+        CAMERAS.build(PluginChoice(kind=kind, options={"path": ".", "colour": "red"} if kind in KINDS[:3]
                                       else {"colour": "red"}))

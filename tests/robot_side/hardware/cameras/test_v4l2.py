@@ -15,7 +15,7 @@ from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.robot_side.config import PluginChoice
 from sightline.robot_side.hardware.cameras.timing import CaptureClock, Clocks
 from sightline.robot_side.hardware.cameras.v4l2 import V4l2Camera, check_device, device_owner, open_error, whole_jpeg
-from sightline.robot_side.plugins import build_device
+from sightline.robot_side.plugins import CAMERAS
 from tests.contracts.cameras import next_picture
 from tests.fixtures.cameras import FakeDevice, jpeg
 
@@ -264,7 +264,7 @@ def test_a_camera_frozen_from_the_start_is_no_camera(opened):
 
 def test_absent_device_lists_what_there_is(tmp_path):
     with pytest.raises(HardwareError, match=r"video9 is not there \((there are|no /dev/video\*)"):
-        build_device("cameras", PluginChoice(kind="v4l2", options={"device": str(tmp_path / "video9")}))
+        CAMERAS.build(PluginChoice(kind="v4l2", options={"device": str(tmp_path / "video9")}))
 
 
 def test_a_plain_file_is_no_camera(tmp_path):
@@ -275,7 +275,7 @@ def test_a_plain_file_is_no_camera(tmp_path):
 
 def test_a_device_that_is_no_camera_does_not_open():
     with pytest.raises(HardwareError, match=r"/dev/full does not open"):
-        build_device("cameras", PluginChoice(kind="v4l2", options={"device": "/dev/full"}))
+        CAMERAS.build(PluginChoice(kind="v4l2", options={"device": "/dev/full"}))
 
 
 def test_no_permission_names_the_group_and_the_command():
