@@ -58,7 +58,7 @@ class Ranges:
 
 
 class Camera(Protocol):
-    """Gives JPEGs. A frame is captured only when `read` asks for one.
+    """Gives JPEGs. A frame is captured only when `read` is called.
 
     `live` is False for a source that may repeat a picture (files); a live one that does so is taken as frozen.
     """

@@ -1,5 +1,10 @@
-"""The table of device groups: each row stands in the configuration, in pyproject.toml and in the documentation."""
+"""The table of device groups: each row stands in the configuration, in pyproject.toml and in docs/configuration.md.
 
+`python -m tests.robot_side.test_plugins` writes the page's table.
+"""
+
+import inspect
+import re
 import tomllib
 from pathlib import Path
 
@@ -11,6 +16,8 @@ from sightline.robot_side.plugins import DEVICE_GROUPS
 
 ROOT = Path(__file__).parent.parent.parent
 ENTRY_POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
+PAGE = ROOT / "docs" / "configuration.md"
+MARKS = re.compile(r"(<!-- generated: devices[^\n]*-->\n).*?(<!-- /generated -->)", re.DOTALL)
 OF_DETECTION = {"sightline.detectors", "sightline.missions"}
 
 
@@ -22,10 +29,28 @@ def test_the_table_the_configuration_and_the_entry_points_name_the_same_groups()
 
 
 @pytest.mark.parametrize("group", DEVICE_GROUPS, ids=lambda group: group.key)
-def test_each_built_in_device_has_what_its_port_demands_and_the_page_names_its_group(group):
+def test_each_built_in_device_has_what_its_port_demands(group):
     demanded = {name for name, value in vars(group.port).items() if callable(value) and not name.startswith("_")}
     assert demanded >= {"close"}
     for kind in ENTRY_POINTS[group.entry_points]:
         plugin = PluginRegistry(group.key, group.entry_points).load(kind)
         assert [name for name in sorted(demanded) if not callable(getattr(plugin, name, None))] == [], kind
-    assert f"`{group.entry_points}`" in (ROOT / "docs" / "configuration.md").read_text()
+
+
+def page_with_table(text: str) -> str:
+    """The page with the table of now: one row per kind of device."""
+    rows = ["| key | what it is | entry points | comes with Sightline |", "|---" * 4 + "|"]
+    for group in DEVICE_GROUPS:
+        about = inspect.getdoc(group.port).splitlines()[0]
+        kinds = ", ".join(f"`{kind}`" for kind in ENTRY_POINTS[group.entry_points])
+        rows.append(f"| `{group.key}` | {about} | `{group.entry_points}` | {kinds} |")
+    return MARKS.sub(lambda marks: marks[1] + "\n".join(rows) + "\n" + marks[2], text)
+
+
+def test_the_page_shows_the_table_of_the_code():
+    assert MARKS.search(PAGE.read_text())
+    assert page_with_table(PAGE.read_text()) == PAGE.read_text()
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page_with_table(PAGE.read_text()))
