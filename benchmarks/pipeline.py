@@ -18,6 +18,7 @@ from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.onnx.detector import OnnxDetector, read_onnx_model
 from sightline.vision_side.detect.onnx.tensors import fit_picture
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame
+from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.pipeline import Frame, Pipeline
 
 BOUNDS_US = {(320, 240): 350.0, (640, 480): 800.0}
@@ -93,14 +94,15 @@ def time_learned(frames: int = 600) -> LearnedTime:
 
 def _time_size(size: tuple[int, int], frames: int, paced_frames: int) -> StepTime:
     pictures = _pictures(*size)
-    pipeline, decoder = Pipeline(VisionConfig(), _camera(*size)), Decoder(*size, size[0] * size[1])
+    config, decoder = VisionConfig(), Decoder(*size, size[0] * size[1])
+    pipeline = Pipeline(config, _camera(*size), configured_detector(config))
     source = _frames(pictures)
     for _ in range(_WARM_UP):
         phase = pipeline.step(next(source)).seen.phase
     hot_us = _took_us(pipeline.step, (next(source) for _ in range(frames)))
     paced_us = median(_took_us(pipeline.step, _paced(source, paced_frames)))
     decode_us = _alone(_took_us(decoder.decode, islice(cycle(pictures), frames)))
-    hsv = HsvDetector(VisionConfig().hsv)
+    hsv = HsvDetector(config.hsv)
     hsv_us = _took_us(lambda jpeg: hsv.detect(decoder.decode(jpeg)), islice(cycle(pictures), frames))
     return StepTime(*size, len(pictures[0]), median(hot_us), _alone(hot_us), paced_us, decode_us, median(hsv_us),
                     _alone(hsv_us), BOUNDS_US[size], phase)

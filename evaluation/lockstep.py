@@ -85,7 +85,7 @@ class Lockstep:
         self._robot_link.subscribe(ACK, lambda message: self._sending.on_ack(message, self._now_us))
         self._vision_link = self.network.link(robot.robot, role=SOURCE)
         self._frames: LatestSlot[Message] = self._vision_link.latest(FRAME)
-        self._pipeline = Pipeline(vision, world.camera_model, eyes=configured_detector(vision))
+        self._pipeline = Pipeline(vision, world.camera_model, configured_detector(vision))
         self._scanned = self._vision_link.latest(SCAN) if self._pipeline.mission.wants_scan else None
         self._labels = Labels(vision.boxes, world.camera_model) if vision.detector.kind == "boxes" else None
         self._computed: deque[tuple[int, Message]] = deque(maxlen=1)
@@ -109,8 +109,8 @@ class Lockstep:
 
     def close(self) -> None:
         """Hear what the detector has to say, and let go of it."""
-        self.run.news += notices_of(self._pipeline.eyes)
-        close_detector(self._pipeline.eyes)
+        self.run.news += notices_of(self._pipeline.detector)
+        close_detector(self._pipeline.detector)
 
     # --- robot ---------------------------------------------------------------------------------------------------
 

@@ -8,16 +8,8 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, RequestId, ScanHeader, Twist
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder, Picture
-from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.plugin_calls import checked_results
-from sightline.vision_side.detect.port import (
-    NO_DEADLINE,
-    DetectFrame,
-    Detection,
-    DetectionResult,
-    Detector,
-    PictureDetector,
-)
+from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Detector
 from sightline.vision_side.missions.port import Plan, RangeScan, View
 from sightline.vision_side.missions.registry import MissionSpec, configured_mission
 from sightline.vision_side.missions.switch import MissionSwitch
@@ -70,22 +62,15 @@ class Pipeline:
     """One robot's pictures with one camera model. A deterministic function of what it is given, in that order."""
 
     def __init__(
-        self,
-        config: VisionConfig,
-        camera: CameraModel,
-        detector: PictureDetector | None = None,
-        chosen: MissionSpec | None = None,
-        eyes: Detector | None = None,
+        self, config: VisionConfig, camera: CameraModel, detector: Detector, chosen: MissionSpec | None = None
     ) -> None:
-        """`chosen` is the mission to begin with, that of `config` if None; `eyes` look in place of `detector`.
+        """`chosen` is the mission to begin with, that of `config` if None.
 
         Raises ConfigError for a mission that there is not.
         """
         self._config = config
         self._camera = camera
-        self._own_eyes = detector is None
-        self._detector = detector or HsvDetector(config.hsv)
-        self._eyes = eyes
+        self.detector = detector
         self.looked: DetectionResult | None = None
         self._decoder = Decoder(camera.width_px, camera.height_px, config.max_pixels)
         self._first = chosen or configured_mission(config)
@@ -111,16 +96,6 @@ class Pipeline:
         """Who asked for it; None for the one it began with."""
         return self._asked
 
-    @property
-    def detector(self) -> PictureDetector:
-        """What looks where there are no `eyes`."""
-        return self._detector
-
-    @property
-    def eyes(self) -> Detector | None:
-        """What looks in place of the pipeline's own detector."""
-        return self._eyes
-
     def switch(self, chosen: MissionSpec, asked: RequestId) -> None:
         """From the next frame on come to rest, then carry out `chosen`; a new session of the robot ends it."""
         self._asked = asked
@@ -138,8 +113,7 @@ class Pipeline:
 
     def with_camera(self, camera: CameraModel) -> "Pipeline":
         """A new pipeline for another camera of the same robot; what somebody asked for goes on."""
-        detector = None if self._own_eyes else self._detector
-        after = Pipeline(self._config, camera, detector, self._first, self._eyes)
+        after = Pipeline(self._config, camera, self.detector, self._first)
         after._scan = self._scan
         if self._asked is not None:
             after._session, after._asked = self._session, self._asked
@@ -154,10 +128,8 @@ class Pipeline:
             picture = self._decoder.decode(frame.jpeg)
         except WireError as error:
             return self._skip(error.reason, error.detail)
-        if self._eyes is None:
-            return self._answer(frame.header, self._detector.detect(picture), picture)
         shown = DetectFrame(self._config.robot, frame.header, frame.jpeg, self._decoder, picture)
-        (result,) = checked_results(self._eyes, [shown], frame.deadline_us)
+        (result,) = checked_results(self.detector, [shown], frame.deadline_us)
         if isinstance(result, str):
             return self._skip(NO_ANSWER, result, "no answer")
         self.looked = result

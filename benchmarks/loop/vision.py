@@ -5,7 +5,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -15,49 +15,50 @@ from sightline.benchmarks.loop.figures import MAX_FPS, LoopSetting
 from sightline.benchmarks.loop.pictures import camera_of
 from sightline.protocol.channels import MAX_HEADER_BYTES
 from sightline.protocol.codec import decode
-from sightline.protocol.messages import CameraModel, FrameHeader
+from sightline.protocol.messages import FrameHeader
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.decode import Picture
-from sightline.vision_side.detect.color.hsv import HsvDetector
-from sightline.vision_side.detect.port import Detection, PictureDetector
+from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
+from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline
 from sightline.vision_side.serving.service import Service
 
 
-class SlowDetector:
+class DelayedDetector:
     """A detector that takes longer: it waits `delay_s`, as for an accelerator, and then works for at least `busy_s`.
 
     It works by detecting the same again and again, as the same code on a slower processor.
     """
 
-    def __init__(self, detector: PictureDetector, delay_s: float, busy_s: float) -> None:
+    def __init__(self, detector: Detector, delay_s: float, busy_s: float) -> None:
         self._detector, self._delay_s, self._busy_s = detector, delay_s, busy_s
 
-    def detect(self, picture: Picture) -> tuple[Detection, ...]:
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """As the detector inside, later."""
         if self._delay_s:
             time.sleep(self._delay_s)
         until_s = time.perf_counter() + self._busy_s
-        found = self._detector.detect(picture)
+        results = self._detector.detect(frames, deadline_us)
         while time.perf_counter() < until_s:
-            found = self._detector.detect(picture)
-        return found
+            results = self._detector.detect(frames, deadline_us)
+        return results
 
 
-def build_pipeline(config: VisionConfig, camera: CameraModel, delay_ms: float, busy_ms: float) -> Pipeline:
-    """The services' own pipeline; unless it is to be slow, its detector is the services' own too."""
-    slow = SlowDetector(HsvDetector(config.hsv), delay_ms / 1000, busy_ms / 1000) if delay_ms or busy_ms else None
-    return Pipeline(config, camera, slow)
+def delayed_detector(config: VisionConfig, delay_ms: float, busy_ms: float) -> Detector:
+    """The services' own detector, unless it is to be slow."""
+    detector = configured_detector(config)
+    return DelayedDetector(detector, delay_ms / 1000, busy_ms / 1000) if delay_ms or busy_ms else detector
 
 
 class PipelineVision:
     """Pictures in, `linear|angular` out."""
 
     def __init__(self, width_px: int, height_px: int, delay_ms: float = 0.0, busy_ms: float = 0.0) -> None:
-        self._pipeline = build_pipeline(VisionConfig(), camera_of(width_px, height_px), delay_ms, busy_ms)
+        config = VisionConfig()
+        detector = delayed_detector(config, delay_ms, busy_ms)
+        self._pipeline = Pipeline(config, camera_of(width_px, height_px), detector)
         self._seq = 0
 
     def answer(self, t_us: int, jpeg: bytes) -> str:
@@ -122,14 +123,8 @@ class TappedService(Service):
     """Remembers the header of every frame it was given."""
 
     def __init__(self, config: VisionConfig, link: Link, delay_ms: float, busy_ms: float) -> None:
-        self._delay_ms, self._busy_ms = delay_ms, busy_ms
-        super().__init__(config, link, _say)
+        super().__init__(config, link, _say, delayed_detector(config, delay_ms, busy_ms))
         self.headers: list[bytes] = []
-
-    def _use(self, camera: CameraModel) -> None:
-        super()._use(camera)
-        if self._delay_ms or self._busy_ms:
-            self._pipeline = build_pipeline(self._config, camera, self._delay_ms, self._busy_ms)
 
     def _frame(self, message: Message, started_ns: int) -> None:
         self.headers.append(message.header)

@@ -79,10 +79,10 @@ def serve(
     loaded: Any = given.config.model_copy(update=everybody)
     with needs("vision"):
         from sightline.vision_side.detect.plugin_calls import close_detector
-        from sightline.vision_side.detect.registry import build_detector, configured_detector
+        from sightline.vision_side.detect.registry import configured_detector
         from sightline.vision_side.serving.detector_service import ServingOptions, run
 
-        detector = configured_detector(loaded) or build_detector("hsv", {}, loaded)
+        detector = configured_detector(loaded)
         try:
             return run(loaded, detector, ServingOptions(name, round(deadline_ms * 1000), max_batch, loaded.max_pixels))
         finally:

@@ -105,7 +105,7 @@ def replay_steps(path: Path) -> Iterator[Step]:
 def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
     """Takes out of `answers` what it uses; what is left cites frames that were not recorded."""
     config = _vision_config(path)
-    camera, eyes = _first_camera(path), configured_detector(config)
+    camera, detector = _first_camera(path), configured_detector(config)
     pipelines: dict[str, Pipeline] = {}
     for recorded in read_recording(path):
         message = recorded.message
@@ -121,7 +121,7 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
             if sent is None and header.session not in pipelines:
                 continue  # before its first twist vision may not have had the camera's model: it only acknowledged
             if header.session not in pipelines:
-                pipelines[header.session] = Pipeline(config, camera, eyes=eyes)
+                pipelines[header.session] = Pipeline(config, camera, detector)
             pipeline = pipelines[header.session]
             _give(pipeline, header, answers, config)
             if config.detector.kind == "boxes":

@@ -13,6 +13,7 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import STILL, AnswerHeader, FrameHeader, RequestId
 from sightline.protocol.text import format_twist
 from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header, encode_answer
 from tests.fixtures.vision.vision import Rig, camera, eight, jpeg_of, scene
 
@@ -27,7 +28,7 @@ def header(seq: int, session: str = "0000abcd", t_us: int | None = None) -> Fram
 
 
 def pipeline() -> Pipeline:
-    return Pipeline(VisionConfig(), MODEL)
+    return Pipeline(VisionConfig(), MODEL, configured_detector(VisionConfig()))
 
 
 def phases(pictures: list[bytes]) -> list[PipelineAnswer]:

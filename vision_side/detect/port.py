@@ -152,12 +152,12 @@ class Detector(Protocol):
         ...
 
 
-class PictureDetector(Protocol):
-    """Finds objects in one picture that is decoded already: what most detectors are inside."""
+class NoDetector:
+    """The detector where boxes are published by another service: no frame gets an answer here."""
 
-    def detect(self, picture: Picture) -> tuple[Detection, ...]:
-        """What is in `picture`, best first. Empty means "saw nothing"; raises nothing for any picture."""
-        ...
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
+        """None for each."""
+        return [None] * len(frames)
 
 
 def result_of(

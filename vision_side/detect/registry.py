@@ -14,7 +14,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
 from sightline.vision_side.detect.plugin_calls import plugin_guard
-from sightline.vision_side.detect.port import Detector
+from sightline.vision_side.detect.port import Detector, NoDetector
 from sightline.vision_side.detect.remote.client import EXAMPLES
 from sightline.vision_side.missions.registry import check_missions, configured_mission
 from sightline.vision_side.plugins import shared_options
@@ -27,26 +27,17 @@ _MOST_NAMED: Final = 12
 _OF_DETECTOR: Final = ("device", "deadline_s")
 
 
-def is_plain(config: VisionConfig) -> bool:
-    """Whether the colour detector alone looks, which needs nothing around it."""
-    one = config.detector
-    return one.kind == "hsv" and not (one.options or one.labels or one.only_colour or one.tracked or one.fallback
-                                      or one.shadow)
-
-
-def configured_detector(config: VisionConfig) -> Detector | None:
-    """The detector of `config.detector` with all that is around it; None where the pipeline's own or nobody looks.
+def configured_detector(config: VisionConfig) -> Detector:
+    """The detector of `config.detector` with all that is around it.
 
     Raises ConfigError for an unknown one or a wrong option, HardwareError for a device that is not there.
     """
     one = config.detector
     if one.kind == BOXES:
         _check_no_detector(config)
-        return None
+        return NoDetector()
     check_device(config)
     _check_fallback(config)
-    if is_plain(config):
-        return None
     detector = build_detector(one.kind, one.options, config)
     if one.fallback:
         from sightline.vision_side.detect.remote.fallback import Fallback

@@ -1,4 +1,4 @@
-"""Results of picture detectors with the time that they took. Shell (a clock)."""
+"""Times what looks at pictures, and makes results of what it finds. Shell (a clock)."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -10,7 +10,6 @@ from sightline.vision_side.detect.port import (
     Detection,
     DetectionResult,
     Maker,
-    PictureDetector,
     clipped,
     result_of,
 )
@@ -46,18 +45,3 @@ def timed(
 ) -> DetectionResult | None:
     """What `look` finds in the picture of `frame`, and how long it looked; None for what is no picture."""
     return timed_together([frame], maker, lambda pictures: [look(one) for one in pictures])[0]
-
-
-class TimedDetector:
-    """A detector of one picture, and how long it looked the last time; None before the first."""
-
-    def __init__(self, inner: PictureDetector) -> None:
-        self._inner = inner
-        self.took_us: int | None = None
-
-    def detect(self, picture: Picture) -> tuple[Detection, ...]:
-        """What the one inside finds."""
-        started_ns = time.perf_counter_ns()
-        found = self._inner.detect(picture)
-        self.took_us = (time.perf_counter_ns() - started_ns) // 1000
-        return found

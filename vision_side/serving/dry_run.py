@@ -86,7 +86,7 @@ class AckingService(Service):
     def __init__(self, config: VisionConfig, link: Link, say: LogLine) -> None:
         super().__init__(config, link, say)
         self._dispatch = ScansOnly(config, link, self._tell, self._refuse)
-        self._dispatch.tell_news(self._eyes)
+        self._dispatch.tell_news(self._detector)
         self._telling = ProgressPrinter(say)
 
     def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
@@ -107,7 +107,7 @@ class ScansOnly(MissionChannel):
     ) -> None:
         """Say only what the detector has to say."""
         if pipeline is not None:
-            self.tell_news(pipeline.eyes)
+            self.tell_news(pipeline.detector)
 
 
 class LocalRun:
@@ -116,7 +116,7 @@ class LocalRun:
     def __init__(self, config: VisionConfig, camera: LocalCamera, say: LogLine) -> None:
         self._camera, self._say = camera, say
         self._patience_us = round(config.detector.deadline_s * 1e6)
-        self._pipeline = Pipeline(config, camera.model, eyes=configured_detector(config))
+        self._pipeline = Pipeline(config, camera.model, configured_detector(config))
         self._telling = ProgressPrinter(say)
         self._tell_news()
         self._session = secrets.token_hex(4)
@@ -140,7 +140,7 @@ class LocalRun:
             self._tell_news()
 
     def _tell_news(self) -> None:
-        for line in notices_of(self._pipeline.eyes):
+        for line in notices_of(self._pipeline.detector):
             self._say(f"vision: {line}")
 
     def _complain(self, fault: str) -> None:

@@ -39,15 +39,17 @@ class _NotifyingLink(LinkWrapper):
 class Fleet:
     """A service for each robot that is heard. One turn gives every robot with something new its turn.
 
-    Where they look through eyes elsewhere, each robot has its own, on a thread of its own: an answer that one of them
-    waits for keeps no other waiting.
+    With a detector that waits for another service, each robot has its own detector and thread: an answer that one of
+    them waits for keeps no other waiting.
     """
 
-    def __init__(self, config: VisionConfig, fleet_link: FleetLink, say: LogLine, eyes: Detector | None = None) -> None:
-        """`eyes` look for every robot, or for the first of those with their own; None for those of `config`."""
+    def __init__(
+        self, config: VisionConfig, fleet_link: FleetLink, say: LogLine, detector: Detector | None = None
+    ) -> None:
+        """`detector`, that of `config` if None, serves every robot, or the first of those that each have their own."""
         self._config, self._fleet_link, self._say = config, fleet_link, say
         self._apart = waits_for_service(config)
-        self._eyes = eyes or configured_detector(config)
+        self._detector = detector or configured_detector(config)
         self._bell, self._ending = threading.Event(), threading.Event()
         self._threads: list[threading.Thread] = []
         self._failed: Exception | None = None
@@ -88,15 +90,16 @@ class Fleet:
         config = self._config.model_copy(update={"robot": robot})
         link = self._fleet_link.link(robot)
         if not self._apart:
-            self.services[robot] = open_service(config, _NotifyingLink(link, self._bell), self._of(robot), self._eyes)
+            notifying = _NotifyingLink(link, self._bell)
+            self.services[robot] = open_service(config, notifying, self._of(robot), self._detector)
             return
         own = configured_detector(config) if self.services else None
-        service = self.services[robot] = open_service(config, link, self._of(robot), own or self._eyes)
+        service = self.services[robot] = open_service(config, link, self._of(robot), own or self._detector)
         self._threads.append(threading.Thread(target=self._serve_one, args=(service, own), name=robot, daemon=True))
         self._threads[-1].start()
 
     def _serve_one(self, service: Service, own: Detector | None) -> None:
-        """What a robot's thread does, its `own` eyes closed at its end. What fails ends all."""
+        """What a robot's thread does, its `own` detector closed at its end. What fails ends all."""
         try:
             with ExitStack() as ending:
                 ending.callback(close_detector, own)
@@ -107,7 +110,7 @@ class Fleet:
             self._bell.set()
 
     def _end(self) -> None:
-        """Robots' threads end together; one whose eyes hang is left behind."""
+        """Robots' threads end together; one whose detector hangs is left behind."""
         self._ending.set()
         until_s = time.monotonic() + _LONGEST_WAIT_S + self._config.detector.deadline_s
         for thread in self._threads:

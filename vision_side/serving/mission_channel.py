@@ -26,7 +26,6 @@ from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.detect.plugin_calls import notices_of
 from sightline.vision_side.detect.port import DetectionResult, Detector
 from sightline.vision_side.detect.shadow import ShadowDetector
-from sightline.vision_side.detect.timing import TimedDetector
 from sightline.vision_side.missions.ranges import decode_scan
 from sightline.vision_side.missions.registry import MissionSpec, configured_mission, requested_mission
 from sightline.vision_side.pipeline import SOURCE, Observation, Pipeline
@@ -123,12 +122,9 @@ class Reporter:
 
     def due(
         self, now_s: float, mission: str, seen: Observation, asked: RequestId | None, refused: str, *,
-        looked: DetectionResult | None = None, beside: str = "", took_us: int | None = None,
+        looked: DetectionResult | None = None, beside: str = "",
     ) -> MissionReport | None:
-        """The report, if it is time for one. `looked` is the detector's newest result, `beside` who else looks.
-
-        `took_us` is how long plain colour looked, which gives no result.
-        """
+        """The report, if it is time for one. `looked` is the detector's newest result, `beside` who else looks."""
         state = (mission, seen.phase, seen.done, asked, refused)
         gap_s = LEAST_GAP_S if state != self._said else PERIOD_S
         if self._said is not None and now_s - self._said_s < gap_s:
@@ -137,16 +133,16 @@ class Reporter:
         return MissionReport(
             mission=mission[:_NAME_LENGTH], phase=_line(seen.phase, _PHASE_LENGTH),
             note=_line(seen.note, _TEXT_LENGTH), done=seen.done,
-            asked=asked, refused=refused[:_TEXT_LENGTH], **self._eyes(looked, beside, took_us),
+            asked=asked, refused=refused[:_TEXT_LENGTH], **self._detector_fields(looked, beside),
         )
 
-    def _eyes(self, looked: DetectionResult | None, beside: str, took_us: int | None) -> dict[str, Any]:
+    def _detector_fields(self, looked: DetectionResult | None, beside: str) -> dict[str, Any]:
         """Who looks, on what, how fast."""
         name = looked.detector if looked else self._detector
         more = f", {beside}" if beside else ""
         said = {"detector": _line(name[: _NAME_LENGTH - len(more)] + more, _NAME_LENGTH)}
         if looked is None:
-            return {**said, "device": self._device, "inference_us": took_us}
+            return {**said, "device": self._device}
         return {**said, "device": _line(looked.device, _DEVICE_LENGTH), "model": _line(looked.model_hash, _NAME_LENGTH),
                 "inference_us": max(0, looked.compute_us)}
 
@@ -198,16 +194,13 @@ class MissionChannel:
         asked, refused = self._desk.asked, self._desk.refused
         if pipeline is not None and asked is not None and asked not in (pipeline.asked, self._swapped):
             refused = refused or _ENDED
-        eyes, looked = (pipeline.eyes, pipeline.looked) if pipeline else (None, None)
-        self.tell_news(eyes)
+        detector, looked = (pipeline.detector, pipeline.looked) if pipeline else (None, None)
+        self.tell_news(detector)
         beside = ""
-        if pipeline is not None and isinstance(eyes, ShadowDetector):
-            eyes.go_by(self._link.robot, pipeline.mission.goes_by)
-            beside = eyes.shadow_text(self._link.robot)
-        plain = pipeline.detector if pipeline else None
-        took_us = plain.took_us if isinstance(plain, TimedDetector) else None
-        report = self._reporter.due(now_s, self._mission, seen, asked, refused, looked=looked, beside=beside,
-                                    took_us=took_us)
+        if pipeline is not None and isinstance(detector, ShadowDetector):
+            detector.go_by(self._link.robot, pipeline.mission.goes_by)
+            beside = detector.shadow_text(self._link.robot)
+        report = self._reporter.due(now_s, self._mission, seen, asked, refused, looked=looked, beside=beside)
         if report is None:
             return
         self._reports += 1
@@ -217,9 +210,9 @@ class MissionChannel:
         header = DetectionsHeader(source=SOURCE, session=self._session, seq=self._reports, echo=echo)
         self._link.publish(REPORT, encode(header), encode(report), SOURCE)
 
-    def tell_news(self, eyes: Detector | None) -> None:
+    def tell_news(self, detector: Detector | None) -> None:
         """What the detector has to say."""
-        for line in notices_of(eyes):
+        for line in notices_of(detector):
             self._tell("detector", line)
 
     def _choose(self, message: Message, pipeline: Pipeline, frame: FrameHeader) -> None:
@@ -229,7 +222,7 @@ class MissionChannel:
             self._refuse(error)
             return
         if isinstance(chosen, DetectorSwap):
-            self._swap(chosen, pipeline.eyes, message.source)
+            self._swap(chosen, pipeline.detector, message.source)
         elif chosen is not None and self._desk.asked is not None:
             pipeline.meet(frame.session)
             pipeline.switch(chosen, self._desk.asked)
@@ -237,12 +230,12 @@ class MissionChannel:
         elif self._desk.refused:
             self._tell("mission", f"a mission of {message.source} is refused: {self._desk.refused}")
 
-    def _swap(self, swap: DetectorSwap, eyes: Detector | None, source: str) -> None:
+    def _swap(self, swap: DetectorSwap, detector: Detector, source: str) -> None:
         """Let the other detector drive."""
         self._swapped = self._desk.asked
         refused = "no detector looks on; start vision with --shadow NAME"
-        if isinstance(eyes, ShadowDetector):
-            refused = eyes.promote(self._link.robot, swap.shadow)
+        if isinstance(detector, ShadowDetector):
+            refused = detector.promote(self._link.robot, swap.shadow)
         self._desk.refused = refused
         who = "the shadow drives" if swap.shadow else "the shadow looks on"
         self._tell("swap", f"{source}: {refused or who}")

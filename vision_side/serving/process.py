@@ -45,16 +45,16 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
     from sightline.protocol.transports.zenoh.session import report_floods
 
     configured_mission(config)  # a mission that there is not is said before anything is opened
-    ending, eyes = threading.Event(), configured_detector(config)
+    ending, detector = threading.Event(), configured_detector(config)
     run_it = _run_fleet if set("*?") & set(config.robot) else _run_one
     try:
         with report_floods(config.listen, lambda line: _say(f"vision: {line}")):
-            return run_it(config, ending, observe, eyes)
+            return run_it(config, ending, observe, detector)
     finally:
-        close_detector(eyes)
+        close_detector(detector)
 
 
-def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | None, eyes: Detector | None) -> int:
+def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | None, detector: Detector) -> int:
     from sightline.protocol.transports.open import open_link
 
     opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
@@ -62,11 +62,11 @@ def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | N
     # Signals are caught only from here on: until the link is open, they end the process by themselves.
     with opened as link, ends_on_signal(ending):
         _say(f"vision: looking for robot {config.robot} at {endpoints_text(config)}")
-        serve(config, link, ending, _say, observe, eyes=eyes)
+        serve(config, link, ending, _say, observe, detector=detector)
     return 0
 
 
-def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe | None, eyes: Detector | None) -> int:
+def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe | None, detector: Detector) -> int:
     from sightline.protocol.transports.zenoh.link import open_fleet
     from sightline.vision_side.serving.fleet import Fleet
 
@@ -74,7 +74,7 @@ def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe |
                        max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     with opened as fleet_link, ends_on_signal(ending):
         _say(f"vision: looking for robots {config.robot} at {endpoints_text(config)}")
-        fleet = Fleet(config, fleet_link, _say, eyes)
+        fleet = Fleet(config, fleet_link, _say, detector)
         if observe is not None:
             observe(fleet.counts)
         fleet.serve(ending)
@@ -83,10 +83,10 @@ def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe |
 
 def serve(
     config: VisionConfig, link: Link, ending: threading.Event, say: LogLine, observe: Observe | None = None, *,
-    eyes: Detector | None = None,
+    detector: Detector | None = None,
 ) -> None:
     """Answer frames that come over `link` until `ending` is set."""
-    service = open_service(config, link, say, eyes)
+    service = open_service(config, link, say, detector)
     if observe is not None:
         observe(lambda: [service.counts()])
     while not ending.is_set():

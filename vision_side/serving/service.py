@@ -16,11 +16,9 @@ from sightline.protocol.messages import CameraModel, FrameHeader, Stamp
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.plugin_calls import attach_detector
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.registry import configured_detector
-from sightline.vision_side.detect.timing import TimedDetector
 from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, encode_answer
 from sightline.vision_side.serving.mission_channel import NO_FRAMES, MissionChannel
 from sightline.vision_side.tracking.locate import REMEMBERED, BoxReader
@@ -135,22 +133,20 @@ LogLine = Callable[[str], None]
 Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
 
 
-def open_service(config: VisionConfig, link: Link, say: LogLine, eyes: Detector | None = None) -> "Service":
-    """The service that fits the configured detector, for one robot. `eyes` are that detector, if it is built."""
+def open_service(config: VisionConfig, link: Link, say: LogLine, detector: Detector | None = None) -> "Service":
+    """The service for one robot that fits its detector; `detector` is that of `config` if None."""
     if config.detector.kind == "boxes":
-
-        return BoxesService(config, link, say)
-    return Service(config, link, say, eyes)
+        return BoxesService(config, link, say, detector)
+    return Service(config, link, say, detector)
 
 
 class Service:
     """What is known of the robot on the other end, and the pipeline that fits it."""
 
-    def __init__(self, config: VisionConfig, link: Link, say: LogLine, eyes: Detector | None = None) -> None:
+    def __init__(self, config: VisionConfig, link: Link, say: LogLine, detector: Detector | None = None) -> None:
         self._config, self._link, self._say = config, link, say
-        self._eyes = eyes or configured_detector(config)
-        self._plain = TimedDetector(HsvDetector(config.hsv))
-        attach_detector(self._eyes, link)
+        self._detector = detector or configured_detector(config)
+        attach_detector(self._detector, link)
         self._cameras: LatestSlot[Message] = link.latest(CAMERA)
         self._frames = self._arrivals(link)
         self._camera: CameraModel | None = None
@@ -214,8 +210,7 @@ class Service:
     def _use(self, camera: CameraModel) -> None:
         self._camera = camera
         before = self._pipeline
-        self._pipeline = (before.with_camera(camera) if before
-                          else Pipeline(self._config, camera, self._plain, eyes=self._eyes))
+        self._pipeline = before.with_camera(camera) if before else Pipeline(self._config, camera, self._detector)
         self._counted.clear()
         lens = "calibrated" if camera.calibrated else "not calibrated"
         self._tell("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")
@@ -347,11 +342,11 @@ class BoxesInbox(LatestSlot[Message]):
 class BoxesService(Service):
     """A `Service` whose detector is elsewhere."""
 
-    def __init__(self, config: VisionConfig, link: Link, say: LogLine) -> None:
+    def __init__(self, config: VisionConfig, link: Link, say: LogLine, detector: Detector | None = None) -> None:
         self._inbox = BoxesInbox(config.boxes.source)
         self._reader = BoxReader(config.boxes)
         self._boxes_heard_s = time.monotonic()
-        super().__init__(config, link, say)
+        super().__init__(config, link, say, detector)
 
     def _arrivals(self, link: Link) -> LatestSlot[Message]:
         for channel in (FRAME, DETECTIONS):

@@ -13,6 +13,7 @@ from sightline.protocol.transports.memory import MemoryLink, MemoryNetwork
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.hsv import HsvDetector
+from sightline.vision_side.detect.port import Maker, result_of
 from sightline.vision_side.pipeline import Pipeline, PipelineAnswer
 from sightline.vision_side.serving.service import Service
 
@@ -35,10 +36,10 @@ class RememberingDecoder:
     """Hands on the detections as if they were the picture."""
 
     def __init__(self, camera: CameraModel) -> None:
-        self._size = camera.width_px, camera.height_px
+        self.size_px = camera.width_px, camera.height_px
 
     def decode(self, jpeg):
-        found = _looked_at(*self._size, jpeg)
+        found = _looked_at(*self.size_px, jpeg)
         if isinstance(found, WireError):
             raise WireError(found.reason, found.detail)
         return found
@@ -47,8 +48,8 @@ class RememberingDecoder:
 class RememberingDetector:
     """What the decoder has handed on."""
 
-    def detect(self, picture):
-        return picture
+    def detect(self, frames, deadline_us):
+        return [result_of(frame, frame.picture(), Maker("hsv", device="cpu")) for frame in frames]
 
 
 class VirtualVision(Service):

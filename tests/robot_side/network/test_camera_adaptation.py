@@ -15,6 +15,7 @@ from sightline.robot_side.network.core import CameraAdaptation, NetworkCore
 from sightline.robot_side.network.stream import StreamConfig
 from sightline.robot_side.ports import Picture, scaled_model, scaled_size
 from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.pipeline import Frame, Pipeline
 
 MODEL = CameraModel(
@@ -136,9 +137,13 @@ def frame(seq, jpeg):
     return Frame(FrameHeader(session="0000aaaa", seq=seq, t_us=1_000_000 + seq * 33_333), jpeg)
 
 
+def pipeline_of(model):
+    return Pipeline(VisionConfig(), model.model_copy(update={"distortion": ()}), configured_detector(VisionConfig()))
+
+
 @pytest.mark.parametrize(("known", "shown"), [(MODEL, HALF), (HALF, MODEL)])
 def test_a_picture_of_another_size_than_the_model_is_acknowledged_and_never_ranged(known, shown):
-    pipeline = Pipeline(VisionConfig(), known.model_copy(update={"distortion": ()}))
+    pipeline = pipeline_of(known)
     for seq in range(5):
         pipeline.step(frame(seq, ball(known)))
     answer = pipeline.step(frame(5, ball(shown)))
@@ -150,7 +155,7 @@ def test_a_picture_of_another_size_than_the_model_is_acknowledged_and_never_rang
 def test_the_same_ball_is_as_far_away_at_half_the_size():
     far_m = []
     for model in (MODEL, HALF):
-        pipeline = Pipeline(VisionConfig(), model.model_copy(update={"distortion": ()}))
+        pipeline = pipeline_of(model)
         for seq in range(6):
             answer = pipeline.step(frame(seq, ball(model)))
         far_m.append(answer.seen.distance_m)

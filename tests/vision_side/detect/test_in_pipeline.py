@@ -25,16 +25,15 @@ def frame(seq: int, jpeg: bytes = BALL) -> Frame:
     return Frame(FrameHeader(session="0000abcd", seq=seq, t_us=seq * 33_333), jpeg)
 
 
-def pipeline(eyes, **config: object) -> Pipeline:
-    return Pipeline(VisionConfig(**config), MODEL, eyes=eyes)
+def pipeline(detector, **config: object) -> Pipeline:
+    return Pipeline(VisionConfig(**config), MODEL, detector)
 
 
-def test_the_same_detector_behind_the_port_gives_the_same_twists() -> None:
-    own, other = Pipeline(VisionConfig(), MODEL), pipeline(Hsv(Hsv.Config()))
+def test_the_colour_detector_is_one_like_any_other() -> None:
+    colour = pipeline(Hsv(Hsv.Config()))
     for seq in range(1, 30):
-        jpeg = jpeg_of(scene(MODEL, 1.0 + 0.01 * seq, 0.2, seed=seq))
-        assert own.step(frame(seq, jpeg)).twist == other.step(frame(seq, jpeg)).twist
-    assert other.looked is not None and other.looked.seq == 29 and own.looked is None
+        assert colour.step(frame(seq, jpeg_of(scene(MODEL, 1.0 + 0.01 * seq, 0.2, seed=seq)))).twist is not None
+    assert colour.looked is not None and (colour.looked.seq, colour.looked.detector) == (29, "hsv")
 
 
 def test_saw_nothing_searches_and_no_answer_does_not() -> None:
@@ -209,9 +208,8 @@ def test_the_report_says_who_looks_on_what_and_how_fast() -> None:
     assert said == ("onnx:ball.onnx", "ab12", "cuda", 1234)
 
 
-def test_plain_colour_says_how_long_it_looked_too() -> None:
+def test_the_colour_detector_reports_how_long_it_took() -> None:
     bench = Bench(VisionConfig())
-    assert bench.service._eyes is None
     bench.frame()
     report = bench.report()
     assert (report.detector, report.device) == ("hsv", "cpu")

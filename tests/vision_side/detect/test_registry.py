@@ -16,12 +16,11 @@ from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.detectors import Adaptive, Hsv
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
 from sightline.vision_side.detect.onnx.detector import OnnxDetector
-from sightline.vision_side.detect.port import DetectFrame, result_of
+from sightline.vision_side.detect.port import DetectFrame, NoDetector, result_of
 from sightline.vision_side.detect.registry import (
     REGISTRY,
     build_detector,
     configured_detector,
-    is_plain,
     split_kind,
 )
 from sightline.vision_side.detect.shadow import ShadowDetector
@@ -79,12 +78,11 @@ def test_a_name_and_what_stands_after_it(kind: str, parts: tuple[str, str]) -> N
     assert split_kind(kind) == parts
 
 
-def test_the_plain_colour_detector_needs_nothing_around_it() -> None:
-    assert configured_detector(VisionConfig()) is None
-    assert is_plain(VisionConfig())
+def test_the_configured_detector_always_exists() -> None:
+    assert isinstance(configured_detector(VisionConfig()), Hsv)
     assert isinstance(configured_detector(config(options={"label": "ball"})), Hsv)
     assert isinstance(configured_detector(config(kind="adaptive")), Adaptive)
-    assert configured_detector(config(kind="boxes")) is None
+    assert isinstance(configured_detector(config(kind="boxes")), NoDetector)
 
 
 def test_a_class_of_ones_own_gets_its_options_and_what_vision_knows() -> None:
@@ -97,7 +95,7 @@ def test_a_class_of_ones_own_gets_its_options_and_what_vision_knows() -> None:
 def test_hsv_takes_the_section_of_its_name_with_its_options_over_it() -> None:
     settings = VisionConfig.model_validate({"hsv": {"min_radius_px": 9.0}})
     made = build_detector("hsv", {"hsv": {"max_contours": 2}}, settings)
-    assert (made._eye._config.min_radius_px, made._eye._config.max_contours) == (9.0, 2)
+    assert (made._hsv_detector._config.min_radius_px, made._hsv_detector._config.max_contours) == (9.0, 2)
 
 
 def test_what_is_around_it_is_built_from_the_inside_out() -> None:

@@ -275,9 +275,9 @@ def test_the_configuration_builds_it() -> None:
     try:
         for _ in range(8):
             bench.frame()
-        assert until(lambda: "% agree" in bench.service._eyes.shadow_text("r1") or bench.frame())
+        assert until(lambda: "% agree" in bench.service._detector.shadow_text("r1") or bench.frame())
     finally:
-        bench.service._eyes.close()
+        bench.service._detector.close()
 
 
 def test_grey_pictures_agree_on_nothing() -> None:

@@ -5,6 +5,8 @@ import pytest
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, FrameHeader, RequestId, Twist
 from sightline.vision_side.config import MissionConfig, VisionConfig
+from sightline.vision_side.detect.port import NoDetector
+from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.registry import mission_spec
 from sightline.vision_side.missions.switch import SETTLE_S, MissionSwitch
@@ -124,7 +126,7 @@ def frame(seq, session="0000abcd"):
 
 
 def test_an_answer_names_the_mission_that_was_asked_for_and_a_new_session_ends_it():
-    pipeline = Pipeline(CONFIG, CAMERA)
+    pipeline = Pipeline(CONFIG, CAMERA, configured_detector(CONFIG))
     assert pipeline.step(frame(1)).mission is None
     pipeline.switch(scripted(), ASKED)
     answers = [pipeline.step(frame(seq)) for seq in range(2, 8)]
@@ -135,7 +137,7 @@ def test_an_answer_names_the_mission_that_was_asked_for_and_a_new_session_ends_i
 
 
 def test_what_was_asked_for_goes_on_with_another_camera_and_without_one_needed_as_it_is():
-    pipeline = Pipeline(CONFIG, CAMERA)
+    pipeline = Pipeline(CONFIG, CAMERA, configured_detector(CONFIG))
     pipeline.step(frame(1))
     larger = CAMERA.model_copy(update={"width_px": 640, "height_px": 480})
     assert pipeline.with_camera(larger).mission.name == "follow"
@@ -156,4 +158,4 @@ def test_what_was_asked_for_goes_on_with_another_camera_and_without_one_needed_a
 
 def test_a_pipeline_of_no_mission_is_refused_in_words():
     with pytest.raises(ConfigError, match="did you mean 'goto'"):
-        Pipeline(VisionConfig(mission=MissionConfig(kind="gotto")), CAMERA)
+        Pipeline(VisionConfig(mission=MissionConfig(kind="gotto")), CAMERA, NoDetector())

@@ -224,9 +224,9 @@ class BoxesRig(Rig):
 
     def _answer(self, t_us: int) -> None:
         while self._up and self._up[0][0] + round(self.detect_s * 1e6) <= t_us:
-            _, frame, self._eye.centre = self._up.pop(0)
+            _, frame, self._exact.centre = self._up.pop(0)
             seen = [Detection(one.x1_px, one.y1_px, one.x2_px, one.y2_px, one.score, "ball")
-                    for one in self._eye.detect(None)]
+                    for one in self._exact.look()]
             answer = self.pipeline.follow(frame.header, tuple(seen))
             self._seen = answer.seen
             if answer.twist is not None and self._rng.random() >= self.loss:

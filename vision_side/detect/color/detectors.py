@@ -28,14 +28,14 @@ class Hsv:
     maker = Maker("hsv", device=_CPU)
 
     def __init__(self, config: Config) -> None:
-        self._eye = HsvDetector(config.hsv, config.label)
+        self._hsv_detector = HsvDetector(config.hsv, config.label)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
         """A result for each; it takes well under a millisecond, whatever the deadline."""
         return [timed(frame, self.maker, self._largest) for frame in frames]
 
     def _largest(self, picture: Picture) -> tuple[Detection, ...]:
-        return self._eye.detect(picture)[:MAX_DETECTED_BOXES]
+        return self._hsv_detector.detect(picture)[:MAX_DETECTED_BOXES]
 
 
 class Adaptive:
