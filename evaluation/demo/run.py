@@ -3,7 +3,6 @@
 import math
 import os
 import socket
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -11,12 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Protocol, Self
-
-from rich.console import Console
-from rich.live import Live
-from rich.table import Table
+from typing import Any, Final
 
 from sightline.evaluation.demo.shaped_vision import Shape
 from sightline.evaluation.processes import Processes, terminated_like_interrupted
@@ -27,6 +21,7 @@ from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.operator_side.recording.recorder import Recorder
 from sightline.operator_side.recording.replay import VISION_CONFIG
+from sightline.operator_side.terminal import LiveBlock
 from sightline.protocol.errors import ConfigError, HardwareError, SightlineError
 from sightline.protocol.messages import Status
 from sightline.protocol.transports.open import open_link
@@ -37,96 +32,18 @@ from sightline.sim.truth import Truth
 from sightline.vision_side.detect.registry import BOXES, check_choice
 from sightline.vision_side.missions.registry import configured_mission
 
-REFRESH_S: Final = 0.2
-PLAIN_S: Final = 1.0
 
-
-class Display(Protocol):
-    """Shows a run as it goes."""
-
-    def show(self, at_s: float, status: Status | None, truth: Truth) -> None:
-        """The newest of everything; called as often as one likes."""
-        ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
-
-
-def display(seconds: float, stand_off_m: float) -> Display:
-    """A live block on a terminal, else lines; both on stderr, so that stdout stays for the result."""
-    console = Console(stderr=True)
-    if console.is_terminal:
-        return LiveBlock(console, seconds, stand_off_m)
-    return PlainLines(stand_off_m)
-
-
-def rows(status: Status | None, truth: Truth, stand_off_m: float) -> list[tuple[str, str]]:
-    """What is shown, as (name, value)."""
+def _lines(status: Status | None, truth: Truth, stand_off_m: float) -> list[str]:
     if status is None:
-        return [("robot", "not heard yet")]
+        return ["robot    no status yet"]
+    hidden = "" if truth.visible else ", not visible"
     return [
-        ("state", f"{status.state}: {status.reason}"),
-        ("frames", f"{status.stream.fps:.0f} fps, age {millis(status.frame_age_us)}"),
-        ("wheels", twist_text(status.applied)),
-        ("bearing", f"{math.degrees(truth.bearing_rad):+.1f} deg" + ("" if truth.visible else ", out of sight")),
-        ("distance", f"{truth.distance_m:.2f} m, to keep {stand_off_m:.2f} m"),
+        f"state    {status.state}: {status.reason}",
+        f"frames   {status.stream.fps:.0f} fps, age {millis(status.frame_age_us)}",
+        f"wheels   {twist_text(status.applied)}",
+        f"bearing  {math.degrees(truth.bearing_rad):+.1f} deg{hidden}",
+        f"distance {truth.distance_m:.2f} m, to keep {stand_off_m:.2f} m",
     ]
-
-
-class LiveBlock:
-    """A table that redraws itself."""
-
-    def __init__(self, console: Console, seconds: float, stand_off_m: float) -> None:
-        self._seconds, self._stand_off_m = seconds, stand_off_m
-        self._live = Live(console=console, refresh_per_second=1 / REFRESH_S, transient=True)
-        self._due_s = 0.0
-
-    def show(self, at_s: float, status: Status | None, truth: Truth) -> None:
-        """Redraw if it is time."""
-        if time.monotonic() < self._due_s:
-            return
-        self._due_s = time.monotonic() + REFRESH_S
-        until = f"of {self._seconds:g} s" if self._seconds else "s, Ctrl-C ends it"
-        table = Table("following", f"{at_s:.0f} {until}", box=None)
-        for row in rows(status, truth, self._stand_off_m):
-            table.add_row(*row)
-        self._live.update(table)
-
-    def __enter__(self) -> Self:
-        self._live.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._live.stop()
-
-
-class PlainLines:
-    """At most one line a second."""
-
-    def __init__(self, stand_off_m: float) -> None:
-        self._stand_off_m = stand_off_m
-        self._due_s = 0.0
-
-    def show(self, at_s: float, status: Status | None, truth: Truth) -> None:
-        """Print a line if it is time."""
-        if time.monotonic() < self._due_s:
-            return
-        self._due_s = time.monotonic() + PLAIN_S
-        shown = "  ".join(f"{name} {value}" for name, value in rows(status, truth, self._stand_off_m))
-        print(f"{at_s:5.1f} s  {shown}", file=sys.stderr, flush=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        pass
 
 
 # `sightline demo`: simulation, robot and vision as processes of their own, armed, watched, ended. Shell.
@@ -236,7 +153,7 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str]
         open_link(ROBOT, connect=[endpoint], role=SOURCE) as link,
         Recorder(link, run.folder / RECORDING, _about(run)) as recorder,
         _truth(sockets) as truth,
-        display(options.seconds, run.scenario.stand_off_m) as block,
+        LiveBlock(is_progress=True) as block,
     ):
         operator = Operator(link)
         if run.scenario.labels:
@@ -263,11 +180,12 @@ def _arm(operator: Operator, processes: Processes) -> None:
             raise SightlineError(f"the robot would not be armed: {reply.detail}")
 
 
-def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthReader, block: Display) -> None:
+def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthReader, block: LiveBlock) -> None:
     """Collect truth and show it until the time is over."""
     _discard_old(truth)
     started_s = time.monotonic()
-    end_s = started_s + run.options.seconds if run.options.seconds else float("inf")
+    seconds = run.options.seconds
+    end_s, until = (started_s + seconds, f"of {seconds:g} s") if seconds else (float("inf"), "s, Ctrl-C ends it")
     while time.monotonic() < end_s:
         processes.check()
         sample = truth.read(timeout_s=_SILENT_S)
@@ -275,7 +193,8 @@ def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthR
             raise HardwareError("the simulation says nothing any more; see sim.log in the run folder")
         run.samples.append(sample)
         report = operator.report
-        block.show(time.monotonic() - started_s, report.status if report else None, sample)
+        lines = _lines(report.status if report else None, sample, run.scenario.stand_off_m)
+        block.show([f"{time.monotonic() - started_s:5.1f} {until}", *lines])
 
 
 def _discard_old(truth: TruthReader) -> None:

@@ -3,15 +3,11 @@
 Each run is a process's own, so that they share the machine's cores; a run itself repeats bit for bit.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import groupby, product
 from typing import Any, Final
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sightline.evaluation.checks import Check, number
 from sightline.evaluation.lockstep import Conditions, Run, run_lockstep
@@ -173,17 +169,7 @@ def _scored_figure(group: str, checks: list[Check], results: list[Score]) -> Sco
     return ScoredFigure(group, first.name, median, worst, first.unit, first.bound, all(check.ok for check in checks))
 
 
-# How `sightline score` shows itself: a progress bar on stderr, a table of median and worst. Shell (a terminal).
-
-
-@contextmanager
-def progress(total: int) -> Iterator[Callable[[], None]]:
-    """A bar over `total` runs, gone when it is full; silent where stderr is no terminal."""
-    console = Console(stderr=True)
-    columns = (TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("runs", total=total)
-        yield lambda: bar.advance(task)
+# How `sightline score` shows its results: a table of median and worst. Pure.
 
 
 def score_text(report: ScoreReport) -> str:

@@ -5,8 +5,8 @@ import json
 import os
 import tempfile
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,6 +17,7 @@ import typer
 from sightline.operator_side.cli.options import CHECK_FAILED, ConfigFile, Device, Json, Sets, numbers
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import check_out_file, needs
+from sightline.operator_side.terminal import progress_bar
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.training.schedule import Training
 
@@ -122,7 +123,7 @@ def score(
     if context.invoked_subcommand is not None:
         return 0
     with needs("all"):
-        from sightline.evaluation.score.runs import cases, progress, run_cases, score_text
+        from sightline.evaluation.score.runs import cases, run_cases, score_text
         from sightline.sim.scenario import scenario_names
     if page is not None:
         return _write_page(page, numbers("--seeds", seeds, int), jobs or os.cpu_count() or 1)
@@ -131,7 +132,7 @@ def score(
         numbers("--seeds", seeds, int), numbers("--latency-ms", latency_ms, float), numbers("--loss", loss, float),
         seconds, mission=mission, robot=robot_model, look=look, detector=detector,
     )
-    with progress(len(wanted)) as advance:
+    with progress_bar(len(wanted)) as advance:
         report = run_cases(wanted, jobs or os.cpu_count() or 1, lambda _case: advance())
     typer.echo(json.dumps(report.to_dict()) if as_json else score_text(report))
     return 0 if report.ok else CHECK_FAILED
@@ -140,8 +141,7 @@ def score(
 def _write_page(page: Path, seeds: list[int], jobs: int) -> int:
     with needs("all"):
         from sightline.evaluation.score.behaviours import write_page
-        from sightline.evaluation.score.runs import progress
-    return 0 if write_page(page, seeds, jobs, progress) else CHECK_FAILED
+    return 0 if write_page(page, seeds, jobs, progress_bar) else CHECK_FAILED
 
 
 # Command `score detectors`: any set of detectors on the same labelled scenes. Shell.
@@ -183,13 +183,12 @@ def detectors(
             close_subjects,
             score_scenes,
         )
-        from sightline.evaluation.score.runs import progress
     if demand and seeds < FROM:
         raise ConfigError(f"--demand judges, which only seeds from {FROM} up are for, not {seeds}")
     columns, shown = _columns(column), frames or (DEMANDED_FRAMES if demand else FRAMES)
     asked = _subjects(names or COMPARED, config, sets or (), device)
     try:
-        with progress(int((len(columns) + LIGHT_SHARE) * shown)) as advance:
+        with progress_bar(int((len(columns) + LIGHT_SHARE) * shown)) as advance:
             report = score_scenes(asked, shown, seeds, looks=looks, columns=columns, each=lambda _scene: advance())
     finally:
         close_subjects(asked)
@@ -388,7 +387,7 @@ def train(
     options = TrainOptions(out, scenes, training, device, processes, validated, judged, weights)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        model = run_training(options, _print_line, _progress)
+        model = run_training(options, _print_line, progress_bar)
     except OSError as error:
         raise ConfigError(f"--out {out}: {error.strerror or error}") from None
     _print_line(f"{model}, {model.with_suffix('.md').name}: try it with `sightline score detectors onnx:{model}`")
@@ -414,16 +413,3 @@ def _sharing(batch: int, processes: int) -> int:
 
 def _print_line(line: str) -> None:
     typer.echo(line)
-
-
-@contextmanager
-def _progress(total: int, what: str) -> Iterator[Callable[[int], None]]:
-    """A bar where there is a terminal; silent elsewhere."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=total)
-        yield lambda done: bar.advance(task, done)

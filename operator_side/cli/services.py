@@ -397,9 +397,12 @@ def metrics(
     from sightline.operator_side.cockpit.metrics import Watched, serving
 
     ending = threading.Event()
-    with open_link(robot, connect=connect, role=ROLE, secure=secure) as link, serving(Watched(link), host, port) as at:
+    with (
+        open_link(robot, connect=connect, role=ROLE, secure=secure) as link,
+        serving(Watched(link), host, port) as address,
+    ):
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: ending.set())
-        typer.echo(f"metrics of {robot}: http://{host}:{at}/metrics")
+        typer.echo(f"metrics of {robot}: {address}metrics")
         ending.wait()
     return 0

@@ -3,16 +3,12 @@
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Final, Self
+from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.live import Live
-from rich.text import Text
 
 from sightline.operator_side.cli.options import DEFAULT_CONNECT, Connect, Json, Port, Robot, Secure
 from sightline.operator_side.client.messages import ChannelInbox, message_line, message_object
@@ -21,6 +17,7 @@ from sightline.operator_side.client.pictures import Pictures, viewer_role
 from sightline.operator_side.client.status import status_lines
 from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.preflight import needs
+from sightline.operator_side.terminal import LiveBlock
 from sightline.protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, Channel, Direction
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.link import Link, Message
@@ -118,7 +115,7 @@ def _why_silent(channel: Channel) -> str:
 def _show_text(link: Link, ends_s: float) -> int:
 
     desk = MissionClient(link)
-    with LiveText() as live:
+    with LiveBlock() as live:
         while time.monotonic() < ends_s:
             try:
                 status = desk.operator.wait_report().status
@@ -129,40 +126,6 @@ def _show_text(link: Link, ends_s: float) -> int:
             live.show([*status_lines(link.robot, status), *(mission_lines(mission) if mission else ())])
             time.sleep(_TEXT_PERIOD_S)
     return 0
-
-
-# Lines on the terminal that are shown anew in place; one block a second where there is no terminal. Shell.
-
-
-PLAIN_S: Final = 1.0
-
-
-class LiveText:
-    """`with LiveText() as live: live.show(lines)`."""
-
-    def __init__(self) -> None:
-        console = Console()
-        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
-        self._due_s = 0.0
-
-    def show(self, lines: Sequence[str]) -> None:
-        """The newest; called as often as one likes."""
-        if self._live is not None:
-            self._live.update(Text("\n".join(lines), no_wrap=True, overflow="ellipsis"), refresh=True)
-        elif time.monotonic() >= self._due_s:
-            self._due_s = time.monotonic() + PLAIN_S
-            print("\n".join(lines) + "\n", file=sys.stdout, flush=True)
-
-    def __enter__(self) -> Self:
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._live is not None:
-            self._live.stop()
 
 
 # The command `capture`: a snapshot or a video of what a robot sees. Shell.

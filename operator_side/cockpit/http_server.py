@@ -1,8 +1,13 @@
-"""A bounded HTTP server on loopback: routes, pages, JSON answers. Shell (threads)."""
+"""A bounded HTTP server: pages for the operator on loopback, metrics where the user wants them. Shell (threads).
+
+Foreign sites are kept out of a page: a request must name this machine as its host, and what changes something must come
+from the page itself.
+"""
 
 import json
+import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from html import escape
@@ -18,38 +23,6 @@ from sightline.protocol.transports.diagnosis import port_owner
 
 MAX_CONNECTIONS: Final = 32
 """Security limit: one more is closed at once. A browser holds six."""
-
-
-class BoundedThreads(ThreadingMixIn):
-    """For a socket server. A connection that says nothing holds up neither the others nor the end."""
-
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, *arguments: Any) -> None:
-        self._places = threading.BoundedSemaphore(MAX_CONNECTIONS)
-        super().__init__(*arguments)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """On a thread of its own, while there is a place."""
-        if self._places.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)  # type: ignore[attr-defined]
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Give the place back afterwards."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._places.release()
-
-
-# A small page for one person on this machine: routes over HTTP, on loopback only. Shell (an HTTP server).  Foreign
-# sites are kept out: a request must name this machine as its host, and what changes something must come from the page
-# itself.
-
-
 HOST: Final = "127.0.0.1"
 MAX_BODY_BYTES: Final = 4096
 """Security limit: what a page posts."""
@@ -89,20 +62,23 @@ def page(name: str, **words: str) -> Answer:
 
 
 @contextmanager
-def served(routes: Mapping[str, Route], port: int) -> Iterator[str]:
+def served(routes: Mapping[str, Route], port: int, host: str = HOST, *, names: Sequence[str] = _NAMES) -> Iterator[str]:
     """Serve `routes` ("GET /", "POST /pick" ...) while inside; gives the address. Port 0 is any that is free.
 
-    Raises LinkError for a port in use.
+    Args: names: the names of this server that a request may use; none permits any, for what is public.
+    Raises: LinkError: for a port in use.
     """
+    handler = type("Handler", (_Handler,), {"routes": dict(routes), "names": names})
     try:
-        server = _Server((HOST, port), type("Handler", (_Handler,), {"routes": dict(routes)}))
+        server = _Server((host, port), handler)
     except (OSError, OverflowError) as error:
         owner = port_owner(port)
-        cause = f"port {port} is in use by {owner}; choose another with --port" if owner else str(error)
-        raise LinkError(f"cannot serve a page on {HOST}:{port}: {cause}") from None
-    threading.Thread(target=server.serve_forever, args=(0.05,), name="page", daemon=True).start()
+        busy = f"port {port} is in use by {owner}; choose another"
+        cause = busy if owner else getattr(error, "strerror", None) or str(error)
+        raise LinkError(f"cannot serve on {host}:{port}: {cause}") from None
+    threading.Thread(target=server.serve_forever, args=(0.05,), name="http", daemon=True).start()
     try:
-        yield f"http://{HOST}:{server.server_port}/"
+        yield f"http://{host}:{server.server_port}/"
     finally:
         server.shutdown()
         server.server_close()
@@ -118,9 +94,34 @@ def _answered(route: Route, query: str, body: bytes) -> Answer:
         return as_json({"error": f"this is not asked rightly: {error}"}, 400)
 
 
-class _Server(BoundedThreads, HTTPServer):
+class _Server(ThreadingMixIn, HTTPServer):
+    """A connection has a thread while there is a place; a silent one delays neither the others nor the end."""
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, *arguments: Any) -> None:
+        self._places = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        super().__init__(*arguments)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if self._places.acquire(blocking=False):
+            threading.Thread(
+                target=self.process_request_thread, args=(request, client_address), name="http-request", daemon=True
+            ).start()
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._places.release()
+
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that goes away in the middle is no news."""
+        """A client that goes away in the middle, or sends nothing, is not an error."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -130,6 +131,7 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "sightline", ""
     timeout = SILENCE_S
     routes: Mapping[str, Route]
+    names: Sequence[str]
 
     def do_GET(self) -> None:
         self._answer("GET")
@@ -156,7 +158,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _refusal(self, method: str) -> Answer | None:
         host = self.headers.get("Host", "")
-        if host.rpartition(":")[0] not in _NAMES and host not in _NAMES:
+        if self.names and host.rpartition(":")[0] not in self.names and host not in self.names:
             return as_json({"error": "this page is for this machine alone"}, 403)
         if method == "POST" and (self.headers.get("Origin", f"http://{host}") != f"http://{host}"
                                  or self.headers.get("Content-Type") != "application/json"):

@@ -5,21 +5,17 @@
 
 from __future__ import annotations
 
-import sys
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final, Protocol
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+from typing import TYPE_CHECKING, Final, Protocol
 
 from sightline.operator_side.client.requests import read_report
-from sightline.operator_side.cockpit.http_server import BoundedThreads
+from sightline.operator_side.cockpit.http_server import Answer, PageRequest, Route, served
 from sightline.protocol.channels import STATUS
-from sightline.protocol.errors import LinkError, WireError
+from sightline.protocol.errors import WireError
 from sightline.protocol.messages import State, Status, StreamStatus
-from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.security import ROBOT_ROLE
 from sightline.protocol.transports.zenoh.presence import PeerInfo
@@ -27,13 +23,7 @@ from sightline.protocol.transports.zenoh.presence import PeerInfo
 if TYPE_CHECKING:
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-
-if TYPE_CHECKING:
     Family = GaugeMetricFamily | CounterMetricFamily
-
-_IDLE_S: Final = 20
-"""After that a connection that says nothing is let go of."""
-Respond = Callable[[str, list[tuple[str, str]]], Any]
 
 
 class Exposed(Protocol):
@@ -69,55 +59,22 @@ def counter(name: str, about: str, values: dict[tuple[str, ...], float], *labels
 
 
 @contextmanager
-def serving(told: Exposed, host: str, port: int) -> Iterator[int]:
-    """Serve `/metrics` and `/health` while inside; gives the port. Raises LinkError for a port in use."""
-    from prometheus_client import CollectorRegistry, make_wsgi_app
+def serving(exposed: Exposed, host: str, port: int) -> Iterator[str]:
+    """Serve `/metrics` and `/health` while inside; gives the address. Raises LinkError for a port in use."""
+    from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 
     registry = CollectorRegistry()
-    registry.register(told)
-    metrics = make_wsgi_app(registry)
+    registry.register(exposed)
 
-    def answer(environ: dict[str, Any], respond: Respond) -> Iterable[bytes]:
-        if environ["PATH_INFO"] == "/health":
-            heard = told.is_heard()
-            respond("200 OK" if heard else "503 Service Unavailable", [("Content-Type", "text/plain")])
-            return [b"heard\n" if heard else b"not heard\n"]
-        body: Iterable[bytes] = metrics(environ, respond)
-        return body
+    def health(_request: PageRequest, _body: bytes) -> Answer:
+        return Answer(b"heard\n", "text/plain") if exposed.is_heard() else Answer(b"not heard\n", "text/plain", 503)
 
-    server = _listening(host, port, answer)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        yield int(server.server_port)
-    finally:
-        server.shutdown()
-        server.server_close()
-
-
-class _Server(BoundedThreads, WSGIServer):
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Who goes away in the middle of it, or says nothing, is no error of ours."""
-        if not isinstance(sys.exception(), OSError):
-            super().handle_error(request, client_address)
-
-
-class _Quiet(WSGIRequestHandler):
-    """One line per change of state, never one per request."""
-
-    timeout = _IDLE_S
-
-    def log_message(self, format: str, *arguments: Any) -> None:
-        """Say nothing."""
-
-
-def _listening(host: str, port: int, answer: Callable[..., Iterable[bytes]]) -> WSGIServer:
-    try:
-        return make_server(host, port, answer, server_class=_Server, handler_class=_Quiet)
-    except OSError as error:
-        owner = port_owner(port)
-        by = f" by {owner}" if owner else ""
-        cause = f"port {port} is in use{by}; choose another" if owner else error.strerror
-        raise LinkError(f"cannot serve on {host}:{port}: {cause}") from None
+    routes: dict[str, Route] = {
+        "GET /metrics": lambda _request, _body: Answer(generate_latest(registry), CONTENT_TYPE_LATEST),
+        "GET /health": health,
+    }
+    with served(routes, port, host, names=()) as address:
+        yield address
 
 
 # A robot's status for Prometheus. Shell (a link).

@@ -4,10 +4,12 @@ import select
 import socket
 import time
 import urllib.request
+from contextlib import contextmanager
+from urllib.parse import urlsplit
 
 import pytest
 
-from sightline.operator_side.cockpit import metrics as metrics_server
+from sightline.operator_side.cockpit import http_server
 from sightline.operator_side.cockpit.http_server import MAX_CONNECTIONS
 from sightline.operator_side.cockpit.metrics import serving
 from tests.fixtures.links import until
@@ -23,6 +25,12 @@ class Nothing:
         return True
 
 
+@contextmanager
+def served_port():
+    with serving(Nothing(), "127.0.0.1", 0) as address:
+        yield urlsplit(address).port
+
+
 def _health(port):
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=3) as answer:
         return answer.read()
@@ -30,7 +38,7 @@ def _health(port):
 
 @pytest.mark.parametrize("said", [b"", b"GET /hea"])
 def test_a_connection_that_says_nothing_holds_up_neither_others_nor_the_end(said):
-    with serving(Nothing(), "127.0.0.1", 0) as port:
+    with served_port() as port:
         idle = [socket.create_connection(("127.0.0.1", port)) for _ in range(3)]
         for one in idle:
             one.sendall(said)
@@ -43,7 +51,7 @@ def test_a_connection_that_says_nothing_holds_up_neither_others_nor_the_end(said
 
 def test_connections_beyond_the_limit_are_closed_and_places_are_returned():
     """Each open connection is a thread of the process that steers."""
-    with serving(Nothing(), "127.0.0.1", 0) as port:
+    with served_port() as port:
         held = [socket.create_connection(("127.0.0.1", port), 5) for _ in range(3 * MAX_CONNECTIONS)]
         assert until(lambda: len(_closed_by_server(held)) >= 2 * MAX_CONNECTIONS)
         assert len(_closed_by_server(held)) == 2 * MAX_CONNECTIONS
@@ -66,8 +74,8 @@ def _is_served(port):
 
 
 def test_a_connection_that_says_nothing_is_let_go_of_in_silence(monkeypatch, capfd):
-    monkeypatch.setattr(metrics_server._Quiet, "timeout", 0.1)
-    with serving(Nothing(), "127.0.0.1", 0) as port, socket.create_connection(("127.0.0.1", port)) as idle:
+    monkeypatch.setattr(http_server._Handler, "timeout", 0.1)
+    with served_port() as port, socket.create_connection(("127.0.0.1", port)) as idle:
         idle.settimeout(5)
         assert idle.recv(1) == b""
         with socket.create_connection(("127.0.0.1", port)) as gone:
