@@ -65,7 +65,7 @@ class DetectorConfig(Config):
     fallback: Annotated[str, Field(max_length=256)] = ""
     """The detector that drives on while the other does not answer; empty for none, and the robot holds."""
     shadow: Annotated[str, Field(max_length=256)] = ""
-    """A second detector that looks at the same frames and never steers, until somebody promotes it."""
+    """A second detector that looks at the same frames, is compared and never steers."""
     shadow_options: dict[str, Any] = Field(default_factory=dict)
 
 

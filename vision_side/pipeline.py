@@ -129,6 +129,7 @@ class Pipeline:
         except WireError as error:
             return self._skip(error.reason, error.detail)
         shown = DetectFrame(self._config.robot, frame.header, frame.jpeg, self._decoder, picture)
+        shown.goes_by = self.mission.goes_by
         (result,) = checked_results(self.detector, [shown], frame.deadline_us)
         if isinstance(result, str):
             return self._skip(NO_ANSWER, result, "no answer")

@@ -1,4 +1,4 @@
-"""Commands about detectors: list, check, promote, and a detector served to many robots. Shell."""
+"""Commands about detectors: list, check, and a detector served to many robots. Shell."""
 
 import json
 import math
@@ -10,17 +10,12 @@ import typer
 
 from sightline.operator_side.cli.options import (
     CHECK_FAILED,
-    DEFAULT_CONNECT,
-    REJECTED_EXIT,
     ConfigFile,
-    Connect,
     Device,
     Json,
     Listen,
     LogForm,
     MaybeSecure,
-    Robot,
-    Secure,
     ServiceConnect,
     Sets,
 )
@@ -89,7 +84,7 @@ def serve(
             close_detector(detector)
 
 
-# The commands `detector list | check | promote`, and `detector --serve`. Shell; heavy imports inside the commands.
+# The commands `detector list | check`, and `detector --serve`. Shell; heavy imports inside the commands.
 
 
 def register(app: typer.Typer) -> None:
@@ -101,7 +96,6 @@ def register(app: typer.Typer) -> None:
     )  # fmt: skip
     group.command(name="list", epilog="Example: sightline detector list --json")(list_detectors)
     group.command(epilog="Example: sightline detector check my_eyes:Eyes --set min_score=0.5")(check)
-    group.command(epilog="Example: sightline detector promote r1")(promote)
     app.add_typer(group, name="detector")
 
 
@@ -221,30 +215,6 @@ def _nested(options: dict[str, Any]) -> dict[str, Any]:
             raise ConfigError(f"--set {name}: options of {last!r} are given besides; give one or the other")
         table[last] = value
     return tables
-
-
-def promote(
-    robot: Robot = "r1",
-    *,
-    back: Annotated[bool, typer.Option("--back", help="The first detector drives again.")] = False,
-    connect: Connect = DEFAULT_CONNECT,
-    secure: Secure = "",
-    as_json: Json = False,
-) -> int:
-    """Let the detector of `vision --shadow NAME` drive from the next frame on, and the other one look on."""
-    from sightline.operator_side.client.missions import MissionClient, detector_line
-    from sightline.operator_side.client.requests import SOURCE
-    from sightline.protocol.transports.open import open_link
-
-    with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
-        report = MissionClient(link).ask("detector", options={"shadow": not back})
-    if as_json:
-        typer.echo(json.dumps({"robot": robot, "ok": not report.refused, **report.model_dump(mode="json")}))
-    elif report.refused:
-        typer.echo(f"error: vision of {robot} refused: {report.refused}", err=True)
-    else:
-        typer.echo(f"{robot}: {detector_line(report)}")
-    return REJECTED_EXIT if report.refused else 0
 
 
 def _as_json(name: str, ok: bool, verdicts: Sequence["PromiseResult"], times: Sequence["Times"]) -> dict[str, Any]:

@@ -20,10 +20,14 @@ class PerSession(Generic[Memory]):
 
     def __init__(self, begin: Callable[[], Memory]) -> None:
         self._begin = begin
-        self._kept: OrderedDict[str, tuple[str, Memory]] = OrderedDict()
+        self._kept: OrderedDict[str, tuple[object, Memory]] = OrderedDict()
 
-    def of(self, robot: str, session: str) -> Memory:
-        """That of the robot's session."""
+    def find(self, robot: str) -> Memory | None:
+        """That of the robot's newest session, if there is one."""
+        return self._kept[robot][1] if robot in self._kept else None
+
+    def of(self, robot: str, session: object) -> Memory:
+        """That of the robot's session, which may be named by more than its id."""
         before = self._kept.pop(robot, None)
         memory = before[1] if before is not None and before[0] == session else self._begin()
         self._kept[robot] = session, memory

@@ -1,6 +1,6 @@
 """The detector port: `Detector`, frames, results, labels, overlap of boxes. Pure."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Final, Protocol
 
@@ -79,10 +79,18 @@ class Detection:
     track_id: int | None = None
 
 
+LabelTest = Callable[[str], bool]
+"""Whether a mission may go by what has this label."""
+
+
+def _any_label(_label: str) -> bool:
+    return True
+
+
 class DetectFrame:
     """One frame to look at: the JPEG as it came, and its pixels for who asks, decoded once for all who share it."""
 
-    __slots__ = ("_decoder", "_picture", "header", "height_px", "jpeg", "robot", "width_px")
+    __slots__ = ("_decoder", "_picture", "goes_by", "header", "height_px", "jpeg", "robot", "width_px")
 
     def __init__(
         self, robot: str, header: FrameHeader, jpeg: bytes, decoder: Decoder, picture: Picture | None = None
@@ -94,6 +102,7 @@ class DetectFrame:
         self.width_px, self.height_px = decoder.size_px
         self._decoder = decoder
         self._picture = picture
+        self.goes_by: LabelTest = _any_label  # that of the robot's mission, where the pipeline knows one
 
     def picture(self) -> Picture:
         """The pixels. Raises WireError MALFORMED for what is no picture of the camera's size."""

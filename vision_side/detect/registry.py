@@ -16,7 +16,7 @@ from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, Track
 from sightline.vision_side.detect.plugin_calls import plugin_guard
 from sightline.vision_side.detect.port import Detector, NoDetector
 from sightline.vision_side.detect.remote.client import EXAMPLES
-from sightline.vision_side.missions.registry import check_missions, configured_mission
+from sightline.vision_side.missions.registry import check_missions
 from sightline.vision_side.plugins import shared_options
 
 BOXES: Final = "boxes"
@@ -48,7 +48,7 @@ def configured_detector(config: VisionConfig) -> Detector:
         from sightline.vision_side.detect.shadow import ShadowDetector
 
         second = _narrowed(build_detector(one.shadow, one.shadow_options, config), config)
-        detector = ShadowDetector(detector, second, one.shadow, config.max_pixels, configured_mission(config).goes_by)
+        detector = ShadowDetector(detector, second, one.shadow, config.max_pixels)
     return detector
 
 

@@ -6,7 +6,6 @@ a network kept back does not start anything.
 
 import secrets
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final
 
 from sightline.protocol.channels import MISSION, REPORT, SCAN
@@ -35,17 +34,6 @@ MAX_AGE_US: Final = 2_000_000
 _LONGEST: Final = 200
 
 
-DETECTOR_SWAP: Final = "detector"
-"""Asked for like a mission, and none: which detector drives, with the option `shadow`, true or false."""
-
-
-@dataclass(frozen=True, slots=True)
-class DetectorSwap:
-    """Which detector is to drive: the one that looks on until now, or the first one again."""
-
-    shadow: bool
-
-
 class MissionRequests:
     """Takes up what is asked for, each once. `asked` is the newest, `refused` why it was not taken up."""
 
@@ -54,7 +42,7 @@ class MissionRequests:
         self.asked: RequestId | None = None
         self.refused = ""
 
-    def take(self, message: Message, frame: FrameHeader) -> MissionSpec | DetectorSwap | None:
+    def take(self, message: Message, frame: FrameHeader) -> MissionSpec | None:
         """What to do from `frame` on; None for what was said before and for what is refused.
 
         Raises WireError for what is no message of this channel; `refused` then says it too.
@@ -71,18 +59,10 @@ class MissionRequests:
         self.asked, self.refused = asked, ""
         try:
             _check(header, message.source, frame)
-            return _swap_of(request) if request.name == DETECTOR_SWAP else requested_mission(request, self._config)
+            return requested_mission(request, self._config)
         except (WireError, ConfigError) as error:
             self.refused = " ".join(str(error).split())[:_LONGEST]
             return None
-
-
-def _swap_of(request: MissionRequest) -> DetectorSwap:
-    """Raises ConfigError for other options than its one."""
-    shadow = request.options.get("shadow")
-    if len(request.options) != 1 or not isinstance(shadow, bool) or request.waypoints:
-        raise ConfigError("which detector drives is said with the option shadow=true or shadow=false alone")
-    return DetectorSwap(shadow)
 
 
 def _check(header: RequestHeader, source: str, frame: FrameHeader) -> None:
@@ -177,7 +157,6 @@ class MissionChannel:
         self._reporter = Reporter(config.detector)
         self._session = secrets.token_hex(4)
         self._reports = 0
-        self._swapped: RequestId | None = None
 
     def before(self, pipeline: Pipeline, frame: FrameHeader) -> None:
         """Give `pipeline` what it has to know before it answers `frame`."""
@@ -192,13 +171,12 @@ class MissionChannel:
         if pipeline is not None:
             self._mission = pipeline.mission.name
         asked, refused = self._desk.asked, self._desk.refused
-        if pipeline is not None and asked is not None and asked not in (pipeline.asked, self._swapped):
+        if pipeline is not None and asked is not None and asked != pipeline.asked:
             refused = refused or _ENDED
         detector, looked = (pipeline.detector, pipeline.looked) if pipeline else (None, None)
         self.tell_news(detector)
         beside = ""
         if pipeline is not None and isinstance(detector, ShadowDetector):
-            detector.go_by(self._link.robot, pipeline.mission.goes_by)
             beside = detector.shadow_text(self._link.robot)
         report = self._reporter.due(now_s, self._mission, seen, asked, refused, looked=looked, beside=beside)
         if report is None:
@@ -221,24 +199,12 @@ class MissionChannel:
         except WireError as error:
             self._refuse(error)
             return
-        if isinstance(chosen, DetectorSwap):
-            self._swap(chosen, pipeline.detector, message.source)
-        elif chosen is not None and self._desk.asked is not None:
+        if chosen is not None and self._desk.asked is not None:
             pipeline.meet(frame.session)
             pipeline.switch(chosen, self._desk.asked)
             self._tell("mission", f"mission {chosen.name}, asked for by {message.source}")
         elif self._desk.refused:
             self._tell("mission", f"a mission of {message.source} is refused: {self._desk.refused}")
-
-    def _swap(self, swap: DetectorSwap, detector: Detector, source: str) -> None:
-        """Let the other detector drive."""
-        self._swapped = self._desk.asked
-        refused = "no detector looks on; start vision with --shadow NAME"
-        if isinstance(detector, ShadowDetector):
-            refused = detector.promote(self._link.robot, swap.shadow)
-        self._desk.refused = refused
-        who = "the shadow drives" if swap.shadow else "the shadow looks on"
-        self._tell("swap", f"{source}: {refused or who}")
 
     def _look(self, pipeline: Pipeline) -> None:
         if self._scans is None:

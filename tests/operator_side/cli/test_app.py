@@ -54,7 +54,7 @@ def test_the_commands_of_this_version_exist():
     groups = {
         "calibrate": ("camera",),
         "config": ("check", "show", "schema"),
-        "detector": ("list", "check", "promote"),
+        "detector": ("list", "check"),
         "score": ("detectors",),
         "bench": ("codec", "pipeline", "demo", "report"),
     }

@@ -102,7 +102,7 @@ def test_what_is_around_it_is_built_from_the_inside_out() -> None:
     made = configured_detector(config(labels=("ball",), only_colour=True, tracked=True, shadow="adaptive"))
     assert isinstance(made, ShadowDetector)
     made.close()
-    tracked = made._eyes[0]
+    tracked = made._driving
     assert isinstance(tracked, TrackIds) and isinstance(tracked.inner, ColorFilter)
     assert isinstance(tracked.inner.inner, LabelFilter) and isinstance(tracked.inner.inner.inner, Hsv)
 
