@@ -167,7 +167,7 @@ def test_with_own_eyes_to_fall_back_on_it_drives_on_without_a_stop_and_goes_back
     with Server(_answer) as server, _driving(tmp_path, _at(server), "--set", "detector.fallback=hsv") as (robot, log):
         port, killed_us = server.port, time.monotonic_ns() // 1000
         server.kill()
-        assert until(lambda: "own eyes drive on" in log.read_text(), 2)
+        assert until(lambda: "the fallback drives on" in log.read_text(), 2)
         assert not until(lambda: _wheels_us(robot, killed_us), 1.5), "the wheels never stopped"
         server.start(port)
         assert until(lambda: "drives again" in log.read_text(), 3.0)

@@ -97,7 +97,7 @@ def _check_fallback(config: VisionConfig) -> None:
 
 def check_takes_pictures(kind: str) -> None:
     """Raise ConfigError for a detector that does not look at what it is given, where there is no robot to hear of."""
-    if kind != BOXES and getattr(REGISTRY.load(split_kind(kind)[0]), "only_hears", False):
+    if kind != BOXES and getattr(REGISTRY.load(split_kind(kind)[0]), "only_receives", False):
         raise ConfigError(f"detector {kind!r} hears what a service says of a robot's own frames, of which there are "
                           "none here; name what that service serves")
 

@@ -1,5 +1,5 @@
-"""What all remote detectors share: addresses, reasons for no answer, reading boxes, one request for each frame.
-Shell (a clock).
+"""Shared by remote detectors: addresses, reasons for no answer, reading boxes, one request for each frame. Shell (a
+clock).
 """
 
 import re
@@ -42,7 +42,7 @@ EXAMPLES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where a server is, and what is asked for there: a path, or a model and perhaps its version."""
+    """A server, and the path there, or the model and perhaps its version."""
 
     scheme: str
     host: str
@@ -52,19 +52,14 @@ class Address:
     version: str = ""
 
 
-def is_address(kind: str) -> bool:
-    """Whether `kind` names a server, well or badly."""
-    return kind.partition("://")[0] in DEFAULT_PORTS and "://" in kind
-
-
 def parse_address(kind: str) -> Address:
-    """Split it. Raises ConfigError, with the right form, for what is none."""
+    """Split an address. Raises ConfigError, with the right form, for an invalid one."""
     scheme = kind.partition("://")[0]
     example = EXAMPLES.get(scheme, EXAMPLES["oip+http"])
     match = _FORM.fullmatch(kind)
     port = int(match[3]) if match and match[3] else DEFAULT_PORTS.get(scheme, 0)
     if match is not None and not 1 <= port <= 65_535:
-        raise ConfigError(f"detector {kind!r}: there is no port {port}; 1 to 65535, e.g. {example}")
+        raise ConfigError(f"detector {kind!r}: invalid port {port}; expected 1 to 65535, e.g. {example}")
     if match is None:
         raise ConfigError(f"detector {kind!r}: write scheme://HOST[:PORT]/..., e.g. {example}")
     host, path = match[2].strip("[]"), match[4] or "/"
@@ -76,37 +71,37 @@ def parse_address(kind: str) -> Address:
     return Address(scheme, host, port, path, named[1], named[2] or "")
 
 
-# Why a remote detector gave no answer that counts: one list, one exception, one tally. Pure.
+# Reasons why a remote detector gave no valid answer: one list, one exception, one counter. Pure.
 
 
 _LONGEST: Final = 160
-_TOLD_AT: Final = frozenset(10**power for power in range(10))
-"""A server gone bad is told at the 1st, 10th, 100th ... refusal of a kind, when it is good again, and when it is bad
-again."""
+_REPORTED_AT: Final = frozenset(10**power for power in range(10))
+"""A server that fails is reported at the 1st, 10th, 100th ... rejection of a kind, when its answers are good again, and
+when they are bad again."""
 _IN_A_ROW: Final = 10
-"""Of answers that were good before, or of refusals: from so many on it is bad again. Fewer come and go, as where one
-robot of several is not answered; a line for each of them would be one for each frame."""
+"""After so many good answers, or so many rejections, it is bad again. Fewer come and go, as where one robot of several
+is not answered; a line for each of them would be one for each frame."""
 
 
 class NoAnswerReason(StrEnum):
-    """What is counted. All of them mean "no answer": none of them moves the robot."""
+    """Reasons that are counted. All of them mean "no answer": none of them moves the robot."""
 
     LATE = "LATE"  # not there by the deadline
-    UNREACHABLE = "UNREACHABLE"  # nobody there, or gone in the middle of it
-    REFUSED = "REFUSED"  # it answered with an error of its own
+    UNREACHABLE = "UNREACHABLE"  # no server there, or gone in the middle of the answer
+    REJECTED = "REJECTED"  # it answered with an error of its own
     TOO_LARGE = "TOO_LARGE"  # more bytes than any answer needs
-    ENCODED = "ENCODED"  # compressed, which was not asked for; never unpacked
+    ENCODED = "ENCODED"  # compressed, which was not requested; never unpacked
     MALFORMED = "MALFORMED"  # not the protocol: grammar, type, shape
-    NOT_FINITE = "NOT_FINITE"  # a box or score that is no number
+    NOT_FINITE = "NOT_FINITE"  # a box or score that is nan or infinite
     TOO_MANY = "TOO_MANY"  # more boxes than any scene has
-    OTHER_FRAME = "OTHER_FRAME"  # it names another frame than the one it was asked about
+    OTHER_FRAME = "OTHER_FRAME"  # it names another frame than the request
     OTHER_SIZE = "OTHER_SIZE"  # it looked at a picture of another size
     UNFIT = "UNFIT"  # its model takes or gives what this end does not speak
-    BAD_PICTURE = "BAD_PICTURE"  # the robot's own frame is none: nobody was asked
+    BAD_PICTURE = "BAD_PICTURE"  # the robot's own frame is not a JPEG of its size: nothing was requested
 
 
 class NoAnswerError(Exception):
-    """There is no answer that counts; `detail` is one line for a person."""
+    """There is no valid answer; `detail` is one line for the operator."""
 
     def __init__(self, reason: NoAnswerReason, detail: str) -> None:
         self.reason = reason
@@ -115,41 +110,41 @@ class NoAnswerError(Exception):
 
 
 class ErrorCounters:
-    """Counts what was refused of one remote, and says so where that is news."""
+    """Counts the rejected answers of one remote detector, and reports each change."""
 
     def __init__(self, name: str) -> None:
-        self.refused: Counter[str] = Counter()
-        self.news = Notices()
+        self.rejected: Counter[str] = Counter()
+        self.notices = Notices()
         self._name = name
-        self._said = ""
+        self._reported = ""
         self._good = self._bad = 0
         """In a row."""
 
-    def refuse(self, error: NoAnswerError) -> None:
-        """Count it."""
-        self.refused[error.reason] += 1
-        count, good_before = self.refused[error.reason], self._good
+    def reject(self, error: NoAnswerError) -> None:
+        """Count one answer that does not count."""
+        self.rejected[error.reason] += 1
+        count, good_before = self.rejected[error.reason], self._good
         self._good, self._bad = 0, self._bad + 1
-        again = self._said == "good" and (good_before >= _IN_A_ROW or self._bad == _IN_A_ROW)
-        if again or count in _TOLD_AT:
-            self._said = error.reason
-            self.news.add(f"detector {self._name}: no answer: {error.reason}: {error.detail} ({count} so far)")
+        again = self._reported == "good" and (good_before >= _IN_A_ROW or self._bad == _IN_A_ROW)
+        if again or count in _REPORTED_AT:
+            self._reported = error.reason
+            self.notices.add(f"detector {self._name}: no answer: {error.reason}: {error.detail} ({count} so far)")
 
     def good(self) -> None:
-        """An answer that counts."""
+        """Count one answer that counts."""
         self._good, self._bad = self._good + 1, 0
-        if self._said != "good":
-            before, self._said = self._said, "good"
-            self.news.add(f"detector {self._name} answers" + (" again" if before else ""))
+        if self._reported != "good":
+            before, self._reported = self._reported, "good"
+            self.notices.add(f"detector {self._name} answers" + (" again" if before else ""))
 
 
-# Columns of numbers from somebody else -> detections, nothing taken on trust. Pure.
+# Columns of numbers from a server -> detections, nothing taken on trust. Pure.
 
 
 MAX_ROWS: Final = 1024
-"""Security limit: a model with a fixed number of rows fills up with scores of 0; more than this is no detector's."""
+"""Security limit: a model with a fixed number of rows fills up with scores of 0; no detector needs more."""
 MIN_SCORE: Final = 0.25
-"""As for boxes on the wire: less sure than this is no box, unless configured otherwise."""
+"""The least score of a box, as for boxes on the wire, unless configured otherwise."""
 _HASH: Final = re.compile("[0-9a-fA-F]{8,64}")
 Numbers = NDArray[Any]
 
@@ -160,8 +155,8 @@ def read_columns(
 ) -> tuple[Detection, ...]:
     """Boxes (K, 4) xyxy, scores (K,) and labels (K) as detections, best first, at most as many as the wire allows.
 
-    `stretch` turns the boxes' pixels into those of the encoded picture. Rows below `min_score` are no boxes and may
-    hold anything finite. Raises NoAnswerError for a wrong shape or order, too many rows, and what is not finite.
+    `stretch` turns the boxes' pixels into those of the encoded picture. Rows below `min_score` are left out and
+    may hold anything finite. Raises NoAnswerError for a wrong shape or order, too many rows, and what is not finite.
     """
     _check_shapes(boxes, scores, labels)
     if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
@@ -183,7 +178,7 @@ def _check_shapes(boxes: Numbers, scores: Numbers, labels: Sequence[str]) -> Non
 def _detection(
     box: Numbers, score: float, label: str, stretch: tuple[float, float], size_px: tuple[int, int]
 ) -> Detection | None:
-    """The part in the picture; None if there is none."""
+    """The part in the picture; None if there is not any."""
     across, down = stretch
     x1, y1, x2, y2 = (float(value) for value in box)
     if x2 < x1 or y2 < y1 or score > 1:
@@ -207,89 +202,89 @@ def _of_wire(box: DetectedBox) -> Detection:
 
 
 def hash_of(text: str) -> str:
-    """A model's hash as results carry it: 16 digits; empty for what is none."""
+    """A model's hash as results carry it: 16 digits; empty for an invalid one."""
     return text[:16].lower() if _HASH.fullmatch(text) else ""
 
 
-# A detector that asks a server about one frame after the other. Shell (the clock, for how long it took).
+# A detector that sends a server one frame after the other. Shell (the clock, for how long it took).
 
 
 REMOTE: Final = "remote"
-"""What a result was made on, where the server does not say."""
+"""The device of a result, where the server does not name one."""
 LONGEST_WAIT_S: Final = 2.0
 """For an answer, whatever the deadline: twice the longest that can be configured."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServerAnswer:
-    """What a server said of one frame, checked, and who said it."""
+    """A server's answer to one frame, checked, and its maker."""
 
     detections: tuple[Detection, ...]
     maker: Maker
 
 
 class Server(Protocol):
-    """How one kind of server is asked."""
+    """The client of one kind of server."""
 
-    def ask(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
-        """Its answer; blocks until about `until_us`. Raises NoAnswerError for everything else."""
+    def request(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
+        """Return its answer; block until about `until_us`. Raises NoAnswerError for everything else."""
         ...
 
     def close(self) -> None:
-        """Let go of its connection."""
+        """Close its connection."""
         ...
 
 
 class FrameByFrame(ABC):
-    """A `Detector` that asks elsewhere about one frame after the other, and counts what it refused."""
+    """A `Detector` that requests one frame after the other from elsewhere, and counts the answers that it rejects."""
 
     def __init__(self, name: str) -> None:
-        self._tally = ErrorCounters(name)
+        self._error_counters = ErrorCounters(name)
 
     @property
-    def refused(self) -> Counter[str]:
-        """What was refused so far, by reason."""
-        return self._tally.refused
+    def rejected(self) -> Counter[str]:
+        """Answers rejected so far, by reason."""
+        return self._error_counters.rejected
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
-        """As the port says."""
+        """See `Detector`."""
         return [self._one(frame, deadline_us) for frame in frames]
 
     def _one(self, frame: DetectFrame, deadline_us: int) -> DetectionResult | None:
         try:
-            result = self._ask(frame, deadline_us)
+            result = self._request(frame, deadline_us)
         except NoAnswerError as error:
-            self._tally.refuse(error)
+            self._error_counters.reject(error)
             return None
-        self._tally.good()
+        self._error_counters.good()
         return result
 
     @abstractmethod
-    def _ask(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
-        """What is seen in `frame`. Raises NoAnswerError."""
+    def _request(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
+        """Return the detections in `frame`. Raises NoAnswerError."""
 
     def news(self) -> list[str]:
-        """What a person may want to know, since the last time."""
-        return self._tally.news.take()
+        """Return the lines since the last call."""
+        return self._error_counters.notices.take()
 
 
 class ServerDetector(FrameByFrame):
-    """Over one server. It may block for longer than the deadline: see `ByDeadline` for who must not."""
+    """A detector over one server. It may block for longer than the deadline; `DeadlineDetector` around it does not."""
 
     def __init__(self, name: str, server: Server) -> None:
         super().__init__(name)
         self._server = server
 
     def close(self) -> None:
-        """Let go of the server."""
+        """Close the server's connection."""
         self._server.close()
 
-    def _ask(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
+    def _request(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
         began_us = monotonic_us()
         _check_picture(frame)
         try:
-            answer = self._server.ask(frame, deadline_us)
-        except WireError as error:  # of pixels that were asked for
+            answer = self._server.request(frame, deadline_us)
+        except WireError as error:  # of pixels that the model needs
             raise NoAnswerError(NoAnswerReason.BAD_PICTURE, error.detail) from None
         ended_us = monotonic_us()
         if ended_us > deadline_us:
@@ -298,7 +293,7 @@ class ServerDetector(FrameByFrame):
 
 
 def _check_picture(frame: DetectFrame) -> None:
-    """Bytes go on undecoded, so that they are a picture of the right size is seen from their head alone."""
+    """Check the size in the JPEG's head: its bytes are sent undecoded."""
     try:
         size = read_jpeg_size(frame.jpeg, frame.width_px * frame.height_px)
     except WireError as error:
@@ -308,5 +303,5 @@ def _check_picture(frame: DetectFrame) -> None:
 
 
 def seconds_left(until_us: int) -> float:
-    """What is left until then, 0 if nothing is; bounded for who has no deadline."""
+    """Return the time left until `until_us`, at least 0; bounded where there is no deadline."""
     return min(max(0, until_us - monotonic_us()) / 1e6, LONGEST_WAIT_S)

@@ -1,7 +1,7 @@
 """Runs any detector on a thread of its own and waits for it until the deadline. Shell.
 
 Whatever hangs in there (a name server, a socket, a model) hangs alone. While it is busy, newer frames replace each
-other in one place; an answer that comes too late is nobody's.
+other in one place; an answer that comes too late is dropped.
 """
 
 import threading
@@ -30,30 +30,30 @@ Results = list[DetectionResult | None]
 PixelBound = Annotated[int, Field(ge=256, le=4096 * 4096)]
 MAX_PIXELS: Final = 1920 * 1080
 FAILED: Final = "FAILED"
-"""Counted beside what the inner detector refuses: it raised or gave what is no answer, which no detector should."""
+"""Counted beside the rejections of the inner detector: it raised or returned an invalid answer."""
 _CLOSE_S: Final = 1.0
 
 
 class Pending:
-    """Frames that were asked about, and the place where their results will be."""
+    """Requested frames, and the place where their results will be."""
 
     def __init__(self, frames: Sequence[DetectFrame], deadline_us: int) -> None:
         self.frames, self.deadline_us = frames, deadline_us
         self.begun = False
-        """Whether somebody began to look at them; newer ones may have taken their place before."""
+        """True once the inner detector has them; newer ones may have taken their place before."""
         self._place: LatestSlot[Results] = LatestSlot()
 
     def answer(self, results: Results) -> None:
-        """They are there."""
+        """Put the results there."""
         self._place.put(results)
 
     def take(self, wait: bool) -> Results | None:
-        """The results, once; None if they are not there, with `wait` by the deadline."""
+        """Take the results, once; None if they are not there, with `wait` by the deadline."""
         return self._place.take(seconds_left(self.deadline_us) if wait else 0.0)
 
     @property
     def over(self) -> bool:
-        """Whether the deadline has passed."""
+        """True after the deadline."""
         return monotonic_us() > self.deadline_us
 
 
@@ -68,31 +68,31 @@ class DeadlineDetector:
         self._decoders = DecoderPool(max_pixels)
         self._failed: Counter[str] = Counter()
         self._news = Notices()
-        self._asked: LatestSlot[Pending | None] = LatestSlot()
+        self._pending: LatestSlot[Pending | None] = LatestSlot()
         self._ending = threading.Event()
         self._ended_by: SightlineError | None = None
         self._thread = threading.Thread(target=self._work, name="detector", daemon=True)
         self._thread.start()
 
     @property
-    def refused(self) -> Counter[str]:
-        """What the inner one refused, if it counts that, and how often it raised or gave what is no answer."""
-        return Counter(getattr(self._inner, "refused", Counter())) + self._failed
+    def rejected(self) -> Counter[str]:
+        """Rejections of the inner detector, if it counts them; and how often it raised, or gave an invalid answer."""
+        return Counter(getattr(self._inner, "rejected", Counter())) + self._failed
 
     @property
     def overtaken(self) -> int:
-        """How often newer frames took the place of older ones that nobody had looked at."""
-        return self._asked.dropped
+        """Frames that newer ones replaced before the inner detector had them."""
+        return self._pending.dropped
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
-        """As the port says."""
-        results = self.ask(frames, deadline_us).take(wait=True) if frames else []
+        """See `Detector`."""
+        results = self.request(frames, deadline_us).take(wait=True) if frames else []
         return [None for _ in frames] if results is None else results
 
-    def ask(self, frames: Sequence[DetectFrame], deadline_us: int) -> Pending:
-        """Begin to ask about `frames`, in place of any that wait."""
+    def request(self, frames: Sequence[DetectFrame], deadline_us: int) -> Pending:
+        """Begin to request `frames`, in place of any that wait."""
         pending = Pending(frames, deadline_us)
-        self._asked.put(pending)
+        self._pending.put(pending)
         return pending
 
     def attach(self, link: Link) -> None:
@@ -100,20 +100,20 @@ class DeadlineDetector:
         attach_detector(self._inner, link)
 
     def news(self) -> list[str]:
-        """What the inner one has to say, and that it failed."""
+        """Return the lines of the inner detector, and its first failure."""
         return [*notices_of(self._inner), *self._news.take()]
 
     def close(self) -> None:
         """End the thread; one that hangs is left behind. Raises ConfigError if the inner one's `close` fails."""
         self._ending.set()
-        self._asked.put(None)
+        self._pending.put(None)
         self._thread.join(_CLOSE_S)
         if self._ended_by is not None:
             raise self._ended_by
 
     def _work(self) -> None:
         while not self._ending.is_set():
-            pending = self._asked.take(LONGEST_WAIT_S)
+            pending = self._pending.take(LONGEST_WAIT_S)
             if pending is not None and not pending.over:
                 pending.begun = True
                 try:
@@ -135,7 +135,7 @@ class DeadlineDetector:
             pending.answer([None if isinstance(one, str) else one for one in results])
 
     def _fail(self, why: str) -> None:
-        """Count it; the first is told."""
+        """Count it; report the first."""
         if not self._failed:
             self._news.add(why)
         self._failed[FAILED] += 1

@@ -1,51 +1,25 @@
 """A local detector that takes over while the remote one is late. Shell.
 
-While they drive, the remote is asked beside them, and drives again after ten good answers in a row. Each robot for
-itself: one whose frames are not answered changes nothing for the others.
+While the local one drives, the remote is requested beside it, and drives again after ten good answers in a row. Each
+robot for itself: one whose frames are not answered changes nothing for the others.
 """
 
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Sequence
 from contextlib import ExitStack
-from typing import Final, Protocol, runtime_checkable
+from typing import Final
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.detect.per_robot import MAX_ROBOTS
 from sightline.vision_side.detect.plugin_calls import Notices, attach_detector, close_detector, notices_of
-from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
-from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, DeadlineDetector
+from sightline.vision_side.detect.port import DetectFrame, Detector
+from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, DeadlineDetector, Pending, Results
 
 GOOD_ANSWERS: Final = 10
 """In a row; a third of a second at 30 fps."""
 RESERVE_US: Final = 20_000
-"""Kept back of a deadline for the own eyes, half of it at most: several times what they need for one picture."""
-Results = list[DetectionResult | None]
-
-
-class PendingAnswer(Protocol):
-    """What was asked and may be answered."""
-
-    begun: bool
-    """Whether somebody began to look; newer frames may have taken its place before."""
-
-    def take(self, wait: bool) -> Results | None:
-        """The results, once; with `wait` by the deadline."""
-        ...
-
-    @property
-    def over(self) -> bool:
-        """Whether the deadline has passed."""
-        ...
-
-
-@runtime_checkable
-class Remote(Detector, Protocol):
-    """A detector that can be asked without waiting, such as `ByDeadline`."""
-
-    def ask(self, frames: Sequence[DetectFrame], deadline_us: int) -> PendingAnswer:
-        """Begin to ask about `frames`."""
-        ...
+"""Part of a deadline for the local detector, half of it at most: several times what it needs for one picture."""
 
 
 class Fallback:
@@ -54,25 +28,20 @@ class Fallback:
     def __init__(
         self, first: Detector, second: Detector, good_answers: int = GOOD_ANSWERS, max_pixels: int = MAX_PIXELS
     ) -> None:
-        """A `first` that cannot be asked without waiting is asked on a thread of its own, about up to `max_pixels`."""
-        self._first: Remote = first if isinstance(first, Remote) else DeadlineDetector(first, max_pixels)
+        """A `first` without a deadline of its own gets a thread of its own, with pictures of up to `max_pixels`."""
+        self._first = first if isinstance(first, DeadlineDetector) else DeadlineDetector(first, max_pixels)
         self._second = second
         self._news = Notices()
         self._good_answers = good_answers
         self._good: OrderedDict[str, int] = OrderedDict()
         """For each robot that the second drives: good answers of the first in a row."""
-        self._beside: list[tuple[list[str], PendingAnswer]] = []
-        """Whose frames the first was asked about beside; each robot is in one at most."""
+        self._beside: list[tuple[list[str], Pending]] = []
+        """Robots and their frames that the first looks at beside; each robot is in one at most."""
         self.switched = 0
 
-    @property
-    def refused(self) -> Counter[str]:
-        """What the first one refused, if it counts that."""
-        return Counter(getattr(self._first, "refused", {}))
-
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
-        """As the port says."""
-        self._judge()
+        """See `Detector`."""
+        self._count_beside()
         firsts = [one for one in frames if one.robot not in self._good]
         others = [one for one in frames if one.robot in self._good]
         first_us = deadline_us - min(RESERVE_US, max(0, deadline_us - monotonic_us()) // 2)
@@ -81,7 +50,7 @@ class Fallback:
         for frame, result in zip(frames, results, strict=True):
             if result is None and frame.robot not in self._good:
                 self._switch(frame.robot)
-        self._ask_beside(others, first_us)  # who would be late when it drives is late here, too
+        self._request_beside(others, first_us)  # an answer that would be late if it drove is late here, too
         return self._filled(results, frames, deadline_us)
 
     def attach(self, link: Link) -> None:
@@ -96,16 +65,16 @@ class Fallback:
             ending.callback(close_detector, self._first)
 
     def news(self) -> list[str]:
-        """What both have to say, and which of them drives."""
+        """Return the lines of both, and which of them drives."""
         return [*notices_of(self._first), *self._news.take(), *notices_of(self._second)]
 
     def _switch(self, robot: str) -> None:
-        """From now on the second drives."""
+        """Let the second drive from now on."""
         self._good[robot] = 0
-        if len(self._good) > MAX_ROBOTS:  # who was switched first begins anew with the first one
+        if len(self._good) > MAX_ROBOTS:  # the robot that was switched first has the first detector again
             self._good.popitem(last=False)
         self.switched += 1
-        self._news.add(f"the first detector is late or silent for {robot}: own eyes drive on")
+        self._news.add(f"the first detector is late or silent for {robot}: the fallback drives on")
 
     def _filled(self, results: Results, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
         """The second one's results where the first had none."""
@@ -113,21 +82,21 @@ class Fallback:
         more = iter(self._second.detect(missing, deadline_us) if missing else [])
         return [next(more) if result is None else result for result in results]
 
-    def _ask_beside(self, frames: Sequence[DetectFrame], deadline_us: int) -> None:
-        """Ask the first about frames that the second answers, of robots of which nothing is under way."""
-        under_way = {robot for robots, _ in self._beside for robot in robots}
-        new = [one for one in frames if one.robot not in under_way]
+    def _request_beside(self, frames: Sequence[DetectFrame], deadline_us: int) -> None:
+        """Request from the first the frames that the second answers, of robots without a request in flight."""
+        in_flight = {robot for robots, _ in self._beside for robot in robots}
+        new = [one for one in frames if one.robot not in in_flight]
         if new:
-            self._beside.append(([one.robot for one in new], self._first.ask(new, deadline_us)))
+            self._beside.append(([one.robot for one in new], self._first.request(new, deadline_us)))
 
-    def _judge(self) -> None:
-        """Count the answers that were asked for beside, where they came, or that they did not."""
+    def _count_beside(self) -> None:
+        """Count the answers of the first beside the second: those that came, and those that did not."""
         waiting = []
-        for robots, asked in self._beside:
-            results = asked.take(wait=False)
-            if results is None and not asked.over:
-                waiting.append((robots, asked))
-            elif results is not None or asked.begun:  # what nobody looked at says nothing of the first
+        for robots, pending in self._beside:
+            results = pending.take(wait=False)
+            if results is None and not pending.over:
+                waiting.append((robots, pending))
+            elif results is not None or pending.begun:  # frames that were never looked at are not its failure
                 self._count(robots, results or [])
         self._beside = waiting
 

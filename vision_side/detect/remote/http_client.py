@@ -1,7 +1,7 @@
 """HTTP/1.1 with one deadline for the whole exchange, and the detector `http+jpeg`. Shell.
 
-Nothing is unpacked, nothing is followed: a redirect, a compressed body and a body over the limit are refused. The
-standard library's own client waits anew for every byte that drips in; here one deadline holds for the whole exchange.
+Nothing is unpacked, nothing is followed: a redirect, a compressed body and a body over the limit are rejected. The
+standard library's own client waits again for every byte that drips in; here one deadline holds for the whole exchange.
 """
 
 import http.client
@@ -60,20 +60,20 @@ class HttpExchange:
         self._socket: socket.socket | None = None
         self._not_before_us = 0
         self._reached: Any = None
-        """Of the addresses that the host's name has, the one that was there last."""
+        """The address of the host that was reached last."""
         self.lost = 0
-        """How often a kept connection turned out to be over: the server behind the next may be another."""
+        """Open connections that turned out to be over: the server behind the next may be another."""
 
     def get(self, path: str, until_us: int) -> Reply:
         """Raises NoAnswerError as `post` does."""
         return self._exchange("GET", self._head("GET", path, {}, 0), b"", until_us)
 
     def post(self, path: str, headers: Mapping[str, str], body: bytes, until_us: int) -> Reply:
-        """Raises NoAnswerError: LATE, UNREACHABLE, REFUSED (any status but 200), TOO_LARGE, ENCODED, MALFORMED."""
+        """Raises NoAnswerError: LATE, UNREACHABLE, REJECTED (any status but 200), TOO_LARGE, ENCODED, MALFORMED."""
         return self._exchange("POST", self._head("POST", path, headers, len(body)), body, until_us)
 
     def close(self) -> None:
-        """Let go of the connection; the next exchange makes another."""
+        """Close the connection; the next exchange opens another."""
         if self._socket is not None:
             with suppress(OSError):
                 self._socket.close()
@@ -86,7 +86,7 @@ class HttpExchange:
         return ("\r\n".join(lines) + "\r\n\r\n").encode("ascii")
 
     def _exchange(self, method: str, head: bytes, body: bytes, until_us: int) -> Reply:
-        """Over the kept connection; once more over a new one if the server had let go of that meanwhile."""
+        """Use the open connection; once more a new one if the server had closed that meanwhile."""
         kept = self._is_kept()
         try:
             return self._once(method, head, body, until_us)
@@ -117,7 +117,7 @@ class HttpExchange:
             raise NoAnswerError(NoAnswerReason.MALFORMED, f"not HTTP: {type(error).__name__}: {error}") from None
 
     def _is_kept(self) -> bool:
-        """Whether the last connection can be used again. Bytes that wait on it answer nothing that will be asked."""
+        """Check that the last connection can be used again. Bytes that wait on it answer no later request."""
         if self._socket is None:
             return False
         self._socket.setblocking(False)
@@ -169,7 +169,7 @@ class HttpExchange:
             encoding = response.headers.get("Content-Encoding", "identity").strip().lower()
             if encoding not in ("", "identity"):
                 raise NoAnswerError(
-                    NoAnswerReason.ENCODED, f"Content-Encoding {encoding[:20]!r}, where none was asked for"
+                    NoAnswerReason.ENCODED, f"Content-Encoding {encoding[:20]!r}, although not requested"
                 )
             if (response.length or 0) > MAX_ANSWER_BYTES:
                 raise NoAnswerError(NoAnswerReason.TOO_LARGE, f"{response.length} bytes, at most {MAX_ANSWER_BYTES}")
@@ -180,7 +180,7 @@ class HttpExchange:
                 raise NoAnswerError(NoAnswerReason.UNREACHABLE, f"it went away {response.length} bytes before the end")
             if response.status != http.client.OK:
                 raise NoAnswerError(
-                    NoAnswerReason.REFUSED, f"status {response.status}: {body[:80].decode('utf-8', 'replace')}"
+                    NoAnswerReason.REJECTED, f"status {response.status}: {body[:80].decode('utf-8', 'replace')}"
                 )
             if response.will_close or not response.isclosed():
                 self.close()
@@ -201,14 +201,14 @@ def _connected(found: Any, timeout_s: float) -> socket.socket:
 
 
 class _Timed(io.RawIOBase):
-    """What a response reads from: each read waits no longer than is left for the whole, and all have one limit."""
+    """A response's source: each read waits no longer than is left for the whole, and all have one limit."""
 
     def __init__(self, connection: socket.socket, until_us: int) -> None:
         self._connection, self._until_us = connection, until_us
         self._taken_bytes = 0
 
     def makefile(self, _mode: str) -> io.BufferedReader:
-        """As a socket does."""
+        """See `socket.socket`."""
         return io.BufferedReader(self)
 
     def readable(self) -> bool:
@@ -240,11 +240,10 @@ def _left_s(until_us: int) -> float:
 
 SESSION, SEQ = "X-Sightline-Session", "X-Sightline-Seq"
 """Headers that name the frame, for servers that log or that answer out of order."""
-_REASONS: Final = {RejectReason.NOT_FINITE: NoAnswerReason.NOT_FINITE}
 
 
 class JpegAnswer(Detections):
-    """What a server answers."""
+    """The answer of a server."""
 
     session: SessionId | None = None
     seq: Counter | None = None
@@ -259,18 +258,18 @@ class JpegServer:
         self._path, self._min_score = address.path, min_score
         self._name = f"{address.scheme}:{address.path}"[:64]
 
-    def ask(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
-        """As `Server` says."""
+    def request(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
+        """See `Server`."""
         named = {"Content-Type": "image/jpeg", SESSION: frame.header.session, SEQ: str(frame.header.seq)}
         body = self._http.post(self._path, named, frame.jpeg, until_us).body
-        said = read_jpeg_answer(body, frame)
-        found = read_boxes(said.boxes, (frame.width_px, frame.height_px), self._min_score)
-        device = clean_label(said.device) if said.device else REMOTE
-        name = clean_label(said.detector) if said.detector else self._name
-        return ServerAnswer(found, Maker(name, hash_of(said.model_hash or said.model), device))
+        answer = read_jpeg_answer(body, frame)
+        found = read_boxes(answer.boxes, (frame.width_px, frame.height_px), self._min_score)
+        device = clean_label(answer.device) if answer.device else REMOTE
+        name = clean_label(answer.detector) if answer.detector else self._name
+        return ServerAnswer(found, Maker(name, hash_of(answer.model_hash or answer.model), device))
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection."""
         self._http.close()
 
 
@@ -278,14 +277,14 @@ class HttpJpeg(DeadlineDetector):
     """The detector `http+jpeg://HOST[:PORT]/PATH`."""
 
     class Config(Settings):
-        """What is asked where."""
+        """The address, and which boxes count."""
 
         address: str
         min_score: Fraction = MIN_SCORE
         max_pixels: PixelBound = MAX_PIXELS
 
     def __init__(self, config: Config) -> None:
-        """Raises ConfigError for an address that is none. Nothing is connected before the first frame."""
+        """Raises ConfigError for an invalid address. Nothing is connected before the first frame."""
         address = parse_address(config.address)
         server = JpegServer(address, config.min_score)
         super().__init__(ServerDetector(config.address, server), config.max_pixels)
@@ -294,23 +293,20 @@ class HttpJpeg(DeadlineDetector):
 def read_jpeg_answer(body: bytes, frame: DetectFrame) -> JpegAnswer:
     """The answer for `frame`. Raises NoAnswerError for anything else."""
     try:
-        said = decode(JpegAnswer, body, MAX_ANSWER_BYTES)
+        answer = decode(JpegAnswer, body, MAX_ANSWER_BYTES)
     except WireError as error:
         reason = NoAnswerReason.TOO_MANY if "at most 64 items" in error.detail else _reason(error)
         raise NoAnswerError(reason, error.detail) from None
-    if said.session not in (None, frame.header.session) or said.seq not in (None, frame.header.seq):
-        raise NoAnswerError(NoAnswerReason.OTHER_FRAME, f"it answers frame {said.seq} of {said.session}")
-    if (said.width_px, said.height_px) != (frame.width_px, frame.height_px):
+    if answer.session not in (None, frame.header.session) or answer.seq not in (None, frame.header.seq):
+        raise NoAnswerError(NoAnswerReason.OTHER_FRAME, f"it answers frame {answer.seq} of {answer.session}")
+    if (answer.width_px, answer.height_px) != (frame.width_px, frame.height_px):
         raise NoAnswerError(
             NoAnswerReason.OTHER_SIZE,
-            f"boxes of a {said.width_px}x{said.height_px} picture, the frame is {frame.width_px}x{frame.height_px}",
+            f"boxes of a {answer.width_px}x{answer.height_px} picture, the frame is {frame.width_px}x{frame.height_px}",
         )
-    return said
+    return answer
 
 
 def _reason(error: WireError) -> NoAnswerReason:
-    return (
-        NoAnswerReason.NOT_FINITE
-        if "finite number" in error.detail
-        else _REASONS.get(error.reason, NoAnswerReason.MALFORMED)
-    )
+    is_not_finite = error.reason is RejectReason.NOT_FINITE or "finite number" in error.detail
+    return NoAnswerReason.NOT_FINITE if is_not_finite else NoAnswerReason.MALFORMED

@@ -33,9 +33,21 @@ _MAX_SIDE: Final = 8192
 _MAX_LABEL_NUMBER: Final = 1 << 31  # of labels written as floats
 
 
+class OipSettings(Settings):
+    """The detector `oip+http`."""
+
+    address: str
+    labels: Annotated[tuple[Label, ...], Field(max_length=1024)] = ()
+    """Names of labels that the model gives as numbers, from 0 on."""
+    min_score: Fraction = MIN_SCORE
+    order: Literal["bgr", "rgb"] = "bgr"
+    """Order of the colors, where the model takes pixels."""
+    max_pixels: PixelBound = MAX_PIXELS
+
+
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """One input or output of a model, as its metadata says: -1 is any size."""
+    """One input or output in a model's metadata: -1 is any size."""
 
     name: str
     datatype: str
@@ -44,7 +56,7 @@ class Slot:
 
 @dataclass(frozen=True, slots=True)
 class OipModel:
-    """What is known of a model: how it is asked, and which outputs it is asked for."""
+    """A model of a server: its input, and the outputs to request."""
 
     name: str
     version: str
@@ -52,14 +64,16 @@ class OipModel:
     outputs: tuple[str, ...]
 
     def title(self, scheme: str, answered: str) -> str:
-        """What results say that they are of: servers tell a version, and no hash. That of the answer counts, for a
-        server takes new versions while it runs; the metadata's where it has none."""
+        """Return the detector's name in results, with the version: servers give no hash.
+
+        The answer's version counts, for a server takes new versions while it runs; else that of the metadata.
+        """
         version = answered or self.version
         return f"{scheme}:{self.name[:40]}" + (f" {version[:8]}" if version else "")
 
     @property
     def takes_jpeg(self) -> bool:
-        """Whether it decodes by itself."""
+        """True for a model that decodes by itself."""
         return self.input.datatype == "BYTES"
 
 
@@ -75,20 +89,11 @@ class Tensor:
 
 @dataclass(frozen=True, slots=True)
 class Inferred:
-    """What an answer holds."""
+    """The tensors of an answer."""
 
     tensors: Mapping[str, NDArray[Any] | list[str]]
     version: str = ""
-    """Of the model that answered; empty where the server does not say."""
-
-
-@dataclass(frozen=True, slots=True)
-class OutputOptions:
-    """How an answer is read: names of labels that are numbers, the least score; and in which order colours go."""
-
-    labels: tuple[str, ...] = ()
-    min_score: float = MIN_SCORE
-    rgb: bool = False
+    """Version of the model that answered; empty where the server does not give one."""
 
 
 def model_of(name: str, version: str, inputs: Sequence[Slot], outputs: Sequence[Slot]) -> OipModel:
@@ -99,7 +104,7 @@ def model_of(name: str, version: str, inputs: Sequence[Slot], outputs: Sequence[
     if one.datatype not in ("BYTES", "UINT8"):
         raise _unfit(name, f"its input is {one.datatype}; BYTES (a JPEG) or UINT8 (pixels) is given")
     if one.datatype == "UINT8" and (len(one.shape) not in (3, 4) or _layout(one.shape) is None):
-        raise _unfit(name, f"its input of shape {list(one.shape)} is no picture of three channels")
+        raise _unfit(name, f"its input of shape {list(one.shape)} is not a picture of three channels")
     if one.datatype == "BYTES" and len(one.shape) not in (1, 2):
         raise _unfit(name, f"its input of shape {list(one.shape)} is not one JPEG")
     missing = {BOXES, SCORES} - given
@@ -122,9 +127,9 @@ def _layout(shape: tuple[int, ...]) -> tuple[int, int, bool] | None:
 
 
 def tensor_of(model: OipModel, frame: DetectFrame, rgb: bool) -> tuple[Tensor, tuple[float, float]]:
-    """What is sent for `frame`, and what turns the answer's pixels into those of the encoded picture.
+    """Return the input for `frame`, and what turns the answer's pixels into those of the encoded picture.
 
-    Raises WireError where pixels are asked for and the JPEG has none.
+    Raises WireError where the model takes pixels and the JPEG has none.
     """
     one = model.input
     if model.takes_jpeg:
@@ -181,7 +186,7 @@ def read_text_tensor(shape: Sequence[int], data: bytes) -> list[str]:
 
 
 def elements_of(shape: Sequence[int]) -> int:
-    """How many there are in a tensor of `shape`. Raises NoAnswerError for a shape that none has, or of too many."""
+    """Count the elements of a tensor of `shape`. Raises NoAnswerError for an invalid shape, or too many elements."""
     if len(shape) > MAX_DIMENSIONS or any(not 0 <= size <= MAX_ELEMENTS for size in shape):
         raise NoAnswerError(NoAnswerReason.MALFORMED, f"a tensor of shape {list(shape)[:MAX_DIMENSIONS]}")
     count = math.prod(shape)
@@ -191,16 +196,16 @@ def elements_of(shape: Sequence[int]) -> int:
 
 
 def detections_of(
-    answer: Inferred, looking: OutputOptions, stretch: tuple[float, float], size_px: tuple[int, int]
+    answer: Inferred, settings: OipSettings, stretch: tuple[float, float], size_px: tuple[int, int]
 ) -> tuple[Detection, ...]:
-    """What an answer's tensors say. Raises NoAnswerError for a missing or misshapen one."""
+    """Read an answer's tensors. Raises NoAnswerError for a missing or misshapen one."""
     outputs = answer.tensors
     boxes, scores = (_numbers(outputs, name) for name in (BOXES, SCORES))
     boxes = boxes.reshape(boxes.shape[-2:]) if boxes.ndim > 2 and math.prod(boxes.shape[:-2]) == 1 else boxes
     scores = _flat(scores)
-    labels = _labels(outputs.get(LABELS), len(scores) if scores.ndim else 0, looking.labels)
+    labels = _labels(outputs.get(LABELS), len(scores) if scores.ndim else 0, settings.labels)
     return read_columns(boxes.astype(np.float64), scores.astype(np.float64), labels, stretch=stretch, size_px=size_px,
-                        min_score=looking.min_score)
+                        min_score=settings.min_score)
 
 
 def _numbers(outputs: Mapping[str, NDArray[Any] | list[str]], name: str) -> NDArray[Any]:
@@ -231,22 +236,3 @@ def _labels(found: NDArray[Any] | list[str] | None, rows: int, names: tuple[str,
             f"labels of shape {numbers.shape} and type {numbers.dtype}; they are text or whole numbers",
         )
     return [names[number] if 0 <= number < len(names) else str(number) for number in numbers.tolist()]
-
-
-# What is configured of a model that is asked by the Open Inference Protocol, over HTTP. Pure.
-
-
-class OipSettings(Settings):
-    """The detector `oip+http`."""
-
-    address: str
-    labels: Annotated[tuple[Label, ...], Field(max_length=1024)] = ()
-    """Names of labels that the model gives as numbers, from 0 on."""
-    min_score: Fraction = MIN_SCORE
-    order: Literal["bgr", "rgb"] = "bgr"
-    """Of the colours, where the model takes pixels."""
-    max_pixels: PixelBound = MAX_PIXELS
-
-    def looking(self) -> OutputOptions:
-        """How its answers are read."""
-        return OutputOptions(self.labels, self.min_score, self.order == "rgb")

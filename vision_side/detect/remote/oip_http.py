@@ -27,7 +27,6 @@ from sightline.vision_side.detect.remote.oip import (
     Inferred,
     OipModel,
     OipSettings,
-    OutputOptions,
     Slot,
     Tensor,
     detections_of,
@@ -39,34 +38,34 @@ from sightline.vision_side.detect.remote.oip import (
 )
 
 HEADER_LENGTH: Final = "Inference-Header-Content-Length"
-"""How many bytes of a body are JSON; tensors follow."""
+"""Header with the number of bytes of a body that are JSON; tensors follow."""
 _Name = Annotated[str, Field(max_length=256)]
 _Shape = Annotated[tuple[int, ...], Field(max_length=MAX_DIMENSIONS)]
 
 
-class _Said(BaseModel):
-    """What a server says; what is not asked for here is left alone."""
+class _FromServer(BaseModel):
+    """A part of an answer; fields unknown here are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-Said = TypeVar("Said", bound=_Said)
+FromServer = TypeVar("FromServer", bound=_FromServer)
 
 
-class _Slot(_Said):
+class _Slot(_FromServer):
     name: _Name
     datatype: _Name
     shape: _Shape
 
 
-class _Metadata(_Said):
+class _Metadata(_FromServer):
     name: _Name
     versions: Annotated[tuple[_Name, ...], Field(max_length=1024)] = ()
     inputs: Annotated[tuple[_Slot, ...], Field(max_length=MAX_TENSORS)]
     outputs: Annotated[tuple[_Slot, ...], Field(max_length=MAX_TENSORS)]
 
 
-class _Parameters(_Said):
+class _Parameters(_FromServer):
     binary_data_size: Annotated[int | None, Field(ge=0)] = None
 
 
@@ -75,7 +74,7 @@ class _Output(_Slot):
     data: Any = None
 
 
-class _Answer(_Said):
+class _Answer(_FromServer):
     id: str | None = None
     model_version: _Name = ""
     outputs: Annotated[tuple[_Output, ...], Field(max_length=MAX_TENSORS)]
@@ -83,9 +82,9 @@ class _Answer(_Said):
 
 def read_metadata(body: bytes) -> OipModel:
     """The model that `GET v2/models/NAME` describes. Raises NoAnswerError."""
-    said = _validated(_Metadata, body)
-    slots = [[Slot(one.name, one.datatype, one.shape) for one in of] for of in (said.inputs, said.outputs)]
-    return model_of(said.name, said.versions[-1] if said.versions else "", *slots)
+    metadata = _validated(_Metadata, body)
+    slots = [[Slot(one.name, one.datatype, one.shape) for one in of] for of in (metadata.inputs, metadata.outputs)]
+    return model_of(metadata.name, metadata.versions[-1] if metadata.versions else "", *slots)
 
 
 def infer_body(model: OipModel, tensor: Tensor, number: str) -> tuple[int, bytes]:
@@ -100,13 +99,13 @@ def infer_body(model: OipModel, tensor: Tensor, number: str) -> tuple[int, bytes
 
 
 def read_infer(body: bytes, json_length: str | None, number: str) -> Inferred:
-    """An answer. Raises NoAnswerError, also if it is the answer to something else."""
+    """Read an answer. Raises NoAnswerError, also if it is the answer to something else."""
     length = _json_length(json_length, len(body))
-    said = _validated(_Answer, body[:length])
-    if said.id not in (None, "", number):
-        raise NoAnswerError(NoAnswerReason.OTHER_FRAME, f"the answer's id is {said.id[:40]!r}, asked was {number!r}")
+    answer = _validated(_Answer, body[:length])
+    if answer.id not in (None, "", number):
+        raise NoAnswerError(NoAnswerReason.OTHER_FRAME, f"the answer's id is {answer.id[:40]!r}, not {number!r}")
     tensors, at = {}, length
-    for one in said.outputs:
+    for one in answer.outputs:
         size = one.parameters.binary_data_size
         if size is None:
             tensors[one.name] = _from_list(one)
@@ -115,7 +114,7 @@ def read_infer(body: bytes, json_length: str | None, number: str) -> Inferred:
             raise NoAnswerError(NoAnswerReason.MALFORMED, f"output {one.name[:40]!r} ends behind the end of the answer")
         tensors[one.name] = _from_bytes(one, body[at : at + size])
         at += size
-    return Inferred(tensors, said.model_version)
+    return Inferred(tensors, answer.model_version)
 
 
 def _json_length(text: str | None, whole: int) -> int:
@@ -143,7 +142,7 @@ def _from_list(one: _Output) -> NDArray[Any] | list[str]:
     return [str(value) for value in values] if one.datatype == "BYTES" else values.reshape(one.shape)
 
 
-def _validated(model: type[Said], data: bytes) -> Said:
+def _validated(model: type[FromServer], data: bytes) -> FromServer:
     try:
         return model.model_validate_json(data)
     except ValidationError as error:
@@ -154,46 +153,46 @@ def _validated(model: type[Said], data: bytes) -> Said:
 
 
 class HttpServer:
-    """A `Server`. What the model is like is asked once, and again after every error but lateness and every
+    """A `Server`. The model's metadata are requested once, and again after every error but lateness and every
     connection that the server ended."""
 
-    def __init__(self, address: Address, looking: OutputOptions) -> None:
+    def __init__(self, address: Address, settings: OipSettings) -> None:
         self._http = HttpExchange(address.host, address.port)
         version = f"/versions/{address.version}" if address.version else ""
         self._path = f"/v2/models/{address.model}{version}"
-        self._looking = looking
+        self._settings = settings
         self._scheme = address.scheme
         self._model: OipModel | None = None
-        self._asked_at = 0
-        """Connections that were lost when the model was asked for."""
+        self._lost_before = 0
+        """Connections that were lost when the metadata were requested."""
 
-    def ask(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
-        """As `Server` says."""
+    def request(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
+        """See `Server`."""
         try:
             return self._answer(frame, until_us)
         except NoAnswerError as error:
-            if error.reason is not NoAnswerReason.LATE:  # to ask anew would make the next answer later still
+            if error.reason is not NoAnswerReason.LATE:  # metadata again would make the next answer later still
                 self._model = None
             raise
 
     def _answer(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
         model = self._known_model(until_us)
-        tensor, stretch = tensor_of(model, frame, self._looking.rgb)
+        tensor, stretch = tensor_of(model, frame, self._settings.order == "rgb")
         number = f"{frame.header.session}-{frame.header.seq}"
         length, body = infer_body(model, tensor, number)
         reply = self._http.post(f"{self._path}/infer", {HEADER_LENGTH: str(length)}, body, until_us)
         answer = read_infer(reply.body, reply.headers.get(HEADER_LENGTH.lower()), number)
-        found = detections_of(answer, self._looking, stretch, (frame.width_px, frame.height_px))
+        found = detections_of(answer, self._settings, stretch, (frame.width_px, frame.height_px))
         return ServerAnswer(found, Maker(model.title(self._scheme, answer.version), device=REMOTE))
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection."""
         self._http.close()
 
     def _known_model(self, until_us: int) -> OipModel:
-        if self._model is None or self._asked_at != self._http.lost:
+        if self._model is None or self._lost_before != self._http.lost:
             self._model = read_metadata(self._http.get(self._path, until_us).body)
-            self._asked_at = self._http.lost
+            self._lost_before = self._http.lost
         return self._model
 
 
@@ -203,6 +202,6 @@ class OipHttp(DeadlineDetector):
     Config = OipSettings
 
     def __init__(self, config: OipSettings) -> None:
-        """Raises ConfigError for an address that is none. Nothing is connected before the first frame."""
-        server = HttpServer(parse_address(config.address), config.looking())
+        """Raises ConfigError for an invalid address. Nothing is connected before the first frame."""
+        server = HttpServer(parse_address(config.address), config)
         super().__init__(ServerDetector(config.address, server), config.max_pixels)

@@ -73,7 +73,7 @@ def test_who_hangs_is_not_waited_for_longer_than_the_deadline(by_deadline, held)
 
 
 def test_what_is_over_before_its_turn_is_not_looked_at(by_deadline, held):
-    by_deadline.ask([frame(1)], within(-1))
+    by_deadline.request([frame(1)], within(-1))
     time.sleep(0.05)
     assert by_deadline.detect([frame(2)], within(2))[0].seq == 2 and held.asked == [[2]]
 
@@ -93,7 +93,7 @@ def test_what_raises_is_no_answer_and_the_next_is_one(by_deadline, held):
     assert by_deadline.detect([frame(1)], within(2)) == [None]
     held.raises = False
     assert by_deadline.detect([frame(2)], within(2))[0].seq == 2
-    assert by_deadline.refused == {FAILED: 1}
+    assert by_deadline.rejected == {FAILED: 1}
     (line,) = by_deadline.news()
     assert "RuntimeError: a plug-in's fault" in line
 
@@ -169,8 +169,8 @@ class Asked:
         return results
 
 
-class FakeRemote(Held):
-    """Asked without waiting; `state` says how: good, none (no answer that counts), late, overtaken, or under way."""
+class FakeRemote(Held, DeadlineDetector):
+    """Requested without waiting; `state` is good, none (no answer that counts), late, overtaken, or under way."""
 
     state = "good"
 
@@ -182,7 +182,10 @@ class FakeRemote(Held):
         self.good = self.state == "good"
         return super().detect(frames, deadline_us)
 
-    def ask(self, frames, deadline_us):
+    def news(self):
+        return []
+
+    def request(self, frames, deadline_us):
         self.besides.append(deadline_us)
         results = self.detect(frames, deadline_us) if self.state in ("good", "none") else None
         return Asked(results, self.state in ("late", "overtaken"), self.state != "overtaken")
@@ -201,7 +204,7 @@ def test_late_once_and_own_eyes_drive_on_in_that_very_frame():
     deadline_us = within(2)
     assert fallback.detect([frame(2)], deadline_us)[0].detector == "own"
     assert remote.deadlines[-1] == deadline_us - RESERVE_US and own.deadlines == [deadline_us]
-    assert "own eyes drive on" in fallback.news()[0] and fallback.switched == 1
+    assert "the fallback drives on" in fallback.news()[0] and fallback.switched == 1
 
 
 def test_asked_beside_the_remote_has_no_more_time_than_when_it_drives():

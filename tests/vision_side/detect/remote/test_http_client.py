@@ -37,7 +37,7 @@ def test_a_jpeg_goes_out_as_it_came_and_boxes_come_back():
     one = result.detections[0]
     assert (one.label, one.score, one.x1_px, one.y1_px, one.x2_px, one.y2_px) == ("ball", 0.9, 100, 80, 140, 120)
     assert (result.robot, result.session, result.seq, result.t_us) == ("r1", "0000abcd", 7, 7 * 33_333)
-    assert (result.width_px, result.height_px, result.device) == (320, 240, "remote") and not detector.refused
+    assert (result.width_px, result.height_px, result.device) == (320, 240, "remote") and not detector.rejected
 
 
 def test_saw_nothing_is_an_answer_and_the_server_may_say_who_it_is():
@@ -67,7 +67,7 @@ def test_one_connection_is_kept_and_made_again_when_the_server_let_go_of_it():
         port = server.port
         server.kill()
         server.start(port)
-        assert _ask(detector, seq=10) and not detector.refused, "the kept connection is over, another one is made"
+        assert _ask(detector, seq=10) and not detector.rejected, "the kept connection is over, another one is made"
 
 
 def test_a_name_whose_first_address_is_dead_is_reached_at_its_second(monkeypatch):
@@ -108,7 +108,7 @@ def test_what_a_server_says_unasked_answers_no_later_frame():
         time.sleep(0.1)
         server.answer = lambda request: http_reply(said(box(x1=99.0)))
         assert [_ask(detector, seq=seq).detections[0].x1_px for seq in (2, 3, 4)] == [99.0] * 3
-        assert server.connections == 2 and not detector.refused
+        assert server.connections == 2 and not detector.rejected
 
 
 MILLION = b'{"width_px":320,"height_px":240,"boxes":[' + b",".join([b"{}"] * 1_000_000) + b"]}"
@@ -117,8 +117,8 @@ HOSTILE = {
     "empty": (http_reply(b""), "MALFORMED"),
     "no json": (http_reply(b"{"), "MALFORMED"),
     "html": (http_reply(b"<html>It works!</html>"), "MALFORMED"),
-    "html error page": (http_reply(b"<html>502</html>", "502 Bad Gateway"), "REFUSED"),
-    "redirect": (http_reply(b"", "302 Found", ["Location: http://127.0.0.1:1/"]), "REFUSED"),
+    "html error page": (http_reply(b"<html>502</html>", "502 Bad Gateway"), "REJECTED"),
+    "redirect": (http_reply(b"", "302 Found", ["Location: http://127.0.0.1:1/"]), "REJECTED"),
     "list": (http_reply(b"[]"), "MALFORMED"),
     "nested": (http_reply(b"[" * 100_000), "MALFORMED"),
     "no boxes field of the right kind": (http_reply(said()[:-1] + b',"boxes":5}'), "MALFORMED"),
@@ -160,7 +160,7 @@ def test_a_hostile_answer_is_refused_and_counted_and_ends_nothing(name):
         detector = _asking(server)
         began_s = time.monotonic()
         assert _ask(detector, seconds=0.3) is None
-        assert time.monotonic() - began_s < 0.6 and dict(detector.refused) == {reason: 1}
+        assert time.monotonic() - began_s < 0.6 and dict(detector.rejected) == {reason: 1}
         server.answer = lambda request: GOOD
         assert _ask(detector, seq=2), "the next answer counts again"
     lines = detector.news()
@@ -174,7 +174,7 @@ def test_a_gzip_bomb_and_a_million_boxes_take_no_memory():
         detector = _asking(server)
         for seq in range(1, 11):
             assert _ask(detector, seq=seq) is None
-    assert sum(detector.refused.values()) == 10
+    assert sum(detector.rejected.values()) == 10
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < 32_000
 
 
@@ -184,7 +184,7 @@ def test_what_is_no_picture_is_not_sent():
         for jpeg in (b"", b"\xff\xd8", b"GIF89a", GREY_JPEG[:100]):
             assert _ask(detector, jpeg=jpeg) is None
         assert _ask(detector, width_px=640, height_px=480) is None
-        assert detector.refused == {"BAD_PICTURE": 5} and not server.requests
+        assert detector.rejected == {"BAD_PICTURE": 5} and not server.requests
 
 
 def test_nobody_there_costs_no_time_and_is_tried_again_soon():
@@ -194,7 +194,7 @@ def test_nobody_there_costs_no_time_and_is_tried_again_soon():
         detector = _asking(server)
         began_s = time.monotonic()
         assert [_ask(detector, seconds=5.0, seq=seq) for seq in range(1, 200)] == [None] * 199
-        assert time.monotonic() - began_s < 1.0 and set(detector.refused) == {"UNREACHABLE"}
+        assert time.monotonic() - began_s < 1.0 and set(detector.rejected) == {"UNREACHABLE"}
         assert len(detector.news()) < 5, "not a line for each frame"
         server.start(port)
         assert until(lambda: _ask(detector), 3 * RETRY_US / 1e6)

@@ -12,7 +12,7 @@ from sightline.vision_side.detect.remote.client import NoAnswerError, NoAnswerRe
 from sightline.vision_side.detect.remote.oip import (
     Inferred,
     OipModel,
-    OutputOptions,
+    OipSettings,
     Slot,
     detections_of,
     model_of,
@@ -40,8 +40,8 @@ def _binary(boxes, scores, labels, **more):
     return head + b"".join(column.tobytes() for column in columns.values()), str(len(head))
 
 
-def _found(answer, **looking):
-    return detections_of(answer, OutputOptions(**looking), (1.0, 1.0), SIZE)
+def _found(answer, **settings):
+    return detections_of(answer, OipSettings(address="", **settings), (1.0, 1.0), SIZE)
 
 
 # --- models ----------------------------------------------------------------------------------------------------------
@@ -56,8 +56,8 @@ def test_metadata_tells_what_to_send():
 @pytest.mark.parametrize(("inputs", "outputs", "why"), [
     ([], OUTPUTS, "takes 0 inputs"), ([JPEG_INPUT, PIXELS], OUTPUTS, "takes 2 inputs"),
     ([Slot("image", "FP32", (1, 3, 240, 320))], OUTPUTS, "FP32; BYTES"), ([PIXELS], OUTPUTS[:1], "scores missing"),
-    ([PIXELS], [], "boxes and scores missing"), ([Slot("image", "UINT8", (240, 320))], OUTPUTS, "no picture"),
-    ([Slot("image", "UINT8", (1, 240, 320, 4))], OUTPUTS, "no picture"),
+    ([PIXELS], [], "boxes and scores missing"), ([Slot("image", "UINT8", (240, 320))], OUTPUTS, "not a picture"),
+    ([Slot("image", "UINT8", (1, 240, 320, 4))], OUTPUTS, "not a picture"),
     ([Slot("image", "BYTES", (1, 1, 1))], OUTPUTS, "not one JPEG"),
 ])  # fmt: skip
 def test_a_model_that_does_not_fit_is_said_in_words(inputs, outputs, why):
@@ -120,7 +120,7 @@ def test_padded_rows_are_no_boxes_whatever_the_batch_dimension(boxes, scores, la
 
 def test_boxes_in_the_models_pixels_become_those_of_the_picture():
     outputs = {"boxes": np.array([[10.0, 10, 20, 20]]), "scores": np.array([0.9])}
-    one = detections_of(Inferred(outputs), OutputOptions(("ball",)), (2.0, 3.0), SIZE)[0]
+    one = detections_of(Inferred(outputs), OipSettings(address="", labels=("ball",)), (2.0, 3.0), SIZE)[0]
     assert (one.x1_px, one.y1_px, one.x2_px, one.y2_px, one.label) == (20, 30, 40, 60, "ball")
 
 

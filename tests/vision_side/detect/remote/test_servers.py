@@ -142,7 +142,7 @@ def test_triton_finds_the_ball_from_jpegs_and_from_pixels(triton, model):
 @pytest.mark.slow
 def test_triton_says_no_to_a_model_it_has_not_and_that_is_counted(triton):
     with _closing(_triton_detector(triton, "cat")) as detector:
-        assert until(lambda: not detector.detect([frame()], within(1.0))[0] and detector.refused["REFUSED"])
+        assert until(lambda: not detector.detect([frame()], within(1.0))[0] and detector.rejected["REJECTED"])
         assert "cat" in " ".join(detector.news())
 
 

@@ -14,14 +14,14 @@ from sightline.vision_side.detect.remote.client import (
     ServerDetector,
     parse_address,
 )
-from sightline.vision_side.detect.remote.oip import Inferred, OutputOptions, detections_of
+from sightline.vision_side.detect.remote.oip import Inferred, OipSettings, detections_of
 from sightline.vision_side.detect.remote.oip_http import HttpServer
 from tests.fixtures.vision.remote import COLUMNS, JPEG_INPUT, OUTPUTS, Server, frame, http_reply, within
 
 
 def _refuse(tally, count):
     for _ in range(count):
-        tally.refuse(NoAnswerError(NoAnswerReason.LATE, "nothing by the deadline"))
+        tally.reject(NoAnswerError(NoAnswerReason.LATE, "nothing by the deadline"))
 
 
 def _tally_after(answered, refused, good):
@@ -34,14 +34,14 @@ def _tally_after(answered, refused, good):
     return tally
 
 
-@pytest.mark.parametrize("between", [NoAnswerReason.REFUSED, None])
+@pytest.mark.parametrize("between", [NoAnswerReason.REJECTED, None])
 def test_a_refusal_is_told_at_the_1st_10th_100th_of_its_kind(between):
     tally, told = ErrorCounters("far"), []
     for count in range(1, 1001):
-        tally.refuse(NoAnswerError(NoAnswerReason.LATE, "nothing by the deadline"))
+        tally.reject(NoAnswerError(NoAnswerReason.LATE, "nothing by the deadline"))
         if between and count < 10:
-            tally.refuse(NoAnswerError(between, "status 503"))
-        told += [(count, line) for line in tally.news.take() if "LATE" in line]
+            tally.reject(NoAnswerError(between, "status 503"))
+        told += [(count, line) for line in tally.notices.take() if "LATE" in line]
     assert [count for count, _ in told] == [1, 10, 100, 1000]
     assert "LATE: nothing by the deadline (1000 so far)" in told[-1][1]
 
@@ -49,11 +49,11 @@ def test_a_refusal_is_told_at_the_1st_10th_100th_of_its_kind(between):
 @pytest.mark.parametrize(("good", "bad"), [(10, 1), (3, 10), (500, 1)])
 def test_what_goes_bad_again_is_told_again(good, bad):
     tally = _tally_after(1, 12, good)
-    tally.news.take()
+    tally.notices.take()
     _refuse(tally, bad - 1)
-    assert not [line for line in tally.news.take() if "LATE" in line]
+    assert not [line for line in tally.notices.take() if "LATE" in line]
     _refuse(tally, 1)
-    assert "no answer: LATE" in tally.news.take()[0]
+    assert "no answer: LATE" in tally.notices.take()[0]
 
 
 def test_one_robot_of_two_that_is_not_answered_is_not_two_lines_for_each_frame():
@@ -61,7 +61,7 @@ def test_one_robot_of_two_that_is_not_answered_is_not_two_lines_for_each_frame()
     for _ in range(1000):
         _refuse(tally, 1)
         tally.good()
-        told += tally.news.take()
+        told += tally.notices.take()
     assert [line for line in told if "1000 so far" in line] and len(told) == 8
 
 
@@ -96,7 +96,8 @@ def _column(name):
 def test_a_model_is_asked_for_once_and_again_after_an_error(closes):
     with ModelServer(closes) as server:
         address = f"oip+http://127.0.0.1:{server.port}/ball"
-        detector = ServerDetector(address, HttpServer(parse_address(address), OutputOptions(("ball", "box"))))
+        settings = OipSettings(address=address, labels=("ball", "box"))
+        detector = ServerDetector(address, HttpServer(parse_address(address), settings))
 
         def label(seq):
             result = detector.detect([frame(seq)], within(2))[0]
@@ -118,9 +119,8 @@ def test_a_model_is_asked_for_once_and_again_after_an_error(closes):
 def test_a_server_that_was_late_once_is_not_made_later_by_asking_for_its_model_again():
     """60 ms for each request of 100: once the model is known that is enough, with its metadata asked for it is not."""
     with ModelServer(closes=False) as server:
-        detector = ServerDetector(
-            "oip", HttpServer(parse_address(f"oip+http://127.0.0.1:{server.port}/ball"), OutputOptions(("b",)))
-        )
+        settings = OipSettings(address=f"oip+http://127.0.0.1:{server.port}/ball", labels=("b",))
+        detector = ServerDetector("oip", HttpServer(parse_address(settings.address), settings))
         assert detector.detect([frame(1)], within(2)) != [None]
         server.takes_s = 0.2
         assert detector.detect([frame(2)], within(0.1)) == [None]
@@ -135,7 +135,7 @@ def test_a_server_that_was_late_once_is_not_made_later_by_asking_for_its_model_a
 def test_numbers_of_labels_may_be_written_as_floats(kind):
     outputs = {"boxes": np.float32([[10, 20, 30, 40], [50, 60, 70, 80]]), "scores": np.float32([0.9, 0.8]),
                "labels": np.array([1, 7], kind)}
-    found = detections_of(Inferred(outputs), OutputOptions(("ball", "box")), (1.0, 1.0), (320, 240))
+    found = detections_of(Inferred(outputs), OipSettings(address="", labels=("ball", "box")), (1.0, 1.0), (320, 240))
     assert [one.label for one in found] == ["box", "7"]
 
 
@@ -143,5 +143,5 @@ def test_numbers_of_labels_may_be_written_as_floats(kind):
 def test_what_is_no_whole_number_is_no_label(bad):
     outputs = {"boxes": np.float32([[10, 20, 30, 40]]), "scores": np.float32([0.9]), "labels": np.float64([bad])}
     with pytest.raises(NoAnswerError) as error:
-        detections_of(Inferred(outputs), OutputOptions(("ball",)), (1.0, 1.0), (320, 240))
+        detections_of(Inferred(outputs), OipSettings(address="", labels=("ball",)), (1.0, 1.0), (320, 240))
     assert error.value.reason is NoAnswerReason.MALFORMED

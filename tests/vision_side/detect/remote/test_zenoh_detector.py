@@ -141,7 +141,7 @@ def test_one_detector_serves_every_robot_of_a_fleet(bench):
 
 def test_without_a_link_it_says_so():
     alone = ZenohDetector(ZenohDetector.Config())
-    assert alone.detect([frame()], within(0.1)) == [None] and alone.refused == {"UNREACHABLE": 1}
+    assert alone.detect([frame()], within(0.1)) == [None] and alone.rejected == {"UNREACHABLE": 1}
     assert "no link to robot r1" in alone.news()[0]
 
 
@@ -220,7 +220,7 @@ def test_a_service_that_is_gone_is_no_answer_by_the_deadline_and_back_by_itself(
                 _served(DetectorService(site, HSV, ServingOptions("hsv"), lambda line: None)),
             ):
                 assert until(lambda: (robot.here(), _result(robot, detector, seconds=DEADLINE_S))[1], 3.0)
-        assert "LATE" in detector.refused and any("answers again" in line for line in detector.news())
+        assert "LATE" in detector.rejected and any("answers again" in line for line in detector.news())
 
 
 # --- hostile answers -------------------------------------------------------------------------------------------------
@@ -260,9 +260,9 @@ def test_boxes_of_another_frame_or_size_are_refused_and_counted(pair, changes, r
         """Every wait that ends without an answer is itself LATE."""
         waited["LATE"] += 1
         assert waiting.detect([asked], within(0.05)) == [None]
-        return waiting.refused - waited
+        return waiting.rejected - waited
 
-    assert until(is_refused) and waiting.refused - waited == {reason: 1}
+    assert until(is_refused) and waiting.rejected - waited == {reason: 1}
     robot.say(asked, BOX)
     assert until(lambda: waiting.detect([asked], within(0.05))[0])
 
@@ -276,7 +276,7 @@ def test_what_is_no_detections_message_is_refused_and_counted(pair, payload):
     asked = frame(3)
     echo = Echo(channel="frame", session=asked.header.session, seq=3, t_us=asked.header.t_us)
     robot.link.publish(DETECTIONS, encode(DetectionsHeader(source=ROLE, session="00000009", seq=1, echo=echo)), payload)
-    assert until(lambda: waiting.detect([asked], within(0.05)) == [None] and waiting.refused["MALFORMED"])
+    assert until(lambda: waiting.detect([asked], within(0.05)) == [None] and waiting.rejected["MALFORMED"])
 
 
 def test_boxes_of_an_older_frame_are_nobodys_and_no_news(pair):
@@ -285,7 +285,7 @@ def test_boxes_of_an_older_frame_are_nobodys_and_no_news(pair):
     for seq in range(4):
         robot.say(frame(seq), BOX)
         time.sleep(0.02)
-    assert waiting.detect([frame(9)], within(0.1)) == [None] and waiting.refused == {"LATE": 1}
+    assert waiting.detect([frame(9)], within(0.1)) == [None] and waiting.rejected == {"LATE": 1}
 
 
 def test_of_two_services_one_is_kept_to_until_it_is_silent(pair):
@@ -298,7 +298,7 @@ def test_of_two_services_one_is_kept_to_until_it_is_silent(pair):
         for box, by in sorted(((BOX, "00000001"), (other, "00000002")), key=lambda pair: pair[1], reverse=seq % 2):
             robot.say(frame(seq), box, by=by)
         labels |= {one.label for one in waiting.detect([frame(seq)], within(1.0))[0].detections}
-    assert labels == {"ball"} and not waiting.refused
+    assert labels == {"ball"} and not waiting.rejected
     assert sum("several services look at robot r1" in line for line in waiting.news()) == 1
     time.sleep(0.6)
     robot.say(frame(9), other, by="00000002")
@@ -318,14 +318,14 @@ def test_anothers_boxes_are_not_even_looked_at(pair):
     robot, waiting = pair
     asked = frame(3)
     robot.say(asked, BOX, source="guest")
-    assert waiting.detect([asked], within(0.1)) == [None] and waiting.refused == {"LATE": 1}
+    assert waiting.detect([asked], within(0.1)) == [None] and waiting.rejected == {"LATE": 1}
 
 
 @pytest.mark.parametrize("ahead_us", [10**12, 900_000])
 def test_boxes_of_a_frame_that_never_was_do_not_stand_in_the_way_for_long(pair, ahead_us):
     robot, waiting = pair
     robot.say(frame(3), BOX, seq=10**9, t_us=frame(3).header.t_us + ahead_us)
-    assert until(lambda: waiting.detect([frame(3)], within(0.05)) == [None] and waiting.refused["OTHER_FRAME"])
+    assert until(lambda: waiting.detect([frame(3)], within(0.05)) == [None] and waiting.rejected["OTHER_FRAME"])
     seq = 3 + ahead_us // 33_333 + 1 if ahead_us < 10**6 else 4  # once the frames are past it, at once if it is far off
     robot.say(frame(seq), BOX)
     assert waiting.detect([frame(seq)], within(1.0))[0], "one message must not blind it for good"
@@ -337,7 +337,7 @@ def test_who_lags_behind_gets_the_boxes_that_were_kept_for_it_though_newer_ones_
         robot.say(frame(said), BOX)
         time.sleep(0.05)
         answer = waiting.detect([frame(asked)], within(0.5))[0]
-        assert (answer is not None) is is_answered, (asked, waiting.refused)
+        assert (answer is not None) is is_answered, (asked, waiting.rejected)
 
 
 def test_boxes_of_a_newer_frame_end_the_waiting_and_are_kept_for_it(pair):
@@ -345,6 +345,6 @@ def test_boxes_of_a_newer_frame_end_the_waiting_and_are_kept_for_it(pair):
     asked, newer = frame(3), frame(4)
     robot.say(newer, BOX)
     began_s = time.monotonic()
-    assert waiting.detect([asked], within(2.0)) == [None] and waiting.refused == {"OTHER_FRAME": 1}
+    assert waiting.detect([asked], within(2.0)) == [None] and waiting.rejected == {"OTHER_FRAME": 1}
     assert time.monotonic() - began_s < 1.0
     assert waiting.detect([newer], within(0.5))[0].detections[0].x2_px == BOX.x2_px
