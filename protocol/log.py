@@ -1,15 +1,15 @@
-"""Log lines as text or JSON, written by a thread that never blocks its caller, and limits on how many there are.
-Shell (streams).
+"""The log of a service: standard `logging` through one handler that never blocks its caller, as text or JSON. Shell.
 
     sightline robot --log json        {"time":"2026-03-01T10:00:00.123Z","level":"info","service":"robot","message":...}
 
-The choice is in the environment, so that a robot's two processes speak alike.
+Information goes to the standard output; warnings and errors go to the standard error. The choice of the form is in the
+environment, so that both processes of a robot use the same.
 """
 
 from __future__ import annotations
 
-import io
 import json
+import logging
 import os
 import queue
 import sys
@@ -22,114 +22,117 @@ from sightline.protocol.errors import ConfigError
 
 LOG_FORMAT_VARIABLE: Final = "SIGHTLINE_LOG"
 LOG_FORMATS: Final = ("text", "json")
-_LONGEST_LINE: Final = 10_000
-"""More without an end is no line of a log; it is cut there."""
 
-_LINES_WAITING: Final = 32
-_WRITE_TIMEOUT_S: Final = 0.1
-"""Once, for a line to be read; whoever tells more meanwhile does not wait at all."""
+_MAX_WAITING_LINES: Final = 256
+_FLUSH_S: Final = 1.0
+
+
+class TextFormatter(logging.Formatter):
+    """The message as it is, an error after `error: `."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line of `record`, with its traceback if it has one."""
+        return ("error: " if record.levelno >= logging.ERROR else "") + super().format(record)
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object per record, on one line."""
+
+    def __init__(self, service: str) -> None:
+        super().__init__()
+        self._service = service
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the object of `record`; a traceback is part of its message."""
+        time = datetime.fromtimestamp(record.created, UTC)
+        return json.dumps({
+            "time": f"{time:%Y-%m-%dT%H:%M:%S}.{time.microsecond // 1000:03}Z",
+            "level": record.levelname.lower(),
+            "service": self._service,
+            "message": super().format(record),
+        }, separators=(",", ":"))
+
+
+class QueueHandler(logging.Handler):
+    """Writes lines from a thread of its own. A stream that is not read costs lines, never time of the caller."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._lines: queue.Queue[tuple[str, TextIO | None]] = queue.Queue(_MAX_WAITING_LINES)
+        self._thread: threading.Thread | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queue the line of `record`, or drop it where no more lines may wait. `logging` holds the handler's lock."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
+            self._thread.start()
+        with suppress(queue.Full):
+            stream = sys.stderr if record.levelno >= logging.WARNING else sys.stdout
+            self._lines.put_nowait((self.format(record), stream))
+
+    def flush(self) -> None:
+        """Wait until all lines are written, for a second at most. `logging` calls it when the process ends."""
+        with self._lines.all_tasks_done:
+            self._lines.all_tasks_done.wait_for(lambda: not self._lines.unfinished_tasks, _FLUSH_S)
+
+    def _write_all(self) -> None:
+        while True:
+            _write(*self._lines.get())
+            self._lines.task_done()
+
+
+def _write(line: str, stream: TextIO | None) -> None:
+    """Write `line` in letters that `stream` has, since peers choose some of them."""
+    if stream is None:
+        return
+    try:
+        encoding = getattr(stream, "encoding", None)
+        print(line.encode(encoding, "backslashreplace").decode(encoding) if encoding else line, file=stream, flush=True)
+    except OSError:  # the reader has gone: what is still buffered must not spoil the exit either
+        with suppress(Exception):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    except Exception:  # whatever a line does to a stream, the next one may be shown
+        return
+
+
+_HANDLER: Final = QueueHandler()
+_HANDLER.setFormatter(TextFormatter())
+
+
+def start_log(form: str | None, service: str) -> None:
+    """Log in `form` from now on, here and in processes started from here; None: as the environment has it.
+
+    Raises ConfigError for an unknown form.
+    """
+    chosen = form or os.environ.get(LOG_FORMAT_VARIABLE) or LOG_FORMATS[0]
+    if chosen not in LOG_FORMATS:
+        where = "--log" if form else LOG_FORMAT_VARIABLE
+        raise ConfigError(f"invalid {where} {chosen!r}: expected {' or '.join(LOG_FORMATS)}")
+    if form:
+        os.environ[LOG_FORMAT_VARIABLE] = form
+    _HANDLER.setFormatter(JsonFormatter(service) if chosen == "json" else TextFormatter())
+    logging.getLogger("sightline").setLevel(logging.INFO)
+    logging.getLogger().addHandler(_HANDLER)  # of the root: third-party libraries and plug-ins log the same way
+    logging.captureWarnings(True)
+    threading.excepthook = _log_thread_error
+
+
+def _log_thread_error(error: threading.ExceptHookArgs) -> None:
+    name = error.thread.name if error.thread else "unknown"
+    raised = error.exc_value or error.exc_type()
+    logging.getLogger("sightline").error("thread %s ended", name, exc_info=raised)
+
+
+def error_line(text: str) -> str:
+    """Return what the log would write for an error, for a program that ends with it."""
+    return _HANDLER.format(logging.makeLogRecord({"msg": text, "levelno": logging.ERROR, "levelname": "ERROR"}))
+
 
 _FIRST_PERIOD_US: Final = 1_000_000
 
 _LONGEST_PERIOD_US: Final = 60_000_000
 
 _MOST_CAUSES: Final = 16
-
-
-class JsonLineStream(io.TextIOBase):
-    """A text stream that writes every finished line to `stream` as one JSON object."""
-
-    def __init__(self, stream: TextIO, service: str, level: str) -> None:
-        self._stream, self._service, self._level = stream, service, level
-        self._begun = ""
-
-    def write(self, text: str) -> int:
-        """Keep `text` until its line ends."""
-        *lines, self._begun = (self._begun + text).split("\n")
-        if len(self._begun) > _LONGEST_LINE:
-            lines, self._begun = [*lines, self._begun], ""
-        for line in lines:
-            if line.strip():
-                self._stream.write(to_json_line(line, self._service, self._level, datetime.now(UTC)) + "\n")
-        return len(text)
-
-    def flush(self) -> None:
-        """What is finished is on its way."""
-        self._stream.flush()
-
-    def fileno(self) -> int:
-        """The descriptor below."""
-        return self._stream.fileno()
-
-    def writable(self) -> bool:
-        """Yes."""
-        return True
-
-
-def to_json_line(line: str, service: str, level: str, time: datetime) -> str:
-    """One line as an object; whatever begins with `error: ` is an error on any stream."""
-    message = line.removeprefix("error: ")
-    return json.dumps({
-        "time": f"{time:%Y-%m-%dT%H:%M:%S}.{time.microsecond // 1000:03}Z",
-        "level": "error" if message != line else level,
-        "service": service,
-        "message": message,
-    }, separators=(",", ":"))
-
-
-def set_log_format(form: str | None, service: str) -> None:
-    """Say everything in `form` from now on, here and in processes started from here; None is what the environment says.
-
-    Raises ConfigError for a form that is none.
-    """
-    chosen = form or os.environ.get(LOG_FORMAT_VARIABLE) or LOG_FORMATS[0]
-    if chosen not in LOG_FORMATS:
-        where = "--log" if form else LOG_FORMAT_VARIABLE
-        raise ConfigError(f"{where} {chosen!r} is no form of a log: {' or '.join(LOG_FORMATS)}")
-    if form:
-        os.environ[LOG_FORMAT_VARIABLE] = form
-    if chosen == "json" and not isinstance(sys.stdout, JsonLineStream):
-        sys.stdout = JsonLineStream(sys.stdout, service, "info")
-        sys.stderr = JsonLineStream(sys.stderr, service, "warning")
-
-
-class AsyncLineWriter:
-    """Prints on a thread of its own, for who must not wait: a terminal that nobody reads costs lines."""
-
-    def __init__(self) -> None:
-        self._lines: queue.Queue[tuple[str, TextIO, threading.Event]] = queue.Queue(_LINES_WAITING)
-        self._begin = threading.Lock()
-        self._thread: threading.Thread | None = None
-        self._stuck = False
-
-    def tell(self, line: str, stream: TextIO | None = None) -> None:
-        """Print `line`, to stderr unless told otherwise: at once, or while nobody reads later, or not at all."""
-        where: TextIO | None = stream or sys.stderr
-        if where is None:
-            return
-        self._be_there()
-        told = threading.Event()
-        with suppress(queue.Full):
-            self._lines.put_nowait((line, where, told))
-            if not self._stuck:
-                self._stuck = not told.wait(_WRITE_TIMEOUT_S)
-
-    def _be_there(self) -> None:
-        with self._begin:
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._print_all, name="teller", daemon=True)
-                self._thread.start()
-
-    def _print_all(self) -> None:
-        while True:
-            line, stream, told = self._lines.get()
-            with suppress(Exception):  # whoever read has gone
-                print(line, file=stream, flush=True)
-            told.set()
-            self._stuck = False
-
-
-log_line: Final = AsyncLineWriter().tell
 
 
 class RepeatLimiter:

@@ -15,13 +15,14 @@ before it judges a RAW: it was sent before the frame, so it is there before any 
 """
 
 import json
+import logging
 import socket
 import struct
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from enum import IntEnum
@@ -33,6 +34,8 @@ from sightline.protocol.config import Config
 from sightline.protocol.messages import Holder, Planar, Pose, SessionId
 from sightline.protocol.transports.link import Message, OutgoingQueue
 from sightline.robot_side.config import RobotConfig
+
+_log: Final = logging.getLogger(__name__)
 
 MAX_PACKET_BYTES = 65_536
 _ISSUED = struct.Struct("<BQQI")
@@ -254,8 +257,7 @@ class NetworkSetup(Config):
 class DriverEnd:
     """The network process as the driver sees it. No method waits for it, except `close`."""
 
-    def __init__(self, config: RobotConfig, session: str, say: Callable[[str], None]) -> None:
-        self._say = say
+    def __init__(self, config: RobotConfig, session: str) -> None:
         self._heard = False
         self._heard_us = 0
         self._config = config
@@ -286,7 +288,7 @@ class DriverEnd:
             try:
                 self._start(first_seq)
             except OSError as error:
-                self._say(f"network process does not start: {error.strerror}; trying again")
+                _log.info("network process does not start: %s; trying again", error.strerror)
                 self._start_at_us = now_us + _LONGEST_BACKOFF_US
 
     def _start(self, first_seq: int) -> None:
@@ -315,7 +317,7 @@ class DriverEnd:
         if not self._was_ready:  # it said why itself
             self.failed_at_start, self.exit_code = True, code if code > 0 else 1
             return
-        self._say(f"network process ended ({code}); starting it again")
+        _log.info("network process ended (%d); starting it again", code)
         self._start_at_us = now_us + self._backoff_us
         self._backoff_us = min(2 * self._backoff_us, _LONGEST_BACKOFF_US)
 

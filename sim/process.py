@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import logging
 import math
 import os
 import selectors
@@ -15,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 from pydantic import Field
 
@@ -41,6 +42,8 @@ from sightline.sim.scenario import load_scenario
 
 if TYPE_CHECKING:
     from sightline.sim.world.world import World
+
+_log: Final = logging.getLogger(__name__)
 
 
 class PeriodicTimer:
@@ -327,7 +330,7 @@ class Simulation:
             time.sleep(-late_us / 1e6)
         self._lag_us = max(0, late_us)
         if self._lag_us > LAG_TOLD_US and not self._told_lag:
-            print(f"simulation is {self._lag_us // 1000} ms behind the clock; is the machine busy?", flush=True)
+            _log.info("simulation is %d ms behind the clock; is the machine busy?", self._lag_us // 1000)
         self._told_lag = self._lag_us > (LAG_TOLD_US // 5 if self._told_lag else LAG_TOLD_US)
         if self._lag_us > LAG_GIVEN_UP_US:
             self._offset_us += self._lag_us
@@ -388,8 +391,7 @@ def _simulate(simulation: Simulation, config: SimConfig, robot: str) -> None:
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        print(f"simulation ready: {config.scenario}, {robot}, seed {config.seed}, in {config.socket_dir}",
-              flush=True)
+        _log.info("simulation ready: %s, %s, seed %d, in %s", config.scenario, robot, config.seed, config.socket_dir)
         simulation.run()
     finally:
         simulation.close()

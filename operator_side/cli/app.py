@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 
 from sightline.operator_side.config.errors import no_such_name
 from sightline.protocol.errors import SightlineError
+from sightline.protocol.log import error_line
 
 INTERRUPTED: Final = 130
 UNEXPECTED: Final = 1
@@ -122,7 +123,7 @@ def _usage_line(text: str, context: typer.Context | None) -> str:
 
 
 def _print_error(line: str, code: int) -> int:
-    typer.echo(f"error: {line}", err=True)
+    typer.echo(error_line(line), err=True)
     return code
 
 

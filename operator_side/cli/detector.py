@@ -28,7 +28,7 @@ from sightline.operator_side.cli.options import (
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.log import set_log_format
+from sightline.protocol.log import start_log
 
 if TYPE_CHECKING:
     from sightline.vision_side.detect.contract import PromiseResult, Times
@@ -63,7 +63,7 @@ def serve(
 
     Raises ConfigError for a detector that looks nowhere itself, and as `sightline vision` does.
     """
-    set_log_format(log, "detector")
+    start_log(log, "detector")
     if name in _ELSEWHERE:
         raise ConfigError(f"detector {name!r} is boxes that somebody else finds: serve one that looks itself, e.g. hsv")
     options = {"robot": robot, "listen": tuple(listen) if listen else None,

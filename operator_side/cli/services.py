@@ -1,12 +1,13 @@
 """Commands that run or configure a service: sim, robot, vision, router, labels, scenarios, config, metrics. Shell."""
 
 import json
+import logging
 import os
 import signal
 import threading
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from pydantic import BaseModel
@@ -29,7 +30,7 @@ from sightline.operator_side.config.loading import load_service, model_of
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.log import set_log_format
+from sightline.protocol.log import start_log
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import RobotConfig
@@ -38,6 +39,8 @@ from sightline.sim.process import SimConfig
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
 from sightline.vision_side.config import VisionConfig
+
+_log: Final = logging.getLogger(__name__)
 
 
 def register(app: typer.Typer) -> None:
@@ -78,7 +81,7 @@ def sim(
     """Simulate a robot's hardware, in place of a real one, until Ctrl-C."""
     from sightline.sim.process import run
 
-    set_log_format(log, "sim")
+    start_log(log, "sim")
     options = {
         "scenario": scenario, "robot": robot_model, "seed": seed, "motor_log": motor_log, "seconds": seconds,
         "socket_dir": socket_dir,
@@ -117,7 +120,7 @@ def robot(
     from sightline.robot_side.driver.process import run
     from sightline.robot_side.driver.process import zero_motors as set_to_zero
 
-    set_log_format(log, "robot")
+    start_log(log, "robot")
     options: dict[str, Any] = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure}
     options |= {f"{device}.options.socket_dir": socket_dir for device in ("camera", "drive")}
     loaded = load_service(
@@ -167,7 +170,7 @@ def vision(
     shape: Annotated[str | None, typer.Option("--shape", hidden=True)] = None,
 ) -> int:
     """Look at a robot's pictures and steer it, until Ctrl-C."""
-    set_log_format(log, "vision")
+    start_log(log, "vision")
     if camera is not None and not dry_run:
         raise ConfigError("--camera looks without a robot, so there is nothing to steer: add --dry-run")
     if camera_sets and camera is None:
@@ -203,7 +206,7 @@ def _measured(run: Any, config: Any, where: str) -> int:
 
 def router(listen: Listen = None, connect: ServiceConnect = None, secure: Secure = "", log: LogForm = None) -> int:
     """Run the place where robots, visions and people of one site meet, until Ctrl-C. All of them connect to it."""
-    set_log_format(log, "router")
+    start_log(log, "router")
     with needs("zenoh"):
         from sightline.operator_side.setup.router import run
 
@@ -218,11 +221,11 @@ def _dry_run(config: Any, camera: str | None, camera_sets: list[str]) -> int:
     if config.detector.kind == "boxes":
         raise ConfigError("--dry-run looks with vision's own eyes; name a detector, e.g. --detector hsv")
     if camera is None:
-        return watch_robot(config, typer.echo, None)
+        return watch_robot(config, _log.info, None)
     check_takes_pictures(config.detector.kind)
     check_vision(config)
     with local_camera(camera, camera_sets) as opened:
-        return watch_camera(config, opened, typer.echo, None)
+        return watch_camera(config, opened, _log.info, None)
 
 
 def _ends(endpoints: list[str] | None) -> tuple[str, ...] | None:
@@ -313,15 +316,12 @@ def labels(
     ] = None,
 ) -> int:
     """Publish what the simulation labels in its pictures as boxes, in place of a detector, until Ctrl-C."""
+    start_log(None, "labels")
     with needs("zenoh"):
         from sightline.evaluation.labels import run
         from sightline.sim.bus import default_socket_dir
 
-        return run(robot, connect or [DEFAULT_ENDPOINT], secure, socket_dir or default_socket_dir(), _print_line)
-
-
-def _print_line(line: str) -> None:
-    print(line, flush=True)
+        return run(robot, connect or [DEFAULT_ENDPOINT], secure, socket_dir or default_socket_dir(), _log.info)
 
 
 # Commands about configuration: `config check | show | schema`. Shell.

@@ -5,6 +5,7 @@ length (uint16, big-endian), header, payload, exactly as they came. `log_time` i
 robot's own clock is in the header. Opens in any MCAP tool; a file cut short by a kill reads up to the cut.
 """
 
+import logging
 import queue
 import struct
 import threading
@@ -31,7 +32,6 @@ from sightline.protocol.channels import (
     Channel,
 )
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.log import log_line
 from sightline.protocol.transports.link import Link, Message
 
 if TYPE_CHECKING:
@@ -44,6 +44,8 @@ MAX_WAITING: Final = 256
 """Messages that wait for the disk; while it is slower than that, new ones are dropped and counted."""
 CHUNK_BYTES: Final = 256 * 1024  # a kill loses at most one chunk
 _LENGTH = struct.Struct(">H")
+
+_log: Final = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +105,7 @@ class Recorder:
         except OSError as error:
             if not self.failed:
                 self.failed = error.strerror or str(error)
-                log_line(f"recording {self._path}: {self.failed}; nothing more is recorded")
+                _log.warning("recording %s: %s; nothing more is recorded", self._path, self.failed)
 
     def _write(self, log_time_ns: int, message: Message) -> None:
         topic = message.channel.name + (f"/{message.source}" if message.source else "")

@@ -1,9 +1,11 @@
 """The control loop of the driver process, and its log of rejected commands. Shell."""
 
+import logging
 import secrets
 import select
 import signal
 import struct
+import threading
 from collections import Counter
 from contextlib import ExitStack, suppress
 from types import FrameType
@@ -17,13 +19,15 @@ from sightline.protocol.messages import LastRejection, State, StreamStatus
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.core import DriverCore
-from sightline.robot_side.driver.persistence import BackgroundWriter, StopLatch
+from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS, SystemdNotifier, request_real_time
 from sightline.robot_side.pipe import DriverEnd
 from sightline.robot_side.plugins import DRIVES, RANGE_SENSORS
 from sightline.robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
 from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
 from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
+
+_log: Final = logging.getLogger(__name__)
 
 _FIRST_PERIOD_US: Final = 1_000_000
 _LONGEST_PERIOD_US: Final = 60_000_000
@@ -71,6 +75,7 @@ class RejectionLog:
 
 _SHUTDOWN_US = 2_000_000
 _WATCHDOG_PERIOD_US = 100_000
+_STACK_BYTES = 256 * 1024  # the process locks its memory, a stack of the usual 8 MB with it
 _WARNING = (
     "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
     "(docs/safety.md)"
@@ -83,6 +88,7 @@ def run(config: RobotConfig) -> int:
     Raises ConfigError, HardwareError or LinkError before anything could move.
     """
     check_robot_id(config.robot)
+    threading.stack_size(_STACK_BYTES)
     with ExitStack() as ending:
         drive = DRIVES.build(config.motors)
         ending.callback(drive.close)
@@ -90,7 +96,7 @@ def run(config: RobotConfig) -> int:
         if ranges is not None:
             ending.callback(ranges.close)
         driver = Driver(config, drive, ranges)
-        ending.callback(driver.scribe.close)
+        ending.callback(driver.latch_writer.close)
         ending.callback(driver.child.close)
         ending.callback(_zero, drive)  # last in, first to run: however the loop ends, the motors are told zero
         return driver.loop()
@@ -116,11 +122,11 @@ class Driver:
 
     def __init__(self, config: RobotConfig, drive: Drive, ranges: RangeSensor | None) -> None:
         latch = StopLatch(config.state_dir, config.robot)
-        self.scribe = BackgroundWriter(latch)
+        self.latch_writer = LatchWriter(latch)
         self._drive = drive
         self._ranges = ranges
         self._driving = DriverCore(config, secrets.token_hex(4), stopped=latch.is_set())
-        self._shown = self._driving.gate.state
+        self._logged_state = self._driving.gate.state
         self._ending_since_us: int | None = None
         self._manager = SystemdNotifier()
         self._watchdog_due_us = self._ticked_us = 0
@@ -129,7 +135,7 @@ class Driver:
         self._verdicts: list[ipc.CommandAck] = []
         self._refusals = RejectionLog()
         self._counted: Counter[str] = Counter()
-        self.child = DriverEnd(config, self._driving.session, self.scribe.say)
+        self.child = DriverEnd(config, self._driving.session)
         for number in EXIT_SIGNALS:
             signal.signal(number, self._on_signal)
         for number in IGNORED_SIGNALS:
@@ -161,7 +167,7 @@ class Driver:
         """What this robot lacks is said before it moves."""
         missing = list(request_real_time())
         for line in [*missing, *([] if self._manager.is_there else [_WARNING])]:
-            self.scribe.say(f"robot {self._driving.config.robot}: {line}")
+            self._log(line)
 
     def _ended(self) -> bool:
         if self.child.failed_at_start:
@@ -185,7 +191,8 @@ class Driver:
                 self.child.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
             self.child.keep_alive(now_us, self._driving.gate.issued.last_seq("frame") + 1)
             self._driving.network_restarts = max(0, self.child.restarts)
-            self._show(self._driving.gate.state, self._driving.gate.reason)
+            self.latch_writer.want(self._driving.gate.state is State.STOPPED)
+            self._log_state(self._driving.gate.state, self._driving.gate.reason)
             self._feed_watchdog(now_us)
 
     def _answer(self) -> None:
@@ -242,13 +249,14 @@ class Driver:
             self._sight = sight
         return scan
 
-    def _show(self, state: State, reason: str) -> None:
-        """One line per change of state; the latch is a level that the scribe keeps."""
-        shown, self._shown = self._shown, state
-        if state is shown or {state, shown} == {State.ACTIVE, State.DEGRADED}:
-            return  # on a lossy link these two alternate many times a second
-        self.scribe.keep(state is State.STOPPED)
-        self.scribe.say(f"robot {self._driving.config.robot}: {state} ({reason})")
+    def _log_state(self, state: State, reason: str) -> None:
+        """One line per change of state."""
+        logged, self._logged_state = self._logged_state, state
+        if state is not logged and {state, logged} != {State.ACTIVE, State.DEGRADED}:
+            self._log(f"{state} ({reason})")  # on a lossy link those two alternate many times a second
+
+    def _log(self, line: str) -> None:
+        _log.info("robot %s: %s", self._driving.config.robot, line)
 
     # --- packets of the network process --------------------------------------------------------------------------
 
@@ -298,4 +306,4 @@ class Driver:
 
     def _tell(self, refusal: LastRejection, times: int = 1) -> None:
         if line := self._refusals.line(refusal, monotonic_us(), times):
-            self.scribe.say(f"robot {self._driving.config.robot}: {line}")
+            self._log(line)

@@ -6,9 +6,9 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 import os
-import sys
 import time
 import tomllib
 from collections.abc import Callable, Sequence
@@ -23,6 +23,8 @@ from sightline.protocol.config import Config, first_problem
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.robot_side.hardware.gpio_low import import_lgpio, leave_low
 from sightline.robot_side.ports import WheelAngles
+
+_log: Final = logging.getLogger(__name__)
 
 Duty = Annotated[float, Field(gt=0, le=1)]
 RimSpeed = Annotated[float, Field(gt=0, le=3)]
@@ -231,10 +233,10 @@ def _warn_of_spi(numbers: Sequence[int]) -> None:
     used = sorted(_SPI_PINS.intersection(numbers))
     if used and _SPI_DEVICE.exists():
         named = ", ".join(map(str, used))
-        print(
-            f"drive gpio: pins {named} are SPI0's and SPI is switched on ({_SPI_DEVICE}): switch it off "
+        _log.warning(
+            "drive gpio: pins %s are SPI0's and SPI is switched on (%s): switch it off "
             "(`sudo raspi-config nonint do_spi 1`, restart) or use other pins",
-            file=sys.stderr, flush=True,
+            named, _SPI_DEVICE,
         )  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """The camera loop of the network process and its threads. Shell."""
 
 import fcntl
+import logging
 import os
 import signal
 import socket
@@ -18,7 +19,7 @@ from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import HardwareError, SightlineError, WireError
-from sightline.protocol.log import log_line, set_log_format
+from sightline.protocol.log import start_log
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
 from sightline.protocol.transports.zenoh.session import report_floods
@@ -27,6 +28,8 @@ from sightline.robot_side.network.core import CameraAdaptation, NetworkCore
 from sightline.robot_side.pipe import NetworkEnd, NetworkSetup
 from sightline.robot_side.plugins import CAMERAS
 from sightline.robot_side.ports import Camera, Picture
+
+_log: Final = logging.getLogger(__name__)
 
 _ASK_ADDRESS: Final = 0x8915  # SIOCGIFADDR of linux/sockios.h
 _ANYWHERE: Final = ("/0.0.0.0:", "/[::]:")
@@ -114,12 +117,12 @@ class Network:
             picture = self._camera.read(_CAMERA_TIMEOUT_S)
         except HardwareError as error:
             if not self._camera_fault:
-                log_line(f"camera: {error}")
+                _log.warning("camera: %s", error)
             self._camera_fault = str(error)
             time.sleep(_CAMERA_RETRY_S)
             return None
         if self._camera_fault and picture is not None:
-            log_line("camera: back", sys.stdout)
+            _log.info("camera: back")
             self._camera_fault = ""
         return picture
 
@@ -197,17 +200,13 @@ class Network:
         self._credit.set()
 
 
-def _say(robot: str, line: str) -> None:
-    print(f"robot {robot}: {line}", flush=True)
-
-
 def _run(driver: NetworkEnd) -> None:
     setup = NetworkSetup.model_validate_json(driver.receive())
     config = setup.config
     with ExitStack() as ending:
         camera = CAMERAS.build(config.camera)
         ending.callback(camera.close)
-        ending.enter_context(report_floods(config.doors, lambda line: _say(config.robot, line)))
+        ending.enter_context(report_floods(config.doors, lambda line: _log.info("robot %s: %s", config.robot, line)))
         link = ending.enter_context(
             open_link(
                 config.robot, listen=config.doors, connect=config.connect, role="robot", secure=config.secure,
@@ -216,15 +215,15 @@ def _run(driver: NetworkEnd) -> None:
         )
         where = ", ".join(config.listen) or "no port of its own"
         where += f", connected to {', '.join(config.connect)}" if config.connect else ""
-        print(f"robot {config.robot}: on {where}, camera {config.camera.kind}", flush=True)
+        _log.info("robot %s: on %s, camera %s", config.robot, where, config.camera.kind)
         if reached := reachable_endpoints(config.listen):
-            _say(config.robot, f"others reach it at {', '.join(reached)}")
+            _log.info("robot %s: others reach it at %s", config.robot, ", ".join(reached))
         Network(setup, driver, link, camera).run()
 
 
 def main() -> None:
     """Entry of the child process: argv[1] and argv[2] are the sockets' descriptors."""
-    set_log_format(None, "robot")
+    start_log(None, "robot")
     for number in _KEYS:  # they reach the whole group; the driver ends us, after zero
         signal.signal(number, signal.SIG_IGN)
     driver = NetworkEnd(*(socket.socket(fileno=int(number)) for number in sys.argv[1:3]))
@@ -233,11 +232,12 @@ def main() -> None:
         _run(driver)
         code = 0
     except SightlineError as error:
-        print(f"error: {error}", file=sys.stderr, flush=True)
+        _log.error("%s", error)
         code = error.exit_code
     except Exception as error:
-        print(f"error: network process: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+        _log.error("network process: %s: %s", type(error).__name__, error)
     finally:
+        logging.shutdown()
         os._exit(code)  # daemon threads of a transport must not keep a finished process
 
 

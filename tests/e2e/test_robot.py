@@ -91,7 +91,7 @@ def test_shutdown_is_after_zero_and_leaves_nothing(tmp_path, number):
 
 
 def test_the_stop_latch_survives_a_restart(tmp_path):
-    StopLatch(tmp_path / "state", "r1").keep(stopped=True)
+    StopLatch(tmp_path / "state", "r1").write(stopped=True)
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
         assert until(lambda: vision.status().state is State.STOPPED)
         assert until(lambda: vision.status().refused.get("STOPPED", 0) > 5)

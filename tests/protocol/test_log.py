@@ -1,8 +1,9 @@
-"""A service's lines as JSON: every line an object, whole however it is written, and a child speaks alike."""
+"""The log of a service: text or JSON, written without holding up the caller, few lines about what repeats."""
 
 import fcntl
 import io
 import json
+import logging
 import os
 import pty
 import random
@@ -17,11 +18,11 @@ import pytest
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import (
     LOG_FORMAT_VARIABLE,
-    AsyncLineWriter,
-    JsonLineStream,
+    JsonFormatter,
+    QueueHandler,
     RepeatLimiter,
-    set_log_format,
-    to_json_line,
+    TextFormatter,
+    start_log,
 )
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
@@ -29,37 +30,34 @@ from tests.fixtures.robot_process import RobotProcess
 SECOND_US = 1_000_000
 
 
-def _written(*texts):
-    below = io.StringIO()
-    stream = JsonLineStream(below, "robot", "info")
-    for text in texts:
-        stream.write(text)
-    return [json.loads(line)["message"] for line in below.getvalue().splitlines()]
+def _record(message, level=logging.INFO):
+    return logging.makeLogRecord({"msg": message, "levelno": level, "levelname": logging.getLevelName(level)})
 
 
-def test_an_object_says_when_who_how_bad_and_what():
-    line = to_json_line('error: "x" is \u00e9', "vision", "warning", datetime(2026, 3, 1, 10, 0, 0, 123_456, UTC))
-    assert json.loads(line) == {
-        "time": "2026-03-01T10:00:00.123Z", "level": "error", "service": "vision", "message": '"x" is \u00e9',
+def test_an_object_has_time_level_service_and_message():
+    record = _record('"x" is \u00e9', logging.WARNING)
+    record.created = datetime(2026, 3, 1, 10, 0, 0, 123_456, UTC).timestamp()
+    assert json.loads(JsonFormatter("vision").format(record)) == {
+        "time": "2026-03-01T10:00:00.123Z", "level": "warning", "service": "vision", "message": '"x" is \u00e9',
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("texts", [("a\nb\n",), ("a", "\n", "b\n"), ("a\n\n", "b", "\n"), tuple("a\nb\n")])
-def test_a_line_is_one_object_however_it_is_written(texts):
-    assert _written(*texts) == ["a", "b"]
+@pytest.mark.parametrize(("form", "begin"), [("text", "error: it broke\n"), ("json", '{"time":')])
+def test_an_error_is_marked_and_keeps_its_traceback(form, begin):
+    record = _record("it broke", logging.ERROR)
+    record.exc_info = (ValueError, ValueError("no such wheel"), None)
+    line = (JsonFormatter("robot") if form == "json" else TextFormatter()).format(record)
+    assert line.startswith(begin) and "ValueError: no such wheel" in line
+    if form == "json":
+        assert "\n" not in line and json.loads(line)["level"] == "error"
 
 
-def test_an_unfinished_line_waits_and_an_endless_one_is_cut():
-    assert _written("a\nb") == ["a"]
-    assert len(_written("x" * 10_001)[0]) == 10_001
-
-
-def test_a_form_that_is_none_is_refused(monkeypatch):
-    with pytest.raises(ConfigError, match=r"--log 'xml' is no form of a log: text or json"):
-        set_log_format("xml", "robot")
+def test_an_unknown_form_is_rejected(monkeypatch):
+    with pytest.raises(ConfigError, match=r"invalid --log 'xml': expected text or json"):
+        start_log("xml", "robot")
     monkeypatch.setenv(LOG_FORMAT_VARIABLE, "yaml")
     with pytest.raises(ConfigError, match=LOG_FORMAT_VARIABLE):
-        set_log_format(None, "robot")
+        start_log(None, "robot")
 
 
 def test_a_service_says_its_errors_as_json_too():
@@ -96,46 +94,93 @@ def unread(request):
     reader, writer = os.pipe() if request.param == "pipe" else pty.openpty()
     if request.param == "pipe":
         fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
-    with suppress(OSError), os.fdopen(reader, "rb", buffering=0) as read, os.fdopen(writer, "w") as written:
+    with suppress(OSError), os.fdopen(writer, "w") as written, os.fdopen(reader, "rb", buffering=0) as read:
         yield read, written
 
 
-@pytest.mark.parametrize("wrapped", [False, True])
-def test_who_tells_does_not_wait_for_who_reads(unread, wrapped):
-    read, written = unread
-    stream, teller, begin_s = (
-        JsonLineStream(written, "robot", "info") if wrapped else written,
-        AsyncLineWriter(),
-        time.monotonic(),
-    )
-    for number in range(300):
-        teller.tell(f"{number} " + 100 * "\U0001f600", stream)
+@pytest.fixture
+def handler(monkeypatch):
+    """A handler with a thread of its own that writes information to `sys.stdout` of the test."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    return QueueHandler()
+
+
+@pytest.mark.parametrize("formatter", [TextFormatter(), JsonFormatter("robot")])
+def test_a_stream_that_is_not_read_costs_no_time_and_its_lines_come_later(unread, handler, formatter):
+    read, sys.stdout = unread
+    handler.setFormatter(formatter)
+    begin_s = time.monotonic()
+    for number in range(3000):
+        handler.handle(_record(f"{number} " + 100 * "\U0001f600"))
+    handler.flush()
     assert time.monotonic() - begin_s < 2
-    heard = b""
-    while b"heard" not in heard:  # once somebody reads, what waited comes, and what is told then
-        heard += read.read(1 << 16)
-        teller.tell("heard", stream)
-    assert heard.startswith(b'{"time"' if wrapped else b"0 ")
+    received = b""
+    while b"once more" not in received:  # once it is read, what waited comes, and what is logged then
+        received += read.read(1 << 16)
+        handler.handle(_record("once more"))
+    assert received.startswith(b'{"time"' if isinstance(formatter, JsonFormatter) else b"0 ")
+    assert b"2999 " not in received, "no more lines wait than the queue holds"
 
 
-def test_a_line_is_there_at_once_where_somebody_reads(unread):
-    read, written = unread
-    AsyncLineWriter().tell("heard", written)
+def test_all_lines_are_there_after_a_flush_where_they_are_read(unread, handler):
+    read, sys.stdout = unread
+    for number in range(20):
+        handler.handle(_record(f"line {number}"))
+    handler.flush()
     os.set_blocking(read.fileno(), False)
-    assert read.read(99).strip() == b"heard"
+    received = b"".join(iter(lambda: read.read(999), None))  # a terminal gives a line at a time
+    assert received.split() == b" ".join(b"line %d" % number for number in range(20)).split()
 
 
-def test_a_line_for_nobody_at_all_is_dropped(monkeypatch):
+def test_a_level_chooses_its_stream_and_a_stream_without_reader_costs_lines_only(monkeypatch, handler):
     reader, writer = os.pipe()
     os.close(reader)
-    teller = AsyncLineWriter()
-    with suppress(BrokenPipeError), os.fdopen(writer, "w") as written:
-        teller.tell("gone", written)
+    with suppress(BrokenPipeError), os.fdopen(writer, "w") as sys.stdout:
+        handler.handle(_record("gone"))
+        handler.flush()
     monkeypatch.setattr(sys, "stderr", None)
-    teller.tell("nowhere")
+    handler.handle(_record("nowhere", logging.WARNING))
+    handler.flush()
+    sys.stdout = io.StringIO()
     monkeypatch.setattr(sys, "stderr", io.StringIO())
-    teller.tell("kept")
-    assert sys.stderr.getvalue() == "kept\n"
+    handler.handle(_record("kept", logging.WARNING))
+    handler.handle(_record("known"))
+    handler.flush()
+    assert (sys.stdout.getvalue(), sys.stderr.getvalue()) == ("known\n", "kept\n")
+
+
+class Failing(io.StringIO):
+    """A stream that fails as no stream should."""
+
+    def write(self, _text):
+        raise ZeroDivisionError
+
+
+def test_a_stream_that_fails_in_any_way_costs_its_line_only(handler):
+    sys.stdout = Failing()
+    handler.handle(_record("a line"))
+    handler.flush()
+    sys.stdout = io.StringIO()
+    handler.handle(_record("the next"))
+    handler.flush()
+    assert sys.stdout.getvalue() == "the next\n"
+
+
+def test_a_letter_that_the_terminal_does_not_have_is_shown_as_its_code(handler):
+    written = io.BytesIO()
+    sys.stdout = io.TextIOWrapper(written, encoding="ascii", errors="strict")
+    handler.handle(_record("AnswerHeader is of version 'é'"))
+    handler.handle(_record("and then \udce9"))
+    handler.flush()
+    assert written.getvalue().decode("ascii").splitlines() == ["AnswerHeader is of version '\\xe9'", "and then \\udce9"]
+
+
+def test_an_object_keeps_every_letter(handler):
+    sys.stdout = io.StringIO()
+    handler.setFormatter(JsonFormatter("robot"))
+    handler.handle(_record("AnswerHeader is of version 'é'"))
+    handler.flush()
+    assert json.loads(sys.stdout.getvalue())["message"] == "AnswerHeader is of version 'é'"
 
 
 def test_a_cause_is_told_at_once_and_then_ever_more_seldom_with_every_one_counted():

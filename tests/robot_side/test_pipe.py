@@ -46,7 +46,7 @@ def test_the_folder_it_starts_in_has_cameras_and_stands_in_for_nothing_else(fold
     camera = PluginChoice(kind=kind, options={"path": "pictures"})
     listen = (free_endpoint(), free_endpoint().replace("tcp/", "ws://"))
     config = RobotConfig(camera=camera, listen=listen, state_dir=folder)
-    child, packets = DriverEnd(config, "0000beef", print), []
+    child, packets = DriverEnd(config, "0000beef"), []
     try:
         child.keep_alive(monotonic_us(), 0)
         assert until(lambda: packets.extend(child.packets()) or packets or child._process.poll() is not None, 20)

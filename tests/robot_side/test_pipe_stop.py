@@ -85,7 +85,7 @@ def test_invalid_requests_are_dropped_when_there_is_no_room():
 
 @pytest.fixture
 def child(tmp_path):
-    made = DriverEnd(RobotConfig(state_dir=tmp_path), "0a0a0a0a", lambda line: None)
+    made = DriverEnd(RobotConfig(state_dir=tmp_path), "0a0a0a0a")
     yield made
     made.close()
 

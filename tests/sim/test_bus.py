@@ -25,8 +25,8 @@ from sightline.sim.robot import load_robot
 pytestmark = pytest.mark.slow
 
 SERVE = (
-    "import sys; from sightline.sim.process import SimConfig, run; "
-    "sys.exit(run(SimConfig.model_validate_json(sys.argv[1])))"
+    "import sys; from sightline.protocol.log import start_log; from sightline.sim.process import SimConfig, run; "
+    "start_log(None, 'sim'); sys.exit(run(SimConfig.model_validate_json(sys.argv[1])))"
 )
 DRIVE = (
     "import sys, time; from sightline.sim.bus import SimDrive\n"

@@ -1,5 +1,6 @@
 """Serves one detector to many robots: a fair queue of newest frames in, boxes out. Shell."""
 
+import logging
 import secrets
 import threading
 import time
@@ -32,6 +33,8 @@ from sightline.vision_side.detect.per_robot import DecoderPool
 from sightline.vision_side.detect.plugin_calls import checked_results, maker_of, notices_of
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
 from sightline.vision_side.serving.process import ends_on_signal
+
+_log: Final = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 
@@ -146,16 +149,16 @@ def run(config: VisionConfig, detector: Detector, serving: ServingOptions) -> in
     from sightline.protocol.transports.zenoh.session import report_floods
 
     ending, services = threading.Event(), list[DetectorService]()
-    with report_floods(config.listen, lambda line: _say(f"detector: {line}")):
+    with report_floods(config.listen, lambda line: _log.info("detector: %s", line)):
         opened = open_fleet(
             config.robot, listen=config.listen, connect=config.connect, role=ROLE, secure=config.secure,
             max_frame_bytes=config.max_frame_bytes,
             about=lambda: services[0].about() if services else f"{serving.name}: starts",
         )
         with opened as fleet_link, ends_on_signal(ending):
-            services.append(DetectorService(fleet_link, detector, serving, _say))
+            services.append(DetectorService(fleet_link, detector, serving, _log.info))
             where = ", ".join([*config.connect, *(f"{one} (listening)" for one in config.listen)])
-            _say(f"detector: {serving.name} for robots {config.robot} at {where}")
+            _log.info("detector: %s for robots %s at %s", serving.name, config.robot, where)
             services[0].serve(ending)
     return 0
 
@@ -335,7 +338,3 @@ def _box(one: Detection) -> DetectedBox:
 def _stamp(frame: FrameHeader, session: str, seq: int, compute_us: int) -> bytes:
     echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
     return encode(DetectionsHeader(source=ROLE, session=session, seq=seq, echo=echo, compute_us=compute_us))
-
-
-def _say(line: str) -> None:
-    print(line, flush=True)

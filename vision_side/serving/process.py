@@ -1,10 +1,12 @@
 """Runs the vision service as a process: opens the link, serves one robot or a fleet, ends on a signal. Shell."""
 
+import logging
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Final
 
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.config import VisionConfig
@@ -14,6 +16,8 @@ from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.missions.registry import configured_mission
 from sightline.vision_side.pipeline import SOURCE
 from sightline.vision_side.serving.service import LogLine, Observe, endpoints_text, open_service
+
+_log: Final = logging.getLogger(__name__)
 
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 
@@ -33,10 +37,6 @@ def ends_on_signal(ending: threading.Event) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _say(line: str) -> None:
-    print(f"{line}\n", end="", flush=True)  # as one piece: several threads may have something to say
-
-
 def run(config: VisionConfig, observe: Observe | None = None) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code 0. `observe` is told how to look at what is done.
 
@@ -48,7 +48,7 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
     ending, detector = threading.Event(), configured_detector(config)
     run_it = _run_fleet if set("*?") & set(config.robot) else _run_one
     try:
-        with report_floods(config.listen, lambda line: _say(f"vision: {line}")):
+        with report_floods(config.listen, lambda line: _log.info("vision: %s", line)):
             return run_it(config, ending, observe, detector)
     finally:
         close_detector(detector)
@@ -61,8 +61,8 @@ def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | N
                         max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     # Signals are caught only from here on: until the link is open, they end the process by themselves.
     with opened as link, ends_on_signal(ending):
-        _say(f"vision: looking for robot {config.robot} at {endpoints_text(config)}")
-        serve(config, link, ending, _say, observe, detector=detector)
+        _log.info("vision: looking for robot %s at %s", config.robot, endpoints_text(config))
+        serve(config, link, ending, _log.info, observe, detector=detector)
     return 0
 
 
@@ -73,8 +73,8 @@ def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe |
     opened = open_fleet(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                        max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     with opened as fleet_link, ends_on_signal(ending):
-        _say(f"vision: looking for robots {config.robot} at {endpoints_text(config)}")
-        fleet = Fleet(config, fleet_link, _say, detector)
+        _log.info("vision: looking for robots %s at %s", config.robot, endpoints_text(config))
+        fleet = Fleet(config, fleet_link, _log.info, detector)
         if observe is not None:
             observe(fleet.counts)
         fleet.serve(ending)

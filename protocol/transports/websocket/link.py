@@ -5,6 +5,7 @@ That is what it subscribed to; and where all connect, what is said only while wa
 
 from __future__ import annotations
 
+import logging
 import secrets
 import threading
 import time
@@ -17,7 +18,7 @@ from sightline.protocol.channels import CHANNELS, FRAME, TWIST, Channel, parse_k
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.log import BurstLimiter, log_line
+from sightline.protocol.log import BurstLimiter
 from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_websocket_endpoint
 from sightline.protocol.transports.link import INEXACT_KEY, BaseLink, LinkRules, Message
 from sightline.protocol.transports.websocket.client import Client as Dialer
@@ -26,6 +27,8 @@ from sightline.protocol.transports.websocket.framing import Hello, IncomingMessa
 from sightline.protocol.transports.websocket.legacy import DriverSlot, LegacyClient, LegacyToRobot, LegacyToVision
 from sightline.protocol.transports.websocket.peer import Peer, Promote, Publication, exchange_hellos
 from sightline.protocol.transports.websocket.server import KeyFolder, Server
+
+_log: Final = logging.getLogger(__name__)
 
 Callback = Callable[[Message], None]
 _WATCHED = tuple(one for one in CHANNELS.values() if one.while_watched)
@@ -311,7 +314,7 @@ class WebSocketLink(BaseLink):
         with self._joining:
             line = self._log.line(text, monotonic_us())
         if line:
-            log_line(line)
+            _log.warning(line)
 
     def _deliver(self, peer: Peer, packet: IncomingMessage) -> None:
         parsed = parse_key(packet.key)

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from sightline.evaluation.lockstep import Conditions, Lockstep
 from sightline.evaluation.scenario_config import robot_config, vision_config
-from sightline.operator_side.recording import recorder as recording
 from sightline.operator_side.recording.recorder import CHUNK_BYTES, MAX_WAITING, Recorder, read_about, read_recording
 from sightline.operator_side.recording.replay import VISION_CONFIG, replay, replay_steps
 from sightline.protocol.channels import CAMERA, CHANNELS, FRAME, STATUS, TWIST
@@ -173,14 +172,12 @@ def test_recording_takes_nothing_from_the_network_it_listens_to(tmp_path):
     assert [one.message for one in read_recording(tmp_path / "run.mcap")] == heard
 
 
-def test_a_disk_that_is_full_ends_the_recording_with_one_line(monkeypatch, capfd):
+def test_a_disk_that_is_full_ends_the_recording_with_one_line(caplog, capfd):
     """No thread dies, `close` comes back, and why it ends early is kept."""
-    lines = []
-    monkeypatch.setattr(recording, "log_line", lines.append)
     wire = Wire()
     with Recorder(wire, Path("/dev/full"), {}, CHANNELS.values()) as recorder:
         for at in range(3 * MAX_WAITING):
             wire.deliver(Message(FRAME, "", b"%d" % at, bytes(CHUNK_BYTES // 4)))
             time.sleep(0.0005)
-    assert lines == ["recording /dev/full: No space left on device; nothing more is recorded"]
+    assert caplog.messages == ["recording /dev/full: No space left on device; nothing more is recorded"]
     assert recorder.failed == "No space left on device" and capfd.readouterr().err == ""

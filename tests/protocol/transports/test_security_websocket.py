@@ -116,7 +116,7 @@ def test_a_bad_option_is_refused(text):
         parse_websocket_endpoint(f"ws-legacy://127.0.0.1:9091?{text}")
 
 
-def test_who_is_not_listed_is_told_why_and_the_log_tells_of_few(capfd):
+def test_who_is_not_listed_is_told_why_and_the_log_tells_of_few(caplog):
     endpoint, here = everywhere("ws-legacy")
     plain = here.replace("ws-legacy", "ws")
     with open_websocket("r1", listen=f"{endpoint}?from=10.1.2.3") as robot:
@@ -130,7 +130,7 @@ def test_who_is_not_listed_is_told_why_and_the_log_tells_of_few(capfd):
         )
         spent_s = time.monotonic() - begin_s
         assert robot.rejected == {NOT_LISTED: 40}
-    lines = capfd.readouterr().err.splitlines()
+    lines = caplog.messages
     assert 1 <= len(lines) <= 10 * (1 + int(spent_s))
     assert "turned 127.0.0.1 away: 127.0.0.1 is not listed" in lines[0]
 
@@ -190,7 +190,7 @@ def test_a_token_is_shown_once_in_one_of_two_ways(authorizations, offers, role):
     assert role_of_token({token: name for name, token in TOKENS.items()}, authorizations, offers) == role
 
 
-def test_a_token_opens_the_door_and_nothing_else_does(keys, capfd):
+def test_a_token_opens_the_door_and_nothing_else_does(keys, caplog):
     endpoint, here = everywhere()
     with open_websocket("r1", listen=endpoint, secure=keys) as robot:
         with open_websocket("r1", connect=here, role="vision", secure=keys) as peer:
@@ -208,7 +208,7 @@ def test_a_token_opens_the_door_and_nothing_else_does(keys, capfd):
         with connect(here, subprotocols=entries, compression=None, legacy=True) as browser:
             assert browser.subprotocol == "sightline.v1"
         assert robot.rejected[NO_TOKEN] >= 3
-    told = capfd.readouterr().err
+    told = caplog.text
     assert "turned 127.0.0.1 away: show the token" in told
     assert TOKEN[:-1] not in told
 
@@ -229,7 +229,7 @@ def test_a_role_may_publish_what_the_table_of_channels_gives_it():
 
 
 @pytest.mark.parametrize("role", TOKENS)
-def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role, capfd):
+def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role, caplog):
     endpoint, here = everywhere()
     sources = ("vision", "teleop", "operator", "guest")
     heard, sent = [], [*itertools.product(["twist", "ack", "request", "detections"], sources)]
@@ -246,7 +246,7 @@ def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role, capfd):
             assert robot.has_listener(STATUS)  # everybody may watch
             # Told once each, at once, ten a second; an acknowledgement that returns no credit is not worth a word.
             forbidden = {"/".join(pair) for pair in sent if pair not in grants_of_role(role) and pair[0] != "ack"}
-            told = [line for line in capfd.readouterr().err.splitlines() if line.startswith("refused ")]
+            told = [line for line in caplog.messages if line.startswith("refused ")]
             named = [line.split()[1] for line in told]
             assert set(named) <= forbidden and len(set(named)) == len(named) >= min(10, len(forbidden))
             assert all(" from 127.0.0.1: the role of its token may not say that" in line for line in told)
@@ -267,7 +267,7 @@ def test_the_seat_is_the_first_s_until_it_leaves_or_is_silent_for_a_second():
     assert seat.claim("a", 900_000 + DRIVER_SLOT_US) == "a"
 
 
-def test_one_client_drives_and_the_rest_only_watch(capfd):
+def test_one_client_drives_and_the_rest_only_watch(caplog):
     endpoint = free_ws("ws-legacy")
     plain = endpoint.replace("ws-legacy", "ws")
     with open_websocket("r1", listen=endpoint) as robot, connect(plain) as viewer, connect(plain) as driver:
@@ -284,6 +284,6 @@ def test_one_client_drives_and_the_rest_only_watch(capfd):
         assert until(lambda: robot.publish(FRAME, b"", b"jpeg") and viewer.recv(1) == driver.recv(1))
         driver.close()
         assert until(lambda: viewer.send("0.9|0") or twists.take(0.05), 0.9)  # its seat is free at once
-    told = [line for line in capfd.readouterr().err.splitlines() if "drives" in line]
+    told = [line for line in caplog.messages if "drives" in line]
     assert len(told) == 3
     assert told[1] == f"{told[1].split()[0]} only watches: {told[0]}"

@@ -38,7 +38,7 @@ class StillDrive:
 def ends(tmp_path):
     """The driver's hold on its child and the child's on its driver, joined by real sockets."""
     waited, aside = (socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2))
-    child = DriverEnd(RobotConfig(state_dir=tmp_path), "0a0a0a0a", lambda line: None)
+    child = DriverEnd(RobotConfig(state_dir=tmp_path), "0a0a0a0a")
     child.socket, child._aside = waited[0], aside[0]
     for end in (waited[0], aside[0]):
         end.setblocking(False)
@@ -54,7 +54,7 @@ def driver(tmp_path, ends):
     made = Driver(config, StillDrive(), None)
     made.child = ends[0]
     yield made
-    made.scribe.close()
+    made.latch_writer.close()
     for number, handler in handlers.items():
         signal.signal(number, handler)
 

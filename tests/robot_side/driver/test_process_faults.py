@@ -12,7 +12,7 @@ from sightline.protocol.config import Config
 from sightline.protocol.messages import Twist
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice, RobotConfig
-from sightline.robot_side.driver.persistence import BackgroundWriter, StopLatch
+from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
 from sightline.robot_side.driver.process import Driver, run
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
 from sightline.robot_side.ports import WheelAngles
@@ -58,7 +58,7 @@ def driver(tmp_path):
     BrokenDrive.fails = BrokenDrive.reading = None
     made = Driver(config, BrokenDrive(), None)
     yield made
-    made.scribe.close()
+    made.latch_writer.close()
     for number, handler in handlers.items():
         signal.signal(number, handler)
 
@@ -131,17 +131,18 @@ def test_however_the_loop_ends_the_motors_are_told_zero(tmp_path, monkeypatch):
         signal.signal(number, handler)
 
 
-def test_a_latch_that_cannot_be_written_is_tried_again_and_holds_nobody_up(tmp_path, capsys):
+def test_a_latch_that_cannot_be_written_is_tried_again_and_does_not_block(tmp_path, caplog):
+    caplog.set_level("INFO", "sightline")
     latch = StopLatch(tmp_path / "state", "r1")
     (tmp_path / "state").rmdir()
-    scribe = BackgroundWriter(latch)
+    latch_writer = LatchWriter(latch)
     began_s = time.monotonic()
-    scribe.keep(stopped=True)
+    latch_writer.want(stopped=True)
     assert time.monotonic() - began_s < 0.1
-    assert until(lambda: "STOP mark is not kept" in capsys.readouterr().out)
+    assert until(lambda: "STOP mark is not kept" in caplog.text)
     (tmp_path / "state").mkdir()
     assert until(latch.is_set)
-    scribe.close()
+    latch_writer.close()
 
 
 def test_a_terminal_that_hangs_up_while_moving_ends_after_zero(tmp_path):

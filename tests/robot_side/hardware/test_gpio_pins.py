@@ -62,12 +62,13 @@ def test_pins_that_another_holds_are_said(board, drive):
     assert board.pin("GPIO10").function == "output", "the first one still has it"
 
 
-def test_spi_that_is_switched_on_is_warned_of(board, monkeypatch, capsys, tmp_path):
+def test_spi_that_is_switched_on_is_warned_of(board, monkeypatch, caplog, tmp_path):
     monkeypatch.setattr(gpio_pins, "_SPI_DEVICE", tmp_path)
     GpioDrive(config()).close()
-    assert "pins 7, 8, 9, 10 are SPI0's" in capsys.readouterr().err
+    assert "pins 7, 8, 9, 10 are SPI0's" in caplog.text
+    caplog.clear()
     GpioDrive(config(left_forward_pin=17, left_backward_pin=27, right_forward_pin=22, right_backward_pin=23)).close()
-    assert capsys.readouterr().err == ""
+    assert caplog.text == ""
 
 
 class FakeLgpio(SimpleNamespace):

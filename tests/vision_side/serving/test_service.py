@@ -141,8 +141,8 @@ def test_the_process_ends_within_a_second_of_a_signal(number: signal.Signals) ->
         free.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     code = (
-        "from sightline.vision_side.config import VisionConfig; "
-        "from sightline.vision_side.serving.process import run; "
+        "from sightline.protocol.log import start_log; from sightline.vision_side.config import VisionConfig; "
+        "from sightline.vision_side.serving.process import run; start_log(None, 'vision'); "
         f"raise SystemExit(run(VisionConfig(connect=(), listen=('{endpoint}',))))"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
