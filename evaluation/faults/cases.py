@@ -111,7 +111,7 @@ def _hold_gil(rig: RobotFixture) -> Injected:
 @contextmanager
 def busy_processes() -> Iterator[None]:
     """Four processes that want all the processor they can get."""
-    busy = [subprocess.Popen([sys.executable, "-c", _BUSY_LOOP]) for _ in range(BUSY)]
+    busy = [subprocess.Popen([sys.executable, "-P", "-c", _BUSY_LOOP]) for _ in range(BUSY)]
     try:
         yield
     finally:

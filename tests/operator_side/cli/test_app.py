@@ -1,10 +1,12 @@
 """The command line: help everywhere, every mistake one line and its exit code, nothing heavy before it is needed."""
 
+import ast
 import json
 import os
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import pytest
 import typer
@@ -213,6 +215,61 @@ def test_operator_commands_import_their_own_group_and_no_image_library(arguments
                             check=True, stdin=subprocess.DEVNULL)
     assert result.stderr.startswith("error: ")
     assert result.stdout.splitlines() == ["app operate options", ""]
+
+
+@pytest.fixture
+def shadowed(tmp_path, monkeypatch):
+    """A folder on PYTHONPATH whose files have the names of our packages."""
+    for name in ("sim", "protocol", "robot_side", "vision_side", "evaluation", "sightline_robot"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('a file of the current folder was imported')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", ".")
+
+
+@pytest.mark.usefixtures("shadowed")
+def test_every_command_and_module_is_found_beside_files_of_our_names():
+    """One process, started as the console script is: without -P, and with the current folder on its path."""
+    script = """if True:
+        import importlib, json, pkgutil, sys
+        import sightline
+        from sightline.operator_side.cli import app as cli
+        assert "" in sys.path
+        for path in json.loads(sys.argv[1]):
+            assert cli.run([*path, "--help"]) == 0, path
+        for module in pkgutil.walk_packages(sightline.__path__, "sightline."):
+            try:
+                importlib.import_module(module.name)
+            except ModuleNotFoundError as error:
+                assert not error.name.startswith("sightline"), error
+    """
+    done = subprocess.run([sys.executable, "-c", script, json.dumps(list(COMMANDS))], capture_output=True, text=True,
+                          check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("Usage: sightline ") == len(COMMANDS)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("shadowed")
+@pytest.mark.parametrize("arguments", [
+    ("demo", "--seconds", "2", "--out", "run"),
+    ("score", "--scenario", "circle", "--seeds", "1,2", "--seconds", "5", "--jobs", "2"),
+], ids=lambda value: value[0])
+def test_child_processes_import_no_file_of_the_current_folder(arguments):
+    command = [str(Path(sys.executable).with_name("sightline")), *arguments, "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=180)
+    assert done.returncode in (0, 5), done.stderr  # so short a run may miss a bound
+    assert json.loads(done.stdout)["checks"]
+
+
+def test_every_python_that_the_product_starts_ignores_the_current_folder():
+    root, starts = Path(cli.__file__).resolve().parents[2], 0
+    for package in (root / ".import/sightline").iterdir():
+        for path in (root / package.name).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+                if isinstance(node, ast.List) and any(ast.unparse(one) == "sys.executable" for one in node.elts):
+                    starts += 1
+                    assert "-P" in [one.value for one in node.elts if isinstance(one, ast.Constant)], path
+    assert starts >= 8
 
 
 @pytest.mark.parametrize(
