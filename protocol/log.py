@@ -15,6 +15,7 @@ import queue
 import sys
 import threading
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final, TextIO
 
@@ -129,60 +130,52 @@ def error_line(text: str) -> str:
 
 
 _FIRST_PERIOD_US: Final = 1_000_000
-
 _LONGEST_PERIOD_US: Final = 60_000_000
+_FORGOTTEN_US: Final = 10_000_000
+"""A key that did not come for so long is news again."""
+_MAX_KEYS: Final = 16
+_OTHERS: Final = ""
 
-_MOST_CAUSES: Final = 16
+
+@dataclass(slots=True)
+class _Repeat:
+    count: int = 0
+    seen_us: int = 0
+    logged_us: int = 0
+    period_us: int = 0
 
 
 class RepeatLimiter:
-    """Per cause a line at once, then after 1, 2, 4 ... 60 s for as long as it goes on, each with how often."""
+    """Permits a line per key at once, then after 1, 2, 4 ... 60 s while it repeats. Beyond 16 keys the rest share one.
+
+    Peers choose some of the keys, so neither their memory nor their lines may grow without bound.
+    """
 
     def __init__(self) -> None:
-        self._untold: dict[str, int] = {}
-        self._told: dict[str, tuple[int, int]] = {}
+        self._repeats: dict[str, _Repeat] = {}
+        """The key that was seen last is the last."""
 
-    def is_due(self, cause: str, now_us: int, times: int = 1) -> int:
-        """`cause` was given `times` more: how often since the last line about it, if one is due; else 0."""
-        self._untold[cause] = self._untold.get(cause, 0) + times
-        told_us, period_us = self._told.get(cause, (now_us - _FIRST_PERIOD_US, 0))
-        silent_us = now_us - told_us
-        if silent_us < period_us:
+    def due(self, key: str, now_us: int, times: int = 1) -> int:
+        """Count `key` `times` more. Return how often it came since its last line if a line is due, else 0."""
+        key = self._bounded(key, now_us)
+        repeat = self._repeats.pop(key, _Repeat(seen_us=now_us - _FORGOTTEN_US))
+        self._repeats[key] = repeat
+        repeat.count += times
+        seen_us, repeat.seen_us = repeat.seen_us, now_us
+        if now_us - seen_us >= _FORGOTTEN_US:
+            repeat.period_us = 0
+        elif now_us - repeat.logged_us < repeat.period_us:
             return 0
-        if silent_us > 2 * _LONGEST_PERIOD_US or not period_us:
-            period_us = _FIRST_PERIOD_US // 2
-        self._told[cause] = (now_us, min(2 * period_us, _LONGEST_PERIOD_US))
-        if len(self._told) > _MOST_CAUSES:
-            self._forget_oldest()
-        return self._untold.pop(cause)
+        repeat.period_us = min(2 * repeat.period_us, _LONGEST_PERIOD_US) or _FIRST_PERIOD_US
+        repeat.logged_us = now_us
+        count, repeat.count = repeat.count, 0
+        return count
 
-    def _forget_oldest(self) -> None:
-        oldest = min(self._told, key=lambda cause: self._told[cause][0])
-        del self._told[oldest]
-        self._untold.pop(oldest, None)
-
-
-# Lines about who was turned away, for the log: few, however many knock. Pure.
-
-
-MAX_LINES_PER_S: Final = 10
-_SECOND_US: Final = 1_000_000
-
-
-class BurstLimiter:
-    """At most ten lines a second; what is left out is counted in the next."""
-
-    def __init__(self) -> None:
-        self._begin_us = -_SECOND_US
-        self._lines = self._left_out = 0
-
-    def line(self, text: str, now_us: int) -> str:
-        """What to print for `text`; "" for nothing."""
-        if now_us - self._begin_us >= _SECOND_US:
-            self._begin_us, self._lines = now_us, 0
-        if self._lines >= MAX_LINES_PER_S:
-            self._left_out += 1
-            return ""
-        self._lines += 1
-        more, self._left_out = f" ({self._left_out} more before)" if self._left_out else "", 0
-        return text + more
+    def _bounded(self, key: str, now_us: int) -> str:
+        if key in self._repeats or len(self._repeats) < _MAX_KEYS:
+            return key
+        oldest = next(iter(self._repeats))
+        if now_us - self._repeats[oldest].seen_us < _FORGOTTEN_US:
+            return _OTHERS
+        del self._repeats[oldest]
+        return key

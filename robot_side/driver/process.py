@@ -1,4 +1,4 @@
-"""The control loop of the driver process, and its log of rejected commands. Shell."""
+"""The control loop of the driver process. Shell."""
 
 import logging
 import secrets
@@ -15,6 +15,7 @@ from sightline.protocol.channels import REQUEST, TWIST, check_robot_id
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import WireError
+from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.messages import LastRejection, State, StreamStatus
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
@@ -28,44 +29,6 @@ from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
 from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
 
 _log: Final = logging.getLogger(__name__)
-
-_FIRST_PERIOD_US: Final = 1_000_000
-_LONGEST_PERIOD_US: Final = 60_000_000
-_FORGOTTEN_US: Final = 10_000_000
-"""A reason that was not given for so long is news again."""
-
-
-class RejectionLog:
-    """Per reason a line at once, then after 1, 2, 4 ... 60 s for as long as it goes on, each with how often."""
-
-    def __init__(self) -> None:
-        self._untold: Counter[str] = Counter()
-        self._period_us: dict[str, int] = {}
-        self._told_us: dict[str, int] = {}
-        self._seen_us: dict[str, int] = {}
-
-    def line(self, refusal: LastRejection, now_us: int, times: int = 1) -> str:
-        """What to log of a refusal, given `times` since the last call; "" while its reason has had its share."""
-        reason = refusal.reason
-        self._untold[reason] += times
-        if not self._is_due(reason, now_us):
-            return ""
-        count = self._untold.pop(reason)
-        often = f" ({count} times)" if count > 1 else ""
-        return f"refused {reason} from {refusal.source or 'somebody'}{often}: {refusal.detail}"
-
-    def _is_due(self, reason: str, now_us: int) -> bool:
-        silent_us = now_us - self._seen_us.get(reason, now_us - _FORGOTTEN_US)
-        self._seen_us[reason] = now_us
-        if silent_us >= _FORGOTTEN_US:
-            self._period_us[reason] = _FIRST_PERIOD_US
-        elif now_us - self._told_us[reason] < self._period_us[reason]:
-            return False
-        else:
-            self._period_us[reason] = min(2 * self._period_us[reason], _LONGEST_PERIOD_US)
-        self._told_us[reason] = now_us
-        return True
-
 
 # The driver process: owns gate and motors, is the parent of the network process, has no network. Shell.
 #
@@ -133,7 +96,7 @@ class Driver:
         self._obeyed = False
         self._sight: tuple[float, ...] = ()
         self._verdicts: list[ipc.CommandAck] = []
-        self._refusals = RejectionLog()
+        self._rejection_limiter = RepeatLimiter()
         self._counted: Counter[str] = Counter()
         self.child = DriverEnd(config, self._driving.session)
         for number in EXIT_SIGNALS:
@@ -288,8 +251,8 @@ class Driver:
         more, self._counted = Counter(counts) - self._counted, Counter(counts)
         self._driving.turned_away += more
         for reason, count in more.items():
-            refusal = LastRejection(source="the network", reason=reason, detail="turned away by the transport")
-            self._tell(refusal, count)
+            refusal = LastRejection(source="the network", reason=reason, detail="rejected by the transport")
+            self._log_rejection(refusal, count)
 
     def _on_raw(self, packet: bytes) -> bool:
         message, refused_before = ipc.unpack_message(packet), self._driving.gate.last_refusal
@@ -301,9 +264,11 @@ class Driver:
             self._driving.on_request(message, monotonic_us())
         refusal = self._driving.gate.last_refusal
         if refusal is not None and refusal is not refused_before:
-            self._tell(refusal)
+            self._log_rejection(refusal)
         return True
 
-    def _tell(self, refusal: LastRejection, times: int = 1) -> None:
-        if line := self._refusals.line(refusal, monotonic_us(), times):
-            self._log(line)
+    def _log_rejection(self, rejection: LastRejection, times: int = 1) -> None:
+        if count := self._rejection_limiter.due(rejection.reason, monotonic_us(), times):
+            often = f" ({count} times)" if count > 1 else ""
+            source = rejection.source or "an unknown source"
+            self._log(f"rejected {rejection.reason} from {source}{often}: {rejection.detail}")

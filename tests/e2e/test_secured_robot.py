@@ -121,7 +121,7 @@ def test_on_a_plain_network_a_rogue_gets_nothing_accepted_while_another_drives_a
         assert until(lambda: "robot r1: on" in robot.output(), 20) and driving(robot)
         began_s, accepted_of = time.monotonic(), driver.status().holder
         with Vision(robot.endpoint, twist=b"-0.4000|1.0000") as rogue:
-            assert until(lambda: "refused NOT_HOLDER from vision" in robot.output(), 1.0), robot.output()
+            assert until(lambda: "rejected NOT_HOLDER from vision" in robot.output(), 1.0), robot.output()
             assert time.monotonic() - began_s < 3.0
             assert until(lambda: driver.status().refused.get("NOT_HOLDER", 0) > 10)
             assert driver.status().holder == accepted_of

@@ -2,6 +2,7 @@
 
 import fcntl
 import io
+import itertools
 import json
 import logging
 import os
@@ -110,7 +111,7 @@ def test_a_stream_that_is_not_read_costs_no_time_and_its_lines_come_later(unread
     read, sys.stdout = unread
     handler.setFormatter(formatter)
     begin_s = time.monotonic()
-    for number in range(3000):
+    for number in range(1000):
         handler.handle(_record(f"{number} " + 100 * "\U0001f600"))
     handler.flush()
     assert time.monotonic() - begin_s < 2
@@ -119,7 +120,7 @@ def test_a_stream_that_is_not_read_costs_no_time_and_its_lines_come_later(unread
         received += read.read(1 << 16)
         handler.handle(_record("once more"))
     assert received.startswith(b'{"time"' if isinstance(formatter, JsonFormatter) else b"0 ")
-    assert b"2999 " not in received, "no more lines wait than the queue holds"
+    assert b"999 " not in received, "no more lines wait than the queue holds"
 
 
 def test_all_lines_are_there_after_a_flush_where_they_are_read(unread, handler):
@@ -183,27 +184,41 @@ def test_an_object_keeps_every_letter(handler):
     assert json.loads(sys.stdout.getvalue())["message"] == "AnswerHeader is of version 'é'"
 
 
-def test_a_cause_is_told_at_once_and_then_ever_more_seldom_with_every_one_counted():
-    lines, told = RepeatLimiter(), {}
-    for second in range(200):
-        for tenth in range(10):
-            now_us = second * SECOND_US + tenth * 100_000
-            times = lines.is_due("wrong keys", now_us)
-            if times:
-                told[now_us / SECOND_US] = times
-    assert list(told)[:7] == [0.0, 1.0, 3.0, 7.0, 15.0, 31.0, 63.0] and len(told) <= 10
-    assert sum(told.values()) >= list(told)[-1] * 10
+def logged(limiter, key, from_us, until_us, step_us):
+    """(when, count) of each line that is due for a key that comes every `step_us`."""
+    due = ((now_us, limiter.due(key, now_us)) for now_us in range(from_us, until_us, step_us))
+    return [(now_us, count) for now_us, count in due if count]
 
 
-def test_two_causes_do_not_hide_one_another_and_an_old_one_is_news_again():
-    lines = RepeatLimiter()
-    assert (lines.is_due("a", 0), lines.is_due("b", 1), lines.is_due("a", 2)) == (1, 1, 0)
-    assert lines.is_due("a", 200 * SECOND_US) == 2
-    assert lines.is_due("a", 201 * SECOND_US) == 1
+@pytest.mark.parametrize("step_us", [100, 20_000, 100_000])
+def test_a_key_is_logged_at_once_and_then_ever_more_seldom_with_its_count(step_us):
+    lines = logged(RepeatLimiter(), "STALE", 0, 8 * SECOND_US, step_us)
+    assert [when_us for when_us, _ in lines] == [0, SECOND_US, 3 * SECOND_US, 7 * SECOND_US]
+    assert [count for _, count in lines] == [1, *(share * SECOND_US // step_us for share in (1, 2, 4))]
 
 
-def test_ever_new_causes_take_no_memory():
-    lines, draw = RepeatLimiter(), random.Random(3)
-    for number in range(2_000):
-        assert lines.is_due(f"{draw.random()}", number * 1_000) == 1
-    assert len(lines._told) + len(lines._untold) <= 33
+def test_a_key_that_goes_on_is_logged_at_least_once_a_minute():
+    times = [when_us for when_us, _ in logged(RepeatLimiter(), "STALE", 0, 600 * SECOND_US, SECOND_US)]
+    assert max(b - a for a, b in itertools.pairwise(times)) == 60 * SECOND_US
+
+
+def test_two_keys_do_not_hide_one_another():
+    limiter = RepeatLimiter()
+    assert (limiter.due("a", 0), limiter.due("b", 1), limiter.due("a", 2)) == (1, 1, 0)
+
+
+@pytest.mark.parametrize(("gap_us", "again"), [(9_999_999, False), (10_000_000, True)])
+def test_a_key_that_did_not_come_for_ten_seconds_is_news_again(gap_us, again):
+    limiter = RepeatLimiter()
+    last_us = logged(limiter, "STALE", 0, 70 * SECOND_US, SECOND_US)[-1][0] + 1
+    assert not limiter.due("STALE", last_us, 7)
+    assert limiter.due("STALE", last_us + gap_us) == (6 + 7 + 1 if again else 0)
+
+
+def test_ever_new_keys_take_no_memory_and_few_lines():
+    limiter, draw = RepeatLimiter(), random.Random(3)
+    counts = [limiter.due(f"{draw.random()}", number * 1_000) for number in range(2_000)]
+    assert counts[:16] == [1] * 16, "as many as can be told apart"
+    assert sum(map(bool, counts)) == 18 and max(counts) == 1_000, "the others share one key"
+    assert len(limiter._repeats) == 17
+    assert limiter.due("later", 20 * SECOND_US) == 1, "an old key makes room"

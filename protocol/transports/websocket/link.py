@@ -18,7 +18,7 @@ from sightline.protocol.channels import CHANNELS, FRAME, TWIST, Channel, parse_k
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.log import BurstLimiter
+from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_websocket_endpoint
 from sightline.protocol.transports.link import INEXACT_KEY, BaseLink, LinkRules, Message
 from sightline.protocol.transports.websocket.client import Client as Dialer
@@ -162,7 +162,7 @@ class WebSocketLink(BaseLink):
         self._in_callback = threading.local()
         self._dropped: Counter[str] = Counter()
         self._seat = DriverSlot()
-        self._log = BurstLimiter()
+        self._repeat_limiter = RepeatLimiter()
 
     @property
     def dropped(self) -> Counter[str]:
@@ -310,11 +310,10 @@ class WebSocketLink(BaseLink):
         return LegacyToRobot(self.robot, end.legacy, monotonic_us, secrets.token_hex(4), bound)
 
     def _tell(self, text: str) -> None:
-        """One line to the log, of not too many."""
         with self._joining:
-            line = self._log.line(text, monotonic_us())
-        if line:
-            _log.warning(line)
+            count = self._repeat_limiter.due(text, monotonic_us())
+        if count:
+            _log.warning("%s%s", text, f" ({count} times)" if count > 1 else "")
 
     def _deliver(self, peer: Peer, packet: IncomingMessage) -> None:
         parsed = parse_key(packet.key)

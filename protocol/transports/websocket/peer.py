@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from sightline.protocol.channels import ACK, Channel
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import WireError
-from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.link import OVERSIZE, Message, OutgoingQueue
 from sightline.protocol.transports.websocket.connection import CLOSE_S, Connection, Keepalive
 from sightline.protocol.transports.websocket.framing import (
@@ -89,7 +88,6 @@ class Peer:
         self._wire, self._dialect = wire, dialect
         self._reader = threading.current_thread()
         self._gone = threading.Event()
-        self._forbidden = RepeatLimiter()
         self._look_us = 0
 
     def hears(self, channel: Channel) -> bool:
@@ -97,17 +95,14 @@ class Peer:
         return self._dialect.hears(channel)
 
     def admits(self, key: str, refuse: Callable[[str], None], tell: Callable[[str], None]) -> bool:
-        """Whether its token lets it publish on `key`; if not, that is counted and, ever more seldom, told."""
+        """Whether its token lets it publish on `key`; if not, that is counted and logged."""
         said = tuple(key.split("/")[2:])
         if self._wire.granted is None or said in self._wire.granted:
             return True
         refuse(NOT_GRANTED)
-        what = "/".join(said)
-        times = 0 if said[0] == ACK.name else self._forbidden.is_due(what, monotonic_us())  # a viewer that acknowledges
-        if times:
-            often = f" ({times} times)" if times > 1 else ""
+        if said[0] != ACK.name:  # a viewer that acknowledges
             who = self._wire.address[0] or "a client"
-            tell(f"refused {what} from {who}{often}: the role of its token may not say that (docs/security.md)")
+            tell(f"rejected {'/'.join(said)} from {who}: the role of its token does not permit it (docs/security.md)")
         return False
 
     def offer(self, post: Publication) -> None:

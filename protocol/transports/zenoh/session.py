@@ -214,9 +214,9 @@ def report_floods(listen: Sequence[str], report: Callable[[str], None]) -> Itera
 
 
 def _watch_floods(ports: set[int], report: Callable[[str], None], ending: threading.Event) -> None:
-    due = RepeatLimiter()
+    limiter = RepeatLimiter()
     while not ending.wait(_FLOOD_CHECK_S):
         for host, count in connections(ports).most_common(1):
-            if count > MAX_SESSIONS and due.is_due(host, monotonic_us()):
+            if count > MAX_SESSIONS and limiter.due(host, monotonic_us()):
                 report(f"{count} connections from {host}, more than the {MAX_SESSIONS} accepted from all; "
                        "block that address or end the program there")
