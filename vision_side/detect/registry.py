@@ -20,7 +20,7 @@ from sightline.vision_side.missions.registry import check_missions
 from sightline.vision_side.plugins import shared_options
 
 BOXES: Final = "boxes"
-"""No detector here: boxes that somebody else publishes, see vision_side/serving/service.py."""
+"""No detector here: boxes of another publisher, see vision_side/serving/service.py."""
 REGISTRY: Final = PluginRegistry("detector", "sightline.detectors")
 _FILLED: Final = ("robot", "connect", "listen", "secure", "max_frame_bytes", "max_pixels")
 _MOST_NAMED: Final = 12
@@ -53,13 +53,13 @@ def configured_detector(config: VisionConfig) -> Detector:
 
 
 def _check_no_detector(config: VisionConfig) -> None:
-    """Raise ConfigError for what only a detector of one's own can have."""
+    """Raise ConfigError for a setting of local detectors."""
     one = config.detector
     given = ["device"] if one.device != "auto" else []
     given += [name for name in ("options", "fallback", "shadow", "shadow_options", "labels", "only_colour", "tracked")
               if getattr(one, name)]
     if given:
-        raise ConfigError(f"detector.{given[0]} goes with a detector that runs here; {BOXES!r} are somebody else's")
+        raise ConfigError(f"detector.{given[0]} goes with a local detector; {BOXES!r} is remote")
 
 
 def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
@@ -73,16 +73,16 @@ def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
 
 
 def _check_labels(kind: str, wanted: Sequence[str], known: Sequence[str]) -> None:
-    """Raise ConfigError for a label that a detector, which says what it knows, never gives."""
+    """Raise ConfigError for a label that is not among those that the detector lists."""
     for label in wanted if known else ():
         if label not in known:
             nearest = difflib.get_close_matches(label, known, n=1)
             hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; it gives {', '.join(known[:_MOST_NAMED])}"
-            raise ConfigError(f"detector.labels: {kind} knows no {label!r}{hint}")
+            raise ConfigError(f"detector.labels: {kind} has no label {label!r}{hint}")
 
 
 def waits_for_service(config: VisionConfig) -> bool:
-    """Whether one of the configured detectors waits for somebody else, so that others should not wait for it."""
+    """True if one of the configured detectors waits for another service, so that others should not wait for it."""
     one = config.detector
     kinds = [kind for kind in (one.kind, one.fallback, one.shadow) if kind and kind != BOXES]
     return any(getattr(REGISTRY.load(split_kind(kind)[0]), "waits", False) for kind in kinds)
@@ -92,18 +92,18 @@ def _check_fallback(config: VisionConfig) -> None:
     """Raise ConfigError for a fallback that may itself be late or gone."""
     kind = config.detector.fallback
     if kind and getattr(REGISTRY.load(split_kind(kind)[0]), "waits", False):
-        raise ConfigError(f"detector.fallback {kind!r} waits for somebody else, too; it has to look here, e.g. hsv")
+        raise ConfigError(f"detector.fallback {kind!r} is remote; choose a local detector, e.g. hsv")
 
 
 def check_takes_pictures(kind: str) -> None:
-    """Raise ConfigError for a detector that does not look at what it is given, where there is no robot to hear of."""
+    """Raise ConfigError for a detector that only receives boxes of a robot's frames, where there is no robot."""
     if kind != BOXES and getattr(REGISTRY.load(split_kind(kind)[0]), "only_receives", False):
-        raise ConfigError(f"detector {kind!r} hears what a service says of a robot's own frames, of which there are "
-                          "none here; name what that service serves")
+        raise ConfigError(f"detector {kind!r} receives boxes of a robot's own frames, and there is no robot here; "
+                          "name the detector that the service serves")
 
 
 def check_device(config: VisionConfig) -> None:
-    """Raise ConfigError where a device is asked for that nothing configured can run on."""
+    """Raise ConfigError for a device that no configured detector can choose."""
     one = config.detector
     if one.device == "auto":
         return
@@ -164,8 +164,7 @@ def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) ->
 def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tuple[Any, Any]:
     """The plug-in and its `Config`."""
     if kind == BOXES:
-        raise ConfigError(f"{BOXES!r} are what somebody else finds; here a detector is needed that looks itself, "
-                          "e.g. hsv")
+        raise ConfigError(f"{BOXES!r} is remote; choose a local detector, e.g. hsv")
     name, address = split_kind(kind)
     plugin = REGISTRY.load(name)
     settings = config_model(plugin)
@@ -176,7 +175,7 @@ def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tup
     given |= {one: getattr(config.detector, one) for one in _OF_DETECTOR if one in fields}
     given |= {"address": address} if address else {}
     if name in EXAMPLES and "address" not in {**given, **options}:
-        raise ConfigError(f"detector {name!r}: say where and what, e.g. {EXAMPLES[name]}")
+        raise ConfigError(f"detector {name!r} has no address: write e.g. {EXAMPLES[name]}")
     own = REGISTRY.settings(name, plugin, shared_options(plugin, given | dict(options), config))
     if not callable(getattr(plugin, "detect", None)):
         raise ConfigError(f"detector {kind!r}: the class has no method detect; see docs/detectors.md")

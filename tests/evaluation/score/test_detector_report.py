@@ -138,7 +138,7 @@ def _nan(frame):
 
 FAULTS = {
     "Raises": (_boom, "RuntimeError: boom and more"), "Silent": (lambda frame: None, "no answer in time"),
-    "Nonsense": (lambda frame: "nonsense", "is none"), "Nan": (_nan, "a number that is none"),
+    "Nonsense": (lambda frame: "nonsense", "invalid answer"), "Nan": (_nan, "nan or infinite"),
 }
 
 

@@ -106,7 +106,7 @@ def test_whatever_a_plug_in_raises_can_be_reported() -> None:
 
     bench = Bench(VisionConfig(), Strange(raises))
     bench.frame()
-    assert bench.report().note == "the detector's answer is none: OSError: ball?.onnx?[2J is gone"
+    assert bench.report().note == "invalid answer of the detector: OSError: ball?.onnx?[2J is gone"
 
 
 @pytest.mark.parametrize(("told_us", "us"), [

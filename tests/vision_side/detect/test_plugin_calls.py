@@ -22,7 +22,7 @@ class Failing:
 def test_what_a_plug_in_raises_is_one_line_that_says_where() -> None:
     bad = Failing(RuntimeError("two\nlines"))
     for what, ask in (("attach", lambda: attach_detector(bad, None)), ("close", lambda: close_detector(bad))):
-        with pytest.raises(ConfigError, match=rf"{what}\(\) raises RuntimeError: two lines; it has to be mended"):
+        with pytest.raises(ConfigError, match=rf"{what}\(\) raises RuntimeError: two lines; fix the plug-in"):
             ask()
     with pytest.raises(HardwareError, match="no camera"):
         close_detector(Failing(HardwareError("no camera")))

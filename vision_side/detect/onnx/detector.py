@@ -1,7 +1,7 @@
 """The detector `onnx:PATH`. Shell.
 
-Without a path it is the model that comes with Sightline. Before the first frame it has run warm, and shown on a known
-picture that it gives here what it should.
+Without a path it is the model that comes with Sightline. Before the first frame it has run warm, and its answer to a
+known picture was compared.
 """
 
 import hashlib
@@ -37,9 +37,9 @@ HASH_DIGITS: Final = 16
 MAX_BYTES: Final = 2**31
 """A protocol buffer can be no larger."""
 _WARM_UP: Final = 3
-_OTHERWISE: Final = 0.25  # the least score that counts, for a model that does not say
+_DEFAULT_MIN_SCORE: Final = 0.25  # for a model without `min_score`
 _NAME_LENGTH: Final = 48
-_MOST_AT_ONCE: Final = 32
+_MAX_BATCH: Final = 32
 """Pictures in one run: bounds a GPU's memory."""
 
 
@@ -47,15 +47,15 @@ class OnnxDetector:
     """One model."""
 
     class Config(Settings):
-        """What to run, on what, and what of its answers counts."""
+        """The model, its device, and which of its answers count."""
 
         address: str = ""
         """The file; empty for the model that comes with Sightline."""
         device: Device = "auto"
         threads: Annotated[int, Field(ge=1, le=64)] = 1
-        """Of the CPU. A small picture only loses by being split."""
+        """Threads on the CPU. A small picture only loses by being split."""
         min_score: Annotated[float | None, Field(ge=0, le=1)] = None
-        """None: what the model's metadata say as `min_score`, or else 0.25."""
+        """None: `min_score` of the model's metadata, or else 0.25."""
         names: Annotated[tuple[str, ...], Field(max_length=1000)] = ()
         """The labels, in order; empty for those of the model's metadata."""
         colour: Literal["auto", "bgr", "rgb"] = "auto"
@@ -64,44 +64,44 @@ class OnnxDetector:
         """Things with these labels are round: their edge is looked for in the picture."""
 
     def __init__(self, config: Config) -> None:
-        """Raises ConfigError for a file that is no such model, HardwareError for a device that is not there."""
+        """Raises ConfigError for a file that is not such a model, HardwareError for a device that is not there."""
         model = read_onnx_model(config)
         path, self._form, self._min_score = model.path, model.form, model.min_score
         self.labels = model.form.labels
         """All that it can call a thing; empty where the model has only numbers."""
         self._refine = frozenset(config.refine)
         self._engine = model.engine
-        self._news = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
+        self._notices = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
         self.maker = Maker(f"onnx:{path.name}"[:_NAME_LENGTH], model.digest, self._engine.device)
         self._failed = False
-        self._at_once = _MOST_AT_ONCE if self._form.batched else 1
+        self._max_batch = _MAX_BATCH if self._form.batched else 1
         self._warm_up(model, config)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """A result for each frame for which there is still time; all at once where the model takes that."""
-        return self._in_parts(frames, deadline_us, self._at_once)
+        return self._in_parts(frames, deadline_us, self._max_batch)
 
     def news(self) -> list[str]:
-        """What it runs on, where that is not what one may think; the first failure."""
-        news, self._news = self._news, []
-        return news
+        """Return the device, where that may surprise, and the first failure."""
+        notices, self._notices = self._notices, []
+        return notices
 
     def _in_parts(self, frames: Sequence[DetectFrame], deadline_us: int, most: int) -> list[DetectionResult | None]:
         results: list[DetectionResult | None] = []
         while len(results) < len(frames):
             some = frames[len(results) : len(results) + most]
             is_late = monotonic_us() > deadline_us
-            results += [None] * len(some) if is_late else self._looked(some, deadline_us)
+            results += [None] * len(some) if is_late else self._run(some, deadline_us)
         return results
 
-    def _looked(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+    def _run(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         try:
-            return timed_together(frames, self.maker, self._seen)
-        except Exception as error:  # an engine that fails on a picture gives no answer, and says so once
+            return timed_together(frames, self.maker, self._detections)
+        except Exception as error:  # an engine that fails on a picture gives no answer, and reports that once
             if len(frames) > 1:
                 return self._fewer_at_once(frames, deadline_us, error)
             if not self._failed:
-                self._news.append(f"{self.maker.detector} gives no answer: {str(error)[:160]}")
+                self._notices.append(f"{self.maker.detector} gives no answer: {str(error)[:160]}")
             self._failed = True
             return [None]
 
@@ -111,19 +111,19 @@ class OnnxDetector:
         """Too many for its memory, or more than the model's inside takes; where that helps, it stays so."""
         fewer = len(frames) // 2
         results = self._in_parts(frames, deadline_us, fewer)
-        if any(results) and fewer < self._at_once:
-            self._at_once = fewer
-            self._news.append(f"{self.maker.detector} fails on {len(frames)} pictures at once, from now on at most "
+        if any(results) and fewer < self._max_batch:
+            self._max_batch = fewer
+            self._notices.append(f"{self.maker.detector} fails on {len(frames)} pictures at once, from now on at most "
                               f"{fewer}: {str(error)[:120]}")
         return results
 
-    def _seen(self, pictures: Sequence[Picture]) -> list[Sequence[Detection]]:
+    def _detections(self, pictures: Sequence[Picture]) -> list[Sequence[Detection]]:
         together = _found(self._engine, pictures, self._form, self._min_score)
         return [tuple(refined(picture, one) if one.label in self._refine else one for one in found)
                 for picture, found in zip(pictures, together, strict=True)]
 
     def _warm_up(self, model: "OnnxModel", config: Config) -> None:
-        """Run warm, on the known picture, and compare: with what the model brought, or with itself on the CPU."""
+        """Run warm, on the known picture, and compare: with the metadata's answer, or with itself on the CPU."""
         picture, path, expected = Picture(golden_picture(), 1), model.path, model.expected
         form, least = model.own_form, model.own_min_score
         try:
@@ -137,20 +137,20 @@ class OnnxDetector:
         wrong = difference(expected, found, least) if expected is not None else ""
         if wrong:
             where = f"{self._engine.device} ({self._engine.name})"
-            raise HardwareError(f"model {path.name} on {where} does not give what it should for its test picture: "
+            raise HardwareError(f"model {path.name} on {where} gives a wrong answer to its test picture: "
                                 f"{wrong}; try --device cpu, or fetch the file again")
 
 
 @dataclass(frozen=True, slots=True)
 class OnnxModel:
-    """A model's file, loaded, and what it says of itself."""
+    """A model's file, loaded, and its metadata."""
 
     path: Path
     engine: Engine
     form: ModelFormat
     min_score: float
     expected: list[Detection] | None
-    """What it should find in the known picture, if it says: by its own labels, from its own least score on."""
+    """Detections in the known picture, if the metadata have them: its own labels, from its own least score on."""
     own_form: ModelFormat
     own_min_score: float
     digest: str
@@ -182,18 +182,18 @@ def read_onnx_model(config: OnnxDetector.Config) -> OnnxModel:
 def _found(
     engine: Engine, pictures: Sequence[Picture], form: ModelFormat, min_score: float
 ) -> list[tuple[Detection, ...]]:
-    """In each picture; more than one only where form and engine take them."""
+    """Return the detections of each picture; more than one only where form and engine take them."""
     fitted = [fit_picture(picture, form) for picture in pictures]
     if len(fitted) == 1:
         each = [engine.run(fitted[0][0])]
     else:
         each = split_batch(engine.run(np.concatenate([pixels for pixels, _ in fitted])), len(pictures))
-    return [read_outputs(outputs, form, fitting, picture, min_score)
-            for outputs, (_, fitting), picture in zip(each, fitted, pictures, strict=True)]
+    return [read_outputs(outputs, form, letterbox, picture, min_score)
+            for outputs, (_, letterbox), picture in zip(each, fitted, pictures, strict=True)]
 
 
 def shipped_digest() -> str:
-    """Of the model that comes with Sightline, as results carry it; empty where none does."""
+    """Return the hash of the model that comes with Sightline, as results carry it; empty without one."""
     return hashlib.sha256(SHIPPED.read_bytes()).hexdigest()[:HASH_DIGITS] if SHIPPED.is_file() else ""
 
 
@@ -214,7 +214,7 @@ def _bytes_of(path: Path) -> bytes:
 def _least(given: float | None, header: OnnxHeader) -> float:
     if given is not None:
         return given
-    least = float(header.metadata.get("min_score", _OTHERWISE))
+    least = float(header.metadata.get("min_score", _DEFAULT_MIN_SCORE))
     if not 0 <= least <= 1:
-        raise ValueError(f"its metadata want a least score of {least:g}; it is between 0 and 1")
+        raise ValueError(f"invalid min_score {least:g} in its metadata: not between 0 and 1")
     return least

@@ -22,7 +22,7 @@ _TYPES: Final = {"tensor(float)": "float32", "tensor(uint8)": "uint8", "tensor(i
                  "tensor(float16)": "float16"}
 _DEVICES: Final = {provider: device for device, provider in PROVIDERS.items()}
 _BEHIND: Final = {"tensorrt": ("tensorrt", "cuda", "cpu"), "cuda": ("cuda", "cpu"), "cpu": ("cpu",)}
-"""What a session for a device may fall back on for single operations."""
+"""Providers that a session for a device may fall back on for single operations."""
 _MISSING: Final = ("onnxruntime is not installed: pip install 'sightline-robot[vision]', or [vision-gpu] for an NVIDIA "
                    "GPU; it has no wheel for 32-bit ARM")
 _FIX: Final = ("install onnxruntime-gpu in place of onnxruntime (never both), see that `nvidia-smi` shows the GPU, or "
@@ -42,7 +42,7 @@ class Tensor:
 
 @dataclass(frozen=True, slots=True)
 class OnnxHeader:
-    """Of one model."""
+    """The head of one model."""
 
     inputs: tuple[Tensor, ...]
     outputs: tuple[Tensor, ...]
@@ -114,7 +114,7 @@ def _session(runtime: Any, path: Path, options: Any, providers: list[str]) -> An
     """On the CPU where the others fail; ONNX Runtime would do that by itself, and print it where our output goes."""
     try:
         return runtime.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
-    except Exception:  # ONNX Runtime's own errors are no RuntimeErrors
+    except Exception:  # ONNX Runtime's own errors do not derive from RuntimeError
         if len(providers) == 1:
             raise
     return runtime.InferenceSession(str(path), options, providers=[PROVIDERS["cpu"]], enable_fallback=0)

@@ -26,19 +26,19 @@ def golden_picture() -> NDArray[np.uint8]:
     """Discs on a chequered floor under a slope of light, BGR."""
     width, height = SIZE_PX
     down, right = np.mgrid[0:height, 0:width]
-    grey = 90 + (down * 60) // height + ((right // 20 + down // 20) % 2) * 18
-    picture = np.repeat(grey[..., None], 3, axis=-1)
-    for x, y, radius, colour in _DISCS:
+    gray = 90 + (down * 60) // height + ((right // 20 + down // 20) % 2) * 18
+    picture = np.repeat(gray[..., None], 3, axis=-1)
+    for x, y, radius, color in _DISCS:
         square = (right - x) ** 2 + (down - y) ** 2
         inside = square <= radius * radius
         shade = 255 - (square * 90) // (radius * radius)
-        for channel, value in enumerate(colour):
+        for channel, value in enumerate(color):
             picture[..., channel] = np.where(inside, value * shade // 255, picture[..., channel])
     return picture.astype(np.uint8)
 
 
 def golden_text(found: Sequence[Detection]) -> str:
-    """What to keep in the metadata."""
+    """Write the detections for the metadata."""
     return json.dumps([[round(one.x1_px, 2), round(one.y1_px, 2), round(one.x2_px, 2), round(one.y2_px, 2),
                         round(one.score, 4), one.label] for one in found])
 

@@ -1,6 +1,6 @@
 """Pictures to input tensors, output tensors to detections. Pure.
 
-Inputs: uint8 rows of pixels (1, H, W, 3), BGR unless told otherwise, or float (1, 3, H, W), RGB as 0..1. Outputs:
+Inputs: uint8 rows of pixels (1, H, W, 3), BGR unless configured, or float (1, 3, H, W), RGB as 0..1. Outputs:
 `boxes` (K, 4), `scores` (K), `labels` (K), as Sightline's own; one (N, 6) of x1, y1, x2, y2, score, class; or one
 (4 + classes, N) of cx, cy, w, h and a score for each class, as YOLO gives it, with overlaps still to be removed.
 """
@@ -23,7 +23,7 @@ from sightline.vision_side.detect.port import Detection, clean_label, clipped
 Arrays = Mapping[str, NDArray[Any]]
 _MAX_ROWS: Final = 100_000
 _MAX_OVERLAP: Final = 0.5
-_GREY: Final = 114  # beside a picture that is narrower or lower than the input; what YOLO was trained with
+_GRAY: Final = 114  # beside a picture that is narrower or lower than the input; what YOLO was trained with
 _STEP_PX: Final = 32  # an input of any size is rounded up to this
 _TRIPLE: Final = {"boxes", "scores", "labels"}
 _MAX_LABELS: Final = 1000
@@ -31,7 +31,7 @@ _MAX_LABELS: Final = 1000
 
 @dataclass(frozen=True, slots=True)
 class Letterbox:
-    """Where the picture lies in the input: `scale` input pixels for each of its own, from (`left`, `top`)."""
+    """Place of the picture in the input: `scale` input pixels for each of its own, from (`left`, `top`)."""
 
     scale: float
     left: int
@@ -40,7 +40,7 @@ class Letterbox:
 
 @dataclass(frozen=True, slots=True)
 class ModelFormat:
-    """How one model takes and gives."""
+    """The inputs and outputs of one model."""
 
     floats: bool
     rgb: bool
@@ -51,13 +51,13 @@ class ModelFormat:
     labels: tuple[str, ...]
     dtype: str = "uint8"
     batched: bool = False
-    """Whether it takes several pictures at once: how many is left open, in what it takes and gives."""
+    """True if it takes several pictures at once: inputs and outputs leave the number open."""
 
 
 def model_format(header: OnnxHeader, names: Sequence[str], colour: str) -> ModelFormat:
     """Raises ValueError for a model that takes or gives something else."""
     if len(header.inputs) != 1:
-        raise ValueError(f"it takes {len(header.inputs)} inputs; one picture is what there is")
+        raise ValueError(f"it takes {len(header.inputs)} inputs; expected one picture")
     one = header.inputs[0]
     rows_first, channels_first = one.shape[3:] == (3,), len(one.shape) == 4 and one.shape[1] == 3
     floats = one.type in ("float32", "float16")
@@ -75,7 +75,7 @@ def model_format(header: OnnxHeader, names: Sequence[str], colour: str) -> Model
 
 
 def _is_for_several(output: Tensor, kind: str) -> bool:
-    """Whether its first dimension is open and counts pictures."""
+    """True if its first dimension is open and counts pictures."""
     sides = 2 if kind == "triple" and output.name != "boxes" else 3
     return len(output.shape) == sides and output.shape[0] is None
 
@@ -93,7 +93,7 @@ def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> str:
             return "rows"
         if len(shape) == 3 and shape[1] is not None and shape[1] > 4:
             if labels and shape[1] != 4 + len(labels):
-                raise ValueError(f"it tells {shape[1] - 4} classes apart and has {len(labels)} names; "
+                raise ValueError(f"it has {shape[1] - 4} classes and {len(labels)} names; "
                                  "detector.options.names has one for each, in order")
             return "yolo"
     given = ", ".join(f"{one.name} {_shape_text(one)}" for one in outputs)
@@ -102,7 +102,7 @@ def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> str:
 
 
 def own_labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
-    """What the model says: `labels` is a JSON list; `names`, as others write it, a Python dictionary of numbers."""
+    """Read the labels: `labels` is a JSON list; `names`, as others write it, a Python dictionary of numbers."""
     try:
         if "labels" in metadata:
             found = json.loads(metadata["labels"])
@@ -127,7 +127,7 @@ def fit_picture(picture: Picture, form: ModelFormat) -> tuple[NDArray[Any], Lett
         bgr = cv2.resize(bgr, (width, height), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
     if (height, width) != (rows, columns):
         bgr = cv2.copyMakeBorder(bgr, top, rows - height - top, left, columns - width - left, cv2.BORDER_CONSTANT,
-                                 value=(_GREY, _GREY, _GREY))
+                                 value=(_GRAY, _GRAY, _GRAY))
     if form.rgb:
         bgr = bgr[..., ::-1]
     if not form.floats:
@@ -138,12 +138,12 @@ def fit_picture(picture: Picture, form: ModelFormat) -> tuple[NDArray[Any], Lett
 
 
 def read_outputs(
-    outputs: Arrays, form: ModelFormat, fitting: Letterbox, picture: Picture, min_score: float
+    outputs: Arrays, form: ModelFormat, letterbox: Letterbox, picture: Picture, min_score: float
 ) -> tuple[Detection, ...]:
-    """What the model saw, surest first, in pixels of the encoded picture.
+    """Return the detections, surest first, in pixels of the encoded picture.
 
-    Raises ValueError for outputs of another shape than the model said, and for numbers that are none in what counts: to
-    have seen nothing is another thing.
+    Raises ValueError for outputs of another shape than in the header, and for numbers that are not finite in what
+    counts: that is not the same as "saw nothing".
     """
     boxes, scores, labels = _READERS[form.kind](outputs)
     count = len(boxes)
@@ -154,12 +154,12 @@ def read_outputs(
     if not (np.isfinite(boxes).all() and np.isfinite(scores).all() and np.isfinite(labels).all()):
         raise ValueError("a box, score or label is nan or infinite")
     if (scores > 1).any():
-        raise ValueError(f"a score of {scores.max():g}; it is between 0 and 1")
+        raise ValueError(f"invalid score {scores.max():g}: not between 0 and 1")
     first = np.argsort(-scores, kind="stable")
     if form.kind == "yolo":
         first = first[_uncovered(boxes[first], scores[first], labels[first])]
     first = first[:MAX_DETECTED_BOXES]  # the surest so many count
-    placed = (boxes[first] - [fitting.left, fitting.top] * 2) / fitting.scale * picture.scale
+    placed = (boxes[first] - [letterbox.left, letterbox.top] * 2) / letterbox.scale * picture.scale
     height, width = (one * picture.scale for one in picture.bgr.shape[:2])
     found = (Detection(x1, y1, x2, y2, score, _word(form.labels, label)) for (x1, y1, x2, y2), score, label in
              zip(placed.tolist(), scores[first].tolist(), labels[first].tolist(), strict=True))
@@ -205,7 +205,7 @@ def _yolo(outputs: Arrays) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
 
 def _bounded(rows: NDArray[Any]) -> NDArray[Any]:
     if len(rows) > _MAX_ROWS:
-        raise ValueError(f"{len(rows)} boxes; {_MAX_ROWS} is the most")
+        raise ValueError(f"{len(rows)} boxes, at most {_MAX_ROWS}")
     return rows
 
 

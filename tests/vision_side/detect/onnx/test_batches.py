@@ -39,7 +39,7 @@ def test_several_pictures_are_one_run_with_the_answers_that_each_gets_alone(tmp_
 
 
 def test_what_is_no_picture_is_left_out_and_no_run_is_too_large(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("sightline.vision_side.detect.onnx.detector._MOST_AT_ONCE", 2)
+    monkeypatch.setattr("sightline.vision_side.detect.onnx.detector._MAX_BATCH", 2)
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1, refine=())
     runs = counted(eye, monkeypatch)
     good = [grey(level, seq) for seq, level in enumerate(LEVELS)]
