@@ -85,7 +85,8 @@ class Lockstep:
         self._robot_link.subscribe(ACK, lambda message: self._sending.on_ack(message, self._now_us))
         self._vision_link = self.network.link(robot.robot, role=SOURCE)
         self._frames: LatestSlot[Message] = self._vision_link.latest(FRAME)
-        self._pipeline = Pipeline(vision, world.camera_model, configured_detector(vision))
+        self._detector = configured_detector(vision)
+        self._pipeline = Pipeline(vision, world.camera_model, self._detector)
         self._scanned = self._vision_link.latest(SCAN) if self._pipeline.mission.wants_scan else None
         self._labels = Labels(vision.boxes, world.camera_model) if vision.detector.kind == "boxes" else None
         self._computed: deque[tuple[int, Message]] = deque(maxlen=1)
@@ -109,8 +110,8 @@ class Lockstep:
 
     def close(self) -> None:
         """Hear what the detector has to say, and let go of it."""
-        self.run.news += notices_of(self._pipeline.detector)
-        close_detector(self._pipeline.detector)
+        self.run.news += notices_of(self._detector)
+        close_detector(self._detector)
 
     # --- robot ---------------------------------------------------------------------------------------------------
 
@@ -167,7 +168,7 @@ class Lockstep:
         frame = Frame(decode(FrameHeader, message.header), message.payload)
         scan = self._scanned.take() if self._scanned else None
         if scan is not None:
-            self._pipeline.see_scan(*decode_scan(scan.header, scan.payload))
+            self._pipeline.put_scan(*decode_scan(scan.header, scan.payload))
         answer = self._pipeline.step(frame) if self._labels is None else self._pipeline.follow(
             *self._labels.of(frame.header)
         )

@@ -1,7 +1,6 @@
 """A frame in, a command out: bound, decode, detect, then the mission. Pure: the clock is the frame's capture time."""
 
-from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from sightline.protocol import VERSION
 from sightline.protocol.errors import WireError
@@ -18,7 +17,7 @@ from sightline.vision_side.tracking.prediction import LatencyEstimator
 Detections = tuple[Detection, ...]
 SOURCE = "vision"
 NO_ANSWER = "NO_ANSWER"
-"""Counted in `skipped`: frames that the detector did not answer, in time or at all."""
+"""In `skipped`: the detector did not answer the frame, in time or at all."""
 _MAX_DT_S = 0.5  # a longer gap between frames says nothing more about what happened in it
 
 
@@ -50,12 +49,20 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class PipelineAnswer:
-    """The answer to one frame; without a twist it only acknowledges. `scan` and `mission` tell what else it went by."""
+    """The answer to one frame; without a twist it only acknowledges."""
 
     twist: Twist | None
     seen: Observation
     scan: int | None = None
-    mission: RequestId | None = None
+    """The number of the range scan that it used."""
+    mission: str = ""
+    """The mission's name."""
+    request: RequestId | None = None
+    """The request for this mission; None for the one it began with."""
+    result: DetectionResult | None = field(default=None, compare=False)
+    """Not compared: it has the time that the detector took."""
+    skipped: str = ""
+    """Why the frame was not used; empty if it was."""
 
 
 class Pipeline:
@@ -70,58 +77,61 @@ class Pipeline:
         """
         self._config = config
         self._camera = camera
-        self.detector = detector
-        self.looked: DetectionResult | None = None
+        self._detector = detector
         self._decoder = Decoder(camera.width_px, camera.height_px, config.max_pixels)
         self._first = chosen or configured_mission(config)
-        self.skipped: Counter[str] = Counter()
         self._session = ""
         self._scan: tuple[ScanHeader, RangeScan] | None = None
         self._forget()
 
     def _forget(self) -> None:
-        """Everything that was learned from earlier frames, and what somebody asked for since."""
-        self._duty = MissionSwitch(self._first, self._camera)
+        """Everything that was learned from earlier frames, and the mission that was requested since."""
+        self._mission_switch = MissionSwitch(self._first, self._camera)
+        self._request: RequestId | None = None
+        self._begin_clock()
+
+    def _begin_clock(self) -> None:
         self._latency = LatencyEstimator(self._config.latency)
-        self._asked: RequestId | None = None
         self._last_us: int | None = None
 
     @property
     def mission(self) -> MissionSpec:
         """The newest chosen."""
-        return self._duty.chosen
+        return self._mission_switch.chosen
 
-    @property
-    def asked(self) -> RequestId | None:
-        """Who asked for it; None for the one it began with."""
-        return self._asked
+    def switch(self, chosen: MissionSpec, request: RequestId, session: str) -> None:
+        """From the next frame on come to rest, then carry out `chosen`; it ends with the robot's `session`.
 
-    def switch(self, chosen: MissionSpec, asked: RequestId) -> None:
-        """From the next frame on come to rest, then carry out `chosen`; a new session of the robot ends it."""
-        self._asked = asked
-        self._duty.switch(chosen)
+        A request that was applied already changes nothing.
+        """
+        self._use_session(session)
+        if request != self._request:
+            self._request = request
+            self._mission_switch.switch(chosen)
 
-    def meet(self, session: str) -> None:
-        """Learn which session the robot is in, before something is asked for it; a new one is met afresh."""
+    def _use_session(self, session: str) -> None:
+        """A new session of the robot begins with nothing."""
         if session != self._session:
             self._session = session
             self._forget()
 
-    def see_scan(self, stamp: ScanHeader, scan: RangeScan) -> None:
+    def put_scan(self, stamp: ScanHeader, scan: RangeScan) -> None:
         """The newest range scan, for the frames from the next one on."""
         self._scan = (stamp, scan)
 
-    def with_camera(self, camera: CameraModel) -> "Pipeline":
-        """A new pipeline for another camera of the same robot; what somebody asked for goes on."""
-        after = Pipeline(self._config, camera, self.detector, self._first)
-        after._scan = self._scan
-        if self._asked is not None:
-            after._session, after._asked = self._session, self._asked
-            after._duty = MissionSwitch(self.mission, camera) if self.mission.needs_camera else self._duty
-        return after
+    def set_camera(self, camera: CameraModel) -> None:
+        """Use another camera of the same robot from the next frame on; a requested mission continues."""
+        self._camera = camera
+        self._decoder = Decoder(camera.width_px, camera.height_px, self._config.max_pixels)
+        if self._request is None:
+            self._forget()
+            return
+        self._begin_clock()
+        if self.mission.needs_camera:
+            self._mission_switch = MissionSwitch(self.mission, camera)
 
     def step(self, frame: Frame) -> PipelineAnswer:
-        """Answer `frame`. Never raises for any JPEG bytes; what cannot be used is counted in `skipped`."""
+        """Answer `frame`. Never raises for any JPEG bytes; the answer's `skipped` gives why one cannot be used."""
         if not self._is_new(frame.header):
             return self._skip("OUT_OF_ORDER", "frame is not newer than the last")
         try:
@@ -130,33 +140,39 @@ class Pipeline:
             return self._skip(error.reason, error.detail)
         shown = DetectFrame(self._config.robot, frame.header, frame.jpeg, self._decoder, picture)
         shown.goes_by = self.mission.goes_by
-        (result,) = checked_results(self.detector, [shown], frame.deadline_us)
+        (result,) = checked_results(self._detector, [shown], frame.deadline_us)
         if isinstance(result, str):
             return self._skip(NO_ANSWER, result, "no answer")
-        self.looked = result
-        return self._answer(frame.header, result.detections, picture)
+        return self._answer(frame.header, result.detections, picture, result)
 
     def follow(self, header: FrameHeader, detections: Detections) -> PipelineAnswer:
-        """Answer the frame of `header`, in which somebody else found `detections`; empty is "saw nothing"."""
+        """Answer the frame of `header`, in which another service found `detections`; empty is "saw nothing"."""
         if not self._is_new(header):
             return self._skip("OUT_OF_ORDER", "what was looked at is not newer than the last")
         return self._answer(header, detections, None)
 
     def _is_new(self, header: FrameHeader) -> bool:
-        """Whether `header` is newer than the last; a robot that started again is met afresh."""
-        self.meet(header.session)
+        """Whether `header` is newer than the last; a robot that started again begins with nothing."""
+        self._use_session(header.session)
         return self._last_us is None or header.t_us > self._last_us
 
     def _skip(self, reason: str, note: str, phase: str = "no picture") -> PipelineAnswer:
-        self.skipped[reason] += 1
-        return PipelineAnswer(None, Observation(phase, note=note))
+        return self.acknowledge(Observation(phase, note=note), reason)
 
-    def _answer(self, header: FrameHeader, detections: Detections, picture: Picture | None) -> PipelineAnswer:
+    def acknowledge(self, seen: Observation, skipped: str = "") -> PipelineAnswer:
+        """An answer without a step: it names the mission and does not steer."""
+        return PipelineAnswer(None, seen, None, self.mission.name, self._request, skipped=skipped)
+
+    def _answer(
+        self, header: FrameHeader, detections: Detections, picture: Picture | None,
+        result: DetectionResult | None = None,
+    ) -> PipelineAnswer:
         dt_s = self._tick(header)
         stamp, scan = self._newest_scan(header)
         view = View(header, dt_s, self._latency.total_s, self._camera, detections, picture, scan)
-        plan = self._duty.step(view)
-        return PipelineAnswer(plan.twist, _seen(plan, detections), stamp.seq if stamp else None, self._asked)
+        plan = self._mission_switch.step(view)
+        return PipelineAnswer(plan.twist, _seen(plan, detections), stamp.seq if stamp else None, self.mission.name,
+                              self._request, result)
 
     def _tick(self, header: FrameHeader) -> float:
         """Seconds since the last picture; also takes in what the robot measured."""
@@ -181,7 +197,7 @@ def answer_header(
 ) -> AnswerHeader:
     """The header of the answer to `frame`, naming it field for field, and what else `answer` went by."""
     echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
-    scan, mission = (answer.scan, answer.mission) if answer else (None, None)
+    scan, mission = (answer.scan, answer.request) if answer else (None, None)
     return AnswerHeader(source=SOURCE, session=session, seq=seq, echo=echo, compute_us=compute_us, scan=scan,
                         mission=mission)
 
@@ -190,7 +206,7 @@ def encode_answer(
     frame: FrameHeader, session: str, seq: int, compute_us: int, answer: PipelineAnswer | None = None
 ) -> bytes:
     """`encode(answer_header(...))` byte for byte, without the models: every part of it was checked when it came in."""
-    scan, mission = (answer.scan, answer.mission) if answer else (None, None)
+    scan, mission = (answer.scan, answer.request) if answer else (None, None)
     by_scan = "" if scan is None else f',"scan":{scan}'
     by_mission = "" if mission is None else f',"mission":{{"session":"{mission.session}","id":{mission.id}}}'
     return (f'{{"v":{VERSION},"source":"{SOURCE}","session":"{session}","seq":{seq},"echo":{{"channel":"frame",'

@@ -95,7 +95,7 @@ class ViewPublisher:
             self._kept.clear()
 
     def show(
-        self, header: FrameHeader, answer: PipelineAnswer, mission: str, camera: CameraModel | None, *, started_ns: int,
+        self, header: FrameHeader, answer: PipelineAnswer, camera: CameraModel | None, *, started_ns: int,
         jpeg: bytes | None = None,
     ) -> None:
         """Show an answered frame to who watches, if it is time; without `jpeg` one that was kept."""
@@ -109,7 +109,7 @@ class ViewPublisher:
         jpeg = jpeg if jpeg is not None else self._kept_of(header)
         if jpeg is None or camera is None or answer.seen.phase == NO_PICTURE:
             return
-        shown = OverlayData(header, answer.seen, answer.twist, mission, camera, self._config.target.radius_m,
+        shown = OverlayData(header, answer.seen, answer.twist, answer.mission, camera, self._config.target.radius_m,
                       self._clock.age_us(header.session, header.t_us, now_us))
         self._jobs.put(_Job(shown, jpeg, channels, started_ns))
         self._wake()

@@ -64,10 +64,10 @@ class PipelineVision:
     def answer(self, t_us: int, jpeg: bytes) -> str:
         """The command for a picture captured at `t_us`. Raises ValueError for one that cannot be answered."""
         self._seq += 1
-        twist = self._pipeline.step(Frame(FrameHeader(session="00000001", seq=self._seq, t_us=t_us), jpeg)).twist
-        if twist is None:
-            raise ValueError(f"no command for the picture of {t_us} us: {dict(self._pipeline.skipped)}")
-        return format_twist(twist).decode()
+        answer = self._pipeline.step(Frame(FrameHeader(session="00000001", seq=self._seq, t_us=t_us), jpeg))
+        if answer.twist is None:
+            raise ValueError(f"no command for the picture of {t_us} us: {answer.skipped}")
+        return format_twist(answer.twist).decode()
 
 
 # More pictures than can be detected, by a chosen factor: by their rate, else by a slower detector. Shell (a clock).

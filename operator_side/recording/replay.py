@@ -113,7 +113,8 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
             model = decode(CameraModel, message.payload, CAMERA.max_payload_bytes)
             if model != camera:
                 camera = model
-                pipelines = {session: one.with_camera(model) for session, one in pipelines.items()}
+                for pipeline in pipelines.values():
+                    pipeline.set_camera(model)
         if message.channel is not FRAME:
             continue
         frame = Frame(decode(FrameHeader, message.header), message.payload)
@@ -145,11 +146,10 @@ def _give(pipeline: Pipeline, header: AnswerHeader, answers: _Answers, config: V
     """What the answer of `header` went by besides its frame, if that is in the recording."""
     scan = answers.scans.get((header.echo.session, header.scan)) if header.scan is not None else None
     if scan is not None:
-        pipeline.see_scan(*decode_scan(scan.header, scan.payload))
-    pipeline.meet(header.echo.session)  # so that its first frame does not end what was asked for it
+        pipeline.put_scan(*decode_scan(scan.header, scan.payload))
     request = answers.missions.get(header.mission) if header.mission else None
-    if header.mission and request and header.mission != pipeline.asked:
-        pipeline.switch(requested_mission(request, config), header.mission)
+    if header.mission and request:
+        pipeline.switch(requested_mission(request, config), header.mission, header.echo.session)
 
 
 def _gather_cited(path: Path, answers: _Answers) -> int:

@@ -85,8 +85,8 @@ class AckingService(Service):
 
     def __init__(self, config: VisionConfig, link: Link, say: LogLine) -> None:
         super().__init__(config, link, say)
-        self._dispatch = ScansOnly(config, link, self._tell, self._refuse)
-        self._dispatch.tell_news(self._detector)
+        self._mission_channel = ScansOnly(config, link, self._detector, self._tell, self._refuse)
+        self._mission_channel.log_notices()
         self._telling = ProgressPrinter(say)
 
     def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
@@ -97,17 +97,13 @@ class AckingService(Service):
 class ScansOnly(MissionChannel):
     """Takes no missions and reports nothing: what the robot does is not this one's doing."""
 
-    def before(self, pipeline: Pipeline, frame: FrameHeader) -> None:  # noqa: ARG002
+    def prepare(self, pipeline: Pipeline, frame: FrameHeader) -> None:  # noqa: ARG002
         """Give `pipeline` the newest scan."""
-        if pipeline.mission.wants_scan:
-            self._look(pipeline)
+        self._give_scan(pipeline)
 
-    def after(
-        self, now_s: float, pipeline: Pipeline | None, frame: FrameHeader | None, seen: Observation  # noqa: ARG002
-    ) -> None:
-        """Say only what the detector has to say."""
-        if pipeline is not None:
-            self.tell_news(pipeline.detector)
+    def report(self, now_s: float, answer: PipelineAnswer, frame: FrameHeader | None) -> None:  # noqa: ARG002
+        """Log only the detector's notices."""
+        self.log_notices()
 
 
 class LocalRun:
@@ -116,9 +112,10 @@ class LocalRun:
     def __init__(self, config: VisionConfig, camera: LocalCamera, say: LogLine) -> None:
         self._camera, self._say = camera, say
         self._patience_us = round(config.detector.deadline_s * 1e6)
-        self._pipeline = Pipeline(config, camera.model, configured_detector(config))
+        self._detector = configured_detector(config)
+        self._pipeline = Pipeline(config, camera.model, self._detector)
         self._telling = ProgressPrinter(say)
-        self._tell_news()
+        self._log_notices()
         self._session = secrets.token_hex(4)
         self._seq = 0
         self._fault = ""
@@ -137,10 +134,10 @@ class LocalRun:
             header = FrameHeader(session=self._session, seq=self._seq, t_us=picture.t_us)
             frame = Frame(header, picture.jpeg, monotonic_us() + self._patience_us)
             self._telling.step(self._pipeline.step(frame), time.monotonic())
-            self._tell_news()
+            self._log_notices()
 
-    def _tell_news(self) -> None:
-        for line in notices_of(self._pipeline.detector):
+    def _log_notices(self) -> None:
+        for line in notices_of(self._detector):
             self._say(f"vision: {line}")
 
     def _complain(self, fault: str) -> None:

@@ -27,7 +27,7 @@ from sightline.vision_side.detect.port import DetectionResult, Detector
 from sightline.vision_side.detect.shadow import ShadowDetector
 from sightline.vision_side.missions.ranges import decode_scan
 from sightline.vision_side.missions.registry import MissionSpec, configured_mission, requested_mission
-from sightline.vision_side.pipeline import SOURCE, Observation, Pipeline
+from sightline.vision_side.pipeline import SOURCE, Observation, Pipeline, PipelineAnswer
 
 MAX_AGE_US: Final = 2_000_000
 """As old as the status that a request to a robot may cite."""
@@ -35,33 +35,33 @@ _LONGEST: Final = 200
 
 
 class MissionRequests:
-    """Takes up what is asked for, each once. `asked` is the newest, `refused` why it was not taken up."""
+    """Applies each request once. `newest` is the last one, `rejection` why it was not applied."""
 
     def __init__(self, config: VisionConfig) -> None:
         self._config = config
-        self.asked: RequestId | None = None
-        self.refused = ""
+        self.newest: RequestId | None = None
+        self.rejection = ""
 
     def take(self, message: Message, frame: FrameHeader) -> MissionSpec | None:
-        """What to do from `frame` on; None for what was said before and for what is refused.
+        """The mission from `frame` on; None for a request that came before and for one that is rejected.
 
-        Raises WireError for what is no message of this channel; `refused` then says it too.
+        Raises WireError for what is no message of this channel; `rejection` then has it too.
         """
         try:
             header = decode(RequestHeader, message.header)
             request = decode(MissionRequest, message.payload, MISSION.max_payload_bytes)
         except WireError as error:
-            self.refused = str(error)[:_LONGEST]
+            self.rejection = str(error)[:_LONGEST]
             raise
-        asked = RequestId(session=header.session, id=request.id)
-        if asked == self.asked:
+        request_id = RequestId(session=header.session, id=request.id)
+        if request_id == self.newest:
             return None
-        self.asked, self.refused = asked, ""
+        self.newest, self.rejection = request_id, ""
         try:
             _check(header, message.source, frame)
             return requested_mission(request, self._config)
         except (WireError, ConfigError) as error:
-            self.refused = " ".join(str(error).split())[:_LONGEST]
+            self.rejection = " ".join(str(error).split())[:_LONGEST]
             return None
 
 
@@ -101,11 +101,11 @@ class Reporter:
         self._said_s = 0.0
 
     def due(
-        self, now_s: float, mission: str, seen: Observation, asked: RequestId | None, refused: str, *,
-        looked: DetectionResult | None = None, beside: str = "",
+        self, now_s: float, mission: str, seen: Observation, newest: RequestId | None, rejection: str, *,
+        result: DetectionResult | None = None, beside: str = "",
     ) -> MissionReport | None:
-        """The report, if it is time for one. `looked` is the detector's newest result, `beside` who else looks."""
-        state = (mission, seen.phase, seen.done, asked, refused)
+        """The report, if it is time for one. `result` is the detector's newest, `beside` tells of the shadow."""
+        state = (mission, seen.phase, seen.done, newest, rejection)
         gap_s = LEAST_GAP_S if state != self._said else PERIOD_S
         if self._said is not None and now_s - self._said_s < gap_s:
             return None
@@ -113,18 +113,18 @@ class Reporter:
         return MissionReport(
             mission=mission[:_NAME_LENGTH], phase=_line(seen.phase, _PHASE_LENGTH),
             note=_line(seen.note, _TEXT_LENGTH), done=seen.done,
-            asked=asked, refused=refused[:_TEXT_LENGTH], **self._detector_fields(looked, beside),
+            asked=newest, refused=rejection[:_TEXT_LENGTH], **self._detector_fields(result, beside),
         )
 
-    def _detector_fields(self, looked: DetectionResult | None, beside: str) -> dict[str, Any]:
-        """Who looks, on what, how fast."""
-        name = looked.detector if looked else self._detector
+    def _detector_fields(self, result: DetectionResult | None, beside: str) -> dict[str, Any]:
+        """The detector, its device and its time."""
+        name = result.detector if result else self._detector
         more = f", {beside}" if beside else ""
         said = {"detector": _line(name[: _NAME_LENGTH - len(more)] + more, _NAME_LENGTH)}
-        if looked is None:
+        if result is None:
             return {**said, "device": self._device}
-        return {**said, "device": _line(looked.device, _DEVICE_LENGTH), "model": _line(looked.model_hash, _NAME_LENGTH),
-                "inference_us": max(0, looked.compute_us)}
+        return {**said, "device": _line(result.device, _DEVICE_LENGTH), "model": _line(result.model_hash, _NAME_LENGTH),
+                "inference_us": max(0, result.compute_us)}
 
 
 def _line(text: str, most: int) -> str:
@@ -143,42 +143,40 @@ class MissionChannel:
     """One robot's missions. Scans are subscribed to only once a mission goes by them."""
 
     def __init__(
-        self, config: VisionConfig, link: Link, tell: Callable[[str, str], None], refuse: Callable[[WireError], None]
+        self, config: VisionConfig, link: Link, detector: Detector, tell: Callable[[str, str], None],
+        refuse: Callable[[WireError], None],
     ) -> None:
         """`tell` prints a line (about what, the line) if it changed; `refuse` counts.
 
         Raises ConfigError for a configured mission that there is not.
         """
-        self._link, self._tell, self._refuse = link, tell, refuse
+        self._link, self._detector, self._tell, self._refuse = link, detector, tell, refuse
         self._mission = configured_mission(config).name
+        self._result: DetectionResult | None = None
         self._missions: LatestSlot[Message] = link.latest(MISSION)
         self._scans: LatestSlot[Message] | None = None
-        self._desk = MissionRequests(config)
+        self._requests = MissionRequests(config)
         self._reporter = Reporter(config.detector)
         self._session = secrets.token_hex(4)
         self._reports = 0
 
-    def before(self, pipeline: Pipeline, frame: FrameHeader) -> None:
-        """Give `pipeline` what it has to know before it answers `frame`."""
+    def prepare(self, pipeline: Pipeline, frame: FrameHeader) -> None:
+        """Give `pipeline` what it has to know before it answers `frame`: a requested mission, the newest scan."""
         message = self._missions.take()
         if message is not None:
-            self._choose(message, pipeline, frame)
-        if pipeline.mission.wants_scan:
-            self._look(pipeline)
+            self._apply(message, pipeline, frame)
+        self._give_scan(pipeline)
 
-    def after(self, now_s: float, pipeline: Pipeline | None, frame: FrameHeader | None, seen: Observation) -> None:
-        """Say what was done, if it is time; without a frame, that none comes."""
-        if pipeline is not None:
-            self._mission = pipeline.mission.name
-        asked, refused = self._desk.asked, self._desk.refused
-        if pipeline is not None and asked is not None and asked != pipeline.asked:
-            refused = refused or _ENDED
-        detector, looked = (pipeline.detector, pipeline.looked) if pipeline else (None, None)
-        self.tell_news(detector)
-        beside = ""
-        if pipeline is not None and isinstance(detector, ShadowDetector):
-            beside = detector.shadow_text(self._link.robot)
-        report = self._reporter.due(now_s, self._mission, seen, asked, refused, looked=looked, beside=beside)
+    def report(self, now_s: float, answer: PipelineAnswer, frame: FrameHeader | None) -> None:
+        """Publish the report of an answer, if it is time; `frame` is None if no frame comes."""
+        self._result = answer.result or self._result
+        newest, rejection = self._requests.newest, self._requests.rejection
+        if answer.mission and newest not in (None, answer.request):
+            rejection = rejection or _ENDED
+        self.log_notices()
+        shadow = self._detector.shadow_text(self._link.robot) if isinstance(self._detector, ShadowDetector) else ""
+        report = self._reporter.due(now_s, answer.mission or self._mission, answer.seen, newest, rejection,
+                                    result=self._result, beside=shadow)
         if report is None:
             return
         self._reports += 1
@@ -188,32 +186,33 @@ class MissionChannel:
         header = DetectionsHeader(source=SOURCE, session=self._session, seq=self._reports, echo=echo)
         self._link.publish(REPORT, encode(header), encode(report), SOURCE)
 
-    def tell_news(self, detector: Detector | None) -> None:
-        """What the detector has to say."""
-        for line in notices_of(detector):
+    def log_notices(self) -> None:
+        """Log what the detector reports."""
+        for line in notices_of(self._detector):
             self._tell("detector", line)
 
-    def _choose(self, message: Message, pipeline: Pipeline, frame: FrameHeader) -> None:
+    def _apply(self, message: Message, pipeline: Pipeline, frame: FrameHeader) -> None:
         try:
-            chosen = self._desk.take(message, frame)
+            chosen = self._requests.take(message, frame)
         except WireError as error:
             self._refuse(error)
             return
-        if chosen is not None and self._desk.asked is not None:
-            pipeline.meet(frame.session)
-            pipeline.switch(chosen, self._desk.asked)
-            self._tell("mission", f"mission {chosen.name}, asked for by {message.source}")
-        elif self._desk.refused:
-            self._tell("mission", f"a mission of {message.source} is refused: {self._desk.refused}")
+        if chosen is not None and self._requests.newest is not None:
+            pipeline.switch(chosen, self._requests.newest, frame.session)
+            self._tell("mission", f"mission {chosen.name}, requested by {message.source}")
+        elif self._requests.rejection:
+            self._tell("mission", f"rejected a mission of {message.source}: {self._requests.rejection}")
 
-    def _look(self, pipeline: Pipeline) -> None:
+    def _give_scan(self, pipeline: Pipeline) -> None:
+        if not pipeline.mission.wants_scan:
+            return
         if self._scans is None:
             self._scans = self._link.latest(SCAN)
         message = self._scans.take()
         if message is None:
             return
         try:
-            pipeline.see_scan(*decode_scan(message.header, message.payload))
+            pipeline.put_scan(*decode_scan(message.header, message.payload))
         except WireError as error:
             self._refuse(error)
-            self._tell("scan", f"scans are refused: {error.detail}")
+            self._tell("scan", f"rejected scans: {error.detail}")

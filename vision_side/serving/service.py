@@ -155,7 +155,6 @@ class Service:
         self._robot_session = ""
         self._sessions = SessionSelector()
         self._said: dict[str, str] = {}
-        self._counted: Counter[str] = Counter()
         if config.camera is not None:
             self._use(config.camera)
         self._heard_s = time.monotonic()
@@ -163,7 +162,7 @@ class Service:
         self._newest: tuple[int, int | None] = (0, None)
         self.answered = self.steered = 0
         self.skipped: Counter[str] = Counter()
-        self._dispatch = MissionChannel(config, link, self._tell, self._refuse)
+        self._mission_channel = MissionChannel(config, link, self._detector, self._tell, self._refuse)
         self._viewing = ViewPublisher(config, link, self._tell)
 
     def _arrivals(self, link: Link) -> LatestSlot[Message]:
@@ -186,7 +185,7 @@ class Service:
 
     def _note_silence(self, now_s: float) -> None:
         if now_s - self._heard_s > _NO_FRAMES_S:
-            self._dispatch.after(now_s, self._pipeline, None, NO_FRAMES)
+            self._mission_channel.report(now_s, self._acknowledge(NO_FRAMES), None)
         if now_s - self._heard_s > _SILENCE_S:
             self._robot_session = ""
             self._tell("link", f"no frames from robot {self._config.robot} at {endpoints_text(self._config)}; is "
@@ -209,9 +208,10 @@ class Service:
 
     def _use(self, camera: CameraModel) -> None:
         self._camera = camera
-        before = self._pipeline
-        self._pipeline = before.with_camera(camera) if before else Pipeline(self._config, camera, self._detector)
-        self._counted.clear()
+        if self._pipeline is None:
+            self._pipeline = Pipeline(self._config, camera, self._detector)
+        else:
+            self._pipeline.set_camera(camera)
         lens = "calibrated" if camera.calibrated else "not calibrated"
         self._tell("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")
 
@@ -233,21 +233,18 @@ class Service:
             self._wait_for_camera()
             self._publish(header, PipelineAnswer(None, Observation("no picture", note="no camera model yet")), 0)
             return
-        self._dispatch.before(self._pipeline, header)
+        self._mission_channel.prepare(self._pipeline, header)
         deadline_us = monotonic_us() + round(self._config.detector.deadline_s * 1e6)
         answer = self._pipeline.step(Frame(header, message.payload, deadline_us))
-        if answer.twist is None:
-            self._count_skipped(self._pipeline.skipped)
+        if answer.skipped:
+            self.skipped[answer.skipped] += 1
         self._publish(header, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._tell_phase(answer)
-        self._dispatch.after(time.monotonic(), self._pipeline, header, answer.seen)
-        self._viewing.show(header, answer, self._pipeline.mission.name, self._camera,
-                           started_ns=started_ns, jpeg=message.payload)
+        self._mission_channel.report(time.monotonic(), answer, header)
+        self._viewing.show(header, answer, self._camera, started_ns=started_ns, jpeg=message.payload)
 
-    def _count_skipped(self, skipped: Counter[str]) -> None:
-        """Add what this pipeline has skipped since the last time to what earlier ones did."""
-        self.skipped.update(skipped - self._counted)
-        self._counted = skipped.copy()
+    def _acknowledge(self, seen: Observation) -> PipelineAnswer:
+        return self._pipeline.acknowledge(seen) if self._pipeline else PipelineAnswer(None, seen)
 
     def _wait_for_camera(self) -> None:
         """The model comes twice a second; only a longer wait is worth a word."""
@@ -368,7 +365,7 @@ class BoxesService(Service):
         if self._pipeline is None:
             self._wait_for_camera()
         elif time.monotonic() - self._boxes_heard_s > _BOXES_SILENCE_S:
-            self._dispatch.after(time.monotonic(), self._pipeline, header, _NO_BOXES)
+            self._mission_channel.report(time.monotonic(), self._acknowledge(_NO_BOXES), header)
             self._tell("boxes", f"frames come, but no boxes from {self._config.boxes.source}; does its detector run?")
 
     def _boxes(self, message: Message, started_ns: int) -> None:
@@ -383,15 +380,15 @@ class BoxesService(Service):
             self._tell("boxes", f"boxes are refused: {error.detail}", f"refused {error.reason}")
             return
         self._tell("boxes", f"boxes from {self._config.boxes.source}")
-        self._dispatch.before(self._pipeline, frame)
+        self._mission_channel.prepare(self._pipeline, frame)
         answer = self._pipeline.follow(frame, found)
-        if answer.twist is None:
-            self.skipped["OUT_OF_ORDER"] += 1
+        if answer.skipped:
+            self.skipped[answer.skipped] += 1
             return
         self._publish(frame, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._tell_phase(answer)
-        self._dispatch.after(time.monotonic(), self._pipeline, frame, answer.seen)
-        self._viewing.show(frame, answer, self._pipeline.mission.name, self._camera, started_ns=started_ns)
+        self._mission_channel.report(time.monotonic(), answer, frame)
+        self._viewing.show(frame, answer, self._camera, started_ns=started_ns)
 
     def _remember_frames(self) -> None:
         """Also those that newer ones replaced before they were taken up."""

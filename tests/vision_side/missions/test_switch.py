@@ -127,33 +127,45 @@ def frame(seq, session="0000abcd"):
 
 def test_an_answer_names_the_mission_that_was_asked_for_and_a_new_session_ends_it():
     pipeline = Pipeline(CONFIG, CAMERA, configured_detector(CONFIG))
-    assert pipeline.step(frame(1)).mission is None
-    pipeline.switch(scripted(), ASKED)
+    first = pipeline.step(frame(1))
+    assert (first.mission, first.request) == ("follow", None)
+    pipeline.switch(scripted(), ASKED, "0000abcd")
     answers = [pipeline.step(frame(seq)) for seq in range(2, 8)]
-    assert {answer.mission for answer in answers} == {ASKED}
+    assert {answer.request for answer in answers} == {ASKED}
     assert answers[-1].seen.phase == "driving" and pipeline.mission.plugin is Scripted
     anew = pipeline.step(frame(8, session="0000beef"))
-    assert (anew.mission, pipeline.mission.name, anew.seen.phase) == (None, "follow", "tracking")
+    assert (anew.request, anew.mission, anew.seen.phase) == (None, "follow", "tracking")
+
+
+def test_a_request_that_comes_twice_is_applied_once():
+    pipeline = Pipeline(CONFIG, CAMERA, configured_detector(CONFIG))
+    for seq in range(1, 6):
+        pipeline.switch(scripted(), ASKED, "0000abcd")
+        answer = pipeline.step(frame(seq))
+    assert answer.seen.phase == "driving"
 
 
 def test_what_was_asked_for_goes_on_with_another_camera_and_without_one_needed_as_it_is():
     pipeline = Pipeline(CONFIG, CAMERA, configured_detector(CONFIG))
     pipeline.step(frame(1))
-    larger = CAMERA.model_copy(update={"width_px": 640, "height_px": 480})
-    assert pipeline.with_camera(larger).mission.name == "follow"
-    pipeline.switch(scripted(), ASKED)
+    pipeline.set_camera(CAMERA.model_copy(update={"width_px": 640, "height_px": 480}))
+    assert pipeline.mission.name == "follow"
+    pipeline.set_camera(CAMERA)
+    pipeline.switch(scripted(), ASKED, "0000abcd")
     for seq in range(2, 6):
         pipeline.step(frame(seq))
-    after = pipeline.with_camera(CAMERA)
-    note = after.step(frame(6)).seen.note
-    assert (after.asked, note) == (ASKED, "1 after 0.00"), "it begins anew: it may have learned the camera by heart"
-    chosen = scripted()
+    pipeline.set_camera(CAMERA)
+    answer = pipeline.step(frame(6))
+    begun = (answer.request, answer.seen.note)
+    assert begun == (ASKED, "1 after 0.00"), "it begins again: it may have learned the camera by heart"
+    chosen, again = scripted(), ASKED.model_copy(update={"id": ASKED.id + 1})
     object.__setattr__(chosen, "plugin", type("Blind", (Scripted,), {"needs_camera": False}))
-    after.switch(chosen, ASKED)
+    pipeline.switch(chosen, again, "0000abcd")
     for seq in range(7, 12):
-        before = after.step(frame(seq)).seen.note
+        before = pipeline.step(frame(seq)).seen.note
     assert int(before.split()[0]) > 2
-    assert int(after.with_camera(CAMERA).step(frame(12)).seen.note.split()[0]) == int(before.split()[0]) + 1
+    pipeline.set_camera(CAMERA)
+    assert int(pipeline.step(frame(12)).seen.note.split()[0]) == int(before.split()[0]) + 1
 
 
 def test_a_pipeline_of_no_mission_is_refused_in_words():

@@ -73,7 +73,7 @@ class Bench:
 
     def report(self) -> MissionReport:
         """The newest, once it had its time."""
-        self.service._dispatch._reporter._said_s = -1e9
+        self.service._mission_channel._reporter._said_s = -1e9
         self.frames()
         return decode(MissionReport, self.reports[-1].payload, REPORT.max_payload_bytes)
 
@@ -88,7 +88,7 @@ def test_a_mission_that_is_asked_for_is_taken_up_cited_and_reported():
     assert (report.asked, report.detector, report.device) == (RequestId(session=ASKER, id=7), "hsv", "cpu")
     header = decode(DetectionsHeader, bench.reports[-1].header)
     assert (header.source, header.echo.channel, header.echo.seq) == ("vision", "frame", bench.seq)
-    assert any("mission band, asked for by operator" in line for line in bench.said)
+    assert any("mission band, requested by operator" in line for line in bench.said)
 
 
 def test_what_is_said_again_is_taken_up_once():
@@ -97,7 +97,7 @@ def test_what_is_said_again_is_taken_up_once():
         bench.ask("band", 1).frames()
         assert decode(MissionReport, bench.reports[-1].payload).phase != "switching"
     bench.ask("band", 2).frames()
-    assert bench.service._pipeline.asked == RequestId(session=ASKER, id=2)
+    assert bench.service._pipeline._request == RequestId(session=ASKER, id=2)
 
 
 @pytest.mark.parametrize(("how", "words"), [
@@ -134,7 +134,7 @@ def test_a_broken_mission_is_counted_and_ends_nothing(payload):
 def test_a_new_session_of_the_robot_ends_what_was_asked_for_and_says_so():
     bench = Bench().frames(5).ask("band", 3).frames(6)
     bench.frames(2, session="0000beef")
-    bench.service._dispatch._reporter._said_s = -1e9
+    bench.service._mission_channel._reporter._said_s = -1e9
     bench.frames(1, session="0000beef")
     report = decode(MissionReport, bench.reports[-1].payload)
     assert (report.mission, report.asked.id) == ("follow", 3) and "started anew" in report.refused
@@ -213,6 +213,6 @@ def test_a_scan_that_is_none_is_refused_counted_and_said_once(payload, reason):
         bench.robot.publish(SCAN, *scan(seq, payload))
         assert bench.answer().scan == 1
     assert bench.service.skipped == {reason: 4}
-    assert sum("scans are refused" in line for line in bench.said) == 1
+    assert sum("rejected scans" in line for line in bench.said) == 1
     bench.robot.publish(SCAN, *scan(7, struct.pack("<f", float("inf"))))
     assert bench.answer().scan == 7
