@@ -30,7 +30,6 @@ def register(app: typer.Typer) -> None:
     group.command(epilog="Example: sightline bench gate")(gate)
     group.command(epilog="Example: sightline bench pipeline")(pipeline)
     group.command(epilog="Example: sightline bench demo --scenario circle --seeds 201,202,203")(demo)
-    group.command(epilog="Example: sightline bench report --section loop --section watchers")(report)
     register_loop_benches(group)
     register_network_bench(group)
     register_detector_benches(group)
@@ -110,19 +109,6 @@ def demo(
         typer.echo(f"{one.name:44} median {number(one.median)}  worst {number(one.worst)} {one.unit}"
                    f"  bound {number(one.bound)}  {said}")
     return 0 if ok else CHECK_FAILED
-
-
-def report(
-    *,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The page to write.")] = Path("docs/performance.md"),
-    section: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Only this one, e.g. loop; may be given again.")
-    ] = None,
-) -> int:
-    """Run the measurements that the performance page shows, and write them into it. All of them take over an hour."""
-    from sightline.benchmarks.report import sections_named, write_report
-
-    return 0 if write_report(out, sections_named(section or ()), typer.echo) else CHECK_FAILED
 
 
 def print_checks(checks: "list[Check]", as_json: bool) -> int:

@@ -113,9 +113,6 @@ def score(
     robot_model: Annotated[str | None, typer.Option(help="In place of the scenario's own robot.")] = None,
     look: Annotated[str | None, typer.Option(help="In place of the scenario's own light, e.g. dim.")] = None,
     detector: Annotated[str | None, typer.Option(help="In place of the scenario's own, e.g. onnx.")] = None,
-    page: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Run every behaviour and its baseline, and write this page.")
-    ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Runs at once [default: one per core].")] = None,
     as_json: Json = False,
 ) -> int:
@@ -125,8 +122,6 @@ def score(
     with needs("all"):
         from sightline.evaluation.score.runs import cases, run_cases, score_text
         from sightline.sim.scenario import scenario_names
-    if page is not None:
-        return _write_page(page, numbers("--seeds", seeds, int), jobs or os.cpu_count() or 1)
     wanted = cases(
         scenario_names() if scenario == "all" else scenario.split(","),
         numbers("--seeds", seeds, int), numbers("--latency-ms", latency_ms, float), numbers("--loss", loss, float),
@@ -136,12 +131,6 @@ def score(
         report = run_cases(wanted, jobs or os.cpu_count() or 1, lambda _case: advance())
     typer.echo(json.dumps(report.to_dict()) if as_json else score_text(report))
     return 0 if report.ok else CHECK_FAILED
-
-
-def _write_page(page: Path, seeds: list[int], jobs: int) -> int:
-    with needs("all"):
-        from sightline.evaluation.score.behaviours import write_page
-    return 0 if write_page(page, seeds, jobs, progress_bar) else CHECK_FAILED
 
 
 # Command `score detectors`: any set of detectors on the same labelled scenes. Shell.

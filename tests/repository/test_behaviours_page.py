@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from sightline.evaluation.score.behaviours import CHARACTER, LATENCY_MS, LOOKS, LOSS, ROWS
+from docs.make.behaviors import CHARACTER, LATENCY_MS, LOOKS, LOSS, ROWS
 
 DOCS = Path(__file__).parent.parent.parent / "docs"
 PAGE = (DOCS / "behaviours.md").read_text()

@@ -58,7 +58,7 @@ def test_the_commands_of_this_version_exist():
         "config": ("check", "show", "schema"),
         "detector": ("list", "check"),
         "score": ("detectors",),
-        "bench": ("codec", "pipeline", "demo", "report"),
+        "bench": ("codec", "pipeline", "demo"),
     }
     assert {(group, name) for group, names in groups.items() for name in names} <= set(COMMANDS)
 

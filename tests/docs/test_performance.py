@@ -5,8 +5,8 @@ import subprocess
 
 import pytest
 
-from sightline.benchmarks import report
-from sightline.benchmarks.report import SECTIONS, page_with, sections_named, write_report
+from docs.make import performance as report
+from docs.make.performance import SECTIONS, page_with, sections_named, write_report
 from sightline.operator_side.cli.app import app
 from sightline.protocol.errors import ConfigError
 

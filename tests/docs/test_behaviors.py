@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from sightline.evaluation.score.behaviours import (
+from docs.make.behaviors import (
     CHARACTER,
     GOALS_M,
     LAWS,
@@ -111,15 +111,16 @@ def test_both_laws_reach_a_near_waypoint():
         assert drive.off_m < 0.06 and 0.05 < drive.top_mps <= 0.5 and abs(drive.speeds_mps[-1]) < 0.01
 
 
-def test_the_command_writes_the_page_and_a_picture_of_the_first_start(tmp_path):
+def test_the_command_writes_the_page_and_a_picture_of_the_first_start(tmp_path, monkeypatch):
     rows, advanced = [Row("legs-slow"), Row("legs-slow", "legs-baseline")], []
 
     @contextmanager
     def progress(total):
         yield lambda: advanced.append(total)
 
+    monkeypatch.setattr("docs.make.behaviors.progress_bar", progress)
     path = tmp_path / "behaviours.md"
-    ok = write_page(path, [905], 2, progress, rows)
+    ok = write_page(path, [905], 2, rows)
     text = path.read_text()
     assert ok == ("**not kept**" not in text) and advanced == [2, 2]
     assert sorted(one.name for one in (tmp_path / "behaviours").iterdir()) == [

@@ -1,4 +1,8 @@
-"""Writes docs/performance.md section by section from the commands that it names. Shell (processes)."""
+"""Writes docs/performance.md section by section from the JSON that its commands print. Shell (processes).
+
+    python -m docs.make.performance                  # all sections: over an hour
+    python -m docs.make.performance loop watchers    # these; the other sections stay as they are
+"""
 
 import json
 import os
@@ -19,7 +23,7 @@ from sightline.protocol.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One command of the page and why it is there; `name` is what `--section` calls it.
+    """One command of the page and why it is there; `name` is its argument of this script.
 
     With a `picture` the command gets `--out`, and its loop.png is shown under that name.
     """
@@ -171,10 +175,11 @@ SECTIONS: Final = (
 
 
 CHECK_FAILED: Final = 5
+PAGE: Final = Path(__file__).parents[1] / "performance.md"
 _HEADING: Final = "## "
 _HEAD: Final = (
-    "# Performance\n\nWritten by `sightline bench report`, section by section; each says when and on what machine it "
-    "was measured. Shared machines are noisy: read medians and ratios, not third digits."
+    "# Performance\n\nWritten by `python -m docs.make.performance`, section by section; each says when and on what "
+    "machine it was measured. Shared machines are noisy: read medians and ratios, not third digits."
 )
 _PACKAGES: Final = ("eclipse-zenoh", "pydantic", "numpy", "opencv-python-headless", "simplejpeg", "onnxruntime",
                     "pybullet")
@@ -185,7 +190,7 @@ def sections_named(names: Sequence[str]) -> tuple[Section, ...]:
     known = [section.name for section in SECTIONS]
     for name in names:
         if name not in known:
-            raise ConfigError(f"--section {name!r}: of {', '.join(known)}")
+            raise ConfigError(f"unknown section {name!r}; expected one of {', '.join(known)}")
     return tuple(section for section in SECTIONS if not names or section.name in names)
 
 
@@ -282,3 +287,12 @@ def _row(check: dict[str, Any], with_median: bool) -> str:
 
 def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
+
+
+def main(names: Sequence[str]) -> int:
+    """Measure the named sections, or all, and write them into the page."""
+    return 0 if write_report(PAGE, sections_named(names), print) else CHECK_FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

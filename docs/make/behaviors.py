@@ -1,15 +1,24 @@
-"""docs/behaviours.md: every scenario with its baseline, in figures and pictures. Shell (processes, files)."""
+"""Writes docs/behaviours.md: every scenario with its baseline, in figures and pictures. Shell (processes, files).
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+    python -m docs.make.behaviors --seeds 201,202,203,204,205,206
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, as_completed
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from sightline.evaluation.checks import Check, number
 from sightline.evaluation.lockstep import Conditions, run_lockstep
-from sightline.evaluation.plots import ROBOT_COLOUR
+from sightline.evaluation.plots import ROBOT_COLOUR, plot_run
 from sightline.evaluation.processes import worker_pool
 from sightline.evaluation.scenario_config import robot_of
 from sightline.evaluation.score.figures import (
@@ -27,14 +36,11 @@ from sightline.evaluation.score.figures import (
     score,
 )
 from sightline.evaluation.score.runs import Case, run_of
-from sightline.operator_side.preflight import needs
+from sightline.operator_side.terminal import progress_bar
 from sightline.sim.scenario import Scenario, Start, load_scenario
 from sightline.sim.truth import Truth
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
+PAGE: Final = Path(__file__).parents[1] / "behaviours.md"
 LATENCY_MS, LOSS = 50.0, 0.1
 LOOKS: Final = ("dim", "bright", "warm", "desaturated", "quality30")
 """The light in which a traffic light must be read, beside the ordinary."""
@@ -195,10 +201,7 @@ _COLOURS = dict(zip(LAWS, (ROBOT_COLOUR, "tab:red"), strict=True))
 
 
 def plot_speeds(path: Path, runs: Sequence[SpeedRun]) -> None:
-    """Draw `runs`. Raises ConfigError without Matplotlib."""
-    with needs("report"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
+    """Draw `runs`."""
     figure = Figure(figsize=(12, 6), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     for column, goal_m in enumerate(GOALS_M):
@@ -212,7 +215,7 @@ def plot_speeds(path: Path, runs: Sequence[SpeedRun]) -> None:
     canvas.print_png(path)  # type: ignore[no-untyped-call]
 
 
-def _plot(axes: "Axes", runs: Sequence[SpeedRun], label: str, values: Sequence[Sequence[float]]) -> None:
+def _plot(axes: Axes, runs: Sequence[SpeedRun], label: str, values: Sequence[Sequence[float]]) -> None:
     axes.axhline(0.0, color="0.7", linewidth=1)
     for run, each in zip(runs, values, strict=True):
         axes.plot(run.times_s, each, color=_COLOURS[run.wish.law], label=run.wish.law)
@@ -255,7 +258,7 @@ def page_lines(
         "demanded of it. [robots.md](robots.md) says what each robot and scenario is, and whose it was.\n"
     )
     yield (
-        f"Written by `sightline score --page docs/behaviours.md --seeds {names}`. See one with `sightline demo\n"
+        f"Written by `python -m docs.make.behaviors --seeds {names}`. See one with `sightline demo\n"
         "--scenario NAME`, judge one with `sightline score --scenario NAME`. Times count from the start, shares and "
         "errors from the first\nacquisition to the end; a `least_` figure must not fall below its bound, every other "
         "must not exceed it; contacts are physics\nsteps of 4 ms.\n"
@@ -388,16 +391,13 @@ def _figure(value: float | None, unit: str) -> str:
 # A picture is of the first seed. The page says which command wrote it; no figure in it is typed by hand.
 
 
-Progress = Callable[[int], AbstractContextManager[Callable[[], None]]]
-
-
-def write_page(page: Path, seeds: Sequence[int], jobs: int, progress: Progress, rows: Sequence[Row] = ROWS) -> bool:
+def write_page(page: Path, seeds: Sequence[int], jobs: int, rows: Sequence[Row] = ROWS) -> bool:
     """Run all rows and write `page`, and its pictures into a folder beside it. True if every bound was kept."""
     wanted = list(dict.fromkeys(case for row in rows for case in row.all_cases(seeds)))
     wishes = speed_cases(seeds[0]) if any(row.scenario == "thymio" for row in rows) else []
     pictures = page.parent / page.stem
     pictures.mkdir(parents=True, exist_ok=True)
-    with progress(len(wanted) + len(wishes)) as advance, worker_pool(jobs) as pool:
+    with progress_bar(len(wanted) + len(wishes)) as advance, worker_pool(jobs) as pool:
         runs = {pool.submit(_run, case, _picture(pictures, case, seeds)): case for case in wanted}
         drives = [pool.submit(speed_run, wish) for wish in wishes]
         everything: list[Future[Any]] = [*runs, *drives]
@@ -406,7 +406,8 @@ def write_page(page: Path, seeds: Sequence[int], jobs: int, progress: Progress, 
             advance()
     results = {case: run.result() for run, case in runs.items()}
     speeds = [drive.result() for drive in drives]
-    _draw_speeds(pictures / SPEEDS, speeds)
+    if speeds:
+        plot_speeds(pictures / SPEEDS, speeds)
     page.write_text("\n".join(page_lines(rows, results, seeds, pictures.name, speeds)) + "\n", "utf-8")
     return all(kept(row, results, seeds) for row in rows)
 
@@ -417,8 +418,6 @@ def _picture(folder: Path, case: Case, seeds: Sequence[int]) -> Path | None:
 
 
 def _run(case: Case, picture: Path | None) -> Score:
-    with needs("report"):
-        from sightline.evaluation.plots import plot_run
     scenario, run = run_of(case)
     if picture is not None:
         whose = f" on {case.robot}" if case.robot else ""
@@ -427,8 +426,14 @@ def _run(case: Case, picture: Path | None) -> Score:
     return score(run.samples, scenario.stand_off_m, figures_of(scenario, run.samples, run.said))
 
 
-def _draw_speeds(path: Path, speeds: Sequence[SpeedRun]) -> None:
-    with needs("report"):
-        pass
-    if speeds:
-        plot_speeds(path, speeds)
+def main() -> int:
+    """Run every behavior and its baseline, and write the page."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--seeds", default="201,202,203,204,205,206", help="separated by commas")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at once")
+    given = parser.parse_args()
+    return 0 if write_page(PAGE, [int(seed) for seed in given.seeds.split(",")], given.jobs) else 5
+
+
+if __name__ == "__main__":
+    sys.exit(main())
