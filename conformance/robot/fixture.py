@@ -16,6 +16,8 @@ from sightline.protocol.messages import CameraModel, FrameHeader, Reply, Stamp, 
 
 GOOD: Final = "GOOD"
 """The verdict on a command that the robot judged good: obeyed, or counted as DISARMED."""
+NOT_COUNTED: Final = "not counted"
+"""The result of a command that the robot did not count."""
 CRAWL: Final = b"0.1000|0.0000"
 """What the kit drives with where the speed does not matter."""
 ANSWER_US: Final = 1_000_000
@@ -185,7 +187,7 @@ class Sender:
             self.ack(frame)
 
     def verdict(self, send: Callable[[], None]) -> str:
-        """What became of the one command that `send` sends: GOOD, a refusal's reason, or "" when it was not counted."""
+        """Return what became of the one command that `send` sends: GOOD, a rejection's reason, or NOT_COUNTED."""
         before = self.robot.status()
         send()
         self.robot.reaches(lambda status: _counts(status) != _counts(before), ANSWER_US)
@@ -193,7 +195,7 @@ class Sender:
         news = _counts(after) - _counts(before)
         del news[CLAMPED]
         names = [GOOD if name in (RejectReason.DISARMED, GOOD) else name for name in news]
-        return "+".join(sorted(names))
+        return "+".join(sorted(names)) or NOT_COUNTED
 
     def expect_result(self, expected: str, send: Callable[[], None], what: str = "it") -> None:
         """Fail the case unless the one command that `send` sends gets the result `expected`."""
@@ -204,7 +206,7 @@ class Sender:
         self._compare(expected, self.judged(text, **changes), what)
 
     def _compare(self, expected: str, result: str, what: str) -> None:
-        self.bench.expect(result == expected, f"{what}: {result or 'not counted'}, expected {expected}")
+        self.bench.expect(result == expected, f"{what}: {result}, expected {expected}")
 
     def judged(self, text: bytes = CRAWL, **changes: Any) -> str:
         """The verdict on a twist that answers the next frame."""
@@ -212,11 +214,11 @@ class Sender:
 
     def verdict_on_next(self, send: Callable[[FrameHeader], None]) -> str:
         """The verdict on what `send` sends about the next frame; sent once more if it was lost, as messages may be."""
-        verdict = ""
+        verdict = NOT_COUNTED
         for _ in range(_SENT_AGAIN):
             self.robot.status()  # whatever has to be waited for comes before the frame
             verdict = self.verdict(partial(send, self._frame_to_answer()))
-            if verdict:
+            if verdict != NOT_COUNTED:
                 break
         return verdict
 
@@ -231,14 +233,14 @@ class Sender:
     def need_good(self) -> None:
         """Leave the case unless an ordinary twist is judged good: R-CAUS-01 says so."""
         verdict = self.judged()
-        self.bench.need(verdict == GOOD, f"an ordinary twist is not judged good here, but {verdict or 'not counted'}")
+        self.bench.need(verdict == GOOD, f"an ordinary twist is not judged good here, but {verdict}")
 
     def need_unknown(self) -> None:
         """Leave the case unless a twist on a frame never issued is refused so: R-CAUS-02 says so."""
         self.robot.status()
         frame = self.robot.frame()
         verdict = self.verdict(lambda: self.twist(frame, echo_seq=frame.seq + 5000))
-        self.bench.need(verdict == "UNKNOWN_FRAME", f"an unknown frame is {verdict or 'not counted'} (R-CAUS-02)")
+        self.bench.need(verdict == "UNKNOWN_FRAME", f"an unknown frame is {verdict} (R-CAUS-02)")
 
     # --- requests ------------------------------------------------------------------------------------------------
 
