@@ -23,21 +23,21 @@ class LiveBench(Bench):
         self,
         robot: str,
         open_it: Callable[[str], Link],
-        hears: Sequence[Channel],
+        channels: Sequence[Channel],
         put_it: Callable[[str, bytes, bytes], None] | None = None,
         *,
         roles: Sequence[str] = ("vision",),
         endpoint: str = "",
-        older: str = "",
+        legacy: str = "",
         access: Access | None = None,
     ) -> None:
-        """`open_it(role)` opens a link, again after each `leave`; `put_it` sends what a link refuses to send.
+        """`open_it(role)` opens a link, again after each `leave`; `put_it` sends what a link rejects.
 
-        Each of `roles` has a link of its own, where keys decide who may say what; the first hears, and says whatever
-        no other may say. Raises what `open_it` raises.
+        Each of `roles` has a link of its own, where keys decide what a source may send; the first receives, and sends
+        what no other may send. Raises what `open_it` raises.
         """
-        super().__init__(robot, endpoint, older, access)
-        self._open_it, self._hears, self._put_it, self._roles = open_it, hears, put_it, roles
+        super().__init__(robot, endpoint, legacy, access)
+        self._open_it, self._channels, self._put_it, self._roles = open_it, channels, put_it, roles
         self._links: dict[str, Link] = {}
         self._news = threading.Condition()
         self._waiting: deque[Message] = deque(maxlen=_WAITING)
@@ -71,7 +71,7 @@ class LiveBench(Bench):
     def join(self) -> None:
         for role in self._roles:
             self._links[role] = self._open_it(role)
-        for channel in self._hears:
+        for channel in self._channels:
             self._links[self._roles[0]].subscribe(channel, self._store)
 
     def _store(self, message: Message) -> None:
@@ -86,7 +86,7 @@ class LiveBench(Bench):
             waiting = list(self._waiting)
             self._waiting.clear()
         for message in waiting:
-            self._hear(message)
+            self._receive(message)
 
     def __enter__(self) -> Self:
         return self
@@ -96,16 +96,16 @@ class LiveBench(Bench):
 
 
 # A bench in virtual time: the peer is an object, the network is memory, a second takes milliseconds. Pure.
-# network = MemoryNetwork()     bench = VirtualBench(network, [MyPeer(network)], hears=FROM_ROBOT, robot="r1")  The
+# network = MemoryNetwork()     bench = VirtualBench(network, [MyPeer(network)], receives=FROM_ROBOT, robot="r1")  The
 # peer makes links of its own in that network; its `tick` is called at every step, its subscriptions as messages come.
 
 
 STEP_US: Final = 5_000
 """Fine enough for ticks of 20 ms and frames of 33 ms, coarse enough that a second costs 200 steps."""
 FROM_ROBOT: Final = tuple(one for one in CHANNELS.values() if one.direction is Direction.FROM_ROBOT)
-"""What a kit that tests a robot hears."""
+"""What a kit that tests a robot receives."""
 TO_ROBOT: Final = tuple(one for one in CHANNELS.values() if one.direction is Direction.TO_ROBOT)
-"""What a kit that plays a robot hears."""
+"""What a kit that plays a robot receives."""
 _MOST_ANSWERS = 8  # messages that go to and fro within one step, before time goes on
 
 
@@ -121,10 +121,10 @@ class VirtualBench(Bench):
     """See the module."""
 
     def __init__(
-        self, network: MemoryNetwork, peers: Sequence[Ticking], hears: Sequence[Channel], robot: str = "r1"
+        self, network: MemoryNetwork, peers: Sequence[Ticking], channels: Sequence[Channel], robot: str = "r1"
     ) -> None:
         super().__init__(robot)
-        self._network, self._peers, self._hears = network, peers, hears
+        self._network, self._peers, self._channels = network, peers, channels
         self._link: MemoryLink | None = None
         self._dropped: Counter[str] = Counter()
         self.join()
@@ -152,8 +152,8 @@ class VirtualBench(Bench):
 
     def join(self) -> None:
         self._link = self._network.link(self.robot)
-        for channel in self._hears:
-            self._link.subscribe(channel, self._hear)
+        for channel in self._channels:
+            self._link.subscribe(channel, self._receive)
 
     def _pass_time(self, until_us: int) -> None:
         now_us = min(until_us, self.now_us + STEP_US)

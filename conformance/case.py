@@ -66,11 +66,11 @@ class Level(StrEnum):
 
 
 class ConformanceError(Exception):
-    """The peer does not conform; the text says what was expected and what was seen."""
+    """The peer does not conform; the text reports what was expected and what was seen."""
 
 
 class NotApplicableError(Exception):
-    """What the case builds on is missing here; the text says what."""
+    """What the case builds on is missing here; the text reports what."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ Model = TypeVar("Model", bound=WireModel)
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """What the kit shows, or asks for: a token for each role, and a folder of keys. Both are empty at an open peer."""
+    """What the kit shows, or requests: a token for each role, and a folder of keys. Both are empty at an open peer."""
 
     tokens: Mapping[str, str] = field(default_factory=dict)
     folder: str = ""
@@ -174,32 +174,32 @@ class Access:
 
     @property
     def watcher(self) -> str:
-        """A role that may ask and may not drive: where keys are asked for, a viewer may say nothing at all."""
+        """A role that may request and may not drive: where keys are demanded, a viewer may send nothing at all."""
         return "operator" if self.is_guarded else "viewer"
 
-    def may_ask(self, source: str) -> bool:
+    def may_request(self, source: str) -> bool:
         """Whether requests of `source` get through."""
         return not self.is_guarded or source in SOURCES_OF_ROLE["operator"]
 
     def token_of(self, source: str) -> str:
-        """What `source` shows; "" where nothing is asked for."""
+        """What `source` shows; "" where no token is demanded."""
         return self.tokens.get(certificate_role(source), "")
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
-    """A message from the peer: when it arrived on the kit's clock, and its number among all that were heard."""
+class Received:
+    """A message from the peer: when it arrived on the kit's clock, and its number among all that were received."""
 
     number: int
     at_us: int
     message: Message
 
     def header(self, model: type[Model]) -> Model | None:
-        """The header as `model`; None for what is none (a case of its own says so)."""
+        """The header as `model`; None for an invalid one (a case of its own tests that)."""
         return _read(model, self.message.header, len(self.message.header))
 
     def payload(self, model: type[Model]) -> Model | None:
-        """The payload as `model`; None for what is none."""
+        """The payload as `model`; None for an invalid one."""
         return _read(model, self.message.payload, len(self.message.payload))
 
 
@@ -213,14 +213,14 @@ def _read(model: type[Model], data: bytes, max_bytes: int) -> Model | None:
 class Bench(ABC):
     """One peer under test. `robot` is the robot's id: the peer's own, or the one that the kit plays."""
 
-    def __init__(self, robot: str, endpoint: str = "", older: str = "", access: Access | None = None) -> None:
-        """`endpoint` is where the peer is, `older` where it speaks the older dialect, `access` what opens its doors.
+    def __init__(self, robot: str, endpoint: str = "", legacy: str = "", access: Access | None = None) -> None:
+        """`endpoint` is where the peer is, `legacy` where it serves the legacy protocol, `access` the keys and tokens.
 
         These three are for cases with sockets of their own.
         """
-        self.robot, self.endpoint, self.older, self.access = robot, endpoint, older, access or Access()
-        self._log: dict[str, deque[Heard]] = {}
-        self._reactions: list[tuple[Channel, Callable[[Heard], None]]] = []
+        self.robot, self.endpoint, self.legacy, self.access = robot, endpoint, legacy, access or Access()
+        self._log: dict[str, deque[Received]] = {}
+        self._reactions: list[tuple[Channel, Callable[[Received], None]]] = []
         self._timers: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = itertools.count(1)
         self._newest_number = 0
@@ -243,11 +243,11 @@ class Bench(ABC):
 
     @abstractmethod
     def put(self, key: str, header: bytes, payload: bytes) -> None:
-        """Publish anything under any key, as a stranger could. Raises NotApplicableError where that cannot be."""
+        """Publish anything under any key, as a third party could. Raises NotApplicableError where that cannot be."""
 
     @abstractmethod
     def leave(self) -> None:
-        """Close the kit's connection; nothing is heard and nothing can be sent until `join`."""
+        """Close the kit's connection; nothing is received and nothing can be sent until `join`."""
 
     @abstractmethod
     def join(self) -> None:
@@ -266,28 +266,28 @@ class Bench(ABC):
         self.send(channel, _bytes(header), _bytes(payload), source)
 
     def mark(self) -> int:
-        """A point in what was heard, for `heard`."""
+        """A point in what was received, for `received`."""
         return self._newest_number
 
     def number(self) -> int:
         """A number that this bench gives only once."""
         return next(self._numbers)
 
-    def heard(self, channel: Channel, since: int = 0) -> list[Heard]:
+    def received(self, channel: Channel, since: int = 0) -> list[Received]:
         """What came on `channel` after the mark `since`, oldest first."""
-        newer: list[Heard] = []
+        newer: list[Received] = []
         for one in reversed(self._log.get(channel.name, ())):
             if one.number <= since:
                 break
             newer.append(one)
         return newer[::-1]
 
-    def newest(self, channel: Channel) -> Heard | None:
+    def newest(self, channel: Channel) -> Received | None:
         """The newest message of `channel`."""
         log = self._log.get(channel.name)
         return log[-1] if log else None
 
-    def on(self, channel: Channel, react: Callable[[Heard], None]) -> None:
+    def on(self, channel: Channel, react: Callable[[Received], None]) -> None:
         """From now on call `react` for every message of `channel`, inside `wait` and `rest`."""
         self._reactions.append((channel, react))
 
@@ -297,9 +297,9 @@ class Bench(ABC):
         self._reactions.clear()
         self._timers.clear()
 
-    def _hear(self, message: Message) -> None:
+    def _receive(self, message: Message) -> None:
         self._newest_number = next(self._numbers)
-        one = Heard(self._newest_number, self.now_us, message)
+        one = Received(self._newest_number, self.now_us, message)
         self._log.setdefault(message.channel.name, deque(maxlen=KEPT_MESSAGES)).append(one)
         for channel, react in tuple(self._reactions):
             if channel is message.channel:
@@ -331,7 +331,7 @@ class Bench(ABC):
         while self._timers and self._timers[0][0] <= now_us:
             heapq.heappop(self._timers)[2]()
 
-    # --- verdicts ------------------------------------------------------------------------------------------------
+    # --- results ------------------------------------------------------------------------------------------------
 
     def expect(self, condition: object, reason: str) -> None:
         """Fail the case with `reason` unless `condition` is true."""

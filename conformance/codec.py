@@ -28,13 +28,13 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.spec.golden import outcome
 
 MAX_ANSWER_BYTES: Final = 1_048_576
-"""Security limit: a longer line is no answer."""
+"""Security limit: a longer line is not an answer."""
 _PRINTED: Final = 120
 Fields = Mapping[str, Any]
 
 
 class ProgramError(Exception):
-    """The program does not keep to the line protocol, or is gone; the text is one line for a person."""
+    """The program does not keep to the line protocol, or is gone; the text is one line for people."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,18 +55,18 @@ class Question:
 
 
 def read_question(line: str | bytes) -> tuple[int, str, dict[str, Any]]:
-    """The other end's: id, kind and fields, as they came. Raises ValueError for what is no question."""
+    """The other end's: id, kind and fields, as they came. Raises ValueError for what is not a question."""
     fields = json.loads(line)
     number, kind = fields.pop("id"), fields.pop("kind")
     return number, kind, fields
 
 
 def read_answer(line: bytes) -> tuple[int, dict[str, Any]]:
-    """The id and the rest of an answer. Raises ProgramError for what is none."""
+    """The id and the rest of an answer. Raises ProgramError for an invalid one."""
     try:
         answer = json.loads(line)
     except (ValueError, RecursionError):
-        raise ProgramError(f"this line is no JSON: {shown(line)}") from None
+        raise ProgramError(f"this line is not JSON: {shown(line)}") from None
     number = answer.pop("id", None) if isinstance(answer, dict) else None
     if not isinstance(number, int) or isinstance(number, bool):
         raise ProgramError(f"this answer has no id: {shown(line)}")
@@ -105,7 +105,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= _PRINTED else text[:_PRINTED] + "..."
 
 
-# A codec of somebody else's as a process: questions to its stdin, answers from its stdout, in time. Shell.
+# A third-party codec as a process: questions to its stdin, answers from its stdout, in time. Shell.
 
 
 START_S: Final = 10.0
@@ -114,7 +114,7 @@ ANSWER_S: Final = 2.0
 """From then on until the next answer, whichever it is."""
 END_S: Final = 2.0
 _READ_BYTES: Final = 65_536
-_LAST_WORDS: Final = 200
+_STDERR_TAIL: Final = 200
 
 
 class CodecProgram:
@@ -131,13 +131,13 @@ class CodecProgram:
             raise ConfigError(f"codec: cannot start {command[0]!r}: {error.strerror}; is it installed?") from None
         self._number = 0
         self._buffer = b""
-        self._last_words = b""
+        self._stderr_tail = b""
         self._answered = False
         assert self._process.stderr is not None
         threading.Thread(target=self._listen, args=(self._process.stderr,), daemon=True).start()
 
-    def ask(self, questions: Iterator[Question]) -> Iterator[tuple[Question, dict[str, Any]]]:
-        """Ask all of them, and give each with its answer as it comes. Raises ProgramError."""
+    def request(self, questions: Iterator[Question]) -> Iterator[tuple[Question, dict[str, Any]]]:
+        """Send all of them, and yield each with its answer as it comes. Raises ProgramError."""
         lines: list[bytes] = []
         waiting: dict[int, Question] = {}
         for question in questions:
@@ -160,7 +160,7 @@ class CodecProgram:
         except subprocess.TimeoutExpired:
             raise ProgramError(f"it does not end within {END_S:g} s of its input") from None
         if code != 0:
-            raise ProgramError(f"it {_ended(code)}{self._said()}")
+            raise ProgramError(f"it {_ended(code)}{self._stderr_line()}")
 
     def __enter__(self) -> Self:
         return self
@@ -173,7 +173,7 @@ class CodecProgram:
     # --- pipes -------------------------------------------------------------------------------------------------------
 
     def _write(self, data: bytes) -> None:
-        """On a thread: a program may answer before it has read all. One that is gone is noticed by who reads."""
+        """On a thread: a program may answer before it has read all. One that is gone is noticed by the reader."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(data)
@@ -184,7 +184,7 @@ class CodecProgram:
     def _listen(self, stderr: IO[bytes]) -> None:
         """On a thread: read what it complains of, and keep the end."""
         while data := os.read(stderr.fileno(), _READ_BYTES):
-            self._last_words = (self._last_words + data)[-_LAST_WORDS:]
+            self._stderr_tail = (self._stderr_tail + data)[-_STDERR_TAIL:]
 
     def _line(self) -> bytes:
         """The next line, without its end. Raises ProgramError if none comes in time, or ever."""
@@ -201,10 +201,10 @@ class CodecProgram:
         assert self._process.stdout is not None
         ready, _, _ = select.select([self._process.stdout], [], [], max(0.0, deadline_s - time.monotonic()))
         if not ready:
-            raise ProgramError(f"no answer within {ANSWER_S if self._answered else START_S:g} s{self._said()}")
+            raise ProgramError(f"no answer within {ANSWER_S if self._answered else START_S:g} s{self._stderr_line()}")
         data = os.read(self._process.stdout.fileno(), _READ_BYTES)
         if not data:
-            raise ProgramError(f"it {self._ending()} before it had answered{self._said()}")
+            raise ProgramError(f"it {self._ending()} before it had answered{self._stderr_line()}")
         self._buffer += data
 
     def _ending(self) -> str:
@@ -213,19 +213,19 @@ class CodecProgram:
         except subprocess.TimeoutExpired:
             return "closed its output"
 
-    def _said(self) -> str:
+    def _stderr_line(self) -> str:
         """Its last words on stderr, as one line."""
-        words = self._last_words.strip().splitlines()
-        return f"; it said {shown(words[-1])}" if words else ""
+        words = self._stderr_tail.strip().splitlines()
+        return f"; it printed {shown(words[-1])}" if words else ""
 
 
 def _ended(code: int) -> str:
     return f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
 
 
-# What a codec is asked: every golden vector, every accepted one cut short, and twists to write. Pure.  A vector's
-# outcome is what its file says; what a cut message must come to is what our own decoders say of it. The files alone
-# decide what is asked: a new vector is a new case.
+# The questions to a codec: every golden vector, every accepted one cut short, and twists to write. Pure.  A vector's
+# outcome is in its file; what a cut message must come to is what our own decoders return. The files alone decide the
+# questions: a new vector is a new case.
 
 
 VECTORS: Final = Path(__file__).parent.parent / "protocol" / "vectors"
@@ -257,7 +257,7 @@ class CodecCase:
     must: bool
     clause: str
     questions: Callable[[], Iterator[Question]]
-    """Made anew each time: there are tens of thousands."""
+    """Made again each time: there are tens of thousands."""
 
 
 def codec_cases(vectors: Path = VECTORS) -> list[CodecCase]:
@@ -274,15 +274,15 @@ def codec_cases(vectors: Path = VECTORS) -> list[CodecCase]:
 
 def _vector_case(number: int, name: str, vector: dict[str, Any]) -> CodecCase:
     expected = {"ok": vector["accept"]} if "accept" in vector else {"refusal": vector["refuse"]}
-    asked = {field: value for field, value in vector.items() if field not in ("purpose", "accept", "refuse")}
+    requested = {field: value for field, value in vector.items() if field not in ("purpose", "accept", "refuse")}
     kind = name.partition("/")[0]
     if "key" in vector:
         kind = "message"
-        asked = {field.removesuffix(_HEX): bytes.fromhex(value) if field.endswith(_HEX) else value
-                 for field, value in asked.items()}
+        requested = {field.removesuffix(_HEX): bytes.fromhex(value) if field.endswith(_HEX) else value
+                 for field, value in requested.items()}
     purpose = f"`vectors/{name}.json`: {vector['purpose']}."
     clause = "17.1 Golden vectors"
-    return CodecCase(number, "vector", purpose, True, clause, lambda: iter((Question(kind, asked, expected),)))
+    return CodecCase(number, "vector", purpose, True, clause, lambda: iter((Question(kind, requested, expected),)))
 
 
 def _cut_case(number: int, name: str, vector: dict[str, Any]) -> CodecCase:
@@ -309,9 +309,9 @@ def _message(key: str, header: bytes, payload: bytes) -> Question:
 
 def _write_case(number: int, name: str, twist: tuple[str, float, float, str]) -> CodecCase:
     purpose, linear, angular, text = twist
-    asked = Question("write_twist", {"linear_mps": linear, "angular_rad_s": angular}, {"ok": text})
+    requested = Question("write_twist", {"linear_mps": linear, "angular_rad_s": angular}, {"ok": text})
     return CodecCase(number, "write", f"A twist is written with {purpose} ({name}).", False, "4.2 Writing",
-                     lambda: iter((asked,)))
+                     lambda: iter((requested,)))
 
 
 # Every case for a codec, and running them against a program on a pipe. Shell.
@@ -323,12 +323,12 @@ END: Final = "C-CODEC-9001"
 
 
 def _on_a_pipe(_bench: Bench) -> None:
-    raise NotApplicableError("a codec is asked on a pipe, not over a network")
+    raise NotApplicableError("a codec is tested on a pipe, not over a network")
 
 
-def _cases(asked: Sequence[CodecCase]) -> tuple[Case, ...]:
+def _cases(requested: Sequence[CodecCase]) -> tuple[Case, ...]:
     suite = Suite("C")
-    for one in asked:
+    for one in requested:
         level = Level.MUST if one.must else Level.SHOULD
         suite.add(Case(f"C-CODEC-{one.number}", level, one.clause, one.purpose, _on_a_pipe))
     title = "The program ends, with 0, when its input ends."
@@ -343,9 +343,9 @@ CASES: Final[tuple[Case, ...]] = _cases(tuple(_SENT.values()))
 def run_codec(
     command: Sequence[str], cases: Sequence[Case] = CASES, on_result: Callable[[Result], None] = lambda _result: None
 ) -> list[Result]:
-    """Ask the program of `command` about each of `cases`.
+    """Test the program of `command` with each of `cases`.
 
-    One that dies, hangs or answers what is no answer fails the case it was in; what it cannot be asked any more is not
+    One that dies, hangs or answers what is not an answer fails the case it was in; the cases after it are not
     applicable. Raises ConfigError if it cannot be started.
     """
     results: list[Result] = []
@@ -366,12 +366,12 @@ def run_codec(
 
 
 def _result(program: CodecProgram, case: Case) -> tuple[Outcome, str]:
-    """Ask one case's questions. Raises ProgramError."""
+    """Send one case's questions. Raises ProgramError."""
     if case.id == END:
         program.finish()
         return Outcome.PASSED, ""
     wrong, unsupported = "", ""
-    for question, answer in program.ask(_SENT[case.id].questions()):
+    for question, answer in program.request(_SENT[case.id].questions()):
         if "unsupported" in answer:
             unsupported = f"the program does not know questions of kind {question.kind}"
         wrong = wrong or ("" if unsupported else same(dict(question.expected), answer))

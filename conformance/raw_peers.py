@@ -207,23 +207,23 @@ class RawWebSocket(RawConnection):
 
 
 def split_url(url: str) -> tuple[bool, str, int]:
-    """(TLS, address, port) of `ws://`, `wss://` or the older dialect's endpoint. Raises ConfigError."""
+    """(TLS, address, port) of `ws://`, `wss://` or the legacy protocol's endpoint. Raises ConfigError."""
     scheme, _, rest = url.partition("://")
     address, _, port = rest.split("/")[0].split("?")[0].rpartition(":")
     if scheme.split("-")[0] not in ("ws", "wss") or not port.isdigit():
-        raise ConfigError(f"endpoint {url!r} is none of WebSocket, e.g. ws://127.0.0.1:9090")
+        raise ConfigError(f"invalid WebSocket endpoint {url!r}: expected ws://HOST:PORT, e.g. ws://127.0.0.1:9090")
     return scheme.startswith("wss"), address.strip("[]"), int(port)
 
 
 def _unverified() -> ssl.SSLContext:
-    """The kit judges what is said, not who vouches for it: a stranger's certificate is the stranger's affair."""
+    """The kit tests the protocol, not the certificate: that of a third party is accepted as it is."""
     context = ssl.create_default_context()
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
     return context
 
 
-# Puts anything under any key, past every bound of a well-behaved link, as a stranger on Zenoh could. Shell (Zenoh).
+# Puts anything under any key, past every bound of a well-behaved link, as a third party on Zenoh could. Shell (Zenoh).
 
 
 _OPEN_S: Final = 5.0
@@ -239,7 +239,7 @@ class RawZenoh:
         self._ending = ExitStack()
 
     def put(self, key: str, header: bytes, payload: bytes) -> None:
-        """Send it. Raises LinkError where nobody answers."""
+        """Send it. Raises LinkError without an answer."""
         if self._put is None:
             secured = load_role_keys(self._folder, self._source)
             session = open_session((), [self._endpoint], _OPEN_S, secured)

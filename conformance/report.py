@@ -28,7 +28,7 @@ def summary(results: Sequence[Result]) -> str:
 
 
 def to_dict(results: Sequence[Result], side: str, peer: str) -> dict[str, Any]:
-    """One object for scripts, as every command that judges prints it."""
+    """One object for scripts, as every command that validates prints it."""
     return {
         "ok": passed(results),
         "side": side,
@@ -67,6 +67,6 @@ def to_junit(results: Sequence[Result], side: str, peer: str) -> str:
         element = ET.SubElement(suite, "testcase", {**names, "time": f"{one.took_us / 1e6:.3f}"})
         if one.outcome is not Outcome.PASSED:
             tag = "failure" if _counted_as(one) == Outcome.FAILED.value else "skipped"
-            said = {"message": printable(one.reason), "type": one.case.level.value}
-            ET.SubElement(element, tag, said if tag == "failure" else {"message": said["message"]})
+            reported = {"message": printable(one.reason), "type": one.case.level.value}
+            ET.SubElement(element, tag, reported if tag == "failure" else {"message": reported["message"]})
     return ET.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"

@@ -58,7 +58,7 @@ def run_cases(
     """Run `cases` in order against one peer; `prepare` brings it to where each begins.
 
     Over a network nothing may be relied on to arrive: with `tries` above 1 a case fails that fails so often in a row,
-    and one that passes later says how it failed before.
+    and one that passes later reports how it failed before.
     """
     results = []
     for case in cases:

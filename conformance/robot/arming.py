@@ -33,14 +33,14 @@ def _driven(bench: Bench, twists: int = 8) -> Sender:
 
 @SUITE.must("R-ARM-02", "6.4 Arming", ready)
 def too_few(_bench: Bench, driver: Sender) -> None:
-    """`arm` is refused as NOT_ALLOWED after two good twists."""
+    """`arm` is rejected as NOT_ALLOWED after two good twists."""
     driver.need_good()
     Sender(driver.robot, "operator").expect_rejected("arm", "NOT_ALLOWED", "two twists")
 
 
 @SUITE.must("R-ARM-03", "6.4 Arming", _driven)
 def arms(_bench: Bench, driver: Sender) -> None:
-    """`arm` is granted while good twists flow, and the robot obeys them."""
+    """`arm` is granted while good twists flow, and the robot applies them."""
     Sender(driver.robot, "operator").expect_granted("arm", "after 8 good twists")
     driver.robot.expect_state(*DRIVEN, within_us=1_000_000)
 
@@ -58,7 +58,7 @@ def unarmed_does_not_move(bench: Bench, driver: Sender) -> None:
 
 @SUITE.must("R-ARM-05", "8.2 Requests and replies", armed)
 def disarms(bench: Bench, driver: Sender) -> None:
-    """`disarm` is granted to anybody without `echo`: wheels to zero, whatever is commanded."""
+    """`disarm` is granted to any role without `echo`: wheels to zero, whatever is commanded."""
     robot = driver.robot
     Sender(robot, "operator").expect_granted("disarm", "disarm was not granted", cite=False)
     rests = robot.reaches(lambda status: status.state is State.DISARMED and status.applied == (0.0, 0.0), 1_500_000)
@@ -67,7 +67,7 @@ def disarms(bench: Bench, driver: Sender) -> None:
 
 @SUITE.must("R-ARM-07", "8.3 Freshness", Robot)
 def arming_needs_news(bench: Bench, robot: Robot) -> None:
-    """`arm` that cites a `status` more than two seconds old is refused as STALE."""
+    """`arm` that cites a `status` more than two seconds old is rejected as STALE."""
     old = robot.stamp()
     bench.rest(2_300_000)
     _driven(bench).expect_rejected("arm", "STALE", "a request 2.5 s late", cite=old)
@@ -75,7 +75,7 @@ def arming_needs_news(bench: Bench, robot: Robot) -> None:
 
 @SUITE.must("R-ARM-08", "8.3 Freshness", _driven)
 def arming_after_disarm(bench: Bench, driver: Sender) -> None:
-    """`arm` that cites a `status` from before the last disarm is refused as STALE."""
+    """`arm` that cites a `status` from before the last disarm is rejected as STALE."""
     before = driver.robot.stamp()
     bench.need(driver.granted("disarm"), "disarm is not granted (R-ARM-05)")
     driver.expect_rejected("arm", "STALE", "a request from before the disarm", cite=before)
@@ -83,7 +83,7 @@ def arming_after_disarm(bench: Bench, driver: Sender) -> None:
 
 @SUITE.must("R-ARM-09", "8.2 Requests and replies", teleop)
 def human_beside(bench: Bench, human: Sender) -> None:
-    """While a human drives, nobody else may arm: NOT_ALLOWED."""
+    """While a human drives, no other source may arm: NOT_ALLOWED."""
     human.need_good()
     human.drive()
     bench.need(bench.wait(lambda: human.seq >= 9, 3_000_000), "too few frames")
@@ -110,7 +110,7 @@ def counts_one_driver(bench: Bench) -> None:
 
 @SUITE.must("R-ARM-12", "6.4 Arming", _driven)
 def arming_starts_nothing(bench: Bench, driver: Sender) -> None:
-    """Twists from before arming are not obeyed after it: without new ones the wheels stay at zero."""
+    """Twists from before arming are not applied after it: without new ones the wheels stay at zero."""
     driver.drive(None)
     bench.need(driver.granted("arm"), "arm is not granted (R-ARM-03)")
     mark = bench.mark()
@@ -120,8 +120,8 @@ def arming_starts_nothing(bench: Bench, driver: Sender) -> None:
 
 
 @SUITE.must("R-ARM-13", "6.4 Arming", armed)
-def refused_between(bench: Bench, driver: Sender) -> None:
-    """Refused twists between the good ones do not break the row: `arm` is granted."""
+def rejected_between(bench: Bench, driver: Sender) -> None:
+    """Rejected twists between the good ones do not break the row: `arm` is granted."""
     disarmed = driver.granted("disarm") and driver.robot.becomes(State.DISARMED)
     bench.need(disarmed, "disarm does not disarm (R-ARM-05)")
     bench.need(driver.robot.stops(1_500_000), "then it moves on (R-ARM-05)")
@@ -149,7 +149,7 @@ def row_ends_with_the_lease(bench: Bench) -> None:
 def _stopped(bench: Bench) -> Sender:
     """An operator whose STOP has worked."""
     operator = Sender(Robot(bench), "operator")
-    operator.request("stop")
+    operator.send_request("stop")
     bench.need(operator.robot.becomes(State.STOPPED), "STOP does not stop this robot (R-STOP-01)")
     operator.robot.next_status()
     return operator
@@ -163,12 +163,12 @@ def _state(robot: Robot, state: State, what: str) -> Status:
 
 def _lifts_nothing(operator: Sender, verb: str, what: str, **changes: Any) -> None:
     """Fail the case unless the robot is STOPPED after the request too."""
-    operator.ask(verb, **changes)
+    operator.request(verb, **changes)
     _state(operator.robot, State.STOPPED, f"after {what}")
 
 
 def _stops_at_rest(operator: Sender) -> None:
-    operator.request("stop", cite=False)
+    operator.send_request("stop", cite=False)
     operator.robot.expect_state(State.STOPPED)
 
 
@@ -178,17 +178,17 @@ def _stops_again(operator: Sender) -> None:
 
 
 SUITE.must_all(operator, {
-    "R-ARM-01": ("8.2 Requests and replies", "`arm` is refused as NOT_ALLOWED while nobody sends good twists.",
+    "R-ARM-01": ("8.2 Requests and replies", "`arm` is rejected as NOT_ALLOWED while no source sends good twists.",
                  lambda it: it.expect_rejected("arm", "NOT_ALLOWED", "a request without any twist")),
-    "R-STOP-03": ("8.2 Requests and replies", "STOP without `echo` is obeyed also from a robot at rest.",
+    "R-STOP-03": ("8.2 Requests and replies", "STOP without `echo` is applied also from a robot at rest.",
                   _stops_at_rest),
 })
 SUITE.must_all(_driven, {
-    "R-ARM-06": ("8.3 Freshness", "`arm` without `echo` is refused as MALFORMED.",
+    "R-ARM-06": ("8.3 Freshness", "`arm` without `echo` is rejected as MALFORMED.",
                  lambda it: it.expect_rejected("arm", "MALFORMED", "a request without echo", cite=False)),
 })
 SUITE.must_all(_stopped, {
-    "R-STOP-07": ("8.3 Freshness", "`reset` without `echo` is refused.",
+    "R-STOP-07": ("8.3 Freshness", "`reset` without `echo` is rejected.",
                   lambda it: _lifts_nothing(it, "reset", "a reset that cites nothing", cite=False)),
     "R-STOP-10": ("6.5 STOP", "`disarm` does not lift STOPPED.", lambda it: _lifts_nothing(it, "disarm", "disarm")),
     "R-STOP-11": ("8.2 Requests and replies", "STOP may be repeated: it is granted again and stays.", _stops_again),
@@ -197,25 +197,25 @@ SUITE.must_all(_stopped, {
 
 @SUITE.must("R-STOP-01", "6.5 STOP", armed)
 def stops(bench: Bench, driver: Sender) -> None:
-    """STOP while driving: STOPPED is said within 300 ms, the reply says so, wheels at zero within 700 ms."""
-    reply = Sender(driver.robot, "operator").ask("stop")
+    """STOP while driving: STOPPED is reported within 300 ms, the reply reports it, wheels at zero within 700 ms."""
+    reply = Sender(driver.robot, "operator").request("stop")
     driver.robot.expect_state(State.STOPPED, within_us=300_000)
     bench.expect(driver.robot.stops(700_000), f"the wheels still turn: {driver.robot.status().applied}")
-    bench.expect(reply is None or reply.ok, f"the reply says {reply}")
+    bench.expect(reply is None or reply.ok, f"the reply reports {reply}")
 
 
 @SUITE.must("R-STOP-02", "13.5 Security", teleop)
-def anybody_stops(bench: Bench, human: Sender) -> None:
+def any_role_stops(bench: Bench, human: Sender) -> None:
     """STOP is granted to a role that may not drive, beside a human who drives."""
     human.need_good()
     human.drive()
-    Sender(human.robot, bench.access.watcher).request("stop")
+    Sender(human.robot, bench.access.watcher).send_request("stop")
     human.robot.expect_state(State.STOPPED)
 
 
 @SUITE.must("R-STOP-04", "5.1 Order", ready)
 def latched(bench: Bench, driver: Sender) -> None:
-    """In STOPPED good twists are refused as STOPPED and change nothing."""
+    """In STOPPED good twists are rejected as STOPPED and change nothing."""
     operator = _stopped(bench)
     for _ in range(6):
         driver.expect("STOPPED")
@@ -224,7 +224,7 @@ def latched(bench: Bench, driver: Sender) -> None:
 
 @SUITE.must("R-STOP-05", "8.2 Requests and replies", _stopped)
 def no_arming(bench: Bench, operator: Sender) -> None:
-    """In STOPPED `arm` is refused as STOPPED."""
+    """In STOPPED `arm` is rejected as STOPPED."""
     Sender(operator.robot).drive()
     bench.rest(500_000)
     operator.expect_rejected("arm", "STOPPED", "a request")
@@ -244,14 +244,14 @@ def reset_starts_nothing(bench: Bench, operator: Sender) -> None:
 
 @SUITE.must("R-STOP-08", "8.3 Freshness", Robot)
 def reset_after_stop(bench: Bench, robot: Robot) -> None:
-    """`reset` that cites a `status` from before the STOP is refused."""
+    """`reset` that cites a `status` from before the STOP is rejected."""
     before = robot.stamp()
     _lifts_nothing(_stopped(bench), "reset", "a reset from before the STOP", cite=before)
 
 
 @SUITE.must("R-STOP-09", "6.5 STOP", _stopped)
 def latched_over_reconnect(bench: Bench, operator: Sender) -> None:
-    """STOPPED holds while nobody is connected and after everybody has come again."""
+    """STOPPED holds while no client is connected and after every client has come again."""
     bench.leave()
     bench.rest(1_500_000)
     bench.join()
@@ -262,17 +262,17 @@ def latched_over_reconnect(bench: Bench, operator: Sender) -> None:
 
 @SUITE.must("R-STOP-12", "8.3 Freshness", Robot)
 def late_stop(bench: Bench, robot: Robot) -> None:
-    """A STOP that a link kept back is obeyed, however old the `status` that it cites."""
+    """A STOP that a link kept back is applied, however old the `status` that it cites."""
     old = robot.stamp()
     bench.rest(2_500_000)
-    Sender(robot, "operator").request("stop", cite=old)
+    Sender(robot, "operator").send_request("stop", cite=old)
     robot.expect_state(State.STOPPED)
 
 
 @SUITE.must("R-STOP-13", "8.2 Requests and replies", armed)
 def reset_of_nothing(bench: Bench, driver: Sender) -> None:
     """`reset` where there is nothing to reset changes nothing: an armed robot drives on."""
-    driver.ask("reset")
+    driver.request("reset")
     status = driver.robot.next_status(2)
     bench.expect(status.state in (State.HOLD, *DRIVEN), f"then it is {status.state}")
 
@@ -286,7 +286,7 @@ def arms_after_reset(bench: Bench, first: Sender) -> None:
     bench.rest(1_200_000)
     bench.need(operator.granted("reset"), "reset is not granted (R-STOP-06)")
     driver = Sender(operator.robot)
-    bench.need(driver.judged(CRAWL) == GOOD, "twists are not judged good after reset (R-STOP-06)")
+    bench.need(driver.twist_result(CRAWL) == GOOD, "twists are not accepted after reset (R-STOP-06)")
     driver.drive()
     bench.rest(500_000)
     bench.expect(driver.granted("arm"), "arm is not granted after reset")

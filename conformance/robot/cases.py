@@ -32,21 +32,21 @@ CASES: Final[tuple[Case, ...]] = tuple(
 
 
 def is_there(bench: Bench) -> bool:
-    """Whether a robot of this id says anything: a case can be judged by nothing else."""
+    """Whether a robot of this id publishes a status: no case can be tested without."""
     return bench.wait(lambda: bench.newest(STATUS), _FIRST_US)
 
 
 def prepare(bench: Bench) -> None:
-    """Bring the robot to where a case begins: DISARMED, nobody drives, wheels at zero. Raises ConformanceError."""
+    """Bring the robot to where a case begins: DISARMED, no holder, wheels at zero. Raises ConformanceError."""
     robot = Robot(bench)
     robot.status()
     operator = Sender(robot, "operator", acks=False)
     robot.next_status()
     for _ in range(3):
         if robot.status().state in (State.STOPPED, State.FAULT):
-            operator.ask("reset")
+            operator.request("reset")
         elif robot.status().state is not State.DISARMED:
-            operator.ask("disarm")
+            operator.request("disarm")
         if robot.reaches(_is_at_rest, _SETTLES_US // 3):
             break
     else:

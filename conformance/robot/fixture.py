@@ -1,6 +1,6 @@
 """The kit as a peer of a robot: what it receives and what it sends. Pure.
 
-Headers towards the robot are made of plain dicts, so that a case can also send what no model would let it say.
+Headers towards the robot are made of plain dicts, so that a case can also send what no model permits.
 """
 
 import json
@@ -9,29 +9,29 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
-from sightline.conformance.case import Bench, Heard
+from sightline.conformance.case import Bench, Received
 from sightline.protocol.channels import ACK, CAMERA, FRAME, REPLY, REQUEST, STATUS, TWIST
 from sightline.protocol.errors import CLAMPED, RejectReason
 from sightline.protocol.messages import CameraModel, FrameHeader, Reply, Stamp, State, Status
 
 GOOD: Final = "GOOD"
-"""The verdict on a command that the robot judged good: obeyed, or counted as DISARMED."""
+"""The result of a command that the robot accepted: applied, or counted as DISARMED."""
 NOT_COUNTED: Final = "not counted"
 """The result of a command that the robot did not count."""
 CRAWL: Final = b"0.1000|0.0000"
 """What the kit drives with where the speed does not matter."""
 ANSWER_US: Final = 1_000_000
-"""Until the effect of a command is in a `status` (10 Hz) that has been heard, with room for a slow machine."""
+"""Until the effect of a command is in a `status` (10 Hz) that has been received, with room for a slow machine."""
 FRAME_US: Final = 1_500_000
 """Until a frame comes to a peer that answers; without an answer credit comes back within 500 ms."""
 REPLY_US: Final = 1_000_000
-"""After which a peer may ask again."""
+"""After which a peer may request again."""
 DRIVEN: Final = (State.ACTIVE, State.DEGRADED)
 _SENT_AGAIN: Final = 2
 
 
 class Robot:
-    """What is heard from the robot under test."""
+    """What is received from the robot under test."""
 
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
@@ -44,13 +44,13 @@ class Robot:
         return status
 
     def _newest_status(self) -> Status | None:
-        readable = (one.payload(Status) for one in reversed(self.bench.heard(STATUS)))
+        readable = (one.payload(Status) for one in reversed(self.bench.received(STATUS)))
         return next((status for status in readable if status is not None), None)
 
     def next_status(self, count: int = 1) -> Status:
         """The newest status once `count` more have come: what happened before the call is in it."""
         mark = self.bench.mark()
-        came = self.bench.wait(lambda: len(self.bench.heard(STATUS, mark)) >= count, 1_000_000 * count)
+        came = self.bench.wait(lambda: len(self.bench.received(STATUS, mark)) >= count, 1_000_000 * count)
         self.bench.expect(came, f"no {count} status within {count} s")
         return self.status()
 
@@ -88,7 +88,7 @@ class Robot:
     def stamp(self) -> Stamp:
         """The header of the newest status that can be read. Raises ConformanceError as `status` does."""
         self.status()
-        stamps = (one.header(Stamp) for one in reversed(self.bench.heard(STATUS)))
+        stamps = (one.header(Stamp) for one in reversed(self.bench.received(STATUS)))
         stamp = next((stamp for stamp in stamps if stamp is not None), None)
         self.bench.expect(stamp is not None, "no status has a header that can be read")
         assert stamp is not None
@@ -102,17 +102,17 @@ class Robot:
         self.bench.need(frames, f"no frame within {within_us / 1e6:g} s")
         return frames[0][1]
 
-    def frames(self, since: int = 0) -> list[tuple[Heard, FrameHeader]]:
+    def frames(self, since: int = 0) -> list[tuple[Received, FrameHeader]]:
         """Frames since a mark, with headers that can be read."""
         return [
-            (one, header) for one in self.bench.heard(FRAME, since) if (header := one.header(FrameHeader)) is not None
+            (one, header) for one in self.bench.received(FRAME, since) if (header := one.header(FrameHeader))
         ]
 
     def each_frame(self, react: Callable[[FrameHeader], None]) -> None:
         """From now on call `react` for every frame whose header can be read."""
 
-        def read(heard: Heard) -> None:
-            header = heard.header(FrameHeader)
+        def read(received: Received) -> None:
+            header = received.header(FrameHeader)
             if header is not None:
                 react(header)
 
@@ -120,8 +120,8 @@ class Robot:
 
     def camera(self) -> CameraModel | None:
         """The newest camera model."""
-        heard = self.bench.newest(CAMERA)
-        return heard.payload(CameraModel) if heard else None
+        received = self.bench.newest(CAMERA)
+        return received.payload(CameraModel) if received else None
 
 
 class Sender:
@@ -154,7 +154,7 @@ class Sender:
     # --- twists and acks -----------------------------------------------------------------------------------------
 
     def twist(self, frame: FrameHeader, text: bytes = CRAWL, **changes: Any) -> None:
-        """Send a twist that cites `frame`; its `seq` is the next unless `changes` say otherwise."""
+        """Send a twist that cites `frame`; its `seq` is the next unless `changes` send otherwise."""
         self.seq += 1
         self.bench.publish(TWIST, as_json(self.header(frame, **changes)), text, self.source)
 
@@ -186,7 +186,7 @@ class Sender:
         elif self.acks:
             self.ack(frame)
 
-    def verdict(self, send: Callable[[], None]) -> str:
+    def result_of(self, send: Callable[[], None]) -> str:
         """Return what became of the one command that `send` sends: GOOD, a rejection's reason, or NOT_COUNTED."""
         before = self.robot.status()
         send()
@@ -199,28 +199,28 @@ class Sender:
 
     def expect_result(self, expected: str, send: Callable[[], None], what: str = "it") -> None:
         """Fail the case unless the one command that `send` sends gets the result `expected`."""
-        self._compare(expected, self.verdict(send), what)
+        self._compare(expected, self.result_of(send), what)
 
     def expect(self, expected: str, text: bytes = CRAWL, what: str = "the twist", **changes: Any) -> None:
         """Fail the case unless a twist that answers the next frame gets the result `expected`."""
-        self._compare(expected, self.judged(text, **changes), what)
+        self._compare(expected, self.twist_result(text, **changes), what)
 
     def _compare(self, expected: str, result: str, what: str) -> None:
         self.bench.expect(result == expected, f"{what}: {result}, expected {expected}")
 
-    def judged(self, text: bytes = CRAWL, **changes: Any) -> str:
-        """The verdict on a twist that answers the next frame."""
-        return self.verdict_on_next(lambda frame: self.twist(frame, text, **changes))
+    def twist_result(self, text: bytes = CRAWL, **changes: Any) -> str:
+        """The result on a twist that answers the next frame."""
+        return self.result_on_next(lambda frame: self.twist(frame, text, **changes))
 
-    def verdict_on_next(self, send: Callable[[FrameHeader], None]) -> str:
-        """The verdict on what `send` sends about the next frame; sent once more if it was lost, as messages may be."""
-        verdict = NOT_COUNTED
+    def result_on_next(self, send: Callable[[FrameHeader], None]) -> str:
+        """The result on what `send` sends about the next frame; sent once more if it was lost, as messages may be."""
+        result = NOT_COUNTED
         for _ in range(_SENT_AGAIN):
             self.robot.status()  # whatever has to be waited for comes before the frame
-            verdict = self.verdict(partial(send, self._frame_to_answer()))
-            if verdict != NOT_COUNTED:
+            result = self.result_of(partial(send, self._frame_to_answer()))
+            if result != NOT_COUNTED:
                 break
-        return verdict
+        return result
 
     def _frame_to_answer(self) -> FrameHeader:
         """The next frame, not acknowledged beside the answer that it is about to get."""
@@ -231,35 +231,35 @@ class Sender:
             self.acks = acks
 
     def need_good(self) -> None:
-        """Leave the case unless an ordinary twist is judged good: R-CAUS-01 says so."""
-        verdict = self.judged()
-        self.bench.need(verdict == GOOD, f"an ordinary twist is not judged good here, but {verdict}")
+        """Leave the case unless an ordinary twist is accepted: R-CAUS-01 tests that."""
+        result = self.twist_result()
+        self.bench.need(result == GOOD, f"an ordinary twist is not accepted here, but {result}")
 
     def need_unknown(self) -> None:
-        """Leave the case unless a twist on a frame never issued is refused so: R-CAUS-02 says so."""
+        """Leave the case unless a twist on a frame never issued is rejected so: R-CAUS-02 tests that."""
         self.robot.status()
         frame = self.robot.frame()
-        verdict = self.verdict(lambda: self.twist(frame, echo_seq=frame.seq + 5000))
-        self.bench.need(verdict == "UNKNOWN_FRAME", f"an unknown frame is {verdict} (R-CAUS-02)")
+        result = self.result_of(lambda: self.twist(frame, echo_seq=frame.seq + 5000))
+        self.bench.need(result == "UNKNOWN_FRAME", f"an unknown frame is {result} (R-CAUS-02)")
 
     # --- requests ------------------------------------------------------------------------------------------------
 
-    def ask(self, verb: str, *, cite: Stamp | bool = True, **changes: Any) -> Reply | None:
+    def request(self, verb: str, *, cite: Stamp | bool = True, **changes: Any) -> Reply | None:
         """Send a request and return the next reply, whomever it names; None when none comes within a second.
 
         `cite` is the status to cite: True the newest, False none. `changes` replace fields of the header.
         """
         mark = self.bench.mark()
-        self.request(verb, cite=cite, **changes)
-        self.bench.wait(lambda: self.bench.heard(REPLY, mark), REPLY_US)
-        replies = [reply for one in self.bench.heard(REPLY, mark) if (reply := one.payload(Reply)) is not None]
+        self.send_request(verb, cite=cite, **changes)
+        self.bench.wait(lambda: self.bench.received(REPLY, mark), REPLY_US)
+        replies = [reply for one in self.bench.received(REPLY, mark) if (reply := one.payload(Reply)) is not None]
         return replies[0] if replies else None
 
-    def request(self, verb: str, *, cite: Stamp | bool = True, **changes: Any) -> None:
-        """Send a request and wait for nothing. Where keys keep this source from asking, an operator asks for it."""
-        if not self.bench.access.may_ask(self.source):
-            self.bench.need(verb not in ("acquire", "release"), f"with its keys {self.source} may ask for nothing")
-            Sender(self.robot, "operator", acks=False).request(verb, cite=cite, **changes)
+    def send_request(self, verb: str, *, cite: Stamp | bool = True, **changes: Any) -> None:
+        """Send a request and wait for nothing. Where keys forbid this source to request, an operator does it."""
+        if not self.bench.access.may_request(self.source):
+            self.bench.need(verb not in ("acquire", "release"), f"with its keys {self.source} may request nothing")
+            Sender(self.robot, "operator", acks=False).send_request(verb, cite=cite, **changes)
             return
         self.request_id += 1
         stamp = self.robot.stamp() if cite is True else cite
@@ -271,14 +271,14 @@ class Sender:
 
     def reply(self, verb: str, **changes: Any) -> Reply:
         """Send a request and return its reply; the case is not applicable without one: R-REQ-01 tests that."""
-        reply = self.ask(verb, **changes)
+        reply = self.request(verb, **changes)
         self.bench.need(reply is not None, f"no reply to {verb} (R-REQ-01)")
         assert reply is not None
         return reply
 
     def expect_granted(self, verb: str, what: str, **changes: Any) -> None:
         """Fail the case unless the request is granted."""
-        reply = self.ask(verb, **changes)
+        reply = self.request(verb, **changes)
         self.bench.expect(reply is not None and reply.ok, f"{what}: {reply}")
 
     def expect_rejected(self, verb: str, reason: str, what: str, **changes: Any) -> None:
@@ -290,8 +290,8 @@ class Sender:
         self.bench.expect(counted, f"{what}: rejected with {reply.detail!r}, expected {reason}")
 
     def granted(self, verb: str, **changes: Any) -> bool:
-        """Ask, and whether it was done."""
-        reply = self.ask(verb, **changes)
+        """Send a request and return whether it was granted."""
+        reply = self.request(verb, **changes)
         return reply is not None and reply.ok
 
 

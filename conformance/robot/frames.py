@@ -5,7 +5,7 @@ from functools import partial
 from itertools import pairwise
 from typing import Final
 
-from sightline.conformance.case import Bench, Heard, Suite
+from sightline.conformance.case import Bench, Received, Suite
 from sightline.conformance.robot.fixture import Robot, Sender, armed, ready, vision
 from sightline.protocol.channels import (
     CAMERA,
@@ -39,16 +39,16 @@ def watched(bench: Bench) -> Robot:
     return robot
 
 
-def _all_frames(robot: Robot, good: Callable[[Heard], object], what: str) -> None:
+def _all_frames(robot: Robot, good: Callable[[Received], object], what: str) -> None:
     bench = robot.bench
-    frames = bench.heard(FRAME)
+    frames = bench.received(FRAME)
     bench.expect(frames, "no frame came within 2 s, though frames were wanted and acknowledged")
     bad = [one for one in frames if not good(one)]
     if bad:
         bench.expect(False, f"{len(bad)} of {len(frames)} frames: {what}; first {bad[0].message.header[:120]!r}")
 
 
-def _is_jpeg(one: Heard) -> bool:
+def _is_jpeg(one: Received) -> bool:
     try:
         read_jpeg_size(one.message.payload)
     except WireError:
@@ -61,7 +61,7 @@ def one_session(bench: Bench, _robot: Robot) -> None:
     """All channels carry the same session for as long as the robot runs."""
     sessions: dict[str, set[str]] = {}
     for channel in (FRAME, STATUS, CAMERA, ODOMETRY):
-        stamps = [one.header(Stamp) for one in bench.heard(channel)]
+        stamps = [one.header(Stamp) for one in bench.received(channel)]
         sessions[channel.name] = {stamp.session for stamp in stamps if stamp}
     everything = set().union(*sessions.values())
     bench.expect(len(everything) == 1, f"sessions by channel: {sessions}")
@@ -96,7 +96,7 @@ def exact_keys(bench: Bench) -> None:
 @SUITE.must("R-FRAM-08", "10.1 Camera, odometry, scan", watched)
 def camera_model_is_of_the_picture(bench: Bench, robot: Robot) -> None:
     """The camera model's width and height are those of the encoded picture."""
-    model, frames = robot.camera(), [one for one in bench.heard(FRAME) if _is_jpeg(one)]
+    model, frames = robot.camera(), [one for one in bench.received(FRAME) if _is_jpeg(one)]
     bench.need(model is not None and frames, "no camera model or no picture to compare")
     assert model is not None
     size = read_jpeg_size(frames[-1].message.payload)
@@ -109,22 +109,22 @@ def camera_model_is_of_the_picture(bench: Bench, robot: Robot) -> None:
 @SUITE.should("R-FRAM-10", "10.2 Camera, odometry, scan", watched)
 def odometry_rate(bench: Bench, _robot: Robot) -> None:
     """Odometry, where the robot has it, comes at 20 Hz and can be read."""
-    bench.need(bench.heard(ODOMETRY), "this robot publishes no odometry")
+    bench.need(bench.received(ODOMETRY), "this robot publishes no odometry")
     _rate(bench, ODOMETRY, Odometry, 20)
 
 
 def _rate(bench: Bench, channel: Channel, model: type[WireModel], rate_hz: int) -> None:
-    name, heard = channel.name, bench.heard(channel)
-    unread = [one for one in heard if one.header(Stamp) is None or one.payload(model) is None]
-    bench.expect(not unread, f"{len(unread)} of {len(heard)} `{name}` cannot be read")
+    name, received = channel.name, bench.received(channel)
+    unread = [one for one in received if one.header(Stamp) is None or one.payload(model) is None]
+    bench.expect(not unread, f"{len(unread)} of {len(received)} `{name}` cannot be read")
     least = int(_SLACK * rate_hz * _WATCHED_US / 1e6)
-    bench.expect(len(heard) >= least, f"{len(heard)} `{name}` in 2 s, at least {least} belong to {rate_hz} Hz")
+    bench.expect(len(received) >= least, f"{len(received)} `{name}` in 2 s, at least {least} belong to {rate_hz} Hz")
 
 
 @SUITE.must("R-FRAM-11", "10.3 Camera, odometry, scan", watched)
 def scans_can_be_read(bench: Bench, _robot: Robot) -> None:
     """A scan, where the robot has them, has a ScanHeader and whole, non-negative float32 ranges."""
-    scans = bench.heard(SCAN)
+    scans = bench.received(SCAN)
     bench.need(scans, "this robot publishes no scans")
     for one in scans:
         bench.expect(one.header(ScanHeader), f"no ScanHeader: {one.message.header[:120]!r}")
@@ -142,9 +142,9 @@ def applied_in_frames(bench: Bench, driver: Sender) -> None:
     bench.rest(300_000)
     mark = bench.mark()
     bench.rest(300_000)
-    told = [header.applied[0] for _, header in driver.robot.frames(mark)]
-    bench.need(told, "no frame while driving")
-    bench.expect(max(told) > 0.05, f"status says {driver.robot.status().applied}, the frames {told[-1]}")
+    reported = [header.applied[0] for _, header in driver.robot.frames(mark)]
+    bench.need(reported, "no frame while driving")
+    bench.expect(max(reported) > 0.05, f"status reports {driver.robot.status().applied}, the frames {reported[-1]}")
 
 
 def _grows(robot: Robot, channel: Channel, what: str, values: Iterable[int], least_step: int = 1) -> None:
@@ -155,7 +155,7 @@ def _grows(robot: Robot, channel: Channel, what: str, values: Iterable[int], lea
 
 
 def _stamps(robot: Robot, channel: Channel) -> list[Stamp]:
-    return [stamp for one in robot.bench.heard(channel) if (stamp := one.header(Stamp)) is not None]
+    return [stamp for one in robot.bench.received(channel) if (stamp := one.header(Stamp)) is not None]
 
 
 def _counts_up(robot: Robot, channel: Channel) -> None:
@@ -204,7 +204,7 @@ def one_clock(bench: Bench, robot: Robot) -> None:
     """All channels are stamped by one clock: a frame is captured before the status that follows it is published."""
     offsets = {name: [] for name in (FRAME.name, STATUS.name)}  # type: dict[str, list[int]]
     for channel in (FRAME, STATUS):
-        for one in bench.heard(channel):
+        for one in bench.received(channel):
             stamp = one.header(Stamp)
             if stamp is not None:
                 offsets[channel.name].append(one.at_us - stamp.t_us)
@@ -222,15 +222,15 @@ def one_clock(bench: Bench, robot: Robot) -> None:
 SLOW_US: Final = 90_000
 """A slow detector: some frames at 30 fps."""
 _LATE_US: Final = 180_000
-"""So late that a picture which waited for the answer is told from one taken after it."""
+"""So late that a picture which waited for the answer differs from one taken after it."""
 OWNED_US: Final = 1_600_000
-"""Credit is its owner's for a second after the last answer: also that of who answered in the case before."""
+"""Credit is its owner's for a second after the last answer: also that of the peer that answered in the case before."""
 TAUGHT: Final = 14
 """Answers after which a robot expects slow ones."""
 _OF_QUICK: Final = 0.8
 """A share of the full rate that no credit leaves to the silent, and no credit at all exceeds."""
 QUICK_FPS: Final = 15
-"""Below this, camera and credit cannot be told apart."""
+"""Below this, camera and credit cannot be distinguished."""
 
 
 def taught(bench: Bench, answers: int = TAUGHT) -> Sender:
@@ -250,14 +250,14 @@ def _quick_fps(bench: Bench, what: str = "to a quick peer") -> float:
 
 
 def _gaps_us(bench: Bench, since: int) -> list[int]:
-    times = [one.at_us for one in bench.heard(FRAME, since)]
+    times = [one.at_us for one in bench.received(FRAME, since)]
     return [then - was for was, then in pairwise(times)]
 
 
 def fps_of(bench: Bench, for_us: int = 1_000_000) -> float:
     mark = bench.mark()
     bench.rest(for_us)
-    return len(bench.heard(FRAME, mark)) * 1e6 / for_us
+    return len(bench.received(FRAME, mark)) * 1e6 / for_us
 
 
 def _rates(bench: Bench) -> tuple[Sender, float, float]:
@@ -301,14 +301,14 @@ def acks_return_credit(bench: Bench, sender: Sender) -> None:
 
 
 @SUITE.must("R-FLOW-04", "7.2 Credit", ready)
-def refused_twists_return_credit(bench: Bench, watcher: Sender) -> None:
-    """A refused twist that cites a frame returns its credit."""
+def rejected_twists_return_credit(bench: Bench, watcher: Sender) -> None:
+    """A rejected twist that cites a frame returns its credit."""
     by_acks = _quick_fps(bench, "with acks")
-    refused = Sender(watcher.robot, acks=False)
-    refused.session = watcher.session
+    rejected = Sender(watcher.robot, acks=False)
+    rejected.session = watcher.session
     watcher.fall_silent()
-    refused.twist(watcher.robot.frame(), seq=10_000)
-    watcher.robot.each_frame(lambda frame: refused.twist(frame, seq=5))
+    rejected.twist(watcher.robot.frame(), seq=10_000)
+    watcher.robot.each_frame(lambda frame: rejected.twist(frame, seq=5))
     fps = fps_of(bench)
     bench.expect(fps >= 0.7 * by_acks, f"{fps:.0f} fps with twists that are OUT_OF_ORDER, {by_acks:.0f} with acks")
 
@@ -326,7 +326,7 @@ def lost_credit_times_out(bench: Bench) -> None:
 
 @SUITE.must("R-FLOW-06", "7.3 Owner", Robot)
 def credit_is_the_drivers(bench: Bench, robot: Robot) -> None:
-    """Acks of others do not return the credit of who drives: frames come at the driver's pace."""
+    """Acks of others do not return the credit of the driver: frames come at the driver's pace."""
     driver = Sender(robot)
     driver.delay_us = driver.compute_us = SLOW_US
     driver.drive()
@@ -358,7 +358,7 @@ def answers_count_for_older(bench: Bench, watcher: Sender) -> None:
     mark = bench.mark()
     watcher.ack(watcher.robot.frames()[-1][1])
     bench.rest(100_000)
-    came = len(bench.heard(FRAME, mark))
+    came = len(bench.received(FRAME, mark))
     bench.expect(came >= 2, f"{came} frames within 100 ms of an answer to the newest of many in flight")
 
 
@@ -381,7 +381,7 @@ def never_stored(bench: Bench, robot: Robot) -> None:
     watcher = Sender(robot)
     watcher.delay_us = watcher.compute_us = _LATE_US
     bench.rest(3_000_000)
-    stamps = [(one, one.header(Stamp)) for one in bench.heard(STATUS)]
+    stamps = [(one, one.header(Stamp)) for one in bench.received(STATUS)]
     clock_us = min((one.at_us - stamp.t_us for one, stamp in stamps if stamp), default=0)
     delays_us = sorted(one.at_us - header.t_us - clock_us for one, header in robot.frames())
     bench.need(len(delays_us) >= 8, "too few frames")
@@ -389,7 +389,7 @@ def never_stored(bench: Bench, robot: Robot) -> None:
     bench.expect(median_us <= _LATE_US // 2, f"half of the frames are {median_us / 1e3:.0f} ms old when they leave")
 
 
-# Cases on whose answers return credit, and on frames while nobody listens. Pure.
+# Cases on whose answers return credit, and on frames while no client listens. Pure.
 
 
 def _second_hastens_nothing(first: Sender) -> None:
@@ -433,7 +433,7 @@ _AT_THE_EDGES: Final = 8
 
 @SUITE.must("R-FLOW-13", "7.3 Owner", vision)
 def credit_is_the_firsts(bench: Bench, first: Sender) -> None:
-    """While nobody drives credit is the first's who answers: a second, quicker one does not hasten the frames."""
+    """While no source drives, the first peer that answers owns the credit: a quicker one does not hasten the frames."""
     first.delay_us = first.compute_us = SLOW_US
     bench.need(bench.wait(lambda: first.ack_seq >= TAUGHT, 6_000_000), "too few frames")
     _second_hastens_nothing(first)
@@ -454,7 +454,7 @@ def credit_passes_on(bench: Bench, first: Sender) -> None:
 
 @SUITE.must("R-FLOW-15", "7.1 Answers", vision)
 def seq_of_acks(bench: Bench, watcher: Sender) -> None:
-    """The `seq` of an ack is not judged: acks that all have the same return credit."""
+    """The `seq` of an ack is not validated: acks that all have the same return credit."""
     bench.rest(OWNED_US)
     quick = _quick_fps(bench)
     watcher.fall_silent()
@@ -466,8 +466,8 @@ def seq_of_acks(bench: Bench, watcher: Sender) -> None:
 
 
 @SUITE.should("R-FLOW-16", "3.4 Rate", vision)
-def nobody_listens(bench: Bench, watcher: Sender) -> None:
-    """While nobody listens no frame is captured: `stream.sent` stands still."""
+def no_client_listens(bench: Bench, watcher: Sender) -> None:
+    """While no client listens no frame is captured: `stream.sent` stands still."""
     watcher.robot.frame()
     watcher.fall_silent()
     before = watcher.robot.next_status(4).stream.sent
@@ -475,8 +475,8 @@ def nobody_listens(bench: Bench, watcher: Sender) -> None:
     bench.rest(_ALONE_US)
     mark = bench.mark()
     bench.join()
-    bench.need(bench.wait(lambda: bench.heard(STATUS, mark), 5_000_000), "no status again (R-RECO-01)")
-    first = bench.heard(STATUS, mark)[0].payload(Status)
+    bench.need(bench.wait(lambda: bench.received(STATUS, mark), 5_000_000), "no status again (R-RECO-01)")
+    first = bench.received(STATUS, mark)[0].payload(Status)
     bench.need(first, "a status that cannot be read (R-FRAM-09)")
     assert first is not None
     grown = first.stream.sent - before

@@ -28,20 +28,20 @@ def _bare(bench: Bench, text: bytes = CRAWL) -> None:
 
 
 def _guest(bench: Bench) -> Sender:
-    """A watcher beside a robot that hears guests."""
+    """A watcher beside a robot that receives guests."""
     watcher = Sender(Robot(bench), bench.access.watcher)
-    verdict = watcher.verdict(lambda: _bare(bench))
-    bench.need(verdict == GOOD, f"guests are not heard here: {verdict}")
+    result = watcher.result_of(lambda: _bare(bench))
+    bench.need(result == GOOD, f"guests are not received here: {result}")
     return watcher
 
 
 @SUITE.must("R-DIAL-01", "4.6 Guests")
 def guests(bench: Bench) -> None:
-    """A twist of `guest` without header is judged, or refused as UNKNOWN_SOURCE where guests are switched off."""
-    bench.need(not bench.access.is_guarded, "where keys are asked for no guest gets in")
+    """A twist of `guest` without header is validated, or rejected as UNKNOWN_SOURCE where guests are switched off."""
+    bench.need(not bench.access.is_guarded, "where keys are demanded no guest gets in")
     watcher = Sender(Robot(bench), bench.access.watcher)
-    verdict = watcher.verdict(lambda: _bare(bench))
-    bench.expect(verdict in (GOOD, "UNKNOWN_SOURCE"), f"it was {verdict}")
+    result = watcher.result_of(lambda: _bare(bench))
+    bench.expect(result in (GOOD, "UNKNOWN_SOURCE"), f"it was {result}")
 
 
 @SUITE.must("R-DIAL-02", "4.6 Guests", _guest)
@@ -66,16 +66,16 @@ def _arm_guest(watcher: Sender) -> None:
 @SUITE.must("R-DIAL-03", "6.1 Lease", _guest)
 def guests_yield(bench: Bench, watcher: Sender) -> None:
     """`vision` takes the lease from a guest."""
-    verdict = Sender(watcher.robot).judged()
-    bench.need(verdict in (GOOD, "NOT_HOLDER"), f"a twist of vision is {verdict} (R-CAUS-01)")
-    bench.expect(verdict == GOOD, f"a twist of vision is {verdict}")
+    result = Sender(watcher.robot).twist_result()
+    bench.need(result in (GOOD, "NOT_HOLDER"), f"a twist of vision is {result} (R-CAUS-01)")
+    bench.expect(result == GOOD, f"a twist of vision is {result}")
 
 
 @SUITE.must("R-DIAL-04", "4.6 Guests")
 def guests_with_header(bench: Bench) -> None:
-    """A guest's twist with a header is judged by it."""
+    """A guest's twist with a header is validated by it."""
     _guest(bench)
-    foreign = Sender(Robot(bench)).judged(echo_session="fffffff0")
+    foreign = Sender(Robot(bench)).twist_result(echo_session="fffffff0")
     bench.need(foreign == "OTHER_SESSION", f"another session is {foreign} (R-CAUS-06)")
     sender = Sender(Robot(bench), "guest")
     sender.expect("OTHER_SESSION", echo_session="fffffff0", what="one that cites another session")
@@ -96,8 +96,8 @@ def guests_are_silent_soon(bench: Bench, watcher: Sender) -> None:
 def guests_are_one(bench: Bench, watcher: Sender) -> None:
     """All who send without a header are one driver, `guest` of session 00000000."""
     _bare(bench)
-    told = watcher.robot.reaches(lambda status: status.holder is not None, 500_000)
-    bench.need(told, "`status` names no holder (R-LEASE-01)")
+    reported = watcher.robot.reaches(lambda status: status.holder is not None, 500_000)
+    bench.need(reported, "`status` names no holder (R-LEASE-01)")
     holder = watcher.robot.status().holder
     bench.expect(holder == Holder(source="guest", session="00000000"), f"holder is {holder}")
 
@@ -111,16 +111,16 @@ def _dropped(sender: Sender, *keys: str) -> None:
         frame = sender.robot.frame()
         sender.seq += 1
         header = as_json(sender.header(frame))
-        verdict = sender.verdict(lambda key=key, header=header: bench.put(key, header, CRAWL))  # type: ignore[misc]
-        bench.expect(verdict != GOOD, f"a twist under {key} was judged good")
+        result = sender.result_of(lambda key=key, header=header: bench.put(key, header, CRAWL))  # type: ignore[misc]
+        bench.expect(result != GOOD, f"a twist under {key} was accepted")
 
 
 def _oversize(sender: Sender, extra: bytes, text: bytes) -> None:
     bench, frame = sender.bench, sender.robot.frame()
     sender.seq += 1
     header = b"{" + extra + as_json(sender.header(frame))[1:]
-    verdict = sender.verdict(lambda: bench.put(key_for(bench.robot, TWIST, sender.source), header, text))
-    bench.expect(GOOD not in verdict, "it was judged good")
+    result = sender.result_of(lambda: bench.put(key_for(bench.robot, TWIST, sender.source), header, text))
+    bench.expect(GOOD not in result, "it was accepted")
     sender.expect(GOOD, what="after it an ordinary twist")
 
 
@@ -135,12 +135,12 @@ def _survives(sender: Sender, *messages: tuple[bytes, bytes]) -> None:
             bench.publish(channel, header, payload, sender.source)
             bench.rest(30_000)
     mark = bench.mark()
-    bench.expect_within(lambda: len(bench.heard(STATUS, mark)) >= 3, 1_500_000, "after it the robot is silent")
+    bench.expect_within(lambda: len(bench.received(STATUS, mark)) >= 3, 1_500_000, "after it the robot is silent")
     sender.expect(GOOD, what="after it an ordinary twist")
 
 
 SUITE.must_all(watcher, {
-    "R-HOST-01": ("5.1 Order", "A twist of a role that may not drive is refused as UNKNOWN_SOURCE.",
+    "R-HOST-01": ("5.1 Order", "A twist of a role that may not drive is rejected as UNKNOWN_SOURCE.",
                   lambda it: it.expect("UNKNOWN_SOURCE")),
 })
 SUITE.must_all(ready, {
@@ -148,16 +148,16 @@ SUITE.must_all(ready, {
                   lambda it: _dropped(it, "sightline/{robot}/twist/*", "sightline/**")),
     "R-HOST-03": ("1.3 Keys", "A twist for another robot, or under a key with more parts, is dropped.",
                   lambda it: _dropped(it, "sightline/other/twist/vision", "sightline/{robot}/twist/vision/more")),
-    "R-HOST-04": ("1.4 Sizes", "A twist of more than 64 bytes is not obeyed, though its number is one.",
+    "R-HOST-04": ("1.4 Sizes", "A twist of more than 64 bytes is not applied, though its number is one.",
                   lambda it: _oversize(it, b"", b"0.1" + b"0" * 80 + b"|0")),
-    "R-HOST-05": ("1.4 Sizes", "A header of more than 512 bytes is not obeyed, though all its fields are right.",
+    "R-HOST-05": ("1.4 Sizes", "A header of more than 512 bytes is not applied, though all its fields are right.",
                   lambda it: _oversize(it, b'"note":"' + b"x" * 600 + b'",', CRAWL)),
-    "R-HOST-06": ("13.2 Bounds", "Bytes that are no protocol at all end nothing.",
+    "R-HOST-06": ("13.2 Bounds", "Bytes that are not protocol at all end nothing.",
                   lambda it: _survives(it, (bytes(range(200, 256)), bytes(range(60))), (b"\0" * 40, b"\xff" * 60),
                                        (b"{", b"{"), (b'"', b"|"))),
     "R-HOST-07": ("13.2 Bounds", "A header nested as deep as its size allows ends nothing.",
                   lambda it: _survives(it, (b"[" * 512, b"1|1"), (b'{"a":' * 90 + b"1" + b"}" * 30, b"1|1"))),
-    "R-HOST-08": ("2.3 Text", "Text that is no Unicode ends nothing.",
+    "R-HOST-08": ("2.3 Text", "Text that is not Unicode ends nothing.",
                   lambda it: _survives(it, (b'{"v":1,"source":"\\ud800"}', b"1|1"),
                                        (b'{"session":"\\udfff\\u0000"}', b'{"verb":"\\ud800"}'))),
 })
@@ -165,14 +165,14 @@ SUITE.must_all(ready, {
 
 @SUITE.must("R-HOST-09", "13.2 Bounds", armed)
 def flood(bench: Bench, driver: Sender) -> None:
-    """A flood of 500 refused twists a second keeps neither status nor the driver back."""
+    """A flood of 500 rejected twists a second keeps neither status nor the driver back."""
     cited = driver.robot.frame()
     before, mark, sent = driver.robot.next_status(), bench.mark(), driver.seq
     hostile = Sender(driver.robot, acks=False)
     for number in range(750):
         bench.after(number * 2_000, lambda: hostile.twist(cited, b"9|9|9"))
     bench.rest(1_500_000)
-    came = len(bench.heard(STATUS, mark))
+    came = len(bench.received(STATUS, mark))
     bench.expect(came >= 8, f"{came} status in 1.5 s")
     accepted, wanted = driver.robot.next_status().accepted - before.accepted, driver.seq - sent
     bench.expect(accepted >= 0.7 * wanted, f"{accepted} of the driver's {wanted} twists were accepted")
@@ -183,7 +183,7 @@ def many_peers(bench: Bench, robot: Robot) -> None:
     """A hundred sessions that send twists leave the lease where it was."""
     driver, second = Sender(robot), Sender(robot)
     driver.need_good()
-    bench.need(second.judged() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
+    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
     driver.drive()
     for number in range(100):
         frame = robot.frame()
@@ -206,12 +206,12 @@ def _away(bench: Bench, for_us: int) -> None:
 
 @SUITE.must("R-RECO-01", "1.2 Messages", vision)
 def serves_again(bench: Bench, sender: Sender) -> None:
-    """Who connects again gets status and frames again."""
+    """A client that connects again gets status and frames again."""
     sender.robot.frame()
     _away(bench, 500_000)
     mark = bench.mark()
-    bench.expect_within(lambda: bench.heard(STATUS, mark), 5_000_000, "no status after a reconnect")
-    bench.expect_within(lambda: bench.heard(FRAME, mark), 5_000_000, "no frame after a reconnect")
+    bench.expect_within(lambda: bench.received(STATUS, mark), 5_000_000, "no status after a reconnect")
+    bench.expect_within(lambda: bench.received(FRAME, mark), 5_000_000, "no frame after a reconnect")
 
 
 @SUITE.must("R-RECO-02", "2.5 Session and sequence", vision)
@@ -221,8 +221,8 @@ def session_goes_on(bench: Bench, sender: Sender) -> None:
     before = sender.robot.stamp()
     _away(bench, 500_000)
     mark = bench.mark()
-    bench.need(bench.wait(lambda: bench.heard(STATUS, mark), 5_000_000), "no status again (R-RECO-01)")
-    after = bench.heard(STATUS, mark)[0].header(Stamp)
+    bench.need(bench.wait(lambda: bench.received(STATUS, mark), 5_000_000), "no status again (R-RECO-01)")
+    after = bench.received(STATUS, mark)[0].header(Stamp)
     bench.need(after, "a status that cannot be read (R-FRAM-09)")
     assert after is not None
     bench.expect(after.session == before.session, f"session {after.session}, before {before.session}")
@@ -235,7 +235,7 @@ def stays_still(bench: Bench, driver: Sender) -> None:
     driver.fall_silent()
     _away(bench, 1_500_000)
     mark = bench.mark()
-    bench.need(bench.wait(lambda: bench.heard(STATUS, mark), 5_000_000), "no status again (R-RECO-01)")
+    bench.need(bench.wait(lambda: bench.received(STATUS, mark), 5_000_000), "no status again (R-RECO-01)")
     moving = driver.robot.reaches(lambda status: status.applied != (0.0, 0.0), 700_000)
     bench.expect(not moving, f"it moves: {driver.robot.status().applied}, {driver.robot.status().state}")
 
@@ -244,7 +244,7 @@ def stays_still(bench: Bench, driver: Sender) -> None:
 def lease_is_not_the_connection(bench: Bench, sender: Sender) -> None:
     """The lease is not the connection: within its second it holds though the driver was cut off."""
     second = Sender(sender.robot)
-    bench.need(second.judged() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
+    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
     sender.twist(sender.robot.frame())
     sender.robot.next_status()
     _away(bench, 100_000)

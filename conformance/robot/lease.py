@@ -11,20 +11,20 @@ _LEASE_US: Final = 1_000_000
 
 
 def _held_alone(bench: Bench) -> tuple[Sender, Sender]:
-    """Who holds the lease, and a second driver whom it keeps out."""
+    """The source that holds the lease, and a second driver that is rejected."""
     first = ready(bench)
     second = Sender(first.robot)
-    bench.need(second.judged() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
+    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
     return first, second
 
 
 def _held_for_a_while(bench: Bench) -> Sender:
-    """Who holds the lease, at a robot where it ends by silence."""
+    """The source that holds the lease, at a robot where it ends by silence."""
     first = ready(bench)
     first.fall_silent()
     bench.rest(_LEASE_US * 3 // 2)
     second = Sender(first.robot)
-    bench.need(second.judged() == GOOD, "the lease does not end by silence (R-LEASE-04)")
+    bench.need(second.twist_result() == GOOD, "the lease does not end by silence (R-LEASE-04)")
     return second
 
 
@@ -35,17 +35,17 @@ def _holder_is(sender: Sender, within_us: int = 400_000) -> bool:
 
 @SUITE.must("R-LEASE-01", "6.1 Lease", ready)
 def first_holds(bench: Bench, sender: Sender) -> None:
-    """Who sends the first good twist holds the lease, and `status` says so."""
+    """The source of the first good twist holds the lease, and `status` names it as holder."""
     bench.expect(_holder_is(sender), f"holder is {sender.robot.status().holder}, not vision {sender.session}")
 
 
 @SUITE.should("R-LEASE-03", "5.1 Order", ready)
-def loser_is_told(bench: Bench, first: Sender) -> None:
-    """The words of the refusal name the source and session that drive."""
-    bench.need(Sender(first.robot).judged() == "NOT_HOLDER", "a second driver is not refused so (R-LEASE-02)")
+def rejected_driver_receives_holder(bench: Bench, first: Sender) -> None:
+    """The words of the rejection name the source and session that drive."""
+    bench.need(Sender(first.robot).twist_result() == "NOT_HOLDER", "a second driver is not rejected so (R-LEASE-02)")
     last = first.robot.status().last_refusal
-    told = last is not None and first.session in last.detail and first.source in last.detail
-    bench.expect(told, f"last_refusal is {last}")
+    reported = last is not None and first.session in last.detail and first.source in last.detail
+    bench.expect(reported, f"last_refusal is {last}")
 
 
 @SUITE.must("R-LEASE-04", "6.1 Lease", ready)
@@ -66,8 +66,8 @@ def lease_lasts(bench: Bench) -> None:
 
 
 @SUITE.must("R-LEASE-06", "6.1 Lease", _held_for_a_while)
-def refused_twists_renew_nothing(bench: Bench, first: Sender) -> None:
-    """Refused twists of the holder do not renew its lease."""
+def rejected_twists_renew_nothing(bench: Bench, first: Sender) -> None:
+    """Rejected twists of the holder do not renew its lease."""
     first.need_unknown()
     first.need_good()
     first.acks = False
@@ -75,7 +75,7 @@ def refused_twists_renew_nothing(bench: Bench, first: Sender) -> None:
         frame = first.robot.frame()
         first.twist(frame, echo_seq=frame.seq + 5000)
         bench.rest(200_000)
-    Sender(first.robot).expect(GOOD, what="after 1.4 s of refused twists a second driver")
+    Sender(first.robot).expect(GOOD, what="after 1.4 s of rejected twists a second driver")
 
 
 @SUITE.must("R-LEASE-07", "6.1 Lease", _held_for_a_while)
@@ -90,10 +90,10 @@ def acks_renew_nothing(bench: Bench, first: Sender) -> None:
 @SUITE.must("R-LEASE-08", "6.1 Lease", vision)
 def acks_take_nothing(bench: Bench, watcher: Sender) -> None:
     """Acks take no lease."""
-    bench.rest(1_700_000)  # whoever acknowledged before owns the credit for another second
+    bench.rest(1_700_000)  # the peer that acknowledged before owns the credit for another second
     bench.need(watcher.ack_seq > 2, "too few frames to acknowledge")
     holder = watcher.robot.next_status().holder
-    bench.expect(holder is None, f"{holder} holds it, though nobody sent a twist")
+    bench.expect(holder is None, f"{holder} holds it, though no source sent a twist")
 
 
 @SUITE.must("R-LEASE-10", "6.1 Lease")
@@ -130,21 +130,21 @@ def human_lets_go(bench: Bench) -> None:
 @SUITE.must("R-LEASE-13", "8.2 Requests and replies", vision)
 def acquire(bench: Bench, sender: Sender) -> None:
     """`acquire` takes the lease before the first twist."""
-    bench.expect(sender.granted("acquire"), "acquire was not granted, though nobody drove")
-    holds = _holder_is(sender) or Sender(sender.robot).judged() == "NOT_HOLDER"
-    bench.expect(holds, f"holder is {sender.robot.status().holder}, and a second driver is not refused")
+    bench.expect(sender.granted("acquire"), "acquire was not granted, though no source drove")
+    holds = _holder_is(sender) or Sender(sender.robot).twist_result() == "NOT_HOLDER"
+    bench.expect(holds, f"holder is {sender.robot.status().holder}, and a second driver is not rejected")
 
 
 @SUITE.must("R-LEASE-14", "8.2 Requests and replies", _held_for_a_while)
 def acquire_does_not_renew(bench: Bench, sender: Sender) -> None:
-    """Asking again does not keep the lease alive without twists."""
+    """Requesting again does not keep the lease alive without twists."""
     sender.acks = False
     bench.rest(_LEASE_US * 3 // 2)
     bench.need(sender.granted("acquire"), "acquire is not granted (R-LEASE-13)")
     began_us = bench.now_us
     while bench.now_us - began_us < 800_000:
         bench.rest(150_000)
-        sender.request("acquire")
+        sender.send_request("acquire")
     bench.rest(500_000)
     Sender(sender.robot).expect(GOOD, what="1.3 s after the first, 0.5 s after the last acquire another")
 
@@ -157,28 +157,28 @@ def release(bench: Bench, first: Sender) -> None:
 
 
 def _frees_nothing(second: Sender) -> None:
-    second.ask("release")
+    second.request("release")
     second.expect("NOT_HOLDER", what="after its release a twist of the second driver")
 
 
 SUITE.must_all(ready, {
-    "R-LEASE-02": ("6.1 Lease", "A second driver of the same rank is refused as NOT_HOLDER.",
+    "R-LEASE-02": ("6.1 Lease", "A second driver of the same rank is rejected as NOT_HOLDER.",
                    lambda it: Sender(it.robot).expect("NOT_HOLDER")),
     "R-LEASE-09": ("6.1 Lease", "`teleop` takes the lease from `vision`.",
                    lambda it: Sender(it.robot, "teleop").expect(GOOD, what="a twist of teleop")),
 })
 SUITE.must_all(lambda bench: _held_alone(bench)[1], {
-    "R-LEASE-16": ("8.2 Requests and replies", "`release` by somebody else frees nothing.", _frees_nothing),
-    "R-LEASE-17": ("8.2 Requests and replies", "`acquire` is refused while an equal or higher rank drives.",
-                   lambda it: it.expect_rejected("acquire", "", "a second vision")),
+    "R-LEASE-16": ("8.2 Requests and replies", "`release` by another source frees nothing.", _frees_nothing),
+    "R-LEASE-17": ("8.2 Requests and replies", "`acquire` is rejected while an equal or higher rank drives.",
+                   lambda it: it.expect_rejected("acquire", "", "a second vision service")),
 })
 SUITE.must_all(operator, {
-    "R-LEASE-18": ("8.2 Requests and replies", "`acquire` is refused to a role that may not drive.",
+    "R-LEASE-18": ("8.2 Requests and replies", "`acquire` is rejected to a role that may not drive.",
                    lambda it: it.expect_rejected("acquire", "", "a role that may not drive")),
 })
 SUITE.must_all(teleop, {
-    "R-LEASE-19": ("8.2 Requests and replies", "`release` of what the asker does not hold is granted all the same.",
-                   lambda it: it.bench.expect(it.reply("release").ok, "it was refused")),
-    "R-LEASE-20": ("8.3 Freshness", "`acquire` without `echo` is refused as MALFORMED.",
+    "R-LEASE-19": ("8.2 Requests and replies", "`release` of what the requester does not hold is granted all the same.",
+                   lambda it: it.bench.expect(it.reply("release").ok, "it was rejected")),
+    "R-LEASE-20": ("8.3 Freshness", "`acquire` without `echo` is rejected as MALFORMED.",
                    lambda it: it.expect_rejected("acquire", "MALFORMED", "a request without echo", cite=False)),
 })

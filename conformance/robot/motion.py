@@ -1,6 +1,6 @@
-"""Cases on what the wheels do: limits, ramps, silence and ageing sight, as seen in `applied`. Pure.
+"""Cases on what the wheels do: limits, ramps, silence and ageing frames, as seen in `applied`. Pure.
 
-How long a stop takes is the time between two arrivals at the kit, so that the link's delay is in both ends of it.
+The duration of a stop is the time between two arrivals at the kit, so that the link's delay is in both ends of it.
 """
 
 import math
@@ -23,8 +23,8 @@ _ZERO: Final = (0.0, 0.0)
 def _settled(robot: Robot) -> Planar:
     """What is applied once the ramps are over."""
     robot.bench.rest(1_200_000)
-    told = [robot.next_status(2).applied, *(header.applied for _, header in robot.frames()[-1:])]
-    return max(told, key=lambda pair: abs(pair[0]) + abs(pair[1]))
+    reported = [robot.next_status(2).applied, *(header.applied for _, header in robot.frames()[-1:])]
+    return max(reported, key=lambda pair: abs(pair[0]) + abs(pair[1]))
 
 
 def _driven(bench: Bench, text: bytes) -> tuple[Status, Planar]:
@@ -45,11 +45,11 @@ def reaches_the_command(bench: Bench) -> None:
 
 
 @SUITE.must("R-LIM-02", "9. Status")
-def limits_are_told(bench: Bench) -> None:
-    """`status` tells the robot's limits, both above zero."""
+def limits_are_reported(bench: Bench) -> None:
+    """`status` reports the robot's limits, both above zero."""
     status = Robot(bench).status()
-    told = (status.max_linear_mps, status.max_angular_rad_s)
-    bench.expect(min(told) > 0, f"max_linear_mps and max_angular_rad_s are {told}")
+    reported = (status.max_linear_mps, status.max_angular_rad_s)
+    bench.expect(min(reported) > 0, f"max_linear_mps and max_angular_rad_s are {reported}")
 
 
 def _limits(status: Status) -> Planar:
@@ -60,7 +60,7 @@ def _limits(status: Status) -> Planar:
 def linear_is_clamped(bench: Bench) -> None:
     """A linear speed beyond the limit is accepted and cut to the limit."""
     status, applied = _driven(bench, b"48.0000|0.0000")
-    bench.need(status.max_linear_mps > 0, "the robot tells no limit (R-LIM-02)")
+    bench.need(status.max_linear_mps > 0, "the robot reports no limit (R-LIM-02)")
     bench.expect(applied[0] <= status.max_linear_mps + _TOLERANCE, f"{applied[0]} m/s of {status.max_linear_mps}")
 
 
@@ -68,7 +68,7 @@ def linear_is_clamped(bench: Bench) -> None:
 def angular_is_clamped(bench: Bench) -> None:
     """A turn rate beyond the limit is accepted and cut to the limit."""
     status, applied = _driven(bench, b"0.0000|-48.0000")
-    bench.need(status.max_angular_rad_s > 0, "the robot tells no limit (R-LIM-02)")
+    bench.need(status.max_angular_rad_s > 0, "the robot reports no limit (R-LIM-02)")
     least = -status.max_angular_rad_s - _TOLERANCE
     bench.expect(applied[1] >= least, f"{applied[1]} rad/s of {status.max_angular_rad_s}")
 
@@ -86,13 +86,13 @@ def clamped_is_counted(bench: Bench, driver: Sender) -> None:
 
 @SUITE.should("R-LIM-06", "4.3 Limits", Robot)
 def the_curve_stays(bench: Bench, robot: Robot) -> None:
-    """Both axes are cut by one factor, so that the robot drives the curve it was told."""
-    told = robot.status()
-    bench.need(min(told.max_linear_mps, told.max_angular_rad_s) > 0, "the robot tells no limits (R-LIM-02)")
-    asked = 4 * told.max_linear_mps, told.max_angular_rad_s
-    _status, applied = _driven(bench, f"{asked[0]:.4f}|{asked[1]:.4f}".encode())
+    """Both axes are cut by one factor, so that the robot drives the curve it was commanded."""
+    reported = robot.status()
+    bench.need(min(reported.max_linear_mps, reported.max_angular_rad_s) > 0, "the robot reports no limits (R-LIM-02)")
+    requested = 4 * reported.max_linear_mps, reported.max_angular_rad_s
+    _status, applied = _driven(bench, f"{requested[0]:.4f}|{requested[1]:.4f}".encode())
     bench.need(applied[0] > 0, "it does not drive (R-LIM-01)")
-    wanted, seen = asked[1] / asked[0], applied[1] / applied[0]
+    wanted, seen = requested[1] / requested[0], applied[1] / applied[0]
     bench.expect(math.isclose(wanted, seen, rel_tol=0.1), f"curvature {seen:.2f} instead of {wanted:.2f} 1/m")
 
 
@@ -100,7 +100,7 @@ def the_curve_stays(bench: Bench, robot: Robot) -> None:
 def ramps_up(bench: Bench, robot: Robot) -> None:
     """Speed builds up in a ramp: the frames show values on the way to the limit."""
     goal = _limits(robot.status())[0]
-    bench.need(goal < math.inf, "the robot tells no limit (R-LIM-02)")
+    bench.need(goal < math.inf, "the robot reports no limit (R-LIM-02)")
     mark = bench.mark()
     armed(bench, text=f"{goal:.4f}|0".encode())
     bench.rest(1_000_000)
@@ -115,15 +115,15 @@ def ramps_up(bench: Bench, robot: Robot) -> None:
 
 def _reports(bench: Bench, since: int) -> list[tuple[int, Planar, State]]:
     """(time of arrival, applied, state) of each status since a mark."""
-    read = ((one.at_us, one.payload(Status)) for one in bench.heard(STATUS, since))
+    read = ((one.at_us, one.payload(Status)) for one in bench.received(STATUS, since))
     return [(at_us, status.applied, status.state) for at_us, status in read if status]
 
 
 def _zero_us(bench: Bench, since: int) -> int | None:
-    """When a status first says that the wheels are at zero, where they stay."""
-    told = [(at_us, applied) for at_us, applied, _ in _reports(bench, since)]
-    last_moving = max((number for number, one in enumerate(told) if one[1] != _ZERO), default=-1)
-    return told[last_moving + 1][0] if last_moving + 1 < len(told) else None
+    """When a status first reports that the wheels are at zero, where they stay."""
+    reported = [(at_us, applied) for at_us, applied, _ in _reports(bench, since)]
+    last_moving = max((number for number, one in enumerate(reported) if one[1] != _ZERO), default=-1)
+    return reported[last_moving + 1][0] if last_moving + 1 < len(reported) else None
 
 
 def _driving(bench: Bench) -> Sender:
@@ -163,8 +163,8 @@ def _expect_stop(bench: Bench, mark: int, what: str) -> None:
     bench.expect(zero_us is not None, f"{what}: the wheels still turn after 1.5 s")
     assert zero_us is not None
     took_us = zero_us - began_us
-    said = f"{what}: at zero {took_us / 1e3:.0f} ms after the first frame not answered"
-    bench.expect(took_us <= _STOPS_WITHIN_US + _RESOLUTION_US, said)
+    reported = f"{what}: at zero {took_us / 1e3:.0f} ms after the first frame not answered"
+    bench.expect(took_us <= _STOPS_WITHIN_US + _RESOLUTION_US, reported)
 
 
 @SUITE.must("R-SIL-01", "5.4 Silence", _driving)
@@ -174,23 +174,23 @@ def silence_stops(bench: Bench, driver: Sender) -> None:
 
 
 @SUITE.must("R-SIL-02", "5.4 Silence")
-def refused_twists_keep_nothing_alive(bench: Bench) -> None:
-    """Refused twists do not keep the wheels turning."""
+def rejected_twists_keep_nothing_alive(bench: Bench) -> None:
+    """Rejected twists do not keep the wheels turning."""
     Sender(Robot(bench)).need_unknown()
     driver = _stopping(bench)
     mark, cited = _silent(driver)
     for number in range(10):
         bench.after(number * 90_000, lambda: driver.twist(cited, echo_seq=cited.seq + 5000))
-    _expect_stop(bench, mark, "refused twists")
+    _expect_stop(bench, mark, "rejected twists")
 
 
 @SUITE.must("R-SIL-03", "5.4 Silence", _stopping)
 def others_keep_nothing_alive(bench: Bench, driver: Sender) -> None:
-    """Good twists of somebody who does not hold the lease do not keep the wheels turning."""
+    """Good twists of a source that does not hold the lease do not keep the wheels turning."""
     other = Sender(driver.robot, acks=False)
-    refused = driver.robot.status().refused.get("NOT_HOLDER", 0)
+    rejected = driver.robot.status().refused.get("NOT_HOLDER", 0)
     other.drive()
-    kept_out = driver.robot.counts("NOT_HOLDER", refused, 1_000_000)
+    kept_out = driver.robot.counts("NOT_HOLDER", rejected, 1_000_000)
     bench.need(kept_out, "a second driver is not kept out (R-LEASE-02)")
     mark, _cited = _silent(driver)
     for number in range(20):  # until before the lease of the first could end
@@ -200,8 +200,8 @@ def others_keep_nothing_alive(bench: Bench, driver: Sender) -> None:
 
 
 @SUITE.must("R-SIL-04", "5.3 Age", _stopping)
-def old_sight_stops(bench: Bench, driver: Sender) -> None:
-    """Twists that go on citing one old frame do not keep the wheels turning: age is judged at every tick."""
+def old_frame_stops(bench: Bench, driver: Sender) -> None:
+    """Twists that go on citing one old frame do not keep the wheels turning: age is validated at every tick."""
     mark, cited = _silent(driver)
     for number in range(38):
         bench.after(number * 10_000, lambda: driver.twist(cited, b"10.0000|0.0000"))
@@ -209,10 +209,10 @@ def old_sight_stops(bench: Bench, driver: Sender) -> None:
 
 
 @SUITE.must("R-SIL-05", "5.3 Age", armed)
-def ageing_sight_slows(bench: Bench, driver: Sender) -> None:
+def ageing_frame_slows(bench: Bench, driver: Sender) -> None:
     """On frames between 150 and 400 ms old the robot drives, DEGRADED, at a lower speed."""
     limit = _limits(driver.robot.status())[0]
-    bench.need(limit < math.inf, "the robot tells no limit (R-LIM-02)")
+    bench.need(limit < math.inf, "the robot reports no limit (R-LIM-02)")
     driver.drive(f"{limit:.4f}|0.0000".encode())
     bench.rest(1_000_000)
     full = driver.robot.next_status().applied[0]
@@ -229,8 +229,8 @@ def ageing_sight_slows(bench: Bench, driver: Sender) -> None:
 
 
 @SUITE.must("R-SIL-06", "5.4 Silence", armed)
-def hold_is_said(_bench: Bench, driver: Sender) -> None:
-    """HOLD is said within 300 ms of the last good twist, give or take a status."""
+def hold_is_reported(_bench: Bench, driver: Sender) -> None:
+    """HOLD is reported within 300 ms of the last good twist, give or take a status."""
     driver.fall_silent()
     driver.robot.expect_state(State.HOLD, within_us=600_000, what="600 ms after the last twist")
 

@@ -22,17 +22,17 @@ SUITE: Final = Suite("R")
 
 
 def _replies(bench: Bench, since: int) -> list[Reply]:
-    return [reply for one in bench.heard(REPLY, since) if (reply := one.payload(Reply)) is not None]
+    return [reply for one in bench.received(REPLY, since) if (reply := one.payload(Reply)) is not None]
 
 
 @SUITE.must("R-REQ-01", "8.1 Requests and replies", operator)
 def one_reply(bench: Bench, operator: Sender) -> None:
     """A request that can be read gets exactly one reply."""
     mark = bench.mark()
-    operator.request("disarm")
+    operator.send_request("disarm")
     bench.rest(700_000)
-    bench.expect(len(bench.heard(REPLY, mark)) == 1, f"{len(bench.heard(REPLY, mark))} replies")
-    bench.expect(len(_replies(bench, mark)) == 1, f"no Reply: {bench.heard(REPLY, mark)[0].message.payload!r}")
+    bench.expect(len(bench.received(REPLY, mark)) == 1, f"{len(bench.received(REPLY, mark))} replies")
+    bench.expect(len(_replies(bench, mark)) == 1, f"no Reply: {bench.received(REPLY, mark)[0].message.payload!r}")
 
 
 @SUITE.must("R-REQ-02", "8.1 Requests and replies", operator)
@@ -44,16 +44,16 @@ def reply_names_the_request(bench: Bench, operator: Sender) -> None:
 
 
 @SUITE.must("R-REQ-03", "8.1 Requests and replies", operator)
-def reply_names_the_asker(bench: Bench, first: Sender) -> None:
-    """`to` of a reply is the session of who asked."""
+def reply_names_the_requester(bench: Bench, first: Sender) -> None:
+    """`to` of a reply is the session of the requester."""
     for asker in (first, Sender(first.robot, bench.access.watcher)):
         reply = asker.reply("disarm")
-        bench.expect(reply.to == asker.session, f"to {reply.to}, asked by {asker.session}")
+        bench.expect(reply.to == asker.session, f"to {reply.to}, requested by {asker.session}")
 
 
 @SUITE.must("R-REQ-04", "8.2 Requests and replies", operator)
 def repeated_request(_bench: Bench, operator: Sender) -> None:
-    """The same request, asked again because its reply was lost, is answered again."""
+    """The same request, requested again because its reply was lost, is answered again."""
     for attempt in ("first", "second", "third"):
         operator.expect_granted("disarm", f"the {attempt} time", id=5, seq=5)
 
@@ -63,7 +63,7 @@ def unknown_verb(bench: Bench, operator: Sender) -> None:
     """A verb that the robot does not know is counted as MALFORMED, granted by no reply, and changes nothing."""
     mark = bench.mark()
     before = operator.robot.status()
-    operator.expect_result("MALFORMED", lambda: operator.request("fly"))
+    operator.expect_result("MALFORMED", lambda: operator.send_request("fly"))
     bench.expect(not any(reply.ok for reply in _replies(bench, mark)), "it was granted")
     bench.expect(operator.robot.status().state is before.state, f"then it is {operator.robot.status().state}")
 
@@ -73,16 +73,16 @@ def state_after(bench: Bench, operator: Sender) -> None:
     """`state` of a reply is the state after the request."""
     reply = operator.reply("stop")
     bench.need(reply.ok, "STOP is not granted (R-STOP-03)")
-    bench.expect(reply.state == State.STOPPED, f"after STOP the reply says {reply.state}")
+    bench.expect(reply.state == State.STOPPED, f"after STOP the reply reports {reply.state}")
 
 
 @SUITE.must("R-REQ-10", "8.1 Requests and replies", operator)
 def reason_in_words(bench: Bench, operator: Sender) -> None:
-    """A reply that refuses gives the reason in `detail`, and then words for a person."""
+    """A reply that rejects gives the reason in `detail`, and then an explanation."""
     reply = operator.reply("arm")
     bench.need(not reply.ok, "arm is granted without twists (R-ARM-01)")
-    told = reply.detail.startswith("NOT_ALLOWED: ") and len(reply.detail) > 15
-    bench.expect(told, f"detail is {reply.detail!r}, expected NOT_ALLOWED: and why")
+    reported = reply.detail.startswith("NOT_ALLOWED: ") and len(reply.detail) > 15
+    bench.expect(reported, f"detail is {reply.detail!r}, expected NOT_ALLOWED: and why")
 
 
 # --- status ----------------------------------------------------------------------------------------------------------
@@ -90,7 +90,7 @@ def reason_in_words(bench: Bench, operator: Sender) -> None:
 
 @SUITE.must("R-STAT-01", "9. Status", vision)
 def counts_each(bench: Bench, sender: Sender) -> None:
-    """Each refused twist is counted once under its reason."""
+    """Each rejected twist is counted once under its reason."""
     sender.need_unknown()
     before = sender.robot.next_status().refused.get("UNKNOWN_FRAME", 0)
     for _ in range(5):
@@ -103,12 +103,12 @@ def counts_each(bench: Bench, sender: Sender) -> None:
 
 @SUITE.must("R-STAT-02", "9. Status", ready)
 def last_refusal(bench: Bench, sender: Sender) -> None:
-    """`last_refusal` names source and reason of the newest refusal, in words."""
-    verdict = sender.judged(b"nan|0")
-    bench.need(verdict == "NOT_FINITE", "nan is not refused as NOT_FINITE (R-GRAM-04)")
+    """`last_refusal` names source and reason of the newest rejection, in words."""
+    result = sender.twist_result(b"nan|0")
+    bench.need(result == "NOT_FINITE", "nan is not rejected as NOT_FINITE (R-GRAM-04)")
     last = sender.robot.status().last_refusal
-    told = last is not None and (last.source, last.reason) == ("vision", "NOT_FINITE") and last.detail
-    bench.expect(told, f"last_refusal is {last}")
+    reported = last is not None and (last.source, last.reason) == ("vision", "NOT_FINITE") and last.detail
+    bench.expect(reported, f"last_refusal is {last}")
 
 
 @SUITE.must("R-STAT-03", "9. Status", armed)
@@ -128,7 +128,7 @@ def accepted_counts(bench: Bench, driver: Sender) -> None:
 
 @SUITE.must("R-STAT-04", "9. Status", Robot)
 def frame_age(bench: Bench, robot: Robot) -> None:
-    """`frame_age_us` is the age of the frame behind the command in force, absent where there is none."""
+    """`frame_age_us` is the age of the frame behind the command in force, absent without one."""
     bench.expect(robot.status().frame_age_us is None, f"without a command it is {robot.status().frame_age_us}")
     armed(bench)
     bench.rest(300_000)
@@ -144,7 +144,7 @@ def latency(bench: Bench, driver: Sender) -> None:
     latency_us = driver.robot.next_status(2).latency_us
     bench.expect(latency_us is not None, "it is absent while driving")
     assert latency_us is not None
-    bench.expect(55_000 <= latency_us <= 400_000, f"answers after 60 ms are said to take {latency_us / 1e3:.0f} ms")
+    bench.expect(55_000 <= latency_us <= 400_000, f"answers after 60 ms are reported to take {latency_us / 1e3:.0f} ms")
 
 
 @SUITE.must("R-STAT-06", "9. Status", Robot)
@@ -160,16 +160,16 @@ def sent_counts(bench: Bench, robot: Robot) -> None:
 
 @SUITE.must("R-STAT-07", "9. Status", Robot)
 def reason_of_the_state(bench: Bench, robot: Robot) -> None:
-    """`reason` says why the robot does not move, and changes with the state."""
+    """`reason` reports why the robot does not move, and changes with the state."""
     unarmed = robot.status().reason
-    Sender(robot, "operator").request("stop")
+    Sender(robot, "operator").send_request("stop")
     bench.need(robot.becomes(State.STOPPED), "it does not stop (R-STOP-03)")
     stopped = robot.status().reason
     bench.expect(unarmed and stopped and unarmed != stopped, f"{unarmed!r}, then {stopped!r}")
 
 
 @SUITE.must("R-STAT-08", "9. Status", Robot)
-def applied_is_told(bench: Bench, robot: Robot) -> None:
+def applied_is_reported(bench: Bench, robot: Robot) -> None:
     """`applied` in `status` is what is given to the wheels: above zero while driving, zero at rest."""
     bench.expect(robot.status().applied == (0.0, 0.0), f"at rest it is {robot.status().applied}")
     armed(bench)
@@ -184,12 +184,12 @@ def applied_is_told(bench: Bench, robot: Robot) -> None:
 @SUITE.must("R-STAT-09", "9. Status", ready)
 def holder_is_none(bench: Bench, first: Sender) -> None:
     """`holder` is absent once a driver has released the lease."""
-    first.ask("release")
+    first.request("release")
     second = Sender(first.robot)
-    bench.need(second.judged() == GOOD, "release frees nothing (R-LEASE-15)")
-    second.ask("release")
+    bench.need(second.twist_result() == GOOD, "release frees nothing (R-LEASE-15)")
+    second.request("release")
     free = first.robot.reaches(lambda status: status.holder is None, 400_000)
-    bench.expect(free, f"{first.robot.status().holder} is said to drive")
+    bench.expect(free, f"{first.robot.status().holder} is reported to drive")
 
 
 # Cases on requests that cannot be read or cite the wrong thing, and on counters that never fall. Pure.
@@ -200,12 +200,12 @@ def unreadable(bench: Bench, operator: Sender) -> None:
     """A request that cannot be read is counted as MALFORMED and gets no reply."""
     mark = bench.mark()
     header = as_json({"v": 1, "source": operator.source, "session": operator.session, "seq": 1})
-    verdict = operator.verdict(
+    result = operator.result_of(
         lambda: bench.publish(REQUEST, header, b'{"id":"one","verb":"disarm"}', operator.source)
     )
-    bench.expect(verdict == "MALFORMED", f"it was {verdict}")
+    bench.expect(result == "MALFORMED", f"it was {result}")
     bench.rest(300_000)
-    bench.expect(not bench.heard(REPLY, mark), "it was answered")
+    bench.expect(not bench.received(REPLY, mark), "it was answered")
 
 
 def _cites_unknown_status(operator: Sender) -> None:
@@ -231,16 +231,16 @@ def _is_malformed(sender: Sender, channel: Channel, header: bytes, payload: byte
 
 
 SUITE.must_all(operator, {
-    "R-REQ-08": ("8.1 Requests and replies", "A request without header is counted as MALFORMED and not obeyed, STOP "
-                 "included: the asker has no name.",
+    "R-REQ-08": ("8.1 Requests and replies", "A request without header is counted as MALFORMED and not applied, STOP "
+                 "included: the requester has no name.",
                  lambda it: _is_malformed(it, REQUEST, b"", b'{"id":1,"verb":"stop"}')),
     "R-REQ-09": ("2.1 JSON", "Unknown fields of a request are ignored.",
                  lambda it: it.expect_granted("disarm", "the reply", extra={"colour": "red"}, mood="calm")),
     "R-REQ-11": ("8.3 Freshness", "What lets a robot move again must cite this session of the robot, else "
                  "OTHER_SESSION.", _cites_other_session),
-    "R-REQ-13": ("8.3 Freshness", "`reset` that cites a `status` never issued is refused as UNKNOWN_FRAME.",
+    "R-REQ-13": ("8.3 Freshness", "`reset` that cites a `status` never issued is rejected as UNKNOWN_FRAME.",
                  _cites_unknown_status),
-    "R-REQ-14": ("8.3 Freshness", "`reset` that cites a frame in place of a `status` is refused as MALFORMED.",
+    "R-REQ-14": ("8.3 Freshness", "`reset` that cites a frame in place of a `status` is rejected as MALFORMED.",
                  _cites_frame),
 })
 SUITE.must_all(watcher, {
@@ -248,9 +248,9 @@ SUITE.must_all(watcher, {
                   lambda it: _is_malformed(it, ACK, b'{"v":1,"seq":"x"}', b"")),
 })
 SUITE.must_all(teleop, {
-    "R-REQ-06": ("8.4 Requests and replies", "A request whose header names another source than its key is refused as "
+    "R-REQ-06": ("8.4 Requests and replies", "A request whose header names another source than its key is rejected as "
                  "UNKNOWN_SOURCE.",
-                 lambda it: it.expect_result("UNKNOWN_SOURCE", lambda: it.request("disarm", source="operator"))),
+                 lambda it: it.expect_result("UNKNOWN_SOURCE", lambda: it.send_request("disarm", source="operator"))),
 })
 
 
@@ -260,7 +260,7 @@ def counters_never_fall(bench: Bench, operator: Sender) -> None:
     sender = Sender(operator.robot)
     sender.need_unknown()
     before = operator.robot.next_status().refused
-    operator.request("stop")
+    operator.send_request("stop")
     bench.need(operator.robot.becomes(State.STOPPED), "STOP does not stop this robot (R-STOP-01)")
     bench.need(operator.granted("reset"), "reset is not granted (R-STOP-06)")
     after = operator.robot.next_status(2).refused

@@ -1,6 +1,6 @@
 """Cases on single twists: header, grammar, what they cite, their order. Pure.
 
-A robot that is not armed judges every command all the same and counts a good one as DISARMED, so no wheel turns here.
+A robot that is not armed validates every command too and counts a good one as DISARMED, so no wheel turns here.
 """
 
 from collections.abc import Callable, Sequence
@@ -56,7 +56,7 @@ MUST, SHOULD = Level.MUST, Level.SHOULD
 HEADERS: Final[Sequence[Row]] = (
     ("R-HEAD-01", MUST, "2.1 JSON", "Unknown fields of a header are ignored.", GOOD,
      (_set(colour="red", nested={"a": [1, 2]}), _echo(note="x"))),
-    ("R-HEAD-02", MUST, "2.4 Version", "Another version is refused as UNSUPPORTED_VERSION.", "UNSUPPORTED_VERSION",
+    ("R-HEAD-02", MUST, "2.4 Version", "Another version is rejected as UNSUPPORTED_VERSION.", "UNSUPPORTED_VERSION",
      (_set(v=2), _set(v=0))),
     ("R-HEAD-03", MUST, "2.4 Version", "An absent version means 1.", GOOD, (_without("v"),)),
     ("R-HEAD-04", MUST, "2.8 Fields", "A header without `session` or `seq` is MALFORMED.", "MALFORMED",
@@ -74,7 +74,7 @@ HEADERS: Final[Sequence[Row]] = (
      (_again("session", '"ffffffff"'), _again("v", "9"))),
     ("R-HEAD-11", MUST, "2.1 JSON", "A byte order mark before the header is MALFORMED.", "MALFORMED",
      (_wrapped(b"\xef\xbb\xbf"),)),
-    ("R-HEAD-12", MUST, "2.1 JSON", "A header that is no JSON object is MALFORMED.", "MALFORMED",
+    ("R-HEAD-12", MUST, "2.1 JSON", "A header that is not JSON object is MALFORMED.", "MALFORMED",
      (_bytes(b"[1,2]"), _bytes(b'{"v":1,'), _bytes(b"null"), _wrapped(b"", b"}"))),
     ("R-HEAD-13", MUST, "2.8 Fields", "An absent `compute_us` means 0.", GOOD, (_without("compute_us"),)),
     ("R-HEAD-14", MUST, "2.2 Numbers", "NaN and Infinity in a header are MALFORMED.", "MALFORMED",
@@ -85,7 +85,7 @@ HEADERS: Final[Sequence[Row]] = (
      (_bytes(b""),)),
     ("R-HEAD-18", MUST, "2.2 Numbers", "The greatest integer that the bounds allow, 2^53 - 1, is taken.", GOOD,
      (_set(compute_us=MAX_INTEGER),)),
-    ("R-HEAD-19", MUST, "2.4 Version", "`v` is judged before all else: whatever is not 1 is UNSUPPORTED_VERSION.",
+    ("R-HEAD-19", MUST, "2.4 Version", "`v` is validated before all else: whatever is not 1 is UNSUPPORTED_VERSION.",
      "UNSUPPORTED_VERSION", (_set(v="1"), _set(v=True), _set(v=None), _set(v=1.0), _bytes(b'{"v":null,"seq":[]}'))),
     ("R-HEAD-20", MUST, "2.2 Numbers", "An integer written with a point or an exponent is MALFORMED: 7.0, 7e0.",
      "MALFORMED", (_set(compute_us=0.0), lambda fields: as_json({**fields, "compute_us": 7})[:-1] + b"e0}",
@@ -97,17 +97,17 @@ HEADERS: Final[Sequence[Row]] = (
 )  # fmt: skip
 
 CITED: Final[Sequence[Row]] = (
-    ("R-CAUS-02", MUST, "5.1 Order", "A twist that cites a `seq` never issued is refused as UNKNOWN_FRAME.",
+    ("R-CAUS-02", MUST, "5.1 Order", "A twist that cites a `seq` never issued is rejected as UNKNOWN_FRAME.",
      "UNKNOWN_FRAME", (_echo(seq=MAX_INTEGER), lambda fields: _echo(seq=fields["echo"]["seq"] + 1000)(fields))),
-    ("R-CAUS-03", MUST, "5.1 Order", "A twist that cites a frame with a `t_us` off by one is refused as UNKNOWN_FRAME.",
+    ("R-CAUS-03", MUST, "5.1 Order", "A twist that cites a frame with a `t_us` off by one is UNKNOWN_FRAME.",
      "UNKNOWN_FRAME", (lambda fields: _echo(t_us=fields["echo"]["t_us"] + 1)(fields),
                        lambda fields: _echo(t_us=fields["echo"]["t_us"] - 1)(fields))),
     ("R-CAUS-05", MUST, "5.1 Order",
      "A time from the future on a known `seq` is UNKNOWN_FRAME: the record before the age.", "UNKNOWN_FRAME",
      (lambda fields: _echo(t_us=fields["echo"]["t_us"] + 10_000_000)(fields),)),
-    ("R-CAUS-06", MUST, "5.1 Order", "A twist that cites another session of the robot is refused as OTHER_SESSION.",
+    ("R-CAUS-06", MUST, "5.1 Order", "A twist that cites another session of the robot is rejected as OTHER_SESSION.",
      "OTHER_SESSION", (_echo(session="fffffff0"),)),
-    ("R-CAUS-08", MUST, "4.5 Echo", "A twist that cites a `beat` is refused as UNKNOWN_FRAME where none is issued.",
+    ("R-CAUS-08", MUST, "4.5 Echo", "A twist that cites a `beat` is rejected as UNKNOWN_FRAME where none is issued.",
      "UNKNOWN_FRAME", (_echo(channel="beat"),)),
     ("R-CAUS-09", MUST, "2.7 Echo", "A twist that cites a channel the robot does not know is MALFORMED.", "MALFORMED",
      (_echo(channel="camera"), _echo(channel="")),),
@@ -128,8 +128,8 @@ def _row_case(row: Row) -> Case:
                 sent = making(sender.header(frame))
                 bench.publish(TWIST, sent, CRAWL, sender.source)
 
-            verdict = sender.verdict_on_next(send)
-            bench.expect(verdict == expected, f"{sent[:160]!r}: {verdict}, expected {expected}")
+            result = sender.result_on_next(send)
+            bench.expect(result == expected, f"{sent[:160]!r}: {result}, expected {expected}")
 
     return Case(number, level, clause, title, run)
 
@@ -146,7 +146,7 @@ TEXTS: Final[Sequence[tuple[str, str, str, Sequence[bytes]]]] = (
      (b"1_0|2", b"0x1|0", "\u0661|0".encode(), b"--1|0", b"1e|0")),
     ("R-GRAM-08", "An exponent of more than three digits is MALFORMED.", "MALFORMED", (b"1e0001|0",)),
     ("R-GRAM-09", "Another mark than the bar is MALFORMED.", "MALFORMED", (b"1,2", b"0.2-0.35", b"1/2", b"1||2")),
-    ("R-GRAM-10", "Bytes that are no text are MALFORMED.", "MALFORMED", (b"\xff\xfe\0\x80", bytes(range(128, 192)))),
+    ("R-GRAM-10", "Bytes that are not text are MALFORMED.", "MALFORMED", (b"\xff\xfe\0\x80", bytes(range(128, 192)))),
     ("R-GRAM-11", "A number too small for a double is zero.", GOOD, (b"1e-999|0", b"0|-1e-400")),
     ("R-GRAM-12", "`nan` in one of two fields is NOT_FINITE, whatever the other is.", "NOT_FINITE",
      (b"nan|x", b"x|-NaN")),
@@ -172,14 +172,14 @@ for _text in TEXTS:
 
 @SUITE.must("R-HEAD-17", "1.3 Keys", ready)
 def source_disagrees(bench: Bench, sender: Sender) -> None:
-    """A source in the header other than the key's is refused as UNKNOWN_SOURCE."""
+    """A source in the header other than the key's is rejected as UNKNOWN_SOURCE."""
 
     def send(frame: FrameHeader) -> None:
         sender.seq += 1
         bench.publish(TWIST, as_json(sender.header(frame)), CRAWL, "teleop")
 
-    verdict = sender.verdict_on_next(send)
-    bench.expect(verdict == "UNKNOWN_SOURCE", f"a header of vision under the key of teleop: {verdict}")
+    result = sender.result_on_next(send)
+    bench.expect(result == "UNKNOWN_SOURCE", f"a header of vision under the key of teleop: {result}")
 
 
 # --- what a twist cites, over time -----------------------------------------------------------------------------------
@@ -187,27 +187,27 @@ def source_disagrees(bench: Bench, sender: Sender) -> None:
 
 @SUITE.must("R-CAUS-04", "5.3 Age", ready)
 def stale_frame(bench: Bench, sender: Sender) -> None:
-    """A twist that cites a frame more than a second old is refused as STALE, or UNKNOWN_FRAME if that is forgotten."""
+    """A twist that cites a frame more than a second old is rejected as STALE, or UNKNOWN_FRAME if that is forgotten."""
     frame = sender.robot.frame()
     bench.rest(1_200_000)
-    verdict = sender.verdict(lambda: sender.twist(frame))
-    bench.expect(verdict in ("STALE", "UNKNOWN_FRAME"), f"it was {verdict}")
+    result = sender.result_of(lambda: sender.twist(frame))
+    bench.expect(result in ("STALE", "UNKNOWN_FRAME"), f"it was {result}")
 
 
 @SUITE.must("R-CAUS-07", "4.5 Echo", ready)
 def cites_a_status(bench: Bench, sender: Sender) -> None:
-    """A twist that cites a `status` is refused as UNKNOWN_FRAME."""
+    """A twist that cites a `status` is rejected as UNKNOWN_FRAME."""
     frame, stamp = sender.robot.frame(), sender.robot.stamp()
     assert stamp is not None
-    verdict = sender.verdict(
+    result = sender.result_of(
         lambda: sender.twist(frame, echo_channel="status", echo_seq=stamp.seq, echo_t_us=stamp.t_us)
     )
-    bench.expect(verdict == "UNKNOWN_FRAME", f"it was {verdict}")
+    bench.expect(result == "UNKNOWN_FRAME", f"it was {result}")
 
 
 @SUITE.must("R-CAUS-10", "5.1 Order", ready)
 def earlier_frame(bench: Bench, sender: Sender) -> None:
-    """A twist that answers the frame before the newest is judged good while that is young."""
+    """A twist that answers the frame before the newest is accepted while that is young."""
     earlier = sender.robot.frame()
     bench.wait(lambda: _newest_seq(sender.robot) > earlier.seq, 300_000)
     bench.need(_newest_seq(sender.robot) > earlier.seq, "no second frame within 300 ms")
@@ -215,14 +215,14 @@ def earlier_frame(bench: Bench, sender: Sender) -> None:
 
 
 def _newest_seq(robot: Robot) -> int:
-    heard = robot.frames()
-    return heard[-1][1].seq if heard else -1
+    received = robot.frames()
+    return received[-1][1].seq if received else -1
 
 
 @SUITE.must("R-CAUS-11", "5.1 Order", ready)
 def reasons_in_order(bench: Bench, sender: Sender) -> None:
-    """Of several faults the first in the order of judging is the reason: session before `seq`."""
-    foreign = sender.judged(echo_session="fffffff0")
+    """Of several faults the first in the order of validation is the reason: session before `seq`."""
+    foreign = sender.twist_result(echo_session="fffffff0")
     bench.need(foreign == "OTHER_SESSION", f"another session is {foreign} (R-CAUS-06)")
     sender.expect("OTHER_SESSION", echo_session="fffffff0", seq=0)
 
@@ -232,33 +232,33 @@ def reasons_in_order(bench: Bench, sender: Sender) -> None:
 
 @SUITE.must("R-SEQ-07", "5.1 Order", ready)
 def earlier_seq(bench: Bench, sender: Sender) -> None:
-    """A twist with a `seq` below the last is refused as OUT_OF_ORDER."""
+    """A twist with a `seq` below the last is rejected as OUT_OF_ORDER."""
     sender.seq = 50
-    bench.need(sender.judged() == GOOD, "an ordinary twist is not judged good")
+    bench.need(sender.twist_result() == GOOD, "an ordinary twist is not accepted")
     sender.expect("OUT_OF_ORDER", seq=20)
 
 
 @SUITE.must("R-SEQ-09", "5.1 Order", ready)
-def new_session_counts_anew(bench: Bench, first: Sender) -> None:
+def new_session_counts_again(bench: Bench, first: Sender) -> None:
     """Another session of the same role counts from its own beginning."""
     first.seq = 5000
-    bench.need(first.judged() == GOOD, "an ordinary twist is not judged good")
+    bench.need(first.twist_result() == GOOD, "an ordinary twist is not accepted")
     first.fall_silent()
     bench.rest(1_500_000)
-    verdict = Sender(first.robot).judged()
-    bench.need(verdict != "NOT_HOLDER", "the lease does not end by silence (R-LEASE-04)")
-    bench.expect(verdict == GOOD, f"it was {verdict}")
+    result = Sender(first.robot).twist_result()
+    bench.need(result != "NOT_HOLDER", "the lease does not end by silence (R-LEASE-04)")
+    bench.expect(result == GOOD, f"it was {result}")
 
 
 @SUITE.must("R-SEQ-10", "5.1 Order", ready)
-def refused_seq_bars_nobody(bench: Bench, sender: Sender) -> None:
-    """The `seq` of a twist refused for what it cites is not remembered: the next ordinary one is good."""
-    refused = sender.judged(echo_seq=MAX_INTEGER, seq=MAX_INTEGER)
-    bench.need(refused == "UNKNOWN_FRAME", f"an unknown frame is {refused} (R-CAUS-02)")
+def rejected_seq_bars_no_driver(bench: Bench, sender: Sender) -> None:
+    """The `seq` of a twist rejected for what it cites is not remembered: the next ordinary one is good."""
+    rejected = sender.twist_result(echo_seq=MAX_INTEGER, seq=MAX_INTEGER)
+    bench.need(rejected == "UNKNOWN_FRAME", f"an unknown frame is {rejected} (R-CAUS-02)")
     sender.expect(GOOD)
 
 
-# Cases on the order in which a twist is judged, and on how much a robot remembers for it. Pure.
+# Cases on the order in which a twist is validated, and on how much a robot remembers for it. Pure.
 
 
 _REMEMBERED_FRAMES: Final = 256
@@ -269,39 +269,40 @@ _OTHERS: Final = 60
 
 
 def _watcher(bench: Bench) -> Sender:
-    """Who may not drive, at a robot that says so."""
+    """A peer that may not drive, at a robot that rejects it as UNKNOWN_SOURCE."""
     watcher = Sender(Robot(bench), bench.access.watcher)
-    verdict = watcher.judged()
-    bench.need(verdict == "UNKNOWN_SOURCE", f"a watcher's twist is {verdict} (R-HOST-01)")
+    result = watcher.twist_result()
+    bench.need(result == "UNKNOWN_SOURCE", f"a watcher's twist is {result} (R-HOST-01)")
     return watcher
 
 
 def _good(status: Status) -> int:
-    """How many twists were judged good: obeyed, or kept from the wheels by nothing but the arming."""
+    """How many twists were accepted: applied, or kept from the wheels by nothing but the arming."""
     return status.accepted + status.refused.get("DISARMED", 0)
 
 
 SUITE.must_all(vision, {
-    "R-CAUS-01": ("5.2 Record", "A twist that answers the newest frame at once is judged good.",
+    "R-CAUS-01": ("5.2 Record", "A twist that answers the newest frame at once is accepted.",
                   lambda it: it.expect(GOOD)),
 })
 SUITE.must_all(ready, {
-    "R-SEQ-06": ("5.1 Order", "A twist with the `seq` of the one before is refused as OUT_OF_ORDER.",
+    "R-SEQ-06": ("5.1 Order", "A twist with the `seq` of the one before is rejected as OUT_OF_ORDER.",
                  lambda it: it.expect("OUT_OF_ORDER", seq=it.seq)),
     "R-SEQ-08": ("2.5 Session and sequence", "A `seq` that jumps forward is taken.",
                  lambda it: it.expect(GOOD, seq=it.seq + 1001)),
 })
 SUITE.must_all(_watcher, {
-    "R-CAUS-12": ("5.1 Order", "The grammar is judged before the role: nonsense of who may not drive is MALFORMED.",
+    "R-CAUS-12": ("5.1 Order", "The grammar is validated before the role: nonsense of a watcher is MALFORMED.",
                   lambda it: it.expect("MALFORMED", b"x")),
-    "R-CAUS-13": ("5.1 Order", "The role is judged before the session: who may not drive and cites another session is "
-                  "UNKNOWN_SOURCE.", lambda it: it.expect("UNKNOWN_SOURCE", echo_session="fffffff0")),
+    "R-CAUS-13": ("5.1 Order",
+                  "The role is validated before the session: a watcher that cites another session is UNKNOWN_SOURCE.",
+                  lambda it: it.expect("UNKNOWN_SOURCE", echo_session="fffffff0")),
 })
 
 
 @SUITE.must("R-CAUS-14", "5.1 Order", ready)
 def record_before_count(_bench: Bench, sender: Sender) -> None:
-    """The record is judged before the count: a replayed `seq` that cites an unknown frame is UNKNOWN_FRAME."""
+    """The record is validated before the count: a replayed `seq` that cites an unknown frame is UNKNOWN_FRAME."""
     sender.need_unknown()
     sender.need_good()
     sender.expect("UNKNOWN_FRAME", echo_seq=MAX_INTEGER, seq=sender.seq)
@@ -309,15 +310,15 @@ def record_before_count(_bench: Bench, sender: Sender) -> None:
 
 @SUITE.must("R-CAUS-15", "4.5 Echo", ready)
 def several_on_one_frame(bench: Bench, sender: Sender) -> None:
-    """Several twists may cite one frame, with rising `seq`: all are judged."""
+    """Several twists may cite one frame, with rising `seq`: all are validated."""
     before = _good(sender.robot.next_status())
     sender.acks = False
     frame = sender.robot.frame()
     for _ in range(3):
         sender.twist(frame)
         bench.rest(_APART_US)
-    judged = _good(sender.robot.next_status(2)) - before
-    bench.expect(judged == 3, f"of three twists on one frame {judged} were judged good")
+    accepted = _good(sender.robot.next_status(2)) - before
+    bench.expect(accepted == 3, f"of three twists on one frame {accepted} were accepted")
 
 
 @SUITE.must("R-CAUS-16", "5.1 Order", ready)
@@ -327,23 +328,23 @@ def remembers_frames(bench: Bench, sender: Sender) -> None:
     bench.rest(3_000_000)
     issued = sender.robot.frames()[-1][1].seq - frame.seq
     bench.need(issued < _REMEMBERED_FRAMES - 20, f"{issued} frames came meanwhile")
-    verdict = sender.verdict(lambda: sender.twist(frame))
-    bench.need(verdict in ("STALE", "UNKNOWN_FRAME"), f"it was {verdict} (R-CAUS-04)")
-    bench.expect(verdict == "STALE", f"it was {verdict}")
+    result = sender.result_of(lambda: sender.twist(frame))
+    bench.need(result in ("STALE", "UNKNOWN_FRAME"), f"it was {result} (R-CAUS-04)")
+    bench.expect(result == "STALE", f"it was {result}")
 
 
 @SUITE.must("R-SEQ-11", "5.1 Order", ready)
-def refused_for_the_lease_counts(bench: Bench, first: Sender) -> None:
-    """A `seq` is used up though the lease refuses its twist: one below it is OUT_OF_ORDER then."""
+def rejected_for_the_lease_counts(bench: Bench, first: Sender) -> None:
+    """A `seq` is used up though the lease rejects its twist: one below it is OUT_OF_ORDER then."""
     second = Sender(first.robot)
-    bench.need(second.judged(seq=5000) == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
+    bench.need(second.twist_result(seq=5000) == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
     second.expect("OUT_OF_ORDER", seq=100)
 
 
 @SUITE.must("R-SEQ-12", "5.1 Order", ready)
 def remembers_senders(bench: Bench, sender: Sender) -> None:
     """A robot remembers 64 senders: a replay is OUT_OF_ORDER after sixty others have sent."""
-    replayed = sender.judged(seq=sender.seq)
+    replayed = sender.twist_result(seq=sender.seq)
     bench.need(replayed == "OUT_OF_ORDER", f"a replay is {replayed} (R-SEQ-06)")
     sender.need_good()
     for number in range(_OTHERS):

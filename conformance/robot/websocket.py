@@ -42,7 +42,7 @@ def hello(bench: Bench, *wants: str, **changes: Any) -> bytes:
 
 @contextmanager
 def spoken(bench: Bench, *wants: str, **changes: Any) -> Iterator[RawWebSocket]:
-    """A connection on which both have said hello."""
+    """A connection on which both have sent hello."""
     with RawWebSocket(endpoint_of(bench), offered(bench, source=changes.get("role", ""))) as raw:
         bench.need(raw.status == SWITCHED, f"the handshake fails with {raw.status} (R-SOCK-01)")
         raw.send(TEXT, hello(bench, *wants, **changes))
@@ -52,7 +52,7 @@ def spoken(bench: Bench, *wants: str, **changes: Any) -> Iterator[RawWebSocket]:
 
 
 def offered(bench: Bench, *others: str, source: str = "") -> tuple[str, ...]:
-    """The sub-protocol entries of a client that may come in, as a watcher unless it says more, after `others`."""
+    """The sub-protocol entries of a client that may come in, as a watcher unless it names another, after `others`."""
     token = bench.access.token_of(source or bench.access.watcher)
     return (*others, SUBPROTOCOL, *([entry_of(token)] if token else ()))
 
@@ -63,7 +63,7 @@ def entry_of(token: str) -> str:
 
 
 def put_over_websocket(bench: Bench, key: str, header: bytes, payload: bytes) -> None:
-    """Send a message past every bound of a well-behaved end. Raises NotApplicableError for keys that cannot be said."""
+    """Send a message past every bound of a well-behaved end. Raises NotApplicableError for keys that cannot be sent."""
     parts = key.split("/")
     if "*" in key or len(parts) != 4 or parts[1] != bench.robot:
         raise NotApplicableError("over WebSocket nothing is sent under a key")
@@ -199,11 +199,11 @@ _NO_HELLO: Final[dict[str, tuple[str, tuple[int, ...], Callable[[RawWebSocket, B
                   lambda raw, bench: raw.send(TEXT, hello(bench, robot="other"))),
     "R-SOCK-09": ("A first message that is not text ends with 1003 and the reason.", (1003,),
                   lambda raw, bench: raw.send(BINARY, disarm_request(bench))),
-    "R-SOCK-10": ("A text that is no hello ends with 1008 and the reason.", (1008,),
+    "R-SOCK-10": ("A text that is not a hello ends with 1008 and the reason.", (1008,),
                   lambda raw, _bench: raw.send(TEXT, b'{"let": "me in"}')),
     "R-SOCK-11": ("A hello of another version ends with 1008 and the reason.", (1008,),
                   lambda raw, bench: raw.send(TEXT, hello(bench, v=2))),
-    "R-SOCK-12": ("Who says no hello within two seconds is dropped with 1008 and the reason.", (1008,),
+    "R-SOCK-12": ("A client that sends no hello within two seconds is dropped with 1008 and the reason.", (1008,),
                   lambda _raw, _bench: None),
 }
 SUITE.must_all(itself, {
@@ -318,7 +318,7 @@ def large_message(bench: Bench) -> None:
 
 @SUITE.must("R-SOCK-28", "14.9 Ends", real=True)
 def bad_messages_end_nothing(bench: Bench) -> None:
-    """A message of an unknown channel or source, or whose header is no JSON, is dropped; the connection stays."""
+    """A message of an unknown channel or source, or whose header is not JSON, is dropped; the connection stays."""
     with spoken(bench, "reply") as raw:
         bad = b'{"channel":"perfume"}', b'{"channel":"twist","source":"../x"}', b'{"channel":"twist","v":1,,}'
         for fields in bad:
@@ -336,7 +336,7 @@ def pings_every_second(bench: Bench) -> None:
 
 
 @SUITE.must("R-SOCK-30", "14.8 Liveness", real=True)
-def the_deaf_are_dropped(bench: Bench) -> None:
+def unanswered_pings_end(bench: Bench) -> None:
     """A peer that leaves pings unanswered is dropped within about two seconds."""
     with RawWebSocket(endpoint_of(bench), offered(bench), answers_pings=False) as raw:
         raw.send(TEXT, hello(bench))
@@ -348,7 +348,7 @@ def the_deaf_are_dropped(bench: Bench) -> None:
 
 @SUITE.must("R-SOCK-31", "13.2 Bounds", real=True)
 def abrupt_ends(bench: Bench) -> None:
-    """Connections that break off anywhere disturb nobody else."""
+    """Connections that break off anywhere disturb no other client."""
     endpoint_of(bench)
     for opening in (b"", b"GET / HTTP/1.1\r\nHost: x", b"\x16\x03\x01\x02\0\x01\0" * 9):
         with RawWebSocket(bench.endpoint, offered(bench)) as raw:
@@ -357,13 +357,13 @@ def abrupt_ends(bench: Bench) -> None:
         raw.send(BINARY, disarm_request(bench)[:9], fin=False)
     mark = bench.mark()
     bench.rest(1_000_000)
-    came = len(bench.heard(STATUS, mark))
+    came = len(bench.received(STATUS, mark))
     bench.expect(came >= 7, f"{came} status within a second after it")
 
 
 @SUITE.should("R-SOCK-32", "14.4 Limits", real=True)
 def sixteen_clients(bench: Bench) -> None:
-    """After sixteen clients the next is refused with 503, and those before are served."""
+    """After sixteen clients the next is rejected with 503, and those before are served."""
     with ExitStack() as ending:
         statuses, opened = [], list[RawWebSocket]()
         for _ in range(17):
@@ -377,11 +377,11 @@ def sixteen_clients(bench: Bench) -> None:
                 break
         bench.expect(statuses[-1] == 503, f"seventeen more clients: {statuses}")
         mark = bench.mark()
-        bench.expect_within(lambda: len(bench.heard(STATUS, mark)) > 3, 1_500_000, "then nobody else is served")
+        bench.expect_within(lambda: len(bench.received(STATUS, mark)) > 3, 1_500_000, "then no other client is served")
 
 
 @SUITE.must("R-SOCK-33", "14.6 Messages", real=True)
-def says_hello_to_many_roles(bench: Bench) -> None:
+def role_is_the_source(bench: Bench) -> None:
     """The `role` of the hello is the source of messages that name none."""
     operator = Sender(Robot(bench), "operator", acks=False)
     with spoken(bench, "reply", role="operator") as raw:
@@ -390,14 +390,14 @@ def says_hello_to_many_roles(bench: Bench) -> None:
         def send() -> None:
             raw.send(BINARY, block(as_json(fields), b'{"id":1,"verb":"disarm"}'))
 
-        verdict = operator.verdict(send)
+        result = operator.result_of(send)
         last = operator.robot.status().last_refusal
-        told = verdict == "MALFORMED" and last is not None and last.source == "operator"
-        bench.expect(told, f"a header without source is {verdict} as {last}")
-        bench.expect(not bench.heard(REPLY)[1:], "it was answered")
+        reported = result == "MALFORMED" and last is not None and last.source == "operator"
+        bench.expect(reported, f"a header without source is {result} as {last}")
+        bench.expect(not bench.received(REPLY)[1:], "it was answered")
 
 
-# Cases on what `sightline.v1` says of blocks, hellos, late handshakes and detections. Shell (raw sockets).
+# Cases on what `sightline.v1` reports of blocks, hellos, late handshakes and detections. Shell (raw sockets).
 
 
 _HANDSHAKE_S: Final = 4.0
@@ -407,9 +407,9 @@ _HANDSHAKE_S: Final = 4.0
 def _reason_given(bench: Bench, send: Callable[[], None]) -> tuple[str, str]:
     """What became of what `send` sends, and whom the robot took for its sender."""
     watcher = Sender(Robot(bench), bench.access.watcher, acks=False)
-    verdict = watcher.verdict(send)
+    result = watcher.result_of(send)
     last = watcher.robot.status().last_refusal
-    return verdict, last.source if last else ""
+    return result, last.source if last else ""
 
 
 @SUITE.must("R-SOCK-41", "12.3 Passing on", real=True)
@@ -426,32 +426,32 @@ def passes_missions_on(bench: Bench) -> None:
 
 
 def _passed_on(bench: Bench, channel: str, role: str, payload: bytes) -> None:
-    """Fail the case unless what `role` says on `channel` comes to another, once and as it was, and not back."""
+    """Fail the case unless what `role` reports on `channel` comes to another, once and as it was, and not back."""
     fields: dict[str, Any] = {"v": 1, "source": role, "session": SESSION, "seq": 7, "note": "as it came"}
     with spoken(bench, channel) as other, spoken(bench, channel, role=role) as speaker:
         speaker.send(BINARY, block(b'{"channel":"%b",' % channel.encode() + as_json(fields)[1:], payload))
-        heard = _said_on(channel, other, bench, 1.0)
-        bench.expect(len(heard) == 1, f"another peer that wants `{channel}` gets {len(heard)} of one that was said")
-        bench.expect(heard[0].payload == payload, f"the payload came as {heard[0].payload[:80]!r}")
-        bench.expect(heard[0].header == as_json(fields), f"the header came as {heard[0].header[:120]!r}")
-        bench.expect(not _said_on(channel, speaker, bench, 0.3), f"who said `{channel}` gets it back")
+        received = _packets_on(channel, other, bench, 1.0)
+        bench.expect(len(received) == 1, f"another peer that wants `{channel}` gets {len(received)} of one sent")
+        bench.expect(received[0].payload == payload, f"the payload came as {received[0].payload[:80]!r}")
+        bench.expect(received[0].header == as_json(fields), f"the header came as {received[0].header[:120]!r}")
+        bench.expect(not _packets_on(channel, speaker, bench, 0.3), f"the client that sent `{channel}` gets it back")
 
 
-def _said_on(channel: str, raw: RawWebSocket, bench: Bench, for_s: float) -> list[IncomingMessage]:
+def _packets_on(channel: str, raw: RawWebSocket, bench: Bench, for_s: float) -> list[IncomingMessage]:
     return [one for one in packets_of(raw, bench, for_s) if f"/{channel}/" in one.key]
 
 
 @SUITE.must("R-SOCK-42", "14.4 Limits", real=True)
 def late_handshake(bench: Bench) -> None:
-    """Who connects and asks for nothing is dropped after two seconds."""
+    """A client that connects and requests nothing is dropped after two seconds."""
     _tls, address, port = split_url(endpoint_of(bench))
     with socket.create_connection((address, port), _HANDSHAKE_S) as near:
         began_s = time.monotonic()
         near.settimeout(_HANDSHAKE_S)
         try:
-            said = near.recv(4096)
-            while said:
-                said = near.recv(4096)
+            reported = near.recv(4096)
+            while reported:
+                reported = near.recv(4096)
         except TimeoutError:
             bench.expect(False, f"after {_HANDSHAKE_S:g} s without a word it is still connected")
         except ConnectionError:
@@ -476,59 +476,59 @@ def hello_again_with_another_role(bench: Bench) -> None:
         raw.send(TEXT, hello(bench, "reply", role="operator"))
         packets_of(raw, bench, 0.3)
         fields = {"channel": "request", "v": 1, "session": SESSION, "seq": 1}
-        told = _reason_given(bench, lambda: raw.send(BINARY, block(as_json(fields), b'{"id":1,"verb":"disarm"}')))
-        bench.need(told[0] == "MALFORMED", f"a header without source is {told[0]} (R-SOCK-33)")
-        bench.expect(told[1] == "operator", f"after a hello as operator it is taken for {told[1]}'s")
+        reported = _reason_given(bench, lambda: raw.send(BINARY, block(as_json(fields), b'{"id":1,"verb":"disarm"}')))
+        bench.need(reported[0] == "MALFORMED", f"a header without source is {reported[0]} (R-SOCK-33)")
+        bench.expect(reported[1] == "operator", f"after a hello as operator it is taken for {reported[1]}'s")
 
 
 @SUITE.must("R-SOCK-45", "14.6 Messages", real=True)
 def block_without_header(bench: Bench) -> None:
     """A block of channel and source alone is a message without header: a guest's twist, or UNKNOWN_SOURCE."""
-    bench.need(not bench.access.is_guarded, "where keys are asked for no guest gets in")
+    bench.need(not bench.access.is_guarded, "where keys are demanded no guest gets in")
     with spoken(bench, role="guest") as raw:
-        verdict = _reason_given(
+        result = _reason_given(
             bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","source":"guest"}', b"0.1|0"))
         )[0]
-        bench.expect(verdict in (GOOD, "UNKNOWN_SOURCE"), f"it was {verdict}")
+        bench.expect(result in (GOOD, "UNKNOWN_SOURCE"), f"it was {result}")
 
 
 @SUITE.must("R-SOCK-46", "14.6 Messages", real=True)
 def header_that_is_no_json(bench: Bench) -> None:
-    """A block that begins with its channel is of it, whatever follows: what is no JSON is counted as MALFORMED."""
+    """A block that begins with its channel is of it, whatever follows: what is not JSON is counted as MALFORMED."""
     with spoken(bench, "reply", role="teleop") as raw:
-        verdict, _source = _reason_given(bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","v":1,,}', b"1|1")))
-        bench.expect(verdict == "MALFORMED", f"it was {verdict}")
+        result, _source = _reason_given(bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","v":1,,}', b"1|1")))
+        bench.expect(result == "MALFORMED", f"it was {result}")
         bench.expect(raw.end(0.3) is None, "the connection ended")
 
 
-# Cases on tokens: who may come in where a robot asks for one, and what a role may say then. Shell (raw sockets).
+# Cases on tokens: which client may connect to a robot that demands one, and what a role may send. Shell (raw sockets).
 
 
 _CLAUSE: Final = "14.3 Token"
 _WRONG_TOKENS: Final = "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"
-"""A token by its form, and nobody's."""
+"""A token by its form that no role has."""
 
 
 def _token(bench: Bench) -> str:
     endpoint_of(bench)
     token = bench.access.token_of(bench.access.watcher)
-    bench.need(token, "no token was named (--token, or --secure): a robot on loopback need not ask for one")
+    bench.need(token, "no token was named (--token, or --secure): a robot on loopback need not request one")
     return token
 
 
 @SUITE.must("R-SOCK-34", _CLAUSE, real=True)
 def no_token(bench: Bench) -> None:
-    """Who shows no token is refused with 401."""
+    """A client that shows no token is rejected with 401."""
     _token(bench)
     _answers(bench, 401, "no token", protocols=(SUBPROTOCOL,))
 
 
 @SUITE.must("R-SOCK-35", _CLAUSE, real=True)
 def wrong_token(bench: Bench) -> None:
-    """A token that is nobody's, or a part of the right one, is refused with 401."""
+    """A token of no role, or a part of the right one, is rejected with 401."""
     token = _token(bench)
     for what, wrong in (
-        ("nobody's token", _WRONG_TOKENS),
+        ("a token of no role", _WRONG_TOKENS),
         ("all but its last letter", token[:-1]),
         ("an empty one", ""),
     ):
@@ -537,7 +537,7 @@ def wrong_token(bench: Bench) -> None:
 
 @SUITE.must("R-SOCK-36", _CLAUSE, real=True)
 def two_tokens(bench: Bench) -> None:
-    """Two tokens, though one of them be right, are refused with 401."""
+    """Two tokens, though one of them be right, are rejected with 401."""
     token = _token(bench)
     _answers(bench, 401, "a second entry", protocols=(SUBPROTOCOL, entry_of(token), entry_of(_WRONG_TOKENS)))
     shown = (("Authorization", f"Bearer {_WRONG_TOKENS}"),)
@@ -574,13 +574,13 @@ def token_is_not_repeated(bench: Bench) -> None:
 
 @SUITE.must("R-SOCK-40", _CLAUSE, real=True)
 def roles_are_kept_apart(bench: Bench) -> None:
-    """What the token's role may not publish is dropped, and the connection stays: a vision asks for nothing."""
+    """What the token's role may not publish is dropped, and the connection stays: a vision service requests nothing."""
     _token(bench)
     bench.need(len(set(bench.access.tokens.values())) > 1, "one token stands for every role here")
     with RawWebSocket(endpoint_of(bench), offered(bench, source="vision")) as raw:
         raw.send(TEXT, hello(bench, "reply"))
         bench.need(raw.frame(SOON_S), "hello is not answered (R-SOCK-07)")
         raw.send(BINARY, disarm_request(bench))
-        bench.expect(not is_answered(raw, bench), "with the token of a vision an operator's request was carried out")
+        bench.expect(not is_answered(raw, bench), "with a vision service's token an operator's request was granted")
         raw.send(BINARY, block(b'{"channel":"ack","source":"vision"}'))
         bench.expect(raw.end(0.5) is None, "the connection ended")

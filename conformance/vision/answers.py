@@ -1,4 +1,4 @@
-"""Cases on a vision's answers: framing, headers, grammar, and where it steers. Pure."""
+"""Cases on a vision service's answers: framing, headers, grammar, and where it steers. Pure."""
 
 import json
 import math
@@ -24,7 +24,7 @@ _FOUR_DECIMALS: Final = re.compile(rb"[+-]?[0-9]+\.[0-9]{4}\|[+-]?[0-9]+\.[0-9]{
 
 
 def _sample(bench: Bench, junk: int = 0) -> list[Answer]:
-    """Answers to six views, of a target beside and ahead and of none, and to so many that are no pictures."""
+    """Answers to six views, of a target beside and ahead and of none, and to so many that are not pictures."""
     robot = RobotPlayed(bench)
     for name in ("left", "left", "centre", "centre", "right", "absent"):
         sent = robot.frame(name)
@@ -42,7 +42,7 @@ def _sample(bench: Bench, junk: int = 0) -> list[Answer]:
 def _every(bench: Bench, good: Callable[[dict[str, Any]], object], reason: str) -> None:
     """Every answer's header is as it must be."""
     for answer in _sample(bench):
-        bench.expect(good(answer.fields), f"{reason}: {answer.heard.message.header[:200]!r}")
+        bench.expect(good(answer.fields), f"{reason}: {answer.received.message.header[:200]!r}")
 
 
 def _integer(value: object, least: int = 0) -> bool:
@@ -74,7 +74,7 @@ def empty_ack(bench: Bench) -> None:
     _sample(bench)
     bench.need(bench.dropped_here[OVERSIZE] == before, "its twists are too large already")
     _sample(bench, junk=3)
-    bench.expect(bench.dropped_here[OVERSIZE] == before, "an answer to what is no picture was over its channel's size")
+    bench.expect(bench.dropped_here[OVERSIZE] == before, "an answer to what is not picture was over its channel's size")
 
 
 @SUITE.must("V-FRAM-04", "1.3 Keys")
@@ -83,23 +83,23 @@ def exact_keys(bench: Bench) -> None:
     before = bench.dropped_here[INEXACT_KEY]
     robot = RobotPlayed(bench)
     robot.film("left", 5, 100_000)
-    bench.expect(bench.dropped_here[INEXACT_KEY] == before, "something came under a key that is none")
+    bench.expect(bench.dropped_here[INEXACT_KEY] == before, "something came under an invalid key")
 
 
 @SUITE.must("V-FRAM-05", "1.3 Keys")
 def same_role(bench: Bench) -> None:
     """The role in an answer's header is the one in its key."""
     for answer in _sample(bench):
-        source, key = answer.fields.get("source"), answer.heard.message.source
+        source, key = answer.fields.get("source"), answer.received.message.source
         bench.need(isinstance(source, str), "its headers name no role")
-        bench.expect(source == key, f"the header says {source!r}, the key {key!r}")
+        bench.expect(source == key, f"the header reports {source!r}, the key {key!r}")
 
 
 @SUITE.must("V-FRAM-06", "1.1 Peers")
 def drives_as_vision(bench: Bench) -> None:
     """It drives as `vision`: teleop is a human's rank, and guests carry no header."""
     for answer in _sample(bench):
-        bench.expect(answer.heard.message.source == "vision", f"it came as {answer.heard.message.source!r}")
+        bench.expect(answer.received.message.source == "vision", f"it came as {answer.received.message.source!r}")
 
 
 # --- frames' headers, as a robot may write them ----------------------------------------------------------------------
@@ -158,7 +158,7 @@ def zeros(bench: Bench) -> None:
 def header_is_an_object(bench: Bench) -> None:
     """An answer's header is one JSON object in UTF-8, without a byte order mark."""
     for answer in _sample(bench):
-        header = answer.heard.message.header
+        header = answer.received.message.header
         bench.expect(answer.fields and header[:1] not in b"\xef\xfe\xff", f"no JSON object in UTF-8: {header[:80]!r}")
 
 
@@ -179,7 +179,7 @@ SUITE.must_all(itself, {
                                        "no 8 lower-case hex digits")),
     "V-HEAD-05": ("2.2 Numbers", "`seq` is an integer from 0 to 2^53 - 1.",
                   lambda bench: _every(bench, lambda it: not it or _integer(it.get("seq")),
-                                       "`seq` is no integer within bounds")),
+                                       "`seq` is not an integer within bounds")),
     "V-HEAD-06": ("2.8 Fields", "`source` is given.",
                   lambda bench: _every(bench, lambda it: not it or isinstance(it.get("source"), str), "no `source`")),
     "V-HEAD-07": ("2.7 Echo", "`echo` has all of its four fields.",
@@ -187,7 +187,7 @@ SUITE.must_all(itself, {
                                        "the echo is not complete")),
     "V-HEAD-08": ("2.2 Numbers", "`compute_us` is an integer from 0 on, or absent.",
                   lambda bench: _every(bench, lambda it: _integer(it.get("compute_us", 0)),
-                                       "`compute_us` is no integer within bounds")),
+                                       "`compute_us` is not an integer within bounds")),
 })
 
 
@@ -203,7 +203,7 @@ def compute_given(bench: Bench) -> None:
 def no_infinite_numbers(bench: Bench) -> None:
     """No NaN and no Infinity in a header: JSON has none."""
     for answer in _sample(bench):
-        header = answer.heard.message.header
+        header = answer.received.message.header
         bench.expect(b"NaN" not in header and b"Infinity" not in header, f"{header[:200]!r}")
 
 
@@ -256,21 +256,21 @@ def no_minus_zero(bench: Bench) -> None:
                      f"{twist.text!r}")
 
 
-# Cases about where a vision steers: towards its target, and nowhere without one. Pure.
+# Cases about where a vision service steers: towards its target, and nowhere without one. Pure.
 #
-# Nearly all are SHOULD: what a vision does with what it sees is its own; these are what a person expects of one that
-# follows a yellow ball, which is what ours do unless told otherwise.
+# Nearly all are SHOULD: what a vision service does with what it sees is its own; an operator expects this of one that
+# follows a yellow ball, as ours do unless configured otherwise.
 
 
 _SECOND: Final = 20
 _EVERY_US: Final = 50_000
 _AHEAD_RAD_S: Final = 0.2
-"""Less than this is no turn: a target straight ahead."""
+"""Less than this is not a turn: a target straight ahead."""
 _STILL_MPS: Final = 0.001
 
 
 def _last_twist(bench: Bench, robot: RobotPlayed, name: str, frames: int = _SECOND) -> Answer:
-    """What it says after so many pictures of one kind."""
+    """What it reports after so many pictures of one kind."""
     mark = bench.mark()
     robot.film(name, frames, _EVERY_US)
     twists = robot.twists(mark)
@@ -288,7 +288,7 @@ SUITE.must_all(met, {
                    partial(_turns, "left", lambda it: it > 0)),
     "V-STEER-02": ("4.4 Signs", "A target to the right is turned to: angular velocity below zero.",
                    partial(_turns, "right", lambda it: it < 0)),
-    "V-STEER-03": ("4.4 Signs", "A target straight ahead is no reason to turn.",
+    "V-STEER-03": ("4.4 Signs", "A target straight ahead is not a reason to turn.",
                    partial(_turns, "centre", lambda it: abs(it) < _AHEAD_RAD_S)),
 }, level=Level.SHOULD)
 
@@ -344,7 +344,7 @@ def _replayed(bench: Bench, every_us: int) -> list[bytes]:
 
 @SUITE.must("V-STEER-08", "2.5 Session and sequence", met)
 def new_start_new_memory(bench: Bench, robot: RobotPlayed) -> None:
-    """A robot that starts anew is not driven by what its last start saw."""
+    """A robot that starts again is not driven by what its last start saw."""
     robot.film("centre", _SECOND // 2, _EVERY_US)
     robot.stop()
     robot = RobotPlayed(bench)

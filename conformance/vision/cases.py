@@ -1,4 +1,4 @@
-"""All cases for visions in the order of the report, and the state in which each begins. Pure."""
+"""All cases for vision services in the order of the report, and the state in which each begins. Pure."""
 
 from typing import Final
 
@@ -7,7 +7,7 @@ from sightline.conformance.vision import answers, causality, flow, hostile, webs
 from sightline.conformance.vision.fixture import RobotPlayed
 
 _FIRST_US: Final = 20_000_000
-"""A vision may still be starting, or be started now."""
+"""A vision service may still be starting, or be started now."""
 _AGAIN_US: Final = 3_000_000
 """One that lost its robot in the last case tries again every second."""
 _EVERY_US: Final = 100_000
@@ -17,13 +17,13 @@ CASES: Final[tuple[Case, ...]] = tuple(case for part in _PARTS for case in part.
 
 
 def is_there(bench: Bench) -> bool:
-    """Whether a vision answers at all: it may have been started a moment ago, or be started now."""
+    """Whether a vision service answers at all: it may have been started a moment ago, or be started now."""
     prepare(bench)
     return bool(bench.mark() or bench.dropped_here.total())
 
 
 def prepare(bench: Bench) -> None:
-    """Wait until the vision hears the kit's robot: some answer, even one that this end turns away.
+    """Wait until the vision receives the kit's robot: some answer, even one that this end turns away.
 
     The robot names no camera: a case is about what happens then.
     """

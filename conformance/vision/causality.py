@@ -120,14 +120,14 @@ def compute_time_is_true(bench: Bench) -> None:
     """`compute_us` is at most the time from sending a frame to hearing its answer."""
     for sent, answer in _cited(bench):
         compute_us = answer.fields.get("compute_us", 0)
-        took_us = answer.heard.at_us - sent.at_us
+        took_us = answer.received.at_us - sent.at_us
         bench.expect(not isinstance(compute_us, int) or compute_us <= took_us,
-                     f"it says {compute_us} us, and its answer took {took_us} us in all")
+                     f"it reports {compute_us} us, and its answer took {took_us} us in all")
 
 
 @SUITE.must("V-CAUS-13", "2.5 Session and sequence", met)
 def gaps_are_fine(_bench: Bench, robot: RobotPlayed) -> None:
-    """`seq` may leap: frames that were never sent are missed by nobody."""
+    """`seq` may leap: frames that were never sent are not missed."""
     for leap in (100, 10_000, 1_000_000):
         fields = robot.next_fields()
         robot.answer_to(robot.frame(seq=fields["seq"] + leap * leap, t_us=fields["t_us"]))
@@ -135,7 +135,7 @@ def gaps_are_fine(_bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.must("V-CAUS-14", "2.6 Clock", met)
 def an_hour_is_fine(_bench: Bench, robot: RobotPlayed) -> None:
-    """The robot's clock may leap ahead by an hour: it is nobody else's."""
+    """The robot's clock may leap ahead by an hour: no other peer shares it."""
     for hours in (1, 2):
         fields = robot.next_fields()
         sent = robot.frame(seq=fields["seq"], t_us=fields["t_us"] + hours * 3_600_000_000)
@@ -147,8 +147,8 @@ def an_hour_is_fine(_bench: Bench, robot: RobotPlayed) -> None:
 
 def _rises(bench: Bench, answers: list[Answer], what: str) -> None:
     numbers = [one.fields.get("seq") for one in answers]
-    told = [number for number in numbers if isinstance(number, int)]
-    bench.expect(all(one < other for one, other in itertools.pairwise(told)), f"{what} came as {told}")
+    reported = [number for number in numbers if isinstance(number, int)]
+    bench.expect(all(one < other for one, other in itertools.pairwise(reported)), f"{what} came as {reported}")
 
 
 @SUITE.must("V-SEQ-01", "2.5 Session and sequence", met)
@@ -181,7 +181,7 @@ def acks_count_up(bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.must("V-SEQ-04", "2.5 Session and sequence")
 def own_session_outlives_the_robot(bench: Bench) -> None:
-    """Within a session of its own, its `seq` goes on when the robot starts anew."""
+    """Within a session of its own, its `seq` goes on when the robot starts again."""
     first = RobotPlayed(bench).met()
     before = first.twists()[-1]
     first.stop()
@@ -192,8 +192,8 @@ def own_session_outlives_the_robot(bench: Bench) -> None:
 
 
 @SUITE.must("V-SEQ-05", "2.5 Session and sequence")
-def robot_starts_anew(bench: Bench) -> None:
-    """A robot that starts anew, from a lower `seq` and an earlier time, is answered at once."""
+def robot_starts_again(bench: Bench) -> None:
+    """A robot that starts again, from a lower `seq` and an earlier time, is answered at once."""
     old = RobotPlayed(bench, first_seq=5_000).met()
     old.stop()
     new = RobotPlayed(bench, first_seq=3, first_t_us=1_000)

@@ -1,4 +1,4 @@
-"""The robot that the kit plays for a vision, and the vision's answers. Pure.
+"""The robot that the kit plays for a vision service, and the vision's answers. Pure.
 
     robot = RobotPlayed(bench).met()
     sent = robot.frame("left")
@@ -15,7 +15,7 @@ import zlib
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
-from sightline.conformance.case import Bench, Heard
+from sightline.conformance.case import Bench, Received
 from sightline.conformance.vision.images import CAMERA as LENS
 from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import ACK, CAMERA, FRAME, STATUS, TWIST, Channel
@@ -28,7 +28,7 @@ FRAME_US: Final = 33_333
 _CAMERA_US: Final = 500_000
 _STATUS_US: Final = 100_000
 _FIRST_T_US: Final = 7_000_000_123
-"""A robot's clock is no clock of the kit's: each start has its own."""
+"""A robot's clock is not a clock of the kit's: each start has its own."""
 _SEQ_APART: Final = 10_000
 _MEETING_FRAMES: Final = 30
 ARMED: Final = Status(state=State.ACTIVE, reason="driving")
@@ -47,15 +47,15 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A twist or an ack. `fields` is its header as JSON, empty if it is none."""
+    """A twist or an ack. `fields` is its header as JSON, empty if it is invalid."""
 
-    heard: Heard
+    received: Received
     fields: dict[str, Any]
 
     @property
     def is_twist(self) -> bool:
         """Whether it drives."""
-        return self.heard.message.channel is TWIST
+        return self.received.message.channel is TWIST
 
     @property
     def echo(self) -> dict[str, Any]:
@@ -66,7 +66,7 @@ class Answer:
     @property
     def text(self) -> bytes:
         """The payload."""
-        return self.heard.message.payload
+        return self.received.message.payload
 
     @property
     def speeds(self) -> tuple[float, float]:
@@ -82,17 +82,17 @@ class Answer:
         return self.echo.get("seq") == sent.seq or self.echo.get("t_us") == sent.t_us
 
     def words(self) -> str:
-        """For a person."""
-        return f"a {self.heard.message.channel.name} that cites {json.dumps(self.echo)[:160]}"
+        """Describe it for a report."""
+        return f"a {self.received.message.channel.name} that cites {json.dumps(self.echo)[:160]}"
 
 
-def read_answer(heard: Heard) -> Answer:
+def read_answer(received: Received) -> Answer:
     """`heard` with its header read as any JSON object."""
     try:
-        fields = json.loads(heard.message.header)
+        fields = json.loads(received.message.header)
     except (ValueError, RecursionError):
         fields = {}
-    return Answer(heard, fields if isinstance(fields, dict) else {})
+    return Answer(received, fields if isinstance(fields, dict) else {})
 
 
 def met(bench: Bench) -> "RobotPlayed":
@@ -123,7 +123,7 @@ class RobotPlayed:
         self._announce_camera()
         self._announce_status()
 
-    # --- what it says ------------------------------------------------------------------------------------------------
+    # --- what it sends ------------------------------------------------------------------------------------------------
 
     def stop(self) -> None:
         """Fall silent for good."""
@@ -139,8 +139,8 @@ class RobotPlayed:
         if camera is not None:
             self.bench.publish(CAMERA, self.stamp(), camera)
 
-    def say(self, channel: Channel, payload: bytes, header: bytes | None = None) -> None:
-        """Any bytes on a channel of the robot's, with a good header unless told otherwise."""
+    def publish(self, channel: Channel, payload: bytes, header: bytes | None = None) -> None:
+        """Any bytes on a channel of the robot's, with a good header unless configured otherwise."""
         self.bench.publish(channel, encode(self.stamp()) if header is None else header, payload)
 
     def frame(self, name: str = "centre", *, jpeg: bytes | None = None, header: bytes | None = None,
@@ -184,16 +184,16 @@ class RobotPlayed:
                 self.bench.publish(STATUS, self.stamp(), self.status)
             self.bench.after(_STATUS_US, self._announce_status)
 
-    # --- what it hears -----------------------------------------------------------------------------------------------
+    # --- what it receives ---------------------------------------------------------------------------------------------
 
     def answers(self, since: int | None = None) -> list[Answer]:
         """Twists and acks since this robot began, or since a mark, in the order of their arrival."""
         since = self._mark if since is None else since
-        heard = [*self.bench.heard(TWIST, since), *self.bench.heard(ACK, since)]
-        for one in heard:
+        received = [*self.bench.received(TWIST, since), *self.bench.received(ACK, since)]
+        for one in received:
             if one.number not in self._read:
                 self._read[one.number] = read_answer(one)
-        return [self._read[number] for number in sorted(one.number for one in heard)]
+        return [self._read[number] for number in sorted(one.number for one in received)]
 
     def twists(self, since: int | None = None) -> list[Answer]:
         """Only what drives."""
@@ -229,7 +229,7 @@ class RobotPlayed:
         return [one for one in self.answers_to(sent) if one.is_twist]
 
     def need_nothing_dropped(self) -> None:
-        """Leave the case if this end's link turned something away: another case says what."""
+        """Leave the case if this end's link turned something away: another case reports what."""
         dropped = self.bench.dropped_here
         self.bench.need(dropped.total() == self._dropped, f"answers came that break the rules of keys or sizes: "
                         f"{', '.join(sorted(dropped))}")

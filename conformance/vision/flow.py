@@ -21,7 +21,7 @@ _STEADY_ANSWERED: Final = 0.9
 
 
 SUITE.must_all(met, {
-    "V-FLOW-01": ("3.3 A refused picture", "What is no picture is acknowledged, so that its credit comes back.",
+    "V-FLOW-01": ("3.3 A refused picture", "An invalid image is acknowledged, so that its credit comes back.",
                   lambda it: it.bench.expect(it.answer_to(it.frame(jpeg=b"no picture at all")), "no answer")),
 }, level=Level.SHOULD)
 
@@ -103,7 +103,7 @@ def replaced_frames(bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.should("V-SIL-01", "7.1 Answers", met)
 def silent_without_frames(bench: Bench, robot: RobotPlayed) -> None:
-    """When frames cease, so do twists: nothing is said twice to keep a robot going."""
+    """When frames cease, so do twists: nothing is sent twice to keep a robot going."""
     robot.film("left", 10)
     bench.rest(_CATCH_UP_US)
     mark = bench.mark()
@@ -127,10 +127,10 @@ def silent_about_no_pictures(bench: Bench, robot: RobotPlayed) -> None:
     for _ in range(10):
         robot.frame(jpeg=b"\xff\xd8\xff\xd9")
         bench.rest(FRAME_US)
-    bench.expect(not robot.twists(mark), f"{len(robot.twists(mark))} twists answered what is no picture")
+    bench.expect(not robot.twists(mark), f"{len(robot.twists(mark))} twists answered what is not picture")
 
 
-# --- what the robot says of itself -----------------------------------------------------------------------------------
+# --- what the robot reports -------------------------------------------------------------------------------------------
 
 
 def _goes_on(status: Status | bytes, what: str, robot: RobotPlayed, *, twists: bool = True) -> None:
@@ -157,9 +157,9 @@ SUITE.must_all(met, {
     "V-STAT-02": ("7.1 Answers", "Frames of a stopped robot are answered: what people see through it needs credit.",
                   partial(_goes_on, Status(state=State.STOPPED, reason="stop was requested"), "while stopped",
                           twists=False)),
-    "V-STAT-03": ("7.1 Answers", "A robot that refuses every twist is answered on.",
-                  partial(_goes_on, _REJECTING, "while refused")),
-    "V-STAT-04": ("7.1 Answers", "While somebody else drives, frames are answered.",
+    "V-STAT-03": ("7.1 Answers", "A robot that rejects every twist is answered on.",
+                  partial(_goes_on, _REJECTING, "while rejected")),
+    "V-STAT-04": ("7.1 Answers", "While another source drives, frames are answered.",
                   partial(_goes_on, _OTHER_HOLDER, "while teleop drives", twists=False)),
     "V-STAT-05": ("11. Versions", "Unknown fields and unknown reasons in `status` change nothing.",
                   partial(_goes_on, _NEWER, "after a status with unknown fields")),
@@ -168,14 +168,14 @@ SUITE.must_all(met, {
 
 @SUITE.must("V-STAT-06", "1.2 Messages")
 def no_status(bench: Bench) -> None:
-    """A robot that says no `status` at all is answered."""
+    """A robot that reports no `status` at all is answered."""
     robot = RobotPlayed(bench, status=None).met()
     for sent in robot.film("left", 5, 100_000):
         bench.expect(robot.answers_to(sent), f"no answer to frame {sent.seq}")
 
 
 BROKEN_STATUS: Final = {
-    "V-STAT-11": ("A `status` that is no JSON ends nothing.", b"{state"),
+    "V-STAT-11": ("A `status` that is not JSON ends nothing.", b"{state"),
     "V-STAT-12": ("A `status` with an unknown state ends nothing.", packed({"state": "FLYING", "reason": "x"})),
     "V-STAT-13": ("Control characters and markup in `status` end nothing.",
                   packed({"state": "HOLD", "reason": "\x1b[2J\x00<script>alert(1)</script>\u202e"})),
@@ -191,20 +191,21 @@ SUITE.must_all(met, {
 
 
 @SUITE.should("V-REQ-01", "6.4 Arming")
-def asks_for_nothing(bench: Bench) -> None:
-    """It asks a disarmed or stopped robot for nothing: arming and reset are a person's."""
+def requests_nothing(bench: Bench) -> None:
+    """It requests nothing from a disarmed or stopped robot: arming and reset are an operator's."""
     for state in (State.DISARMED, State.STOPPED):
-        robot = RobotPlayed(bench, status=Status(state=state, reason="a person did this"))
+        robot = RobotPlayed(bench, status=Status(state=state, reason="an operator did this"))
         robot.film("left", 20, 100_000)
         robot.stop()
-    bench.expect(not bench.heard(REQUEST), f"it asked: {[one.message.payload for one in bench.heard(REQUEST)][:3]}")
+    requests = bench.received(REQUEST)
+    bench.expect(not requests, f"it requested: {[one.message.payload for one in requests][:3]}")
 
 
 # Cases about a robot that goes away and comes back. Pure.
 
 
 _BACK_US: Final = 5_000_000
-"""A second at most between two tries, two seconds until a silent peer is given up, and time to say hello."""
+"""A second at most between two tries, two seconds until a silent peer is given up, and time to send hello."""
 
 
 def _answered_again(bench: Bench, robot: RobotPlayed, what: str) -> None:
@@ -230,17 +231,17 @@ def connection_lost(bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.must("V-RECO-02", "2.5 Session and sequence")
 def robot_restarted(bench: Bench) -> None:
-    """When the robot is gone for a second and starts anew, it is answered within five seconds."""
+    """When the robot is gone for a second and starts again, it is answered within five seconds."""
     RobotPlayed(bench).met().stop()
     bench.leave()
     bench.rest(1_000_000)
     bench.join()
-    _answered_again(bench, RobotPlayed(bench, first_seq=0, first_t_us=500), "after the robot started anew")
+    _answered_again(bench, RobotPlayed(bench, first_seq=0, first_t_us=500), "after the robot started again")
 
 
 @SUITE.must("V-RECO-03", "14.8 Liveness", met)
 def connection_flaps(bench: Bench, robot: RobotPlayed) -> None:
-    """A connection lost three times in a row, in the middle of frames, is no reason to give up."""
+    """A connection lost three times in a row, in the middle of frames, is not a reason to give up."""
     for _ in range(3):
         robot.frame()
         bench.leave()
@@ -266,14 +267,14 @@ def counts_on(bench: Bench, robot: RobotPlayed) -> None:
     after = robot.twists(mark)[0]
     numbers = before.fields.get("seq"), after.fields.get("seq")
     same = before.fields.get("session") == after.fields.get("session")
-    told = isinstance(numbers[0], int) and isinstance(numbers[1], int)
-    bench.expect(not same or not told or numbers[0] < numbers[1],  # type: ignore[operator]
+    reported = isinstance(numbers[0], int) and isinstance(numbers[1], int)
+    bench.expect(not same or not reported or numbers[0] < numbers[1],  # type: ignore[operator]
                  f"`seq` was {numbers[0]} before and {numbers[1]} after, in one session")
 
 
 @SUITE.must("V-RECO-05", "1.5 Delivery", met)
 def nothing_kept_back(bench: Bench, robot: RobotPlayed) -> None:
-    """What it could not say while the robot was gone is not said later."""
+    """What it could not send while the robot was gone is not sent later."""
     sent = robot.film("left", 3, 0)
     bench.leave()
     bench.rest(1_000_000)

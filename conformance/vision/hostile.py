@@ -133,7 +133,7 @@ def absurd_odometry(_bench: Bench, robot: RobotPlayed) -> None:
 _LENS: Final[Fields] = LENS.model_dump(mode="json")
 _SMALL: Final[Fields] = HALF_CAMERA.model_dump(mode="json")
 CAMERAS: Final[dict[str, tuple[str, str, bytes, Fields]]] = {
-    "V-HOST-41": ("A camera model that is no JSON", _CAMERA, b"{width", {}),
+    "V-HOST-41": ("A camera model that is not JSON", _CAMERA, b"{width", {}),
     "V-HOST-42": ("A camera model without focal length", _CAMERA, packed(_SMALL | {"fx_px": 0}), {}),
     "V-HOST-43": ("A camera model 15 pixels wide", _CAMERA, packed(_SMALL | {"width_px": 15}), {}),
     "V-HOST-44": ("A camera model with nine terms of distortion", _CAMERA,
@@ -148,7 +148,7 @@ CAMERAS: Final[dict[str, tuple[str, str, bytes, Fields]]] = {
 
 def _not_believed(payload: bytes, header: Fields, title: str, robot: RobotPlayed) -> None:
     robot.camera = None  # the good one is not repeated
-    robot.say(CAMERA, payload, packed(robot.stamp().model_dump() | header))
+    robot.publish(CAMERA, payload, packed(robot.stamp().model_dump() | header))
     robot.film("centre", 4, 80_000)  # it may look at cameras between frames only
     robot.expect_driven(title[0].lower() + title[1:])
 
@@ -193,7 +193,7 @@ SUITE.must_all(met, {
 })
 
 
-# Cases about pictures: those that must be refused before a decoder sees them, and odd ones that are good. Pure.
+# Cases about pictures: those that must be rejected before a decoder sees them, and odd ones that are good. Pure.
 
 
 _CHECK: Final = "3.2 Bounds check"
@@ -206,7 +206,7 @@ def _cut(share: float) -> bytes:
     return whole[: int(len(whole) * share)]
 
 
-REFUSED: Final[dict[str, tuple[str, Callable[[], bytes]]]] = {
+REJECTED: Final[dict[str, tuple[str, Callable[[], bytes]]]] = {
     "V-LIM-01": ("A JPEG of 21 bytes that claims 65500 x 65500 pixels", lambda: claiming(65_500, 65_500)),
     "V-LIM-02": ("A JPEG that claims a row more than 1920 x 1080 pixels", lambda: claiming(1920, 1081)),
     "V-LIM-03": ("A JPEG without width", lambda: claiming(0, 240)),
@@ -241,7 +241,7 @@ def _image_drives_nothing(jpeg: Callable[[], bytes], title: str, robot: RobotPla
         robot.bench.expect(not robot.twists_to(sent), f"it drove by this: {title}")
 
 
-for _level, _table in ((Level.MUST, REFUSED), (Level.SHOULD, DOUBTED)):
+for _level, _table in ((Level.MUST, REJECTED), (Level.SHOULD, DOUBTED)):
     SUITE.must_all(met, {
         number: (_CHECK, f"{title} drives nothing.", partial(_image_drives_nothing, jpeg, title))
         for number, (title, jpeg) in _table.items()
@@ -249,12 +249,12 @@ for _level, _table in ((Level.MUST, REFUSED), (Level.SHOULD, DOUBTED)):
 
 
 @SUITE.must("V-LIM-31", "13.2 Bounds", met)
-def all_refused_and_well(bench: Bench, robot: RobotPlayed) -> None:
-    """After every picture that must be refused, plain frames are answered as before."""
-    for _, jpeg in (*REFUSED.values(), *DOUBTED.values()):
+def all_rejected_and_well(bench: Bench, robot: RobotPlayed) -> None:
+    """After every picture that must be rejected, plain frames are answered as before."""
+    for _, jpeg in (*REJECTED.values(), *DOUBTED.values()):
         robot.frame(jpeg=jpeg())
         bench.rest(20_000)
-    robot.expect_driven("pictures that are none")
+    robot.expect_driven("invalid images")
 
 
 @SUITE.must("V-LIM-32", "13.2 Bounds", met)

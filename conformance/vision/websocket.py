@@ -1,6 +1,6 @@
-"""Cases on a vision's WebSocket, with a server that can misbehave. Shell (sockets).
+"""Cases on a vision service's WebSocket, with a server that can misbehave. Shell (sockets).
 
-It knows just enough of RFC 6455 to accept one client at a time, and leaves everything else to who uses it.
+It knows just enough of RFC 6455 to accept one client at a time, and leaves everything else to the case.
 """
 
 import base64
@@ -28,7 +28,7 @@ from sightline.protocol.transports.security import server_tls_context
 from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL, pack, parse_hello
 
 SESSION_BEGINS: Final = "5ca1"
-"""So the tests' broken visions tell this server from the kit's own link."""
+"""So the tests' broken vision services report this server from the kit's own link."""
 _GUID: Final = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 _SEND_S: Final = 2.0
 
@@ -113,7 +113,7 @@ class AcceptedClient(RawConnection):
         self._socket.close()
 
 
-# Cases about a vision's WebSocket itself: opening, hello, liveness, ends; with a server that can misbehave. Shell.
+# Cases on a vision service's WebSocket itself: opening, hello, liveness, ends; with a server that can misbehave. Shell.
 
 
 SUITE = Suite("V")
@@ -128,7 +128,7 @@ _TOO_LARGE_BYTES: Final = 3_000_000
 
 def need_websocket(bench: Bench) -> None:
     there = bench.endpoint.startswith(("ws://", "wss://"))
-    bench.need(there, "only for a vision that connects to a WebSocket endpoint")
+    bench.need(there, "only for a vision service that connects to a WebSocket endpoint")
 
 
 @contextmanager
@@ -154,7 +154,7 @@ def client_of(bench: Bench, server: RawServer) -> AcceptedClient:
 
 
 def _hello(client: AcceptedClient) -> tuple[int, bytes]:
-    """Its first message; (0, b"") if there was none."""
+    """Its first message; (0, b"") without one."""
     frame = client.frame(_HELLO_S)
     return (frame.opcode, frame.data) if frame else (0, b"")
 
@@ -181,7 +181,7 @@ def _frame(client: AcceptedClient, seq: int) -> bytes:
 
 
 def met(bench: Bench, server: RawServer) -> AcceptedClient:
-    """A client that has said hello, was greeted, and knows the camera."""
+    """A client that has sent hello, was greeted, and knows the camera."""
     client = client_of(bench, server)
     _hello(client)
     _greet(client, bench.robot)
@@ -207,7 +207,7 @@ def offers_the_sub_protocol(bench: Bench) -> None:
 
 
 @SUITE.must("V-SOCK-02", "14.5 Hello", real=True)
-def says_hello_first(bench: Bench) -> None:
+def sends_hello_first(bench: Bench) -> None:
     """Its first message is a hello for this robot: JSON text of at most 1024 bytes, within two seconds."""
     with server_of(bench) as server:
         kind, text = _hello(client_of(bench, server))
@@ -229,7 +229,7 @@ def wants_frames(bench: Bench) -> None:
 
 
 @SUITE.must("V-SOCK-04", "14.5 Hello", real=True)
-def says_its_role(bench: Bench) -> None:
+def names_its_role(bench: Bench) -> None:
     """Its hello names the role that it drives as."""
     with server_of(bench) as server:
         role = _fields(_hello(client_of(bench, server))[1]).get("role")
@@ -238,7 +238,7 @@ def says_its_role(bench: Bench) -> None:
 
 @SUITE.must("V-SOCK-05", "14.5 Hello", real=True)
 def leaves_another_robot(bench: Bench) -> None:
-    """It ends the connection to who says hello as another robot, and drives nothing there."""
+    """It ends the connection to a robot that sends hello as another robot, and drives nothing there."""
     with server_of(bench) as server:
         client = client_of(bench, server)
         _hello(client)
@@ -325,12 +325,12 @@ def too_large(bench: Bench) -> None:
 
 @SUITE.must("V-SOCK-12", "14.9 Ends", real=True)
 def no_hello(bench: Bench) -> None:
-    """A first message that is no hello ends the connection."""
+    """A first message that is not a hello ends the connection."""
     with server_of(bench) as server:
         client = client_of(bench, server)
         _hello(client)
         client.send(BINARY, _frame(client, 1))
-        bench.expect(client.end(_END_S), "it stayed with a robot that said no hello")
+        bench.expect(client.end(_END_S), "it stayed with a robot that sent no hello")
 
 
 @SUITE.must("V-SOCK-13", "14.8 Liveness", real=True)
@@ -341,7 +341,7 @@ def comes_back_after_a_reset(bench: Bench) -> None:
         bench.expect(server.accept(BACK_S), f"it did not connect again within {BACK_S:g} s")
 
 
-# Cases about how a vision opens a WebSocket: its token, its names, and a robot that falls silent. Shell (sockets).
+# Cases on opening a WebSocket: the vision service's token, its names, and a robot that falls silent. Shell (sockets).
 
 
 _ENTRY: Final = "sightline.token."
@@ -384,17 +384,17 @@ def token_is_in_no_url(bench: Bench) -> None:
 def names_its_host(bench: Bench) -> None:
     """It names one Host, and no Origin but that Host."""
     with server_of(bench) as server:
-        said = client_of(bench, server).headers
-        hosts = [value.lower() for name, value in said if name == "host"]
+        reported = client_of(bench, server).headers
+        hosts = [value.lower() for name, value in reported if name == "host"]
         bench.expect(len(hosts) == 1, f"it names {len(hosts)} hosts")
-        origins = [value.lower() for name, value in said if name == "origin"]
+        origins = [value.lower() for name, value in reported if name == "origin"]
         own = {f"http://{hosts[0]}", f"https://{hosts[0]}"}
         bench.expect(set(origins) <= own, f"Origin {origins}, Host {hosts[0]}")
 
 
 @SUITE.must("V-SOCK-17", "14.8 Liveness", real=True)
 def leaves_the_silent(bench: Bench) -> None:
-    """A robot that says nothing and answers no ping is given up, and connected to again."""
+    """A robot that sends nothing and answers no ping is given up, and connected to again."""
     with server_of(bench) as server:
         client = met(bench, server)
         client.answers_pings = False

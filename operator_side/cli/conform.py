@@ -58,7 +58,7 @@ def _token_in(file: Path) -> str:
     try:
         return file.read_text("ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or "it is no text"
+        why = getattr(error, "strerror", None) or "it is not text"
         raise ConfigError(f"--token {file} cannot be read: {why}; name a file that holds a token, {_EXAMPLE}") from None
 
 
@@ -95,7 +95,7 @@ _COLOURS: Final = {Outcome.PASSED: "green", Outcome.FAILED: "red", Outcome.SKIPP
 
 @contextmanager
 def progress(total: int) -> Iterator[Callable[[Result], None]]:
-    """A bar over `total` cases with what has failed above it; a line per failure where stderr is no terminal."""
+    """A bar over `total` cases with what has failed above it; a line per failure where stderr is not a terminal."""
     console = Console(stderr=True)
     with Progress(
         TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), console=console, transient=True,
@@ -141,16 +141,16 @@ def _alike(results: Sequence[Result]) -> Iterator[list[Result]]:
 
 
 def _row_of_many(alike: Sequence[Result]) -> tuple[str, str, str, str]:
-    said = f"{len(alike)} cases, to {alike[-1].case.id}\n[dim]{escape(alike[0].reason)}[/dim]"
-    return f"  {alike[0].case.id}", "", f"[dim]{Outcome.SKIPPED.value}[/dim]", said
+    reported = f"{len(alike)} cases, to {alike[-1].case.id}\n[dim]{escape(alike[0].reason)}[/dim]"
+    return f"  {alike[0].case.id}", "", f"[dim]{Outcome.SKIPPED.value}[/dim]", reported
 
 
 def _row(one: Result) -> tuple[str, str, str, str]:
     weak = one.outcome is Outcome.FAILED and one.case.level is Level.SHOULD
     colour = "yellow" if weak else _COLOURS[one.outcome]
-    said = f"\n[dim]{escape(one.reason)}[/dim]" if one.reason else ""
+    reported = f"\n[dim]{escape(one.reason)}[/dim]" if one.reason else ""
     outcome = f"[{colour}]{one.outcome.value}[/{colour}]"
-    return f"  {one.case.id}", one.case.level.value, outcome, f"{escape(one.case.title)}{said}"
+    return f"  {one.case.id}", one.case.level.value, outcome, f"{escape(one.case.title)}{reported}"
 
 
 def listing(cases: Sequence[Case]) -> str:
@@ -185,7 +185,7 @@ Tokens = Annotated[
     ),
 ]  # fmt: skip
 OwnToken = Annotated[
-    list[str] | None, typer.Option("--token", metavar="FILE", help="File with the WebSocket token to ask for.")
+    list[str] | None, typer.Option("--token", metavar="FILE", help="File with the WebSocket token to request.")
 ]
 Junit = Annotated[Path | None, typer.Option("--junit", metavar="FILE", help="Write JUnit XML, for a CI.")]
 Save = Annotated[Path | None, typer.Option("--save", metavar="FILE", help="Write the JSON to a file too.")]
@@ -262,8 +262,8 @@ def robot(
     endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Where it listens: tcp/..., ws:// or wss://.")],
     *,
     robot: Robot = "r1",
-    older: Annotated[
-        str, typer.Option("--older", metavar="ENDPOINT", help="Its older dialect's port, ws-legacy://HOST:9091.")
+    legacy: Annotated[
+        str, typer.Option("--older", metavar="ENDPOINT", help="Its legacy protocol's port, ws-legacy://HOST:9091.")
     ] = "",
     secure: Secure = "",
     tokens: Tokens = None,
@@ -291,13 +291,13 @@ def robot(
         put = put_it if "://" in endpoint else ending.enter_context(RawZenoh(endpoint, access.folder)).put
         roles = _ROLES if access.is_guarded else _ROLES[:1]
         bench = LiveBench(
-            robot, open_it, FROM_ROBOT, put, roles=roles, endpoint=endpoint, older=older, access=access
+            robot, open_it, FROM_ROBOT, put, roles=roles, endpoint=endpoint, legacy=legacy, access=access
         )  # fmt: skip
         ending.enter_context(bench)
         if not side.is_there(bench):
-            raise LinkError(f"{endpoint} answers, but no robot {robot} says its status there; is that its id?")
-        tell = ending.enter_context(progress(len(cases)))
-        results = run_cases(cases, bench, side.prepare, tell, TRIES)
+            raise LinkError(f"{endpoint} answers, but no robot {robot} publishes its status there; check --robot")
+        show_result = ending.enter_context(progress(len(cases)))
+        results = run_cases(cases, bench, side.prepare, show_result, TRIES)
     return run.report(results, "robot", endpoint)
 
 
@@ -305,12 +305,14 @@ def vision(
     endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Where the kit listens, as a robot would.")],
     *,
     robot: Robot = "r1",
-    dial: Annotated[bool, typer.Option("--dial", help="Connect to a vision or router that listens there.")] = False,
+    dial: Annotated[
+        bool, typer.Option("--dial", help="Connect to a vision service or router that listens there.")
+    ] = False,
     secure: Secure = "",
     tokens: OwnToken = None,
     run: RunOptions,
 ) -> int:
-    """Test a vision: the kit plays its robot at ENDPOINT; start the vision against it, before or after."""
+    """Test a vision service: the kit plays its robot at ENDPOINT; start the service against it, before or after."""
     from sightline.conformance.benches import TO_ROBOT
     from sightline.conformance.raw_peers import RawZenoh
     from sightline.conformance.vision import cases as side
@@ -326,16 +328,16 @@ def vision(
             ends: dict[str, Any] = {"connect": [endpoint]} if dial else {"listen": [endpoint]}
             return open_link(robot, role=role, secure=access.folder, **ends)
 
-        stranger = ending.enter_context(RawZenoh(endpoint, access.folder, "robot"))
-        put = None if "://" in endpoint else stranger.put
+        third_party = ending.enter_context(RawZenoh(endpoint, access.folder, "robot"))
+        put = None if "://" in endpoint else third_party.put
         bench = ending.enter_context(
             LiveBench(robot, open_it, TO_ROBOT, put, roles=("robot",), endpoint=endpoint, access=access)
         )
         if not side.is_there(bench):
             raise LinkError(f"no vision answers robot {robot} at {endpoint}; start one, before or after this: "
                             f"sightline vision --connect {endpoint} --robot {robot}")
-        tell = ending.enter_context(progress(len(cases)))
-        results = run_cases(cases, bench, side.prepare, tell, TRIES)
+        show_result = ending.enter_context(progress(len(cases)))
+        results = run_cases(cases, bench, side.prepare, show_result, TRIES)
     return run.report(results, "vision", endpoint)
 
 
@@ -352,6 +354,6 @@ def codec(
         return 0
     if not command:
         raise ConfigError("no command: write it after two dashes, e.g. sightline conform codec -- node codec.js")
-    with progress(len(cases)) as tell:
-        results = side.run_codec(command, cases, tell)
+    with progress(len(cases)) as show_result:
+        results = side.run_codec(command, cases, show_result)
     return run.report(results, "codec", " ".join(command))

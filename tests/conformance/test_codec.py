@@ -82,9 +82,9 @@ def test_a_broken_codec_fails_its_family_and_no_other(name):
 
 
 @pytest.mark.parametrize(("name", "line"), [
-    ("dies", "it ended with 7 before it had answered; it said 'out of luck'"),
+    ("dies", "it ended with 7 before it had answered; it printed 'out of luck'"),
     ("hangs", "no answer within 1 s"),
-    ("babbles", r"this line is no JSON: 'Traceback: \x1b[31mno\x1b[0m idea'"),
+    ("babbles", r"this line is not JSON: 'Traceback: \x1b[31mno\x1b[0m idea'"),
     ("answers_twice", "an answer has the id 3, which waits for none"),
     ("answers_nothing", "this answer is not one of ok, refusal, unsupported: '{\"id\": 3}'"),
     ("never_ends_its_line", "an answer is longer than 1048576 bytes: 'xxx"),

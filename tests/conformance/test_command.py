@@ -121,7 +121,7 @@ def test_a_robot_of_another_name_is_exit_code_4(capsys, tmp_path):
         assert until(lambda: f"on {endpoint}" in robot.output(), 20.0), robot.output()
         code, out, err = run(capsys, "robot", endpoint, "--robot", "r9")
     assert (code, out) == (4, "")
-    assert "no robot r9 says its status there" in err and err.count("\n") == 1
+    assert "no robot r9 publishes its status there" in err and err.count("\n") == 1
 
 
 def test_no_vision_is_exit_code_4(capsys, monkeypatch):
@@ -135,7 +135,7 @@ def test_no_vision_is_exit_code_4(capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("program", "reason"),
     [
-        (["sh", "-c", "while read line; do echo nonsense; done"], "this line is no JSON"),
+        (["sh", "-c", "while read line; do echo nonsense; done"], "this line is not JSON"),
         (["true"], "it ended with 0 before it had answered"),
     ],
 )
@@ -179,9 +179,9 @@ def test_a_token_beside_a_folder_stands_before_the_one_in_it(tmp_path):
 
 
 def test_behind_keys_a_viewer_is_mute_so_an_operator_watches():
-    assert (Access().watcher, Access().may_ask("vision")) == ("viewer", True)
+    assert (Access().watcher, Access().may_request("vision")) == ("viewer", True)
     guarded = Access({"operator": TOKEN})
-    assert (guarded.watcher, guarded.may_ask("vision"), guarded.may_ask("teleop")) == ("operator", False, True)
+    assert (guarded.watcher, guarded.may_request("vision"), guarded.may_request("teleop")) == ("operator", False, True)
     assert (guarded.token_of("teleop"), guarded.token_of("vision")) == (TOKEN, "")
 
 

@@ -203,6 +203,6 @@ def test_the_log_is_bounded_and_forgets_between_cases():
     for _ in range(KEPT_MESSAGES + 100):
         robot.emit(status)
     bench.rest(10_000)
-    assert len(bench.heard(status.channel)) == KEPT_MESSAGES
+    assert len(bench.received(status.channel)) == KEPT_MESSAGES
     bench.forget()
     assert bench.newest(status.channel) is None

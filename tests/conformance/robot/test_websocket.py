@@ -35,7 +35,7 @@ def run_at(endpoint, older="", folder="", cases=REAL):
         return open_link("r1", connect=[endpoint], role=role, timeout_s=20, secure=folder)
 
     roles = tuple(TOKENS) if folder else ("vision",)
-    options = {"roles": roles, "endpoint": endpoint, "older": older, "access": Access(tokens, folder)}
+    options = {"roles": roles, "endpoint": endpoint, "legacy": older, "access": Access(tokens, folder)}
     with LiveBench("r1", open_it, FROM_ROBOT, **options) as bench:
         return run_cases(cases, bench, prepare)
 
@@ -110,7 +110,7 @@ def test_endpoints_are_taken_apart():
     assert split_url("wss://[::1]:9/") == (True, "::1", 9)
     assert split_url("ws-legacy://host:9091?dashed") == (False, "host", 9091)
     for none in ("tcp/127.0.0.1:7447", "ws://host", "http://host:80"):
-        with pytest.raises(ConfigError, match="none of WebSocket"):
+        with pytest.raises(ConfigError, match="invalid WebSocket endpoint"):
             split_url(none)
 
 

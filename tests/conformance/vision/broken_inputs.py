@@ -3,7 +3,7 @@
 import json
 from contextlib import suppress
 
-from sightline.conformance.vision.hostile import CAMERAS, DOUBTED, READ, REFUSED
+from sightline.conformance.vision.hostile import CAMERAS, DOUBTED, READ, REJECTED
 from sightline.conformance.vision.images import CAMERA, picture
 from tests.conformance.vision.broken import STANDING, BrokenVision, breaks, frame_header, header_of
 
@@ -158,7 +158,7 @@ def seeing(case, wrong, odd, instead):
     breaks(case, wrong)(type("Seeing", (BrokenVision,), {"hears": hears}))
 
 
-for _id, (_title, _jpeg) in (REFUSED | DOUBTED).items():
+for _id, (_title, _jpeg) in (REJECTED | DOUBTED).items():
     seeing(_id, f"drives by this: {_title}", _jpeg(), picture("left"))
 for _id, (_, _title, _, _jpeg) in READ.items():
     seeing(_id, f"not so: {_title}", _jpeg(), b"")
