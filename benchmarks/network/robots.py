@@ -81,7 +81,7 @@ class PlayedRobot:
             if not self._sending.may_capture(at_us, self._link.has_listener(FRAME)):
                 return
             sent = self._sending.on_camera(Picture(self._jpegs[self._ticks % len(self._jpegs)], at_us), at_us)
-            camera = self._sending.camera_message(self._model, at_us)
+            camera = self._sending.announce_camera(self._model, at_us)
         for message in (camera, sent and sent[1]):
             if message is not None:
                 self._link.publish(message.channel, message.header, message.payload)

@@ -22,55 +22,6 @@ from sightline.robot_side.network.stream import Stream, StreamConfig
 from sightline.robot_side.pipe import CommandAck, Motion
 from sightline.robot_side.ports import Adjustable, Camera, Picture, scaled_model
 
-
-class CameraAdaptation:
-    """Passes the stream's wish on, once per change, to a camera that can follow it."""
-
-    def __init__(self, camera: Camera) -> None:
-        self._camera = camera
-        self._told = EncodingTarget()
-        self._scale_percent = 100
-        self.shown = EncodingTarget()
-        """What the camera does: unchanged where it passes its own JPEGs through."""
-
-    def follow(self, wish: EncodingTarget) -> None:
-        """Ask for `wish` unless that was asked already; a camera that is gone is asked when it is back."""
-        if wish == self._told or not isinstance(self._camera, Adjustable):
-            return
-        try:
-            followed = self._camera.adjust(*wish)
-        except HardwareError:
-            return  # reading says so
-        self._told = wish
-        if followed:
-            self.shown = wish
-
-    def seen(self, picture: Picture) -> CameraModel:
-        """The model of `picture`, the newest."""
-        self._scale_percent = picture.scale_percent
-        return self.model
-
-    def shown_in(self, status: StreamStatus, dropped: Mapping[str, int]) -> StreamStatus:
-        """`status` with what the camera does and what its slot and the link's slots dropped, by channel."""
-        missed = getattr(self._camera, "missed_captures", None)  # of cameras that capture by themselves
-        counted = sorted(((name, count) for name, count in dropped.items() if count), key=lambda item: -item[1])
-        return status.model_copy(update={
-            "quality_percent": self.shown.quality_percent,
-            "scale_percent": self.shown.scale_percent,
-            "calibrated": self._camera.model.calibrated,
-            "dropped": dict(counted[:MAX_CHANNELS_SHOWN]),
-            "missed_captures": missed() if missed else 0,
-        })
-
-    @property
-    def model(self) -> CameraModel:
-        """The model of the newest picture."""
-        return scaled_model(self._camera.model, self._scale_percent)
-
-
-# The network process's own logic: pictures in, frames out, credit. Pure; `network.py` is its shell.
-
-
 _CAMERA_PERIOD_US = 500_000
 
 
@@ -87,7 +38,11 @@ class NetworkCore:
         self._last_t_us = -1
         self._camera_seq = 0
         self._camera_due_us = 0
-        self._told_model: CameraModel | None = None
+        self._announced: CameraModel | None = None
+        self._scale_percent = 100
+        self._requested = EncodingTarget()
+        self._applied = EncodingTarget()
+        """What the camera does: unchanged where it passes its own JPEGs through."""
 
     def may_capture(self, now_us: int, listening: bool) -> bool:
         """Whether to take a picture now."""
@@ -103,6 +58,7 @@ class NetworkCore:
             self._refused_pictures += 1
             return None
         self._last_t_us = picture.t_us
+        self._scale_percent = picture.scale_percent
         header = self._header(picture.t_us)
         self._stream.on_sent(self._seq, picture.t_us, now_us, len(picture.jpeg))
         self._seq += 1
@@ -136,25 +92,59 @@ class NetworkCore:
         if seq < self._seq:
             self._stream.on_answer(who, seq, compute_us, now_us)
 
-    @property
-    def wish(self) -> EncodingTarget:
-        """How the next picture should be encoded, where the camera can."""
-        return self._stream.wish
+    def adapt(self, camera: Camera) -> None:
+        """Pass a new encoding target on to a camera that can follow it; retry while the camera is gone."""
+        target = self._stream.wish
+        if target == self._requested or not isinstance(camera, Adjustable):
+            return
+        try:
+            followed = camera.adjust(*target)
+        except HardwareError:
+            return  # reading reports it
+        self._requested = target
+        if followed:
+            self._applied = target
 
-    def camera_message(self, model: CameraModel, now_us: int) -> Message | None:
-        """The model of the pictures that are sent: twice a second, and before the first picture of another model."""
-        if now_us < self._camera_due_us and model == self._told_model:
+    def announce_camera(self, full_model: CameraModel, now_us: int) -> Message | None:
+        """The model of the newest image: twice a second, and before the first frame of another model.
+
+        Args:
+            full_model: of the camera's images at full size.
+        """
+        model = scaled_model(full_model, self._scale_percent)
+        if now_us < self._camera_due_us and model == self._announced:
             return None
-        self._told_model = model
+        self._announced = model
         self._camera_due_us = now_us + _CAMERA_PERIOD_US
         stamp = Stamp(session=self._session, seq=self._camera_seq, t_us=now_us)
         self._camera_seq += 1
         return Message(CAMERA, "", encode(stamp), encode(model))
 
-    def status(self, now_us: int, dropped_commands: int = 0) -> StreamStatus:
-        """Counters of the stream."""
-        status = self._stream.status(now_us, dropped_commands)
-        return status.model_copy(update={"refused_pictures": self._refused_pictures})
+    def status(
+        self, now_us: int, dropped_commands: int = 0, dropped: Mapping[str, int] | None = None, missed_captures: int = 0
+    ) -> StreamStatus:
+        """Counters of the stream, and what the camera does.
+
+        Args:
+            dropped: by channel, what the slots of the link dropped.
+            missed_captures: what the slot of the camera dropped.
+        """
+        stream = self._stream
+        counted = sorted(((name, count) for name, count in (dropped or {}).items() if count), key=lambda item: -item[1])
+        return StreamStatus(
+            sent=stream.sent,
+            credit_timeouts=stream.credit_timeouts,
+            window=stream.window,
+            fps=stream.fps(now_us),
+            dropped_commands=dropped_commands,
+            refused_pictures=self._refused_pictures,
+            calibrated=self._announced is not None and self._announced.calibrated,
+            overtaken=stream.overtaken,
+            dropped=dict(counted[:MAX_CHANNELS_SHOWN]),
+            missed_captures=missed_captures,
+            quality_percent=self._applied.quality_percent,
+            scale_percent=self._applied.scale_percent,
+        )
 
 
 def _rounded(pair: Planar) -> Planar:

@@ -24,7 +24,7 @@ from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
 from sightline.protocol.transports.zenoh.session import report_floods
 from sightline.robot_side import pipe as ipc
-from sightline.robot_side.network.core import CameraAdaptation, NetworkCore
+from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.pipe import NetworkEnd, NetworkSetup
 from sightline.robot_side.plugins import CAMERAS
 from sightline.robot_side.ports import Camera, Picture
@@ -73,7 +73,6 @@ class Network:
         self._driver = driver
         self._link = link
         self._camera = camera
-        self._adjusting = CameraAdaptation(camera)
         config = setup.config
         self._sending = NetworkCore(config.stream, setup.session, setup.first_seq, config.max_frame_bytes)
         self._lock = threading.Lock()
@@ -97,22 +96,36 @@ class Network:
     # --- frames --------------------------------------------------------------------------------------------------
 
     def _stream_one(self) -> None:
-        listening = self._link.has_listener(FRAME)
+        """Wait for credit, or take an image and publish its frame. The model of the camera is announced before it."""
+        picture = self._read_camera() if self._may_capture() else None
         self._sending.motion = self._driver.motion(self._sending.motion)
+        with self._lock:
+            sent = self._sending.on_camera(picture, monotonic_us()) if picture else None
+            camera = self._sending.announce_camera(self._camera.model, monotonic_us())
+        if camera is not None:
+            self._link.publish(camera.channel, camera.header, camera.payload)
+        if picture is None or sent is None:
+            return
+        header, message = sent
+        # The driver must know a frame before anybody can answer it.
+        fingerprint = zlib.crc32(picture.jpeg) if self._camera.live else 0
+        if self._driver.tell_aside(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
+            self._link.publish(message.channel, message.header, message.payload)
+
+    def _may_capture(self) -> bool:
+        """Whether to take an image now; else wait a little for credit."""
+        listening = self._link.has_listener(FRAME)
         with self._lock:
             due = self._sending.may_capture(monotonic_us(), listening)
             nap_s = self._sending.wait_us(monotonic_us()) / 1e6
         if not due:
             self._credit.wait(min(nap_s, _LONGEST_NAP_S) if listening and nap_s > 0 else _LONGEST_NAP_S)
             self._credit.clear()
-            return
-        self._adjusting.follow(self._sending.wish)
-        picture = self._read_camera()
-        if picture is not None:
-            self._send(picture)
+        return due
 
     def _read_camera(self) -> Picture | None:
-        """A picture, or None; a camera that is gone is said once and tried again."""
+        """An image, or None; a camera that is gone is logged once and tried again."""
+        self._sending.adapt(self._camera)
         try:
             picture = self._camera.read(_CAMERA_TIMEOUT_S)
         except HardwareError as error:
@@ -125,21 +138,6 @@ class Network:
             _log.info("camera: back")
             self._camera_fault = ""
         return picture
-
-    def _send(self, picture: Picture) -> None:
-        self._sending.motion = self._driver.motion(self._sending.motion)
-        with self._lock:
-            sent = self._sending.on_camera(picture, monotonic_us())
-            camera = self._sending.camera_message(self._adjusting.seen(picture), monotonic_us())
-        if camera is not None:  # before the first picture that it is the model of
-            self._link.publish(camera.channel, camera.header, camera.payload)
-        if sent is None:
-            return
-        header, message = sent
-        # The driver must know a frame before anybody can answer it.
-        fingerprint = zlib.crc32(picture.jpeg) if self._camera.live else 0
-        if self._driver.tell_aside(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
-            self._link.publish(message.channel, message.header, message.payload)
 
     # --- the driver ----------------------------------------------------------------------------------------------
 
@@ -172,16 +170,15 @@ class Network:
             self._link.publish(message.channel, message.header, message.payload)
 
     def _report(self, now_us: int) -> None:
-        """Tell the driver how the stream does, and everybody what the camera is."""
+        """Report to the driver how the stream does, and what was rejected before it."""
+        missed = getattr(self._camera, "missed_captures", None)  # of cameras that capture by themselves
         with self._lock:
-            status = self._sending.status(now_us, self._driver.dropped_commands)
-            status = self._adjusting.shown_in(status, self._link.dropped)
-            camera = self._sending.camera_message(self._adjusting.model, now_us)
+            status = self._sending.status(
+                now_us, self._driver.dropped_commands, self._link.dropped, missed() if missed else 0
+            )
         self._driver.tell(bytes([ipc.PacketKind.STREAM]) + encode(status))
         self._relay.look()
         self._report_refused()
-        if camera is not None:
-            self._link.publish(camera.channel, camera.header, camera.payload)
 
     def _report_refused(self) -> None:
         """What never reached the driver is shown in `status` too."""

@@ -13,7 +13,7 @@ from typing import Annotated
 from pydantic import Field
 
 from sightline.protocol.config import Config
-from sightline.protocol.messages import Holder, StreamStatus
+from sightline.protocol.messages import Holder
 from sightline.robot_side.network.bitrate_control import BitrateControl, EncodingTarget
 from sightline.robot_side.network.congestion_window import AckSample, CongestionWindow
 
@@ -66,7 +66,7 @@ class Stream:
         self._may_probe = False
         self._held_back = False
         self._next_us = 0
-        self._sent = self._credit_timeouts = self._overtaken = 0
+        self.sent = self.credit_timeouts = self.overtaken = 0
         self._sent_us: deque[int] = deque(maxlen=256)
 
     @property
@@ -115,7 +115,7 @@ class Stream:
             self._sent_frames.popitem(last=False)
         # A tenth of slack: a camera that ticks a hair faster than `max_fps` must not be asked one tick too late.
         self._next_us = t_us + self._interval_us * 9 // 10
-        self._sent += 1
+        self.sent += 1
         self._sent_us.append(now_us)
         self._encoding.on_sent(size_bytes, now_us)
 
@@ -128,7 +128,7 @@ class Stream:
         # Newest wins at the peer: whatever is older than the answered frame will never be answered.
         passed = {old: self._sent_frames.pop(old) for old in tuple(self._sent_frames) if old <= seq}
         if seq in passed:
-            self._overtaken += len(passed) - 1
+            self.overtaken += len(passed) - 1
             self._measure(passed[seq], list(passed.values()), compute_us, now_us)
         answered = [old for old in self._in_flight if old <= seq]
         for old in answered:
@@ -205,7 +205,7 @@ class Stream:
         late = [seq for seq, expires_us in self._in_flight.items() if now_us >= expires_us]
         for seq in late:
             del self._in_flight[seq]
-            self._credit_timeouts += 1
+            self.credit_timeouts += 1
         if self._answer_us is not None and any(self._sent_at_us(seq) >= self._overdue_at_us for seq in late):
             self._overdue += 1
             self._overdue_at_us = now_us
@@ -214,16 +214,6 @@ class Stream:
                 self._window.on_timeout(now_us)
                 self._encoding.on_overdue(now_us)
 
-    def status(self, now_us: int, dropped_commands: int = 0) -> StreamStatus:
-        """Counters and the rate over the last second."""
-        recent = sum(1 for sent_us in self._sent_us if now_us - sent_us <= 1_000_000)
-        return StreamStatus(
-            sent=self._sent,
-            credit_timeouts=self._credit_timeouts,
-            window=self.window,
-            fps=float(recent),
-            dropped_commands=dropped_commands,
-            overtaken=self._overtaken,
-            quality_percent=self.wish.quality_percent,
-            scale_percent=self.wish.scale_percent,
-        )
+    def fps(self, now_us: int) -> float:
+        """Frames sent in the last second."""
+        return float(sum(1 for sent_us in self._sent_us if now_us - sent_us <= 1_000_000))

@@ -126,7 +126,7 @@ class ReferenceRobot:
         if now_us - self._reported_us >= STREAM_US:
             self._reported_us = now_us
             self.driving.stream = self.sending.status(now_us)
-        camera = self.sending.camera_message(MODEL, now_us)
+        camera = self.sending.announce_camera(MODEL, now_us)
         if camera is not None:
             self.emit(camera)
         if now_us >= self._filmed * CAMERA_US:

@@ -11,7 +11,7 @@ from sightline.protocol.codec import decode
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import MAX_CHANNELS_SHOWN, CameraModel, FrameHeader, StreamStatus
 from sightline.robot_side.network.bitrate_control import EncodingTarget
-from sightline.robot_side.network.core import CameraAdaptation, NetworkCore
+from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.network.stream import StreamConfig
 from sightline.robot_side.ports import Picture, scaled_model, scaled_size
 from sightline.vision_side.config import VisionConfig
@@ -58,43 +58,45 @@ class PlainEye:
         pass
 
 
-def test_a_wish_is_passed_on_once_per_change():
-    eye = Eye()
-    adjusting = CameraAdaptation(eye)
-    for wish in (
-        EncodingTarget(),
-        EncodingTarget(80, 100),
-        EncodingTarget(80, 100),
-        EncodingTarget(80, 50),
-        EncodingTarget(),
-    ):
-        adjusting.follow(wish)
+class Core(NetworkCore):
+    """With the encoding target that a test sets."""
+
+    def __init__(self):
+        super().__init__(StreamConfig(), "0000aaaa", 0, 400_000)
+
+    def follow(self, camera, *target):
+        """Pass `target` on, and return the share of quality and of size that the status shows."""
+        self._stream._encoding.wish = EncodingTarget(*target)
+        self.adapt(camera)
+        status = self.status(0)
+        return status.quality_percent, status.scale_percent
+
+
+def test_a_target_is_passed_on_once_per_change():
+    eye, core = Eye(), Core()
+    for target in ((100, 100), (80, 100), (80, 100), (80, 50), (100, 100)):
+        assert core.follow(eye, *target) == target
     assert eye.asked == [(80, 100), (80, 50), (100, 100)]
 
 
-def test_a_camera_that_was_gone_is_asked_again():
-    eye = Eye()
-    adjusting = CameraAdaptation(eye)
+def test_a_camera_that_was_gone_receives_the_target_again():
+    eye, core = Eye(), Core()
     eye.gone = True
-    adjusting.follow(EncodingTarget(80, 100))
-    assert adjusting.shown == EncodingTarget()
+    assert core.follow(eye, 80, 100) == (100, 100)
     eye.gone = False
-    adjusting.follow(EncodingTarget(80, 100))
-    assert adjusting.shown == EncodingTarget(80, 100)
+    assert core.follow(eye, 80, 100) == (80, 100)
 
 
 @pytest.mark.parametrize("camera", [Eye(follows=False), PlainEye()])
 def test_what_is_passed_through_is_shown_as_it_is(camera):
-    adjusting = CameraAdaptation(camera)
-    adjusting.follow(EncodingTarget(30, 50))
-    shown = adjusting.shown_in(StreamStatus(quality_percent=30, scale_percent=50), {})
-    assert (shown.quality_percent, shown.scale_percent, shown.missed_captures) == (100, 100, 0)
+    assert Core().follow(camera, 30, 50) == (100, 100)
 
 
 def test_drops_are_shown_by_channel_and_bounded():
     dropped = {f"channel{number:02}": number for number in range(40)}
-    shown = CameraAdaptation(Eye()).shown_in(StreamStatus(), dropped)
+    shown = Core().status(0, dropped=dropped, missed_captures=3)
     assert len(shown.dropped) == MAX_CHANNELS_SHOWN and shown.dropped["channel39"] == 39
+    assert shown.missed_captures == 3
     assert StreamStatus.model_validate_json(shown.model_dump_json()) == shown
 
 
@@ -111,15 +113,26 @@ def test_a_scaled_model_sees_every_pixel_along_the_same_ray(scale_percent):
     assert (scaled.distortion, scaled.z_m) == (MODEL.distortion, MODEL.z_m)
 
 
-def test_a_new_model_is_sent_before_the_first_picture_of_it():
-    sending = NetworkCore(StreamConfig(), "0000aaaa", 0, 400_000)
-    adjusting = CameraAdaptation(Eye())
-    first = sending.camera_message(adjusting.seen(Picture(b"", 1)), 0)
+def test_a_new_model_is_announced_before_the_first_picture_of_it():
+    core = Core()
+    core.on_camera(Picture(b"", 1), 0)
+    first = core.announce_camera(MODEL, 0)
     assert first is not None and first.channel is CAMERA
-    assert sending.camera_message(adjusting.seen(Picture(b"", 2)), 1_000) is None, "known, and not yet due"
-    changed = sending.camera_message(adjusting.seen(Picture(b"", 3, scale_percent=50)), 2_000)
+    core.on_camera(Picture(b"", 2), 1_000)
+    assert core.announce_camera(MODEL, 1_000) is None, "known, and not yet due"
+    core.on_camera(Picture(b"", 3, scale_percent=50), 2_000)
+    changed = core.announce_camera(MODEL, 2_000)
     assert changed is not None and decode(CameraModel, changed.payload) == HALF
-    assert sending.camera_message(adjusting.model, 3_000) is None
+    assert core.announce_camera(MODEL, 3_000) is None
+    assert core.announce_camera(MODEL, 502_000) is not None, "twice a second"
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_the_status_shows_whether_the_announced_model_was_measured(calibrated):
+    core = Core()
+    assert not core.status(0).calibrated
+    core.announce_camera(MODEL.model_copy(update={"calibrated": calibrated}), 0)
+    assert core.status(0).calibrated is calibrated
 
 
 # --- vision ------------------------------------------------------------------------------------------------------
