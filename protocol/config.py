@@ -6,6 +6,7 @@ A plug-in is named by an entry point of a group, or, from a configuration or a c
 
 import difflib
 import linecache
+import logging
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,9 +16,9 @@ from functools import cache
 from importlib.machinery import PathFinder
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from sightline.protocol.errors import ConfigError
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 PLUGIN_ERRORS: Final = (Exception, SystemExit)
 """What a plug-in's own code may raise: `sys.exit` in it is to end itself, not the service around it."""
 _LONGEST_DETAIL: Final = 160
+_log: Final = logging.getLogger(__name__)
 _HERE: Final = Path(__file__).resolve().parent
 _CLASS: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
 _OLD_PACKAGES: Final = ("protocol", "robot_side", "vision_side", "sim", "operator_side", "benchmarks")
@@ -38,6 +40,24 @@ class Config(BaseModel):
     """Frozen; unknown keys, nan and inf are errors. Units are in the names, bounds in the fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    renamed_keys: ClassVar[Mapping[str, str]] = {}
+    """Keys of the release before, each with its new name. They are accepted for one release, with one warning."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _rename_keys(cls, given: Any) -> Any:
+        if not isinstance(given, dict) or cls.renamed_keys.keys().isdisjoint(given):
+            return given
+        for old in cls.renamed_keys.keys() & given.keys():
+            _warn_renamed(old, cls.renamed_keys[old])
+        return {key: value for key, value in given.items() if key not in cls.renamed_keys} | {
+            new: given[old] for old, new in cls.renamed_keys.items() if old in given
+        }
+
+
+@cache
+def _warn_renamed(old: str, new: str) -> None:
+    _log.warning("configuration key %r is now %r; rename it", old, new)
 
 
 def first_problem(error: ValidationError, noun: str = "", known: Iterable[str] = (), whole: str = "") -> str:

@@ -2,8 +2,9 @@
 
 import difflib
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -111,6 +112,7 @@ class Legs(Config):
 class Thing(Config):
     """What every one of them has: a shape on the floor."""
 
+    renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color"}
     shape: Literal["ball", "box", "cylinder", "legs", "place"] = "ball"
     """`place` is a point of the floor: nothing to see and nothing to touch."""
     radius_m: Annotated[float, Field(gt=0, le=1)] = 0.10
@@ -120,7 +122,7 @@ class Thing(Config):
     height_m: Side = 0.4
     """Of a cylinder or a leg."""
     legs: Legs = Legs()
-    colour: Color = (0.95, 0.78, 0.05)
+    color: Color = (0.95, 0.78, 0.05)
 
     @property
     def middle_m(self) -> float:
@@ -374,11 +376,12 @@ class Start(Config):
 class Wall(Config):
     """An upright slab on the floor between two points."""
 
+    renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color"}
     start_m: Point
     end_m: Point
     thickness_m: Annotated[float, Field(gt=0, le=10)] = 0.05
     height_m: Annotated[float, Field(gt=0, le=10)] = 0.35
-    colour: Color = (0.62, 0.64, 0.68)
+    color: Color = (0.62, 0.64, 0.68)
 
     @model_validator(mode="after")
     def _has_length(self) -> Self:

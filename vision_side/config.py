@@ -1,6 +1,7 @@
 """Every number of the vision side, with its unit, bounds and reason. Pure."""
 
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -49,6 +50,7 @@ Device = Literal["auto", "cpu", "cuda", "tensorrt"]
 class DetectorConfig(Config):
     """Whose eyes: a detector of `sightline detector list`, or `boxes`, which somebody publishes as `detections`."""
 
+    renamed_keys: ClassVar[Mapping[str, str]] = {"only_colour": "only_color"}
     kind: Annotated[str, Field(min_length=1, max_length=256)] = "hsv"
     """A name, or `package.module:Name`; what follows a colon is the detector's own: onnx:ball.onnx, oip+http://..."""
     options: dict[str, Any] = Field(default_factory=dict)
@@ -58,7 +60,7 @@ class DetectorConfig(Config):
     """A remote detector's answer that takes longer is no answer. Later than this, the robot is slowing down already."""
     labels: Annotated[tuple[str, ...], Field(max_length=64)] = ()
     """Only detections with one of these labels count, and `target` of the colour detectors; empty for all."""
-    only_colour: bool = False
+    only_color: bool = False
     """Only detections that are mostly of the colours of `hsv.ranges` count: the model says ball, the colour which."""
     tracked: bool = False
     """Give what is found in one frame after the other the same `track_id`."""

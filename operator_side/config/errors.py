@@ -22,7 +22,7 @@ def known_keys(model: type[BaseModel]) -> Iterator[Key]:
 
 def is_known(model: type[BaseModel], key: Key) -> bool:
     """Whether `key` names a value or a table of `model`; below a free-form table anything is."""
-    field = model.model_fields.get(key[0])
+    field = model.model_fields.get(getattr(model, "renamed_keys", {}).get(key[0], key[0]))
     if field is None:
         return False
     inner = table_of(field.annotation)

@@ -86,8 +86,8 @@ def _collision(client: int, thing: Thing) -> int:
 
 def _visual(client: int, thing: Thing) -> int:
     if thing.shape == "ball":
-        return ball_visual(client, thing.radius_m, thing.colour)
-    look = {"rgbaColor": [*thing.colour, 1], "specularColor": [0, 0, 0], "physicsClientId": client}
+        return ball_visual(client, thing.radius_m, thing.color)
+    look = {"rgbaColor": [*thing.color, 1], "specularColor": [0, 0, 0], "physicsClientId": client}
     if thing.shape == "box":
         return int(pybullet.createVisualShape(
             pybullet.GEOM_BOX, halfExtents=[side / 2 for side in thing.size_m], **look

@@ -43,7 +43,7 @@ def faces_of(wall: Wall, light_from: PoseMatrix) -> list[Face]:
     turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
     corners = (_CORNERS * [length_m, wall.thickness_m, wall.height_m]) @ turn.T
     corners[:, :2] += (start + end) / 2
-    colour = np.array(wall.colour)
+    colour = np.array(wall.color)
     return [
         Face(corners[list(order)], turn @ normal, colour, light_from)
         for order, normal in zip(_FACES, _NORMALS, strict=True)

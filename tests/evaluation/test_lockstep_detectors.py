@@ -55,7 +55,7 @@ def test_the_scenario_is_what_the_write_up_had():
     assert (*lowest, *highest) == pytest.approx(WRITE_UP, abs=0.02)
     assert vision_config(SCENARIO, ROBOT).hsv == HsvConfig(ranges=(one,)), "nothing else of ours is changed"
     assert one == older_range.RANGE
-    assert {one.colour for one in SCENARIO.things} == {SCENARIO.target.colour} and len(SCENARIO.things) == 3
+    assert {one.color for one in SCENARIO.things} == {SCENARIO.target.color} and len(SCENARIO.things) == 3
     assert all(one.jitter_m == 0 for one in SCENARIO.things), "their places are what the truth is judged by"
     assert SCENARIO.start.distance_m[1] < SCENARIO.stand_off_m and SCENARIO.start.bearing_deg[0] > ACQUIRED_WITHIN_DEG
 

@@ -1,6 +1,7 @@
 """Plug-ins by name, and validation errors as one line."""
 
 import sys
+from typing import ClassVar
 
 import pytest
 from pydantic import Field, ValidationError
@@ -70,3 +71,14 @@ def test_a_plug_in_that_exits_on_import_ends_nothing(folder):
     (folder / "leaves.py").write_text("import sys\nsys.exit('bye')\n")
     with pytest.raises(ConfigError, match="'leaves:Camera' cannot be loaded: bye"):
         CAMERAS.load("leaves:Camera")
+
+
+class Paint(Config):
+    renamed_keys: ClassVar = {"colour": "color"}
+    color: str = "red"
+
+
+def test_renamed_key_is_accepted_with_one_warning(caplog):
+    assert [Paint.model_validate({"colour": "blue"}).color for _ in range(3)] == ["blue"] * 3
+    assert caplog.messages == ["configuration key 'colour' is now 'color'; rename it"]
+    assert Paint.model_validate({"color": "green"}).color == "green" and len(caplog.messages) == 1

@@ -56,7 +56,7 @@ def _check_no_detector(config: VisionConfig) -> None:
     """Raise ConfigError for a setting of local detectors."""
     one = config.detector
     given = ["device"] if one.device != "auto" else []
-    given += [name for name in ("options", "fallback", "shadow", "shadow_options", "labels", "only_colour", "tracked")
+    given += [name for name in ("options", "fallback", "shadow", "shadow_options", "labels", "only_color", "tracked")
               if getattr(one, name)]
     if given:
         raise ConfigError(f"detector.{given[0]} goes with a local detector; {BOXES!r} is remote")
@@ -67,7 +67,7 @@ def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
     if one.labels:
         _check_labels(one.kind, one.labels, getattr(detector, "labels", ()))
         detector = LabelFilter(detector, one.labels)
-    if one.only_colour:
+    if one.only_color:
         detector = ColorFilter(detector, config.hsv.ranges)
     return TrackIds(detector) if one.tracked else detector
 

@@ -197,3 +197,11 @@ def test_what_is_missing_is_told_with_the_file_of_what_stands_beside_it(tmp_path
     assert one_line(error).startswith(f"{file}: camera.height_px: is missing")
     with pytest.raises(ConfigError, match=r"^camera\.height_px: is missing"):
         load("vision", environ={"SIGHTLINE_VISION__CAMERA__WIDTH_PX": "320"})
+
+
+@pytest.mark.parametrize("old_key", [
+    {"sets": ["detector.only_colour=true"]},
+    {"environ": {"SIGHTLINE_VISION__DETECTOR__ONLY_COLOUR": "true"}},
+])
+def test_renamed_key_is_accepted_from_every_source(old_key):
+    assert load("vision", **{"environ": {}, **old_key}).config.detector.only_color is True

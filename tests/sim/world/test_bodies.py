@@ -126,7 +126,7 @@ def test_the_picture_shows_what_truth_says_is_lit(name):
 def test_a_file_says_only_what_differs():
     ball, eight = load_scenario("ball"), load_scenario("ball-eight")
     assert (eight.seconds, len(eight.target.path)) == (60.0, 2)
-    assert (eight.target.colour, eight.vision, eight.start) == (ball.target.colour, ball.vision, ball.start)
+    assert (eight.target.color, eight.vision, eight.start) == (ball.target.color, ball.vision, ball.start)
     assert load_scenario("thymio-box").things == ()
 
 

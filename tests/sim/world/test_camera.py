@@ -78,7 +78,7 @@ def test_a_wall_meets_the_floor_where_the_pinhole_model_has_it():
     ahead, across = truth.yaw_rad, truth.yaw_rad + math.pi / 2
     middle = (lens[0] + 1.05 * math.cos(ahead), lens[1] + 1.05 * math.sin(ahead))
     ends = [(middle[0] + s * math.cos(across), middle[1] + s * math.sin(across)) for s in (-3, 3)]
-    wall = Wall(start_m=ends[0], end_m=ends[1], thickness_m=0.1, height_m=0.2, colour=(0.0, 0.0, 0.2))
+    wall = Wall(start_m=ends[0], end_m=ends[1], thickness_m=0.1, height_m=0.2, color=(0.0, 0.0, 0.2))
     with World(scenario.model_copy(update={"walls": (wall,)}), robot_with(), 1) as world:
         rows = np.nonzero(picture(world)[:, 160, 0] < 60)[0]
     assert rows.min() == pytest.approx(model.cy_px - model.fy_px * (0.2 - model.z_m), abs=1.5)

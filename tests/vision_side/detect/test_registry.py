@@ -99,7 +99,7 @@ def test_hsv_takes_the_section_of_its_name_with_its_options_over_it() -> None:
 
 
 def test_what_is_around_it_is_built_from_the_inside_out() -> None:
-    made = configured_detector(config(labels=("ball",), only_colour=True, tracked=True, shadow="adaptive"))
+    made = configured_detector(config(labels=("ball",), only_color=True, tracked=True, shadow="adaptive"))
     assert isinstance(made, ShadowDetector)
     made.close()
     tracked = made._driving

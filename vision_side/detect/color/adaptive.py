@@ -5,8 +5,9 @@ does, slowly, and the cloud goes along.
 """
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import cv2
 import numpy as np
@@ -166,6 +167,7 @@ _CORE: Final = 0.7  # of the radius: the rim's pixels are half the floor's
 class AdaptiveConfig(Settings):
     """The ranges to begin with, and how much it goes along with."""
 
+    renamed_keys: ClassVar[Mapping[str, str]] = {"colour_sigmas": "color_sigmas"}
     hsv: HsvConfig = HsvConfig()
     label: Label = "target"
     confirm: Annotated[int, Field(ge=1, le=30)] = 3
@@ -174,7 +176,7 @@ class AdaptiveConfig(Settings):
     """Not seen for this long, it is lost, and is looked for everywhere again."""
     remembered_s: Annotated[float, Field(ge=0, le=60)] = 5.0
     """What was lost is only taken up again if it has the learned colour, for this long."""
-    colour_sigmas: Annotated[float, Field(gt=1, le=8)] = 4.0
+    color_sigmas: Annotated[float, Field(gt=1, le=8)] = 4.0
     """A pixel further than this from the learned colour is none of the thing's."""
     adapt_s: Annotated[float, Field(gt=0.05, le=60)] = 0.3
     """How slowly the colour goes along with the light. A lamp that turns from warm to cold in 3 s is not lost yet."""
@@ -227,7 +229,7 @@ class AdaptiveTracker:
         part = picture.bgr[rows, columns]
         if not part.size:
             return None
-        return Region(part, self._chroma.mask(part, self._config.colour_sigmas), (columns.start, rows.start))
+        return Region(part, self._chroma.mask(part, self._config.color_sigmas), (columns.start, rows.start))
 
     def _acquire(self, picture: Picture, t_us: int, dt_s: float) -> Detection | None:
         """The largest of the configured colour, once it was at one place for some pictures in a row."""
@@ -250,7 +252,7 @@ class AdaptiveTracker:
 
     def _is_it(self, picture: Picture, found: Detection, known: ColorModel | None) -> bool:
         pixels = _pixels(picture, _circle(found))
-        return len(pixels) > 0 and (known is None or known.distance(pixels) <= self._config.colour_sigmas)
+        return len(pixels) > 0 and (known is None or known.distance(pixels) <= self._config.color_sigmas)
 
     def _learn(self, picture: Picture, found: Detection, dt_s: float) -> None:
         pixels = _pixels(picture, _circle(found))

@@ -5,10 +5,10 @@ known picture was compared.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -49,6 +49,7 @@ class OnnxDetector:
     class Config(Settings):
         """The model, its device, and which of its answers count."""
 
+        renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color"}
         address: str = ""
         """The file; empty for the model that comes with Sightline."""
         device: Device = "auto"
@@ -58,7 +59,7 @@ class OnnxDetector:
         """None: `min_score` of the model's metadata, or else 0.25."""
         names: Annotated[tuple[str, ...], Field(max_length=1000)] = ()
         """The labels, in order; empty for those of the model's metadata."""
-        colour: Literal["auto", "bgr", "rgb"] = "auto"
+        color: Literal["auto", "bgr", "rgb"] = "auto"
         """The order of an input's channels; `auto`: bytes are BGR, floats RGB."""
         refine: Annotated[tuple[str, ...], Field(max_length=64)] = ("ball",)
         """Things with these labels are round: their edge is looked for in the picture."""
@@ -168,7 +169,7 @@ def read_onnx_model(config: OnnxDetector.Config) -> OnnxModel:
     engine = open_engine(path, config.device, config.threads)
     try:
         header = engine.header
-        form, least = model_format(header, config.names, config.colour), _least(config.min_score, header)
+        form, least = model_format(header, config.names, config.color), _least(config.min_score, header)
         if KEY not in header.metadata:
             return OnnxModel(path, engine, form, least, None, form, _least(None, header), digest)
         own = replace(form, labels=own_labels(header.metadata))

@@ -54,7 +54,7 @@ class ModelFormat:
     """True if it takes several pictures at once: inputs and outputs leave the number open."""
 
 
-def model_format(header: OnnxHeader, names: Sequence[str], colour: str) -> ModelFormat:
+def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelFormat:
     """Raises ValueError for a model that takes or gives something else."""
     if len(header.inputs) != 1:
         raise ValueError(f"it takes {len(header.inputs)} inputs; expected one picture")
@@ -71,7 +71,7 @@ def model_format(header: OnnxHeader, names: Sequence[str], colour: str) -> Model
     labels = tuple(map(clean_label, names)) or own_labels(header.metadata)
     kind = _kind(header.outputs, labels)
     batched = size is not None and one.shape[0] is None and all(_is_for_several(one, kind) for one in header.outputs)
-    return ModelFormat(floats, floats if colour == "auto" else colour == "rgb", size, kind, labels, one.type, batched)
+    return ModelFormat(floats, floats if color == "auto" else color == "rgb", size, kind, labels, one.type, batched)
 
 
 def _is_for_several(output: Tensor, kind: str) -> bool:
