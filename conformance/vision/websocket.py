@@ -24,8 +24,8 @@ from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError, WireError
 from sightline.protocol.messages import FrameHeader, Stamp
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint
-from sightline.protocol.transports.security import server_tls_context
 from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL, pack, parse_hello
+from sightline.protocol.transports.websocket.tls import server_tls_context
 
 SESSION_BEGINS: Final = "5ca1"
 """So the tests' broken vision services report this server from the kit's own link."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import ipaddress
 import socket
-import ssl
 from collections import Counter
 from collections.abc import Collection
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
 from sightline.protocol.transports.security import RoleKeys
+
+if TYPE_CHECKING:
+    import ssl  # takes 4 MB, so functions import it when something is wrong
 
 TABLES: Final = Path("/proc/net")
 """Linux's lists of TCP sockets."""
@@ -101,12 +103,16 @@ def diagnose_tls(endpoint: str, secured: RoleKeys | None) -> str:
         return "it speaks TLS only; write tls/... and give --secure DIR"
     if secured is None:
         return "a tls/ endpoint needs keys; give --secure DIR"
+    import ssl
+
     context = ssl.create_default_context(cafile=f"{secured.folder}/ca.pem")
     context.load_cert_chain(f"{secured.folder}/{secured.role}.pem", f"{secured.folder}/{secured.role}.key")
     return _try_handshake(host, port, context)
 
 
 def _speaks_tls(host: str, port: int) -> bool:
+    import ssl
+
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:
@@ -121,6 +127,8 @@ def _speaks_tls(host: str, port: int) -> bool:
 
 def _try_handshake(host: str, port: int, context: ssl.SSLContext) -> str:
     """Shake hands as Zenoh would, and wait a moment for the other end's verdict on our certificate."""
+    import ssl
+
     try:
         with socket.create_connection((host, port), _TLS_TIMEOUT_S) as plain:
             try:

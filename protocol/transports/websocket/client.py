@@ -10,10 +10,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES, WebSocketEndpoint
-from sightline.protocol.transports.security import bearer_header, client_tls_context, own_token, tls_handshake
+from sightline.protocol.transports.security import bearer_header, own_token
 from sightline.protocol.transports.websocket.connection import Connection
 from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL, PeerError
 from sightline.protocol.transports.websocket.peer import OPEN_S, PROTOCOL_OPTIONS
+from sightline.protocol.transports.websocket.tls import client_tls_context, tls_handshake
 
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed

@@ -31,12 +31,11 @@ from sightline.protocol.transports.security import (
     grants_of_role,
     read_tokens,
     role_of_token,
-    server_tls_context,
-    tls_handshake,
 )
 from sightline.protocol.transports.websocket.connection import CLOSE_S, Connection
 from sightline.protocol.transports.websocket.framing import BAD_FRAMING, MAX_HELLO_BYTES, SUBPROTOCOL, PeerError
 from sightline.protocol.transports.websocket.peer import OPEN_S, PROTOCOL_OPTIONS, Promote, count_close
+from sightline.protocol.transports.websocket.tls import server_tls_context, tls_handshake
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
