@@ -1,0 +1,162 @@
+"""Writes docs/faults.md, and its worst values into docs/safety.md, from what `sightline faults --json` prints. Shell.
+
+    python -m docs.make.faults --repeat 10 --jobs 3                     # all rows: about an hour
+    python -m docs.make.faults --only wire.thin --repeat 10 --jobs 3    # these again; the other rows stay as they are
+
+docs/faults.json has the results. Both pages are made of it, so that they cannot disagree.
+"""
+
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+from docs.make.performance import CHECK_FAILED, processor
+from sightline.evaluation.faults.report import figure_text, value_text
+
+DOCS: Final = Path(__file__).parents[1]
+PACKAGES: Final = ("eclipse-zenoh", "pybullet", "opencv-python-headless", "pydantic")
+_SHOWN_IF_WRONG: Final = ("on old sight", "drives again", "reset refused", "exit code", "last speed told")
+"""Yes or no: in the table they are in what was demanded."""
+_MARKS: Final = re.compile(r"(<!-- worst values[^\n]*-->\n).*?(<!-- /worst values -->)", re.DOTALL)
+_FIGURES: Final = {"falls": "ms", "zero": "ms", "distance": "m", "memory": "MB"}
+_STOP_BOUND: Final = re.compile(r"falls <= [0-9.]+ ms, zero <= [0-9.]+ ms, <= [0-9.]+ m")
+_HEAD: Final = "| what broke | rows | a stop demanded within | " + " | ".join(
+    f"{name}, {unit}" for name, unit in _FIGURES.items()
+) + " | rows passed |"
+_LEGEND: Final = (
+    "Real processes, one fault each, injected at 0.3 m/s or more (vision follows a ball) or at 0.5 m/s (a scripted",
+    "driver), and judged from the simulated motors' own log. Times count from the last valid command. *Falls*: the",
+    "wheels leave their highest speed for good. *Zero*: they are told zero and really roll slower than 0.01 m/s.",
+    "*Injected*: how often the fault was done; a row that injected nothing fails. In every row, besides that:",
+    "no motion that no frame younger than 400 ms allows, and no process of Sightline grows by 5 MB. A row during which",
+    "this machine stood still for over 20 ms is run again, three times at most.",
+)
+
+Record = Mapping[str, Any]
+"""The object that the command printed, with the command, the machine and the commands that ran rows again."""
+
+
+def describe_machine() -> list[str]:
+    """CPU, cores, load, kernel, Python and the packages that matter, one line each."""
+    return [
+        f"CPU: {processor()}, {os.cpu_count()} cores; load average at the start {os.getloadavg()[0]:.1f}",
+        f"system: {platform.system()} {platform.release()}, {platform.machine()}",
+        f"Python {platform.python_version()}; " + ", ".join(f"{name} {version(name)}" for name in PACKAGES),
+    ]
+
+
+def measured(arguments: Sequence[str]) -> Record:
+    """Run the command. Raises RuntimeError with its error line if it printed no result."""
+    machine, command = describe_machine(), ["faults", *arguments]
+    program = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
+    done = subprocess.run([*program, *command, "--json"], stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode not in (0, CHECK_FAILED):
+        raise RuntimeError(f"sightline {' '.join(command)} ended with {done.returncode}")
+    result = json.loads(done.stdout.splitlines()[-1])
+    return {"command": f"sightline {' '.join(command)}", "machine": machine, "again": [], **result}
+
+
+def merged(record: Record, newer: Record) -> Record:
+    """`record` with the rows that `newer` ran in place of its own; rows that only `newer` has come last."""
+    again = {row["id"]: row for row in newer["rows"]}
+    rows = {row["id"]: row for row in record["rows"]} | again
+    checks = [one for one in record["checks"] if _id_of(one) not in again] + newer["checks"]
+    note = {"command": newer["command"], "rows": [row["what"] for row in newer["rows"]]}
+    return {**record, "rows": list(rows.values()), "checks": checks, "again": [*record["again"], note]}
+
+
+def report_page(record: Record) -> str:
+    """The whole of docs/faults.md."""
+    ran = _ran(record)
+    again = [f"run again by `{one['command']}`: {'; '.join(one['rows'])}" for one in record["again"]]
+    return "\n".join([
+        "# What the robot did when things broke",
+        "",
+        f"Written by `{record['command']}`; do not edit. {_passed(ran)} of {len(ran)} rows passed.",
+        "",
+        *_LEGEND,
+        "",
+        *(f"- {line}" for line in [*record["machine"], *again]),
+        "",
+        f"| fault | demanded | worst of {max(row['runs'] for row in record['rows'])} | pass |",
+        "|---|---|---|---|",
+        *(_table_row(row, _checks(record, row)) for row in record["rows"]),
+        "",
+    ])
+
+
+def _table_row(row: Record, checks: Iterable[Record]) -> str:
+    if row["skipped"]:
+        return f"| {row['what']} | {row['demanded']} | {row['skipped']} | not run |"
+    shown = [figure_text(one["name"], one["value"], one["unit"]) for one in checks
+             if not one["ok"] or one["name"] not in _SHOWN_IF_WRONG]
+    trouble = [row["trouble"]] if row["trouble"] else []
+    figures, passed = ", ".join([*trouble, *shown]), "yes" if row["ok"] else "**no**"
+    return f"| {row['what']} | {row['demanded']} | {figures} | {passed} |"
+
+
+def safety_page(page: str, record: Record) -> str:
+    """`page` with the worst figures, by what broke, between its marks; as it was if it has no marks."""
+    return _MARKS.sub(lambda marks: marks[1] + _worst_values(record) + marks[2], page)
+
+
+def _worst_values(record: Record) -> str:
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for row in _ran(record):
+        bound = _STOP_BOUND.search(row["demanded"])
+        groups.setdefault((row["what"].partition(":")[0], bound[0] if bound else "-"), []).append(row)
+    lines = [_summary_row(record, group, bound, rows) for (group, bound), rows in groups.items()]
+    source = f"The worst of every run of `{record['command']}`, of what broke in the same way."
+    return "\n".join([source, "", _HEAD, "|---" * (_HEAD.count("|") - 1) + "|", *lines, ""])
+
+
+def _summary_row(record: Record, group: str, bound: str, rows: Sequence[Record]) -> str:
+    checks = [one for row in rows for one in _checks(record, row)]
+    cells = [_worst([one["value"] for one in checks if one["name"] == name]) for name in _FIGURES]
+    return f"| {group} | {len(rows)} | {bound} | {' | '.join(cells)} | {_passed(rows)} of {len(rows)} |"
+
+
+def _worst(values: Sequence[float | None]) -> str:
+    if not values:
+        return "-"
+    return value_text(None if None in values else max(value for value in values if value is not None))
+
+
+def _checks(record: Record, row: Record) -> list[Record]:
+    """The worst checks of a row, by their name within it."""
+    return [{**one, "name": one["name"].partition(": ")[2]} for one in record["checks"] if _id_of(one) == row["id"]]
+
+
+def _id_of(check: Record) -> str:
+    return str(check["name"].partition(": ")[0])
+
+
+def _ran(record: Record) -> list[Record]:
+    return [row for row in record["rows"] if not row["skipped"]]
+
+
+def _passed(rows: Iterable[Record]) -> int:
+    return sum(row["ok"] for row in rows)
+
+
+def main(arguments: Sequence[str], docs: Path = DOCS) -> int:
+    """Run the command with `arguments` and write its result and both pages."""
+    file, safety = docs / "faults.json", docs / "safety.md"
+    record = measured(arguments)
+    if "--only" in arguments and file.exists():
+        record = merged(json.loads(file.read_text("utf-8")), record)
+    file.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", "utf-8")
+    (docs / "faults.md").write_text(report_page(record), "utf-8")
+    safety.write_text(safety_page(safety.read_text("utf-8"), record), "utf-8")
+    return 0 if all(row["ok"] for row in _ran(record)) else CHECK_FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
