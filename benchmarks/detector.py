@@ -228,7 +228,7 @@ def _service(endpoint: str, each_us: int, log: Path) -> "subprocess.Popen[bytes]
 
 def _wait_ready(robots: _Streams, log: Path, streams: int, service: "subprocess.Popen[bytes]") -> None:
     deadline_s = time.monotonic() + _READY_S
-    while log.read_text("utf-8", "replace").count("looks at the pictures") < streams:
+    while log.read_text("utf-8", "replace").count("receives the frames") < streams:
         if time.monotonic() > deadline_s or service.poll() is not None:
             raise SightlineError(f"the detector service did not start: {log.read_text('utf-8', 'replace')[-300:]}")
         robots.say()

@@ -457,7 +457,7 @@ def _publish_status(robot: Any, processes: Any) -> None:
     from sightline.protocol.messages import Stamp, State, Status
 
     stamp, status = encode(Stamp(session="0000abcd", seq=1, t_us=1)), encode(Status(state=State.HOLD, reason="bench"))
-    while "looks at the pictures" not in processes.log("detector").read_text("utf-8", "replace"):
+    while "receives the frames" not in processes.log("detector").read_text("utf-8", "replace"):
         robot.publish(STATUS, stamp, status)
         processes.check(0.1)
 

@@ -1,9 +1,9 @@
-"""Commands about detectors: list, check, and a detector served to many robots. Shell."""
+"""The commands `detector list | check`, and `detector --serve` for many robots. Shell; heavy imports inside them."""
 
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -19,18 +19,13 @@ from sightline.operator_side.cli.options import (
     ServiceConnect,
     Sets,
 )
-from sightline.operator_side.cli.options import (
-    Listen as MaybeListen,
-)
-from sightline.operator_side.cli.options import (
-    ServiceConnect as MaybeConnect,
-)
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import start_log
 
 if TYPE_CHECKING:
+    from sightline.protocol.config import PluginRegistry
     from sightline.vision_side.detect.contract import PromiseResult, Times
     from sightline.vision_side.detect.port import Detector
 
@@ -41,13 +36,26 @@ Robots = Annotated[
 DeadlineMs = Annotated[
     float, typer.Option("--deadline-ms", min=5, max=1000, help="From a frame's arrival to its boxes, at most.")
 ]
-MaxBatch = Annotated[int, typer.Option("--max-batch", min=1, max=256, help="Frames looked at together, at most.")]
-_ELSEWHERE = ("zenoh", "boxes")
+MaxBatch = Annotated[int, typer.Option("--max-batch", min=1, max=256, help="Frames in one batch, at most.")]
+_REMOTE = ("zenoh", "boxes")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    group = typer.Typer(
+        help="Detectors: list them, check one, and serve many robots with one.",
+        no_args_is_help=False, rich_markup_mode=None, invoke_without_command=True, callback=serve,
+        epilog="Example: sightline detector --serve onnx:ball.onnx --listen tcp/0.0.0.0:7447",
+    )  # fmt: skip
+    group.command(name="list", epilog="Example: sightline detector list --json")(list_detectors)
+    group.command(epilog="Example: sightline detector check my_detector:Mine --set min_score=0.5")(check)
+    app.add_typer(group, name="detector")
 
 
 def serve(
-    name: str,
+    context: typer.Context,
     *,
+    name: Annotated[str, typer.Option("--serve", metavar="NAME", help="Detect for every robot in reach.")] = "",
     robot: Robots = None,
     listen: Listen = None,
     connect: ServiceConnect = None,
@@ -59,19 +67,26 @@ def serve(
     sets: Sets = None,
     log: LogForm = None,
 ) -> int:
-    """Look at the newest frames of every robot that is heard and say what is in them, until Ctrl-C.
+    """Publish the detections in the newest frames of every robot, until Ctrl-C.
 
-    Raises ConfigError for a detector that looks nowhere itself, and as `sightline vision` does.
+    Raises ConfigError for a remote detector, and as `sightline vision` does.
     """
+    if context.invoked_subcommand is not None:
+        if name:
+            raise ConfigError(f"--serve {name} runs by itself; leave out {context.invoked_subcommand!r}")
+        return 0
+    if not name:
+        typer.echo(context.get_help())
+        return 0
     start_log(log, "detector")
-    if name in _ELSEWHERE:
-        raise ConfigError(f"detector {name!r} is boxes that somebody else finds: serve one that looks itself, e.g. hsv")
+    if name in _REMOTE:
+        raise ConfigError(f"--serve {name!r} is remote; choose a local detector, e.g. hsv")
     options = {"robot": robot, "listen": tuple(listen) if listen else None,
                "connect": tuple(connect) if connect else None, "secure": secure, "detector.kind": name,
                "detector.device": device}
     given = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
-    everybody = {} if given.origin(("robot",)) != "default" else {"robot": "*"}
-    loaded: Any = given.config.model_copy(update=everybody)
+    every_robot = {} if given.origin(("robot",)) != "default" else {"robot": "*"}
+    loaded: Any = given.config.model_copy(update=every_robot)
     with needs("vision"):
         from sightline.vision_side.detect.plugin_calls import close_detector
         from sightline.vision_side.detect.registry import configured_detector
@@ -84,52 +99,11 @@ def serve(
             close_detector(detector)
 
 
-# The commands `detector list | check`, and `detector --serve`. Shell; heavy imports inside the commands.
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    group = typer.Typer(
-        help="Detectors: what there is, whether one keeps its promises, and one that serves many robots.",
-        no_args_is_help=False, rich_markup_mode=None, invoke_without_command=True, callback=_serve,
-        epilog="Example: sightline detector --serve onnx:ball.onnx --listen tcp/0.0.0.0:7447",
-    )  # fmt: skip
-    group.command(name="list", epilog="Example: sightline detector list --json")(list_detectors)
-    group.command(epilog="Example: sightline detector check my_eyes:Eyes --set min_score=0.5")(check)
-    app.add_typer(group, name="detector")
-
-
-def _serve(
-    context: typer.Context,
-    *,
-    name: Annotated[str, typer.Option("--serve", metavar="NAME", help="Look for every robot that is heard.")] = "",
-    robot: Robots = None,
-    listen: MaybeListen = None,
-    connect: MaybeConnect = None,
-    secure: MaybeSecure = None,
-    device: Device = None,
-    deadline_ms: DeadlineMs = 100.0,
-    max_batch: MaxBatch = 16,
-    config: ConfigFile = None,
-    sets: Sets = None,
-    log: LogForm = None,
-) -> int:
-    if context.invoked_subcommand is not None:
-        if name:
-            raise ConfigError(f"--serve {name} runs by itself; leave out {context.invoked_subcommand!r}")
-        return 0
-    if not name:
-        typer.echo(context.get_help())
-        return 0
-    return serve(name, robot=robot, listen=listen, connect=connect, secure=secure, device=device,
-                         deadline_ms=deadline_ms, max_batch=max_batch, config=config, sets=sets, log=log)
-
-
 def list_detectors(as_json: Json = False) -> int:
-    """Name every detector, and say whether it can be used here."""
+    """List every detector, and whether it can be used here."""
     with needs("vision"):
         from sightline.vision_side.detect.registry import REGISTRY
-    rows = [(name, _problem(lambda name=name: REGISTRY.load(name))) for name in REGISTRY.names()]  # type: ignore[misc]
+    rows = [(name, _problem(REGISTRY, name)) for name in REGISTRY.names()]
     model = _shipped_model()
     if as_json:
         listed = [{"name": name, "usable": not why, "why": why} for name, why in rows]
@@ -138,24 +112,24 @@ def list_detectors(as_json: Json = False) -> int:
         comes = f", comes with model {model}" if model else "; comes without a model: onnx:PATH"
         for name, why in rows:
             typer.echo(f"{name:<12} {why or 'ok'}{comes if name == 'onnx' and not why else ''}")
-        typer.echo("or package.module:Name; boxes: what somebody else publishes, see docs/detectors.md")
+        typer.echo("or package.module:Name; boxes: those of another publisher, see docs/detectors.md")
     return 0
 
 
 def _shipped_model() -> str:
     try:
         from sightline.vision_side.detect.onnx.detector import shipped_digest
-    except ImportError:  # the list says itself what is missing
+    except ImportError:  # the list itself shows the missing package
         return ""
     return shipped_digest()
 
 
-def _problem(load: Callable[[], Any]) -> str:
+def _problem(registry: "PluginRegistry", name: str) -> str:
     try:
-        plugin = load()
+        registry.load(name)
     except ConfigError as error:
         return str(error)
-    return str(plugin.unusable()) if hasattr(plugin, "unusable") else ""
+    return ""
 
 
 def check(
@@ -169,7 +143,7 @@ def check(
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> int:
-    """Hold a detector to what the port promises, with drawn pictures, and time it. Exit code 5 if it breaks it."""
+    """Check that a detector keeps the port's promises, with drawn pictures, and time it. Exit code 5 if it does not."""
     options: dict[str, Any] = {"detector.device": device}
     given: Any = load_service("vision", file=config, sets=(), options=options, environ=os.environ).config
     with needs("vision"):
@@ -185,17 +159,17 @@ def check(
         made.append(build_detector(name, own, settings))
         return made[-1]
 
-    verdicts = check_detector(make, seed)
-    ok = not any(one.wrong for one in verdicts)
+    results = check_detector(make, seed)
+    ok = not any(one.wrong for one in results)
     times = time_detector(make, seed=seed) if ok else []
-    said = list(dict.fromkeys(line for one in made for line in notices_of(one)))
-    report = _as_json(name, ok, verdicts, times) | {"said": said}
-    typer.echo(json.dumps(report) if as_json else _as_text(name, verdicts, times, said))
+    notices = list(dict.fromkeys(line for one in made for line in notices_of(one)))
+    report = _as_json(name, ok, results, times) | {"said": notices}
+    typer.echo(json.dumps(report) if as_json else _as_text(name, results, times, notices))
     return 0 if ok else CHECK_FAILED
 
 
 def own_options(texts: Sequence[str]) -> dict[str, Any]:
-    """What `--set KEY=VALUE` gives a detector's own `Config`; a dot is for a section. Raises ConfigError."""
+    """Read `--set KEY=VALUE` for a detector's own `Config`; a dot is for a section. Raises ConfigError."""
     from sightline.operator_side.config.toml_text import options_of
 
     return _nested(options_of(texts))
@@ -217,9 +191,9 @@ def _nested(options: dict[str, Any]) -> dict[str, Any]:
     return tables
 
 
-def _as_json(name: str, ok: bool, verdicts: Sequence["PromiseResult"], times: Sequence["Times"]) -> dict[str, Any]:
+def _as_json(name: str, ok: bool, results: Sequence["PromiseResult"], times: Sequence["Times"]) -> dict[str, Any]:
     checks = [{"name": one.name, "value": one.wrong or "kept", "unit": "", "bound": one.promise, "ok": not one.wrong}
-              for one in verdicts]
+              for one in results]
     took = [{"size": f"{one.width_px}x{one.height_px}", "p50_ms": _or_none(one.p50_ms), "p95_ms": _or_none(one.p95_ms)}
             for one in times]
     return {"ok": ok, "detector": name, "checks": checks, "times": took}
@@ -229,11 +203,11 @@ def _or_none(value: float) -> float | None:
     return None if math.isnan(value) else round(value, 3)
 
 
-def _as_text(name: str, verdicts: Sequence["PromiseResult"], times: Sequence["Times"], said: Sequence[str]) -> str:
+def _as_text(name: str, results: Sequence["PromiseResult"], times: Sequence["Times"], notices: Sequence[str]) -> str:
     lines = [f"{name}:"]
-    for one in verdicts:
+    for one in results:
         lines.append(f"  {'FAIL' if one.wrong else 'ok':<5} {one.promise}" + (f": {one.wrong}" if one.wrong else ""))
     for took in times:
         lines.append(f"  {took.width_px}x{took.height_px}: {took.p50_ms:.2f} ms p50, {took.p95_ms:.2f} ms p95")
-    lines += [f"  it says: {line}" for line in said]
+    lines += [f"  note: {line}" for line in notices]
     return "\n".join(lines)

@@ -199,6 +199,6 @@ def test_a_killed_detector_service_is_the_same_over_zenoh(tmp_path):
             assert until(lambda: _wheels_us(robot, killed_us), 3)
             assert _wheels_us(robot, killed_us) - killed_us <= ZERO_US + DEADLINE_US
             serve(robot.endpoint)
-            processes.wait_line("detector", "looks at the pictures", 15)
+            processes.wait_line("detector", "receives the frames", 15)
             assert until(lambda: robot.speed() > 0.5, 3.0), log.read_text()
             assert "searching" not in log.read_text()

@@ -96,7 +96,7 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("detector", "check", "boxes"), 2, "choose a local detector"),
         (("detector", "check", "zenoh"), 2, "that the service serves"),
         (("score", "detectors", "zenoh", "--frames", "1"), 2, "that the service serves"),
-        (("detector", "--serve", "zenoh"), 2, "serve one that looks itself"),
+        (("detector", "--serve", "zenoh"), 2, "'zenoh' is remote"),
         (("vision", "--dry-run", "--camera", "v4l2", "--detector", "zenoh"), 2, "that the service serves"),
         (("vision", "--dry-run", "--camera", "v4l2", "--detector", "hvs"), 2, "did you mean 'hsv'"),
         (("vision", "--dry-run", "--camera", "v4l2", "--mission", "folow"), 2, "did you mean 'follow'"),
@@ -124,7 +124,7 @@ def test_every_mistake_is_one_line(capsys, arguments: tuple[str, ...], code: int
 
 def test_what_a_detector_says_while_it_is_checked_is_shown(capsys) -> None:
     code, out, _ = run(capsys, "detector", "check", "http+jpeg://127.0.0.1:1/eyes")
-    assert code == 5 and "FAIL  Every picture" in out and "it says: " in out and "UNREACHABLE" in out
+    assert code == 5 and "FAIL  Every picture" in out and "note: " in out and "UNREACHABLE" in out
 
 
 def test_an_option_of_a_section_is_set_by_a_dot() -> None:

@@ -69,7 +69,7 @@ class Bench:
         return message and decode(Detections, message.payload, DETECTIONS.max_payload_bytes)
 
     def tally(self):
-        return self.service.tallies()["r1"]
+        return self.service.counters()["r1"]
 
 
 def test_what_is_refused_is_no_load_and_each_reason_is_told_once():
@@ -82,10 +82,10 @@ def test_what_is_refused_is_no_load_and_each_reason_is_told_once():
     says.found, says.changes = (GOOD,), {"device": "d" * 100}
     for _ in range(30):
         assert bench.look() is None
-    told = [line for line in bench.words if "looks at" not in line]
+    told = [line for line in bench.words if "receives the frames" not in line]
     assert len(told) == 2 and "out of memory" in told[0] and "cannot be sent" in told[1]
-    bench.service._look_at_load(1e9)
-    assert bench.tally().refused == 60 and "overloaded" not in bench.service.about() and len(bench.words) == 3
+    bench.service._check_load(1e9)
+    assert bench.tally().rejected == 60 and "overloaded" not in bench.service.about() and len(bench.words) == 3
 
 
 def test_other_reasons_each_time_end_somewhere():
@@ -114,8 +114,8 @@ def test_an_answer_that_is_too_long_for_the_wire_loses_its_last_boxes_and_ends_n
 def test_what_the_wire_cannot_say_is_counted_and_said_once_with_what_is_wrong(detector, why):
     bench = Bench(detector)
     assert bench.look() is None and bench.look() is None
-    assert (bench.tally().refused, bench.tally().served) == (2, 0)
-    (line,) = [one for one in bench.words if "looks at" not in one]
+    assert (bench.tally().rejected, bench.tally().served) == (2, 0)
+    (line,) = [one for one in bench.words if "receives the frames" not in one]
     assert why in line and line.startswith("detector: ") and "\n" not in line
 
 
@@ -154,4 +154,4 @@ class Late:
 def test_what_comes_after_the_deadline_is_late_and_not_refused(answers):
     bench = Bench(Late(answers), deadline_us=5_000)
     assert bench.look() is None
-    assert (bench.tally().late, bench.tally().refused) == (1, 0)
+    assert (bench.tally().late, bench.tally().rejected) == (1, 0)

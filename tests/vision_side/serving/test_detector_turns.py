@@ -14,7 +14,7 @@ def test_the_newest_takes_the_place_of_the_one_before_and_is_counted():
     for item in range(5):
         turns.offer("r1", item, item)
     assert [(turn.robot, turn.item) for turn in turns.take(5)] == [("r1", 4)] and turns.take(6) == []
-    tally = turns.tallies["r1"]
+    tally = turns.counters["r1"]
     assert (tally.offered, tally.overtaken, tally.dropped) == (5, 4, 4)
 
 
@@ -42,7 +42,7 @@ def test_what_is_too_old_to_be_answered_in_time_is_not_looked_at():
     turns.offer("old", 1, 0)
     turns.offer("young", 2, 60_000)
     assert [turn.robot for turn in turns.take(95_000, each_us=10_000)] == ["young"]
-    assert turns.tallies["old"].stale == 1
+    assert turns.counters["old"].stale == 1
     turns.offer("edge", 3, 0)
     assert [turn.robot for turn in turns.take(DEADLINE_US)] == ["edge"]
 
@@ -82,5 +82,5 @@ def test_twice_the_load_is_shared_fairly_and_nothing_is_answered_late(seed):
             ages.append(now_us - turn.arrived_us)
     mean = sum(served.values()) / len(served)
     assert max(abs(count - mean) for count in served.values()) <= 0.1 * mean
-    assert 0.45 < sum(served.values()) / sum(tally.offered for tally in turns.tallies.values()) < 0.55
+    assert 0.45 < sum(served.values()) / sum(tally.offered for tally in turns.counters.values()) < 0.55
     assert sorted(ages)[int(len(ages) * 0.95)] <= DEADLINE_US

@@ -18,7 +18,7 @@ from tests.vision_side.detect.remote.test_zenoh_detector import Robot
 
 
 @pytest.mark.parametrize(("arguments", "what"), [
-    (["--serve", "boxes"], "somebody else finds"), (["--serve", "zenoh"], "somebody else finds"),
+    (["--serve", "boxes"], "is remote"), (["--serve", "zenoh"], "is remote"),
     (["--serve", "hvs"], "did you mean 'hsv'"), (["--serve", "http+jpeg://"], "http+jpeg://127.0.0.1:8080/detect"),
     (["--serve", "oip+http://127.0.0.1"], "names no model"), (["--serve", "hsv", "--device", "gpu"], "device"),
     (["--serve", "hsv", "--connect", "ws://127.0.0.1:9"], "Zenoh"), (["--serve", "hsv", "--deadline-ms", "0"], "5"),

@@ -96,7 +96,7 @@ class Bench:
     def robot(self, name):
         robot = Robot(name, self.endpoint)
         self._ending.callback(robot.link.close)
-        assert until(lambda: (robot.here(), f"detector: looks at the pictures of {name}" in self.words)[1])
+        assert until(lambda: (robot.here(), f"detector: receives the frames of {name}" in self.words)[1])
         return robot
 
     def detector(self, *robots):
@@ -149,11 +149,11 @@ def test_a_bad_picture_and_a_bad_header_get_no_answer_and_are_counted(bench):
     robot = bench.robot("r1")
     detector = bench.detector("r1")
     assert until(lambda: _result(robot, detector))
-    before = bench.service.tallies()["r1"].refused
+    before = bench.service.counters()["r1"].rejected
     for jpeg in (b"", BALL_JPEG[:300], b"GIF89a"):
         assert _result(robot, detector, jpeg, seconds=0.05) is None
     robot.frame(header=b"{}")
-    assert until(lambda: bench.service.tallies()["r1"].refused == before + 4)
+    assert until(lambda: bench.service.counters()["r1"].rejected == before + 4)
     assert _result(robot, detector) is not None
 
 
@@ -162,7 +162,7 @@ def test_a_picture_of_no_cameras_size_is_refused_before_any_detector_sees_it(ben
     robot, odd = bench.robot("r1"), bench.robot("r2")
     detector = bench.detector("r1")
     odd.frame(jpeg_of(np.full((size[1], size[0], 3), 128, np.uint8)))
-    assert until(lambda: "r2" in (of := bench.service.tallies()) and of["r2"].refused == 1)
+    assert until(lambda: "r2" in (of := bench.service.counters()) and of["r2"].rejected == 1)
     assert until(lambda: _result(robot, detector)) and len(bench.words) == 2, bench.words
 
 
@@ -189,7 +189,7 @@ def test_a_detector_that_fails_gives_no_answer_and_the_service_goes_on():
         robot = bench.robot("r1")
         for asked in (1, 2, 3):
             robot.frame()
-            assert until(lambda asked=asked: getattr(bench.service.tallies().get("r1"), "refused", 0) == asked)
+            assert until(lambda asked=asked: getattr(bench.service.counters().get("r1"), "rejected", 0) == asked)
         detector = bench.detector("r1")
         assert until(lambda: _result(robot, detector)), "and then it looks"
         assert [line for line in bench.words if "out of memory" in line], bench.words
