@@ -7,6 +7,7 @@ from pathlib import Path
 from statistics import median
 from typing import Final
 
+from sightline.evaluation.checks import Check, at_most
 from sightline.protocol.errors import ConfigError
 
 OURS: Final = "sightline"
@@ -229,17 +230,6 @@ class Figures:
     hot_ms: float | None
 
 
-@dataclass(frozen=True, slots=True)
-class LoopCheck:
-    """One demanded figure."""
-
-    name: str
-    value: float | None
-    unit: str
-    bound: float
-    ok: bool
-
-
 def percentile(values: Sequence[float], percent: float) -> float | None:
     """The smallest of `values` that at least `percent` (0..100) of them do not exceed; None of none."""
     if not values:
@@ -285,7 +275,7 @@ def _parts(ages_us: Sequence[tuple[int, int]]) -> tuple[float | None, float | No
     return median(first) / 1000, median(last) / 1000
 
 
-def loop_checks(figures: Mapping[str, Figures], setting: LoopSetting) -> list[LoopCheck]:
+def loop_checks(figures: Mapping[str, Figures], setting: LoopSetting) -> list[Check]:
     """Hold Sightline against the floor of the same run, or, with a detector slower than the camera, against its delay.
 
     And against every rival there is; transports with our eyes are shown and not judged. `figures` has at least the
@@ -303,7 +293,7 @@ def loop_checks(figures: Mapping[str, Figures], setting: LoopSetting) -> list[Lo
     return [*checks, at_most("samples disturbed by others", len(disturbed), "", 0.0)]
 
 
-def _unloaded(ours: Figures, floor: Figures) -> list[LoopCheck]:
+def _unloaded(ours: Figures, floor: Figures) -> list[Check]:
     cpu_ms = ours.cpu_ms["vision"] - floor.cpu_ms["vision"]
     return [
         at_most("p50 over floor", _over(ours.p50_ms, floor.p50_ms), "ms", P50_OVER_FLOOR_MS),
@@ -313,7 +303,7 @@ def _unloaded(ours: Figures, floor: Figures) -> list[LoopCheck]:
     ]
 
 
-def _loaded(ours: Figures, delay_ms: float) -> list[LoopCheck]:
+def _loaded(ours: Figures, delay_ms: float) -> list[Check]:
     drift = _over(ours.last_ms, ours.first_ms)
     drift_percent = None if drift is None or not ours.first_ms else 100 * abs(drift) / ours.first_ms
     return [
@@ -327,7 +317,3 @@ def _loaded(ours: Figures, delay_ms: float) -> list[LoopCheck]:
 def _over(value: float | None, other: float | None) -> float | None:
     return None if value is None or other is None else value - other
 
-
-def at_most(name: str, value: float | None, unit: str, bound: float) -> LoopCheck:
-    """Hold `value` against `bound`; a value that there is not does not hold."""
-    return LoopCheck(name, value, unit, bound, value is not None and value <= bound)

@@ -28,7 +28,6 @@ from sightline.benchmarks.loop.figures import (
     TAKEN_BOUND_PERCENT,
     Course,
     Figures,
-    LoopCheck,
     LoopSetting,
     Sample,
     course_of_tally,
@@ -40,6 +39,7 @@ from sightline.benchmarks.loop.ours import endpoint_of, running_services
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.processes import BenchProcesses, free_port
 from sightline.benchmarks.loop.vision import overloaded
+from sightline.evaluation.checks import Check
 from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.protocol.clock import monotonic_us
 
@@ -158,7 +158,7 @@ class Race:
     jpeg_bytes: float
     samples: dict[str, Sample]
     figures: dict[str, Figures]
-    checks: list[LoopCheck]
+    checks: list[Check]
 
 
 def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:

@@ -21,14 +21,13 @@ from sightline.benchmarks.loop.figures import (
     ANSWERED_PERCENT,
     TAKEN_BOUND_PERCENT,
     Course,
-    LoopCheck,
     LoopSetting,
-    at_most,
     percentile,
 )
 from sightline.benchmarks.loop.ours import ROBOT, Ours, running_services
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.processes import BenchProcesses
+from sightline.evaluation.checks import Check, at_most
 from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.protocol.channels import FRAME
 from sightline.protocol.transports.link import Message
@@ -82,7 +81,7 @@ class Watch:
     taken_percent: float
 
 
-def measure_watchers(setting: LoopSetting, viewers: int, say: Callable[[str], None]) -> list[LoopCheck]:
+def measure_watchers(setting: LoopSetting, viewers: int, say: Callable[[str], None]) -> list[Check]:
     """Run `setting.seconds` without, and again with `viewers` (2 to 12); `setting.pictures` is filled in.
 
     Taken again, `setting.tries` times at most, while others have the machine. Raises ConfigError for an unknown
@@ -143,7 +142,7 @@ def _is_disturbed(watch: Watch) -> bool:
     return watch.taken_percent > TAKEN_BOUND_PERCENT
 
 
-def _checks(alone: Watch, crowded: Watch) -> list[LoopCheck]:
+def _checks(alone: Watch, crowded: Watch) -> list[Check]:
     ages_ms = [[age_us / 1000 for _, age_us in one.course.ages_us] for one in (alone, crowded)]
     first_ms, then_ms = (percentile(one, 95) for one in ages_ms)
     later_ms = None if first_ms is None or then_ms is None else then_ms - first_ms

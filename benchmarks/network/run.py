@@ -14,7 +14,6 @@ from typing import Final
 import cv2
 import numpy as np
 
-from sightline.benchmarks.loop.figures import LoopCheck, at_most
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.network.cases import Case, spans_s
@@ -30,6 +29,7 @@ from sightline.benchmarks.network.stage import (
     start_robot,
     start_vision,
 )
+from sightline.evaluation.checks import Check, at_most
 from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError
@@ -92,7 +92,7 @@ def _run(row: Case, stage: Stage, scenes: Mapping[str, Scene]) -> NetworkRun:
         return scenes[row.scene](row, stage) if row.scene else _course(row, stage)
     except HardwareError as error:
         why = f"runs: {error}"[:160]
-        return NetworkRun(row, stage.seed, 0, (), (LoopCheck(why, None, "", 1.0, ok=False),))
+        return NetworkRun(row, stage.seed, 0, (), (Check(why, None, "", 1.0, ok=False),))
 
 
 def _course(row: Case, stage: Stage) -> NetworkRun:
@@ -113,13 +113,13 @@ def _course(row: Case, stage: Stage) -> NetworkRun:
         crew.end()
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
     figures = tuple(figures_of(notes, stretch) for stretch in stretches)
-    harmed = LoopCheck("injected", float(injected), "", 1.0, injected >= 1)
+    harmed = Check("injected", float(injected), "", 1.0, injected >= 1)
     return NetworkRun(
         row, stage.seed, injected, figures, (harmed, *network_checks(row, figures), *_wheel_checks(stage, notes))
     )
 
 
-def _wheel_checks(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[LoopCheck]:
+def _wheel_checks(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[Check]:
     """From what the wheels were told, whatever the robot says of itself; over Zenoh, where twists can be heard."""
     if notes["twists"]:
         lines = on_old_sight(read_wheel_commands(stage.wheels.read_text("ascii")), notes["twists"])

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 
-from sightline.benchmarks.loop.figures import LoopCheck, at_most, percentile
+from sightline.benchmarks.loop.figures import percentile
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.network.cases import Case
@@ -19,6 +19,7 @@ from sightline.benchmarks.network.figures import WheelCommand, moves_again_s, re
 from sightline.benchmarks.network.robots import Settings
 from sightline.benchmarks.network.stage import EVERYWHERE, BenchWire, NetworkRun, Stage, start_robot, start_vision
 from sightline.benchmarks.network.stop_client import RESET, STOPPED
+from sightline.evaluation.checks import Check, at_most
 from sightline.evaluation.faults.evidence import REQUESTED, MotorRow, measure_stop, moved_on_old_sight, wheel_mps
 from sightline.evaluation.faults.fixture import ROBOT, RobotFixture, Setup
 from sightline.protocol.clock import monotonic_us
@@ -125,7 +126,7 @@ def _checks(row: Case, stage: Stage, harm: Callable[[], int], what: str, bound_s
         harmed_us = harm()
         took_s.append(_wait_again(stage, harmed_us))
     checks = (
-        LoopCheck("injected", float(len(took_s)), "times", 1.0, ok=True),
+        Check("injected", float(len(took_s)), "times", 1.0, ok=True),
         at_most(f"{what}, worst", _worst(took_s), "s", bound_s),
     )
     return NetworkRun(row, stage.seed, len(took_s), (), checks, {f"time {n}": one for n, one in enumerate(took_s)})
@@ -224,9 +225,9 @@ def _stream_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: tuple[int,
 def _uplink_run(row: Case, stage: Stage, injected: int, streams: Sequence[tuple[float, float]]) -> NetworkRun:
     (alone_bytes, alone_fps), (crowded_bytes, crowded_fps) = streams
     checks = (
-        LoopCheck("injected", float(injected), "", 1.0, injected >= 1),
+        Check("injected", float(injected), "", 1.0, injected >= 1),
         at_most("bytes from the robot, over one stream", crowded_bytes / max(1.0, alone_bytes), "times", MOST_SHARE),
-        LoopCheck("frames while crowded", crowded_fps, "fps", UPLINK_LEAST_FPS, crowded_fps >= UPLINK_LEAST_FPS),
+        Check("frames while crowded", crowded_fps, "fps", UPLINK_LEAST_FPS, crowded_fps >= UPLINK_LEAST_FPS),
     )
     facts = {"alone_bytes_per_frame": alone_bytes, "crowded_bytes_per_frame": crowded_bytes, "alone_fps": alone_fps}
     return NetworkRun(row, stage.seed, injected, (), checks, facts)
@@ -274,13 +275,13 @@ def fleet(row: Case, stage: Stage) -> NetworkRun:
         injected = wire.shape(LinkShapes()) - before
         crew.end()
     answers = json.loads(settings.notes.read_text("utf-8"))
-    harmed = LoopCheck("injected", float(injected), "", 1.0, injected >= 1)
+    harmed = Check("injected", float(injected), "", 1.0, injected >= 1)
     return NetworkRun(row, stage.seed, injected, (), (harmed, *fleet_checks(answers, begin_us, end_us)))
 
 
 def fleet_checks(
     answers: Mapping[str, Sequence[Sequence[int]]], begin_us: int, end_us: int
-) -> tuple[LoopCheck, LoopCheck, LoopCheck]:
+) -> tuple[Check, Check, Check]:
     """The robot with the fewest answers, and the one with the oldest. `answers`: (captured_us, age_us) of each."""
     seconds = (end_us - begin_us) / 1e6
     ages_ms = [[age_us / 1000 for at_us, age_us in seen if begin_us <= at_us < end_us] for seen in answers.values()]
@@ -289,8 +290,8 @@ def fleet_checks(
     known = [one for one in p95_ms if one is not None]
     oldest_ms = max(known) if known and len(known) == len(p95_ms) else None
     return (
-        LoopCheck("robots", float(len(answers)), "", float(ROBOTS), len(answers) >= ROBOTS),
-        LoopCheck("answered, least", least_fps, "fps", FLEET_LEAST_FPS, least_fps >= FLEET_LEAST_FPS),
+        Check("robots", float(len(answers)), "", float(ROBOTS), len(answers) >= ROBOTS),
+        Check("answered, least", least_fps, "fps", FLEET_LEAST_FPS, least_fps >= FLEET_LEAST_FPS),
         at_most("age p95, worst robot", oldest_ms, "ms", MOST_P95_MS),
     )
 
@@ -331,7 +332,7 @@ def _medium_run(row: Case, stage: Stage, rig: RobotFixture) -> NetworkRun:
     told_us = [one.t_us for one in rig.noted("person", REQUESTED)]
     rows = rig.motors()
     checks = (
-        LoopCheck("injected", float(injected), "", 1.0, injected >= 1),
+        Check("injected", float(injected), "", 1.0, injected >= 1),
         *stop_checks_of(rows, told_us, [one.t_us for one in rig.noted("person", RESET)]),
         reported_check(told_us, [one.frame_us for one in rig.noted("person", STOPPED)]),
         at_most("moved on frames over 400 ms", moved_on_old_sight(rows, rig.sent(), None), "lines", 0),
@@ -339,7 +340,7 @@ def _medium_run(row: Case, stage: Stage, rig: RobotFixture) -> NetworkRun:
     return NetworkRun(row, stage.seed, injected, (), checks, {"stops": len(told_us)})
 
 
-def stop_checks_of(rows: Sequence[MotorRow], told_us: Sequence[int], reset_us: Sequence[int]) -> Sequence[LoopCheck]:
+def stop_checks_of(rows: Sequence[MotorRow], told_us: Sequence[int], reset_us: Sequence[int]) -> Sequence[Check]:
     """When each STOP, said at `told_us`, shows in what the motors were told, and when the wheels stood; each holds
     until the wheels turn after its reset.
     """
@@ -353,7 +354,7 @@ def stop_checks_of(rows: Sequence[MotorRow], told_us: Sequence[int], reset_us: S
     )
 
 
-def reported_check(told_us: Sequence[int], stopped_us: Sequence[int]) -> LoopCheck:
+def reported_check(told_us: Sequence[int], stopped_us: Sequence[int]) -> Check:
     """When the robot itself said, in the status with that stamp, that it was stopped."""
     said = [(stop_us - at_us) / 1000 for at_us, stop_us in zip(told_us, stopped_us, strict=False)]
     value = percentile(said, 99) if len(stopped_us) == len(told_us) else None

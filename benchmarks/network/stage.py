@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from sightline.benchmarks.loop.figures import LoopCheck
 from sightline.benchmarks.loop.ours import ROBOT
 from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.network.cases import WEBSOCKET, ZENOH, Case
 from sightline.benchmarks.network.figures import NetworkFigures
+from sightline.evaluation.checks import Check
 from sightline.protocol.errors import ConfigError
 from sightline.sim.network_emulator import LinkShapes
 
@@ -63,7 +63,7 @@ class NetworkRun:
     seed: int
     injected: int
     figures: tuple[NetworkFigures, ...]
-    checks: tuple[LoopCheck, ...]
+    checks: tuple[Check, ...]
     facts: Mapping[str, float | None] = field(default_factory=dict)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,7 +17,6 @@ from sightline.protocol.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from sightline.benchmarks.loop.figures import LoopCheck
     from sightline.benchmarks.loop.race import Race
     from sightline.benchmarks.network.stage import NetworkRun
     from sightline.evaluation.checks import Check
@@ -111,7 +110,7 @@ def demo(
     return 0 if ok else CHECK_FAILED
 
 
-def print_checks(checks: "list[Check]", as_json: bool) -> int:
+def print_checks(checks: "Sequence[Check]", as_json: bool) -> int:
     """Print them, and return the exit code."""
     from sightline.evaluation.checks import check_line
 
@@ -131,35 +130,6 @@ _ALONE = (
     "transport alone costs, without credit, age or a gate; shown, not judged."
 )
 Transport = Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")]
-
-
-class AnyCheck(Protocol):
-    """A check, whichever bench made it."""
-
-    @property
-    def name(self) -> str:
-        """What is demanded."""
-        ...
-
-    @property
-    def value(self) -> float | None:
-        """What was measured."""
-        ...
-
-    @property
-    def unit(self) -> str:
-        """Of value and bound."""
-        ...
-
-    @property
-    def bound(self) -> float:
-        """The most that is allowed."""
-        ...
-
-    @property
-    def ok(self) -> bool:
-        """Whether it holds."""
-        ...
 
 
 def register_loop_benches(group: typer.Typer) -> None:
@@ -193,6 +163,8 @@ def loop(
     setting = LoopSetting(
         Path(), width_px, height_px, fps, transport, detector_delay_ms, overload, seconds=seconds, peers=peers_of(peers)
     )
+    from sightline.evaluation.checks import check_line
+
     race = run_race(setting, lambda line: typer.echo(line, err=True))
     result = _race_result(race)
     if out is not None:
@@ -200,7 +172,7 @@ def loop(
     if as_json:
         typer.echo(json.dumps(result))
     else:
-        typer.echo("\n".join([*_table(race), "", *_check_lines(race.checks)]))
+        typer.echo("\n".join([*_table(race), "", *map(check_line, race.checks)]))
     return 0 if result["ok"] else CHECK_FAILED
 
 
@@ -217,16 +189,7 @@ def watchers(
         from sightline.benchmarks.loop.viewers import measure_watchers
 
     setting = LoopSetting(Path(), transport=transport, seconds=seconds)
-    return _print_loop_checks(measure_watchers(setting, viewers, lambda line: typer.echo(line, err=True)), as_json)
-
-
-def _print_loop_checks(checks: "Sequence[LoopCheck]", as_json: bool) -> int:
-    ok = all(check.ok for check in checks)
-    if as_json:
-        typer.echo(json.dumps({"ok": ok, "checks": [asdict(check) for check in checks]}))
-    else:
-        typer.echo("\n".join(_check_lines(checks)))
-    return 0 if ok else CHECK_FAILED
+    return print_checks(measure_watchers(setting, viewers, lambda line: typer.echo(line, err=True)), as_json)
 
 
 def _race_result(race: "Race") -> dict[str, Any]:
@@ -265,12 +228,6 @@ def _row(name: str, race: "Race") -> str:
     memory = " ".join(f"{megabytes:.0f}" for megabytes in one.memory_mb.values())
     carried = f"{one.bytes_per_picture or 0:8.0f} {one.taken_percent:5.1f} %"
     return f"{name:18} {one.answered_percent:7.1f} % {ages}    {carried}  {cpu}; {memory}"
-
-
-def _check_lines(checks: "Sequence[AnyCheck]") -> list[str]:
-    from sightline.evaluation.checks import Check, check_line
-
-    return [check_line(Check(one.name, one.value, one.unit, one.bound, one.ok)) for one in checks]
 
 
 # `sightline bench network`: two machines and a bad network between them, on this one. Shell. Needs root.
@@ -318,7 +275,7 @@ def _network_result(runs: "Sequence[NetworkRun]", transport: str) -> dict[str, A
             "rows": rows}
 
 
-def _worst(runs: "Sequence[NetworkRun]") -> "Iterator[LoopCheck]":
+def _worst(runs: "Sequence[NetworkRun]") -> "Iterator[Check]":
     """Of each demand on a row, the seed that did worst."""
     from sightline.benchmarks.network.figures import worst_of_seeds
 
@@ -347,11 +304,11 @@ def _print_worst(runs: "Sequence[NetworkRun]") -> None:
     _print_network_checks(list(_worst(runs)), as_json=False)
 
 
-def _print_network_checks(checks: "Sequence[LoopCheck]", *, as_json: bool) -> None:
-    from sightline.evaluation.checks import Check, check_line
+def _print_network_checks(checks: "Sequence[Check]", *, as_json: bool) -> None:
+    from sightline.evaluation.checks import check_line
 
     for check in checks:
-        typer.echo("  " + check_line(Check(check.name, check.value, check.unit, check.bound, check.ok)), err=as_json)
+        typer.echo("  " + check_line(check), err=as_json)
 
 
 # `sightline bench detector` and `bench streams`: what eyes elsewhere cost, and one service for many. Shell.
@@ -403,7 +360,7 @@ def detector(
         judged = bound if way == "hot" else float("inf")
         checks.append(Check(what, cost.added_us, "us", judged, cost.added_us <= judged))
         checks.append(Check(f"{name}: not answered of {frames}", cost.unanswered, "", most, cost.unanswered <= most))
-    return _print(checks, as_json)
+    return print_checks(checks, as_json)
 
 
 def streams(
@@ -428,7 +385,7 @@ def streams(
         Check("robots never answered", missing, "", 0, missing == 0),
         Check("memory of the service grew", load.growth_mb, "MB", bench.MEMORY_MB, load.growth_mb <= bench.MEMORY_MB),
     ]
-    return _print(checks, as_json)
+    return print_checks(checks, as_json)
 
 
 @contextmanager
@@ -475,8 +432,3 @@ def _free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-def _print(checks: "list[Check]", as_json: bool) -> int:
-
-    return print_checks(checks, as_json)

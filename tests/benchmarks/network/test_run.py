@@ -7,11 +7,11 @@ import sys
 
 import pytest
 
-from sightline.benchmarks.loop.figures import LoopCheck, at_most
 from sightline.benchmarks.network.cases import CASES, Case, chosen, spans_s
 from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks, sent_between, worst_of_seeds
 from sightline.benchmarks.network.run import SCENES, write_film
 from sightline.benchmarks.network.stage import NetworkSetting
+from sightline.evaluation.checks import Check, at_most
 from sightline.protocol.errors import ConfigError
 from sightline.sim.network_emulator import EmulatedLink, LinkShape, LinkShapes
 from sightline.sim.tun_emulator import why_impossible
@@ -139,7 +139,7 @@ def test_a_bound_that_is_broken_is_not_ok_and_none_is_never_ok():
 
 def test_the_worst_seed_of_each_demand_is_shown():
     def answered(fps):
-        return LoopCheck("answered", fps, "fps", 12.0, fps >= 12)
+        return Check("answered", fps, "fps", 12.0, fps >= 12)
 
     runs = [(at_most("age", age_ms, "ms", 160), answered(fps)) for age_ms, fps in ((90, 20), (110, 14), (80, 30))]
     assert [(one.name, one.value, one.ok) for one in worst_of_seeds("radio", runs)] == [
