@@ -49,15 +49,16 @@ class Config(BaseModel):
         if not isinstance(given, dict) or cls.renamed_keys.keys().isdisjoint(given):
             return given
         for old in cls.renamed_keys.keys() & given.keys():
-            _warn_renamed(old, cls.renamed_keys[old])
+            warn_renamed("configuration key", old, cls.renamed_keys[old])
         return {key: value for key, value in given.items() if key not in cls.renamed_keys} | {
             new: given[old] for old, new in cls.renamed_keys.items() if old in given
         }
 
 
 @cache
-def _warn_renamed(old: str, new: str) -> None:
-    _log.warning("configuration key %r is now %r; rename it", old, new)
+def warn_renamed(noun: str, old: str, new: str) -> None:
+    """Log once that a name which is still accepted has changed."""
+    _log.warning("%s %r is now %r; rename it", noun, old, new)
 
 
 def first_problem(error: ValidationError, noun: str = "", known: Iterable[str] = (), whole: str = "") -> str:

@@ -24,6 +24,8 @@ from sightline.vision_side.detect.port import (
     is_label,
 )
 
+OLD_NOTICES: Final = "news"
+"""The name of `notices` in the release before; accepted for one release."""
 MAX_NOTICES: Final = 16
 """Lines stored between two calls of `take`; the oldest go first."""
 
@@ -62,7 +64,7 @@ class DetectorWrapper:
         """Give the one inside a robot's link."""
         attach_detector(self.inner, link)
 
-    def news(self) -> list[str]:
+    def notices(self) -> list[str]:
         """Return the lines of the one inside."""
         return notices_of(self.inner)
 
@@ -86,13 +88,13 @@ def attach_detector(detector: Any, link: Link) -> None:
 
 def notices_of(detector: Any) -> list[str]:
     """Return the detector's lines for the operator since the last call; one that raises is reported."""
-    news: Callable[[], list[str]] | None = getattr(detector, "news", None)
-    if news is None:
+    notices: Callable[[], list[str]] | None = getattr(detector, "notices", getattr(detector, OLD_NOTICES, None))
+    if notices is None:
         return []
     try:
-        return [" ".join(str(line).split()) for line in news()]
+        return [" ".join(str(line).split()) for line in notices()]
     except PLUGIN_ERRORS as error:  # a detector that only reports badly may still detect well
-        return [_raises("the detector's news()", error)]
+        return [_raises("the detector's notices()", error)]
 
 
 def maker_of(detector: Any) -> Maker | None:

@@ -145,18 +145,17 @@ class DetectionResult:
 class Detector(Protocol):
     """Finds objects in frames, of one robot or of several.
 
-    A class of this kind has a pydantic `Config` and is built as `Plugin(config)`. It may have `news()`, which returns
-    lines for a person that were not returned before, few and short; `maker`, who its results will name; `attach(link)`,
-    called with each robot's link before its first frame, for who hears something else of it; `close()`, called once,
-    when nobody will ask again; and, on the class, `waits = True` where it waits for somebody else: each robot of a
-    fleet then has one of its own, on a thread of its own.
+    A class of this kind has a pydantic `Config` and is built as `Plugin(config)`. It may have `notices()`, which
+    returns the few short lines for the operator that it did not return before; `maker`, the `Maker` of its results;
+    `attach(link)`, called with each robot's link before its first frame; `close()`, called once at the end; and, on the
+    class, `waits = True` if it waits for another service: each robot of a fleet then has its own detector and thread.
     """
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """One result for each frame, in their order; None is "no answer", never "saw nothing".
 
-        `deadline_us` is on this machine's monotonic clock: who waits for somebody else gives up by then. Boxes lie in
-        the picture. Raises nothing for any frame whatever: bytes that do not decode get no answer.
+        `deadline_us` is on this machine's monotonic clock: a detector that waits for a service gives up by then.
+        Boxes lie in the picture. Raises nothing for any frame: bytes that do not decode get no answer.
         """
         ...
 

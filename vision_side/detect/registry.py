@@ -9,11 +9,11 @@ import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from sightline.protocol.config import PluginRegistry, config_model
+from sightline.protocol.config import PluginRegistry, config_model, warn_renamed
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
-from sightline.vision_side.detect.plugin_calls import plugin_guard
+from sightline.vision_side.detect.plugin_calls import OLD_NOTICES, plugin_guard
 from sightline.vision_side.detect.port import Detector, NoDetector
 from sightline.vision_side.detect.remote.client import EXAMPLES
 from sightline.vision_side.missions.registry import check_missions
@@ -179,4 +179,6 @@ def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tup
     own = REGISTRY.settings(name, plugin, shared_options(plugin, given | dict(options), config))
     if not callable(getattr(plugin, "detect", None)):
         raise ConfigError(f"detector {kind!r}: the class has no method detect; see docs/detectors.md")
+    if hasattr(plugin, OLD_NOTICES) and not hasattr(plugin, "notices"):
+        warn_renamed(f"detector {kind!r}: method", OLD_NOTICES, "notices")
     return plugin, own

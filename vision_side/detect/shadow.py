@@ -134,7 +134,7 @@ class ShadowDetector:
         agreement = self._agreements.find(robot)
         return f"shadow {agreement.share:.0%} agree" if agreement and agreement.compared else "shadow no answer yet"
 
-    def news(self) -> list[str]:
+    def notices(self) -> list[str]:
         """Where the two disagree, at most every few seconds, and what both have to report."""
         return [*notices_of(self._driving), *notices_of(self._shadow), *self._notices.take()]
 

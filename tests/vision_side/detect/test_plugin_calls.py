@@ -16,7 +16,7 @@ class Failing:
     def _fail(self, *_: object) -> None:
         raise self._error
 
-    attach = close = news = _fail
+    attach = close = notices = _fail
 
 
 def test_what_a_plug_in_raises_is_one_line_that_says_where() -> None:
@@ -30,7 +30,7 @@ def test_what_a_plug_in_raises_is_one_line_that_says_where() -> None:
 
 def test_who_only_talks_badly_may_go_on_looking() -> None:
     (line,) = notices_of(Failing(KeyError("x" * 500)))
-    assert "news() raises KeyError" in line and len(line) <= 160
+    assert "notices() raises KeyError" in line and len(line) <= 160
     assert notices_of(object()) == []
 
 

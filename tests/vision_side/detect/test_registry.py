@@ -16,6 +16,7 @@ from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.detectors import Adaptive, Hsv
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
 from sightline.vision_side.detect.onnx.detector import OnnxDetector
+from sightline.vision_side.detect.plugin_calls import notices_of
 from sightline.vision_side.detect.port import DetectFrame, NoDetector, result_of
 from sightline.vision_side.detect.registry import (
     REGISTRY,
@@ -175,3 +176,16 @@ def test_a_device_is_handed_to_who_can_have_one(tmp_path: Path) -> None:
     assert isinstance(configured_detector(config(kind=f"onnx:{path}", device="cpu")), OnnxDetector)
     with pytest.raises(HardwareError, match="--device cuda"):
         configured_detector(config(kind=f"onnx:{path}", device="cuda"))
+
+
+class Older(Mine):
+    """A plug-in whose notices have their name of the release before."""
+
+    def news(self):
+        return ["warm"]
+
+
+def test_renamed_hook_of_a_plug_in_is_accepted_with_one_warning(caplog) -> None:
+    for _ in range(2):
+        assert notices_of(build_detector(f"{__name__}:Older", {}, config())) == ["warm"]
+    assert caplog.messages == [f"detector '{__name__}:Older': method 'news' is now 'notices'; rename it"]

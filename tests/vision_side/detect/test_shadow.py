@@ -118,7 +118,7 @@ def test_the_shadow_sees_the_frames_and_never_answers_them(pair) -> None:
         assert names(both.detect([frame(seq)], NO_DEADLINE)) == ["one"]
         assert until(lambda seq=seq: ("r1", seq) in shadow.seen)
     assert until(lambda: both.shadow_text("r1") == "shadow 0% agree")
-    assert any("two" in line and "one" in line for line in both.news())
+    assert any("two" in line and "one" in line for line in both.notices())
 
 
 def test_a_shadow_that_hangs_delays_nothing_and_then_sees_the_newest(pair) -> None:
@@ -155,7 +155,7 @@ def test_a_shadow_that_raises_is_told_and_goes_on(pair) -> None:
     _, shadow, both = pair
     shadow.detect, good = None, shadow.detect  # calling None raises
     both.detect([frame(1)], NO_DEADLINE)
-    assert until(lambda: any("failed" in line for line in both.news()))
+    assert until(lambda: any("failed" in line for line in both.notices()))
     shadow.detect = good
     both.detect([frame(2)], NO_DEADLINE)
     assert until(lambda: ("r1", 2) in shadow.seen)

@@ -24,7 +24,7 @@ LONGEST = Detection(10.123456789012345, 11.123456789012345, 312.1234567890123, 2
 
 
 class Says:
-    """Answers what it is told to; an exception is raised, and `news` are told once."""
+    """Answers what it is told to; an exception is raised, and `notices` are given once."""
 
     def __init__(self, *found, **changes):
         self.found, self.changes, self.lines = found, changes, []
@@ -34,7 +34,7 @@ class Says:
             raise self.found[0]
         return [replace(result_of(one, self.found, Maker("says", device="cpu")), **self.changes) for one in frames]
 
-    def news(self):
+    def notices(self):
         lines, self.lines = self.lines, []
         return lines
 

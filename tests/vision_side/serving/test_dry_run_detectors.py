@@ -27,7 +27,7 @@ class Talking:
         self.lines.append(GONE)
         return [result_of(one, (), Maker("talking")) for one in frames]
 
-    def news(self):
+    def notices(self):
         lines, self.lines = self.lines, []
         return lines
 

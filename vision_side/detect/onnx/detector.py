@@ -82,7 +82,7 @@ class OnnxDetector:
         """A result for each frame for which there is still time; all at once where the model takes that."""
         return self._in_parts(frames, deadline_us, self._max_batch)
 
-    def news(self) -> list[str]:
+    def notices(self) -> list[str]:
         """Return the device, where that may surprise, and the first failure."""
         notices, self._notices = self._notices, []
         return notices

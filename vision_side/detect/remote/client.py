@@ -263,7 +263,7 @@ class FrameByFrame(ABC):
     def _request(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
         """Return the detections in `frame`. Raises NoAnswerError."""
 
-    def news(self) -> list[str]:
+    def notices(self) -> list[str]:
         """Return the lines since the last call."""
         return self._error_counters.notices.take()
 

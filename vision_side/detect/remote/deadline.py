@@ -99,7 +99,7 @@ class DeadlineDetector:
         """Give the inner one a robot's link."""
         attach_detector(self._inner, link)
 
-    def news(self) -> list[str]:
+    def notices(self) -> list[str]:
         """Return the lines of the inner detector, and its first failure."""
         return [*notices_of(self._inner), *self._news.take()]
 

@@ -64,7 +64,7 @@ class Fallback:
             ending.callback(close_detector, self._second)
             ending.callback(close_detector, self._first)
 
-    def news(self) -> list[str]:
+    def notices(self) -> list[str]:
         """Return the lines of both, and which of them drives."""
         return [*notices_of(self._first), *self._news.take(), *notices_of(self._second)]
 

@@ -59,19 +59,19 @@ def test_a_model_that_cannot_do_with_many_pictures_is_given_fewer(tmp_path: Path
     frames = [grey(level, seq) for seq, level in enumerate([*LEVELS, 90, 180])]
     results = eye.detect(frames, NO_DEADLINE)
     assert [one.seq for one in results] == [0, 1, 2, 3, 4] and runs == [5, 2, 2, 1]
-    *_, told = eye.news()
+    *_, told = eye.notices()
     assert "fails on 5 pictures at once, from now on at most 2: " in told and "for 5 pictures" in told
-    assert all(eye.detect(frames, NO_DEADLINE)) and runs[4:] == [2, 2, 1] and not eye.news()
+    assert all(eye.detect(frames, NO_DEADLINE)) and runs[4:] == [2, 2, 1] and not eye.notices()
 
 
 def test_an_engine_that_fails_on_every_picture_is_told_of_and_gives_no_answer(tmp_path: Path, monkeypatch) -> None:
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1)
-    eye.news()
+    eye.notices()
     monkeypatch.setattr(eye._engine, "run", None, raising=False)
     assert eye.detect([grey(level) for level in LEVELS], NO_DEADLINE) == [None] * 3
-    (told,) = eye.news()
+    (told,) = eye.notices()
     assert "gives no answer" in told
-    assert eye.detect([grey(level) for level in LEVELS], NO_DEADLINE) == [None] * 3 and not eye.news()
+    assert eye.detect([grey(level) for level in LEVELS], NO_DEADLINE) == [None] * 3 and not eye.notices()
     monkeypatch.undo()
     runs = counted(eye, monkeypatch)
     assert all(eye.detect([grey(level) for level in LEVELS], NO_DEADLINE)) and runs == [3], "all at once again"

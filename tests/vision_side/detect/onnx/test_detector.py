@@ -142,11 +142,11 @@ def test_a_device_that_is_not_there_is_refused_with_the_fix(tmp_path: Path, kind
 
 def test_auto_says_once_that_it_runs_on_the_cpu(tmp_path: Path) -> None:
     eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))
-    assert len(told := eye.news()) == 1 and "cpu" in told[0]
+    assert len(told := eye.notices()) == 1 and "cpu" in told[0]
     eye.detect([frame(PICTURE.bgr)], NO_DEADLINE)
-    assert eye.news() == []
+    assert eye.notices() == []
     chosen = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]), device="cpu")
-    assert chosen.news() == [], "nothing is reported of the CPU where it was chosen"
+    assert chosen.notices() == [], "nothing is reported of the CPU where it was chosen"
 
 
 class _FakeRuntime:

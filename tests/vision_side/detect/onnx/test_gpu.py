@@ -50,7 +50,7 @@ def _seen(eyes):
 
 
 def test_every_result_says_what_it_ran_on(on_gpu):
-    assert [one.device for one in _seen(on_gpu)] == [GPU] * len(JPEGS) and on_gpu.news() == []
+    assert [one.device for one in _seen(on_gpu)] == [GPU] * len(JPEGS) and on_gpu.notices() == []
 
 
 def test_it_sees_what_it_sees_on_the_cpu(on_gpu):

@@ -60,10 +60,10 @@ class _Dying:
 def test_a_gpu_that_is_lost_is_no_answer_and_not_the_cpu_under_its_name(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "onnxruntime", _Dying)
     eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]), device="cuda", refine=())
-    assert eye.detect([frame(GREY)], NO_DEADLINE)[0].device == "cuda" and eye.news() == []
+    assert eye.detect([frame(GREY)], NO_DEADLINE)[0].device == "cuda" and eye.notices() == []
     eye._engine._session.lost = True
     assert eye.detect([frame(GREY)], NO_DEADLINE) == [None]
-    assert "CUDA failure" in eye.news()[0]
+    assert "CUDA failure" in eye.notices()[0]
 
 
 def test_the_real_runtime_can_be_told_to_stay_where_it_is(tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_what_raises_is_no_answer_and_the_next_is_one(by_deadline, held):
     held.raises = False
     assert by_deadline.detect([frame(2)], within(2))[0].seq == 2
     assert by_deadline.rejected == {FAILED: 1}
-    (line,) = by_deadline.news()
+    (line,) = by_deadline.notices()
     assert "RuntimeError: a plug-in's fault" in line
 
 
@@ -107,8 +107,8 @@ def test_nonsense_is_no_answer_and_the_first_is_told():
     own = Held("own")
     fallback = Fallback(Strange(), own)
     assert [_who(fallback, seq) for seq in range(1, 20)] == [["own"]] * 19, "and none of it is a good answer"
-    assert [line for line in fallback.news() if "nan or infinite" in line], "why is said"
-    assert fallback.news() == []
+    assert [line for line in fallback.notices() if "nan or infinite" in line], "why is said"
+    assert fallback.notices() == []
     fallback.close()
 
 
@@ -182,7 +182,7 @@ class FakeRemote(Held, DeadlineDetector):
         self.good = self.state == "good"
         return super().detect(frames, deadline_us)
 
-    def news(self):
+    def notices(self):
         return []
 
     def request(self, frames, deadline_us):
@@ -204,7 +204,7 @@ def test_late_once_and_own_eyes_drive_on_in_that_very_frame():
     deadline_us = within(2)
     assert fallback.detect([frame(2)], deadline_us)[0].detector == "own"
     assert remote.deadlines[-1] == deadline_us - RESERVE_US and own.deadlines == [deadline_us]
-    assert "the fallback drives on" in fallback.news()[0] and fallback.switched == 1
+    assert "the fallback drives on" in fallback.notices()[0] and fallback.switched == 1
 
 
 def test_asked_beside_the_remote_has_no_more_time_than_when_it_drives():
@@ -236,7 +236,7 @@ def test_it_drives_again_after_ten_good_answers_in_a_row_and_no_earlier():
             assert _who(fallback, 10 + seq) == ["own"]
     remote.state = "good"
     assert [_who(fallback, 50 + seq)[0] for seq in range(GOOD_ANSWERS + 1)] == ["own"] * GOOD_ANSWERS + ["remote"]
-    assert "drives again" in fallback.news()[-1]
+    assert "drives again" in fallback.notices()[-1]
 
 
 def test_an_answer_under_way_is_waited_for_by_later_frames_not_by_this_one():

@@ -163,7 +163,7 @@ def test_a_hostile_answer_is_refused_and_counted_and_ends_nothing(name):
         assert time.monotonic() - began_s < 0.6 and dict(detector.rejected) == {reason: 1}
         server.answer = lambda request: GOOD
         assert _ask(detector, seq=2), "the next answer counts again"
-    lines = detector.news()
+    lines = detector.notices()
     assert len(lines) == 2 and reason in lines[0] and "answers again" in lines[1]
 
 
@@ -195,7 +195,7 @@ def test_nobody_there_costs_no_time_and_is_tried_again_soon():
         began_s = time.monotonic()
         assert [_ask(detector, seconds=5.0, seq=seq) for seq in range(1, 200)] == [None] * 199
         assert time.monotonic() - began_s < 1.0 and set(detector.rejected) == {"UNREACHABLE"}
-        assert len(detector.news()) < 5, "not a line for each frame"
+        assert len(detector.notices()) < 5, "not a line for each frame"
         server.start(port)
         assert until(lambda: _ask(detector), 3 * RETRY_US / 1e6)
 

@@ -133,7 +133,7 @@ def _triton_detector(server, model):
 @pytest.mark.parametrize("model", ["ball_jpeg", "ball_pixels"])
 def test_triton_finds_the_ball_from_jpegs_and_from_pixels(triton, model):
     with _closing(_triton_detector(triton, model)) as detector:
-        assert until(lambda: detector.detect([frame()], within(1.0))[0], 10), detector.news()
+        assert until(lambda: detector.detect([frame()], within(1.0))[0], 10), detector.notices()
         result = detector.detect([frame(5)], within(1.0))[0]
         assert _is_the_ball(result) and result.seq == 5 and result.detector == f"oip+http:{model} 1"
         assert detector.detect([frame(jpeg=GREY_JPEG)], within(1.0))[0].detections == ()
@@ -143,7 +143,7 @@ def test_triton_finds_the_ball_from_jpegs_and_from_pixels(triton, model):
 def test_triton_says_no_to_a_model_it_has_not_and_that_is_counted(triton):
     with _closing(_triton_detector(triton, "cat")) as detector:
         assert until(lambda: not detector.detect([frame()], within(1.0))[0] and detector.rejected["REJECTED"])
-        assert "cat" in " ".join(detector.news())
+        assert "cat" in " ".join(detector.notices())
 
 
 @pytest.mark.slow
@@ -162,7 +162,7 @@ def test_a_killed_triton_is_no_answer_by_the_deadline_and_back_within_three_seco
             assert detector.detect([frame(seq)], within(0.1)) == [None]
             assert time.monotonic() - began_s < 0.25
         triton.start()
-        assert until(lambda: detector.detect([frame()], within(0.1))[0], 3.0), detector.news()
+        assert until(lambda: detector.detect([frame()], within(0.1))[0], 3.0), detector.notices()
 
 
 def test_the_page_shows_the_configuration_that_was_run():

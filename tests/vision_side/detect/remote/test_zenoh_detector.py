@@ -142,7 +142,7 @@ def test_one_detector_serves_every_robot_of_a_fleet(bench):
 def test_without_a_link_it_says_so():
     alone = ZenohDetector(ZenohDetector.Config())
     assert alone.detect([frame()], within(0.1)) == [None] and alone.rejected == {"UNREACHABLE": 1}
-    assert "no link to robot r1" in alone.news()[0]
+    assert "no link to robot r1" in alone.notices()[0]
 
 
 def test_a_bad_picture_and_a_bad_header_get_no_answer_and_are_counted(bench):
@@ -220,7 +220,7 @@ def test_a_service_that_is_gone_is_no_answer_by_the_deadline_and_back_by_itself(
                 _served(DetectorService(site, HSV, ServingOptions("hsv"), lambda line: None)),
             ):
                 assert until(lambda: (robot.here(), _result(robot, detector, seconds=DEADLINE_S))[1], 3.0)
-        assert "LATE" in detector.rejected and any("answers again" in line for line in detector.news())
+        assert "LATE" in detector.rejected and any("answers again" in line for line in detector.notices())
 
 
 # --- hostile answers -------------------------------------------------------------------------------------------------
@@ -299,7 +299,7 @@ def test_of_two_services_one_is_kept_to_until_it_is_silent(pair):
             robot.say(frame(seq), box, by=by)
         labels |= {one.label for one in waiting.detect([frame(seq)], within(1.0))[0].detections}
     assert labels == {"ball"} and not waiting.rejected
-    assert sum("several services look at robot r1" in line for line in waiting.news()) == 1
+    assert sum("several services look at robot r1" in line for line in waiting.notices()) == 1
     time.sleep(0.6)
     robot.say(frame(9), other, by="00000002")
     assert waiting.detect([frame(9)], within(1.0))[0].detections[0].label == "box", "the first one is gone"
