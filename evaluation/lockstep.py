@@ -79,10 +79,10 @@ class Lockstep:
             seed, round(conditions.latency_ms * 1000), round(conditions.jitter_ms * 1000), conditions.loss
         )
         self.driving = DriverCore(robot, _ROBOT_SESSION)
-        self._sending = NetworkCore(robot.stream, _ROBOT_SESSION, 0, robot.max_frame_bytes)
+        self._network_core = NetworkCore(robot.stream, _ROBOT_SESSION, 0, robot.max_frame_bytes)
         self._robot_link = self.network.link(robot.robot)
         self._robot_link.subscribe(TWIST, self._on_twist)
-        self._robot_link.subscribe(ACK, lambda message: self._sending.on_ack(message, self._now_us))
+        self._robot_link.subscribe(ACK, lambda message: self._network_core.on_ack(message, self._now_us))
         self._vision_link = self.network.link(robot.robot, role=SOURCE)
         self._frames: LatestSlot[Message] = self._vision_link.latest(FRAME)
         self._detector = configured_detector(vision)
@@ -120,9 +120,9 @@ class Lockstep:
         if self._now_us < self._camera_tick * self._frame_interval_us:
             return
         self._camera_tick += 1
-        if not self._sending.may_capture(self._now_us, self._robot_link.has_listener(FRAME)):
+        if not self._network_core.may_capture(self._now_us, self._robot_link.has_listener(FRAME)):
             return
-        sent = self._sending.on_camera(Picture(self.world.render(), self._now_us), self._now_us)
+        sent = self._network_core.on_camera(Picture(self.world.render(), self._now_us), self._now_us)
         if sent is not None:
             header, message = sent
             if self._labels is not None:
@@ -131,15 +131,15 @@ class Lockstep:
             self._robot_link.publish(message.channel, message.header, message.payload)
 
     def _on_twist(self, message: Message) -> None:
-        judged = self.driving.on_twist(message, self._now_us)
-        if judged is not None:
-            self._sending.on_judged(judged, self._now_us)
+        ack = self.driving.on_twist(message, self._now_us)
+        if ack is not None:
+            self._network_core.on_command_ack(ack, self._now_us)
         self._tick()
 
     def _tick(self) -> None:
         scan = self.world.scan() if self._scans.due(self._now_us) else None
         self.world.set_wheels(*self.driving.tick(self._now_us, self.world.wheel_angles(), scan))
-        self._sending.motion = self.driving.motion()
+        self._network_core.motion = self.driving.motion()
         self._publish_scans()
         self.run.states.add(self.driving.gate.state)
 

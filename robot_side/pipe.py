@@ -1,17 +1,17 @@
 """The pipe between driver and network process: packets, pending requests, and both ends. Shell.
 
-    network -> driver   RAW     bytes of a twist or request as they came: channel, source, header, payload
-                        STREAM  stream counters, JSON
-                        REFUSED what the transport turned away so far: how often, by reason
-                        READY   the endpoint is open
-              aside     ISSUED  a frame is about to be published: seq, capture time, fingerprint
-    driver -> network   VERDICT a twist was judged: whose, which frame, computing time, and who drives
-                        PUBLISH bytes to publish: channel, header, payload
-              aside     MOTION  what the next frame's header says of the robot
+    network -> driver   RAW          bytes of a twist or request as they came: channel, source, header, payload
+                        STREAM       stream counters, JSON
+                        REJECTED     what the transport rejected so far: how often, by reason
+                        READY        the endpoint is open
+              aside     ISSUED       a frame is about to be published: seq, capture time, fingerprint
+    driver -> network   COMMAND_ACK  a twist was validated: whose, which frame, computing time, and the holder
+                        PUBLISH      bytes to publish: channel, header, payload
+              aside     MOTION       what the header of the next frame contains of the robot
 
-`aside` is a second socket that nobody waits on: whoever needs what is there reads it all first. So a frame that leaves
-wakes no driver just when vision wants the processor, and no tick wakes the network process. The driver reads ISSUED
-before it judges a RAW: it was sent before the frame, so it is there before any answer.
+`aside` is a second socket that no process waits on: the process that needs what is there reads it all first. So a frame
+that leaves wakes no driver just when vision wants the processor, and no tick wakes the network process. The driver
+reads ISSUED before it validates a RAW: it was sent before the frame, so it is there before any answer.
 """
 
 import json
@@ -52,13 +52,13 @@ class PacketKind(IntEnum):
     STREAM = 3
     READY = 4
     MOTION = 5
-    VERDICT = 6
+    COMMAND_ACK = 6
     PUBLISH = 7
-    REFUSED = 8
+    REJECTED = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class RobotMotion:
     """The robot at this moment, for frame headers."""
 
     pose: Pose = (0.0, 0.0, 0.0)
@@ -69,7 +69,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class CommandAck:
-    """A twist was judged (accepted or refused): it answers frame `seq`; `holder` drives now."""
+    """A twist was validated (accepted or rejected): it answers frame `seq`; `holder` drives now."""
 
     sender: Holder
     seq: int
@@ -93,32 +93,32 @@ def unpack_issued(packet: bytes) -> tuple[int, int, int]:
     return seq, t_us, fingerprint
 
 
-def pack_motion(motion: Motion) -> bytes:
+def pack_motion(motion: RobotMotion) -> bytes:
     """The robot at this moment."""
     latency_us = -1 if motion.latency_us is None else motion.latency_us
     return _MOTION.pack(PacketKind.MOTION, *motion.pose, *motion.moving, *motion.applied, latency_us)
 
 
-def unpack_motion(packet: bytes) -> Motion:
+def unpack_motion(packet: bytes) -> RobotMotion:
     """The inverse."""
     _, x, y, yaw, linear, angular, applied_linear, applied_angular, latency_us = _MOTION.unpack(packet)
     latency = None if latency_us < 0 else latency_us
-    return Motion((x, y, yaw), (linear, angular), (applied_linear, applied_angular), latency)
+    return RobotMotion((x, y, yaw), (linear, angular), (applied_linear, applied_angular), latency)
 
 
-def pack_ack(judged: CommandAck) -> bytes:
-    """A twist was judged."""
+def pack_command_ack(ack: CommandAck) -> bytes:
+    """A twist was validated."""
     return _ACK.pack(
-        PacketKind.VERDICT, judged.seq, judged.compute_us, *_pack_holder(judged.sender), *_pack_holder(judged.holder)
+        PacketKind.COMMAND_ACK, ack.seq, ack.compute_us, *_pack_holder(ack.sender), *_pack_holder(ack.holder)
     )
 
 
-def unpack_ack(packet: bytes) -> CommandAck:
+def unpack_command_ack(packet: bytes) -> CommandAck:
     """The inverse."""
     _, seq, compute_us, source, session, holder_source, holder_session = _ACK.unpack(packet)
     sender = _unpack_holder(source, session)
     if sender is None:
-        raise ValueError("a judged twist has a sender")
+        raise ValueError("an ack has a sender")
     return CommandAck(sender, seq, compute_us, _unpack_holder(holder_source, holder_session))
 
 
@@ -133,7 +133,7 @@ def _unpack_holder(source: bytes, session: bytes) -> Holder | None:
 
 def pack_rejected(counts: Mapping[str, int]) -> bytes:
     """What never reached the driver, by reason."""
-    return bytes([PacketKind.REFUSED]) + json.dumps(dict(counts)).encode()
+    return bytes([PacketKind.REJECTED]) + json.dumps(dict(counts)).encode()
 
 
 def unpack_rejected(packet: bytes) -> dict[str, int]:
@@ -159,7 +159,7 @@ def unpack_message(packet: bytes) -> Message:
 
 # Requests that the driver's socket had no room for: kept until it has, STOP ahead of all. Pure.
 #
-# A twist that finds no room is dropped, for a newer one follows. A request comes once or is a person's STOP: it waits.
+# A twist that finds no room is dropped, for a newer one follows. A request comes once or is a STOP: it waits.
 
 
 MAX_PENDING: Final = 32
@@ -185,18 +185,18 @@ class NetworkEnd:
         except OSError:
             return b""
 
-    def motion(self, last: Motion) -> Motion:
-        """The newest that the driver said of the robot; `last` if it said nothing since."""
+    def motion(self, last: RobotMotion) -> RobotMotion:
+        """The newest motion that the driver process sent; `last` if it sent nothing since."""
         with suppress(OSError):
             while packet := self._aside.recv(MAX_PACKET_BYTES, socket.MSG_DONTWAIT):
                 last = unpack_motion(packet)
         return last
 
-    def tell(self, packet: bytes) -> bool:
+    def send(self, packet: bytes) -> bool:
         """Hand over a packet that the driver waits for; False if there is no room."""
         return _send_if_room(self._waited, packet)
 
-    def tell_aside(self, packet: bytes) -> bool:
+    def send_aside(self, packet: bytes) -> bool:
         """Hand over what the driver reads when it needs it; False if there is no room."""
         return _send_if_room(self._aside, packet)
 
@@ -216,7 +216,7 @@ class NetworkEnd:
                 self._pending_requests.flush(self._pass)
 
     def _pass(self, message: Message) -> bool:
-        return self.tell(pack_message(PacketKind.RAW, message))
+        return self.send(pack_message(PacketKind.RAW, message))
 
 
 def _send_if_room(end: socket.socket, packet: bytes) -> bool:
@@ -233,7 +233,7 @@ def _send_if_room(end: socket.socket, packet: bytes) -> bool:
 _PACKETS_PER_WAKE = 64  # a flood is drained in portions, so that no tick waits for its end
 _PACKETS_ASIDE = 1024  # more than that socket holds: all of it, but not for ever
 _DRAIN_US = 500_000  # to read what a dead process sent; a descendant may hold its end open
-_FIRST_BACKOFF_US = 700_000  # the wheels are at zero before anybody can drive them again
+_FIRST_BACKOFF_US = 700_000  # the wheels are at zero before a peer can drive them again
 _LONGEST_BACKOFF_US = 2_000_000
 _WEDGED_US = 2_000_000
 _STARTS_WITHIN_US = 30_000_000  # a first start reads its packages from a slow card
@@ -247,7 +247,7 @@ may be called as one of Python's, nor in another copy of this package than the d
 
 
 class NetworkSetup(Config):
-    """What the network process is told at its start, as its first packet."""
+    """What the network process receives at its start, as its first packet."""
 
     config: RobotConfig
     session: SessionId
@@ -258,15 +258,15 @@ class DriverEnd:
     """The network process as the driver sees it. No method waits for it, except `close`."""
 
     def __init__(self, config: RobotConfig, session: str) -> None:
-        self._heard = False
-        self._heard_us = 0
+        self._received = False
+        self._received_us = 0
         self._config = config
         self._session = session
         self._process: subprocess.Popen[bytes] | None = None
         self.socket: socket.socket | None = None
-        """To wait on: commands from it, verdicts and messages to it."""
+        """To wait on: commands from it, acks and messages to it."""
         self._aside: socket.socket | None = None
-        """Nobody waits on it: frames issued, and the robot's motion. It wakes neither end."""
+        """No process waits on it: frames issued, and the robot's motion. It wakes neither end."""
         self._gone_us = 0
         self._start_at_us = 0
         self._backoff_us = _FIRST_BACKOFF_US
@@ -279,12 +279,12 @@ class DriverEnd:
         """Start it if it is not there and its time has come."""
         if self._process is not None and self._process.poll() is not None and self._is_read(now_us):
             self._on_exit(self._process.returncode, now_us)
-        if self._heard:
-            self._heard, self._heard_us = False, now_us
-        if self._process is not None and self._was_ready and now_us - self._heard_us > _WEDGED_US:
+        if self._received:
+            self._received, self._received_us = False, now_us
+        if self._process is not None and self._was_ready and now_us - self._received_us > _WEDGED_US:
             self._process.kill()  # stopped or wedged: it reports five times a second while it is well
         if self._process is None and now_us >= self._start_at_us and not self.failed_at_start:
-            self._heard_us = now_us + _STARTS_WITHIN_US
+            self._received_us = now_us + _STARTS_WITHIN_US
             try:
                 self._start(first_seq)
             except OSError as error:
@@ -313,8 +313,8 @@ class DriverEnd:
 
     def _on_exit(self, code: int, now_us: int) -> None:
         self._process, self._gone_us = None, 0
-        self._hang_up()
-        if not self._was_ready:  # it said why itself
+        self._close_sockets()
+        if not self._was_ready:  # it reported why itself
             self.failed_at_start, self.exit_code = True, code if code > 0 else 1
             return
         _log.info("network process ended (%d); starting it again", code)
@@ -327,7 +327,7 @@ class DriverEnd:
         self._backoff_us = _FIRST_BACKOFF_US
 
     def send(self, packet: bytes) -> None:
-        """Hand over a packet or drop it: a child that does not read must not slow the driver."""
+        """Hand over a packet or drop it: a network process that does not read must not slow the driver."""
         _send_or_drop(self.socket, packet)
 
     def send_aside(self, packet: bytes) -> None:
@@ -342,7 +342,7 @@ class DriverEnd:
             if not packet:
                 break
             yield packet
-        self._heard = self._heard or bool(arrived)
+        self._received = self._received or bool(arrived)
         yield from arrived
 
     def _arrived(self) -> Iterator[bytes]:
@@ -356,7 +356,7 @@ class DriverEnd:
                 self.socket.close()
                 self.socket = None
 
-    def _hang_up(self) -> None:
+    def _close_sockets(self) -> None:
         for end in (self.socket, self._aside):
             if end:
                 end.close()
@@ -364,7 +364,7 @@ class DriverEnd:
 
     def close(self) -> None:
         """End it: it leaves when its socket closes, and is killed if it does not within a second."""
-        self._hang_up()
+        self._close_sockets()
         if self._process is None:
             return
         deadline_s = time.monotonic() + _END_S
@@ -388,12 +388,12 @@ def _send_or_drop(end: socket.socket | None, packet: bytes) -> None:
 
 
 def _receive(end: socket.socket) -> bytes | None:
-    """The next packet; None while there is none; empty when the other end is gone and all it sent has been read."""
+    """The next packet; None while no packet waits; empty when the other end is gone and all it sent has been read."""
     for _ in range(2):
         try:
             return end.recv(MAX_PACKET_BYTES)
         except BlockingIOError:
             return None
-        except OSError:  # that it left packets of ours unread is told first, once; what it sent still waits
+        except OSError:  # that it left packets of ours unread is reported first, once; what it sent still waits
             continue
     return b""

@@ -100,7 +100,7 @@ class ViewPublisher:
     ) -> None:
         """Show an answered frame to who watches, if it is time; without `jpeg` one that was kept."""
         now_us = monotonic_us()
-        self._clock.hear(header.session, header.t_us, now_us)
+        self._clock.update(header.session, header.t_us, now_us)
         channels = tuple(
             channel for channel, pace in self._paces.items() if self._link.has_listener(channel) and pace.is_due(now_us)
         )

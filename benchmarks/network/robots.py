@@ -57,7 +57,7 @@ class PlayedRobot:
         size = read_jpeg_size(self._jpegs[0])
         self._model = camera_of(size.width_px, size.height_px)
         self._session = secrets.token_hex(4)
-        self._sending = NetworkCore(StreamConfig(max_fps=settings.fps), self._session, 0, FRAME.max_payload_bytes)
+        self._network_core = NetworkCore(StreamConfig(max_fps=settings.fps), self._session, 0, FRAME.max_payload_bytes)
         self._lock = threading.Lock()
         self._period_us = round(1e6 / settings.fps)
         self._due_us, self._status_due_us = due_us, 0
@@ -78,10 +78,10 @@ class PlayedRobot:
 
     def _see(self, at_us: int) -> None:
         with self._lock:
-            if not self._sending.may_capture(at_us, self._link.has_listener(FRAME)):
+            if not self._network_core.may_capture(at_us, self._link.has_listener(FRAME)):
                 return
-            sent = self._sending.on_camera(Picture(self._jpegs[self._ticks % len(self._jpegs)], at_us), at_us)
-            camera = self._sending.announce_camera(self._model, at_us)
+            sent = self._network_core.on_camera(Picture(self._jpegs[self._ticks % len(self._jpegs)], at_us), at_us)
+            camera = self._network_core.announce_camera(self._model, at_us)
         for message in (camera, sent and sent[1]):
             if message is not None:
                 self._link.publish(message.channel, message.header, message.payload)
@@ -89,7 +89,7 @@ class PlayedRobot:
     def _say(self, at_us: int) -> None:
         self._statuses += 1
         with self._lock:
-            stream = self._sending.status(at_us)
+            stream = self._network_core.status(at_us)
         stamp = Stamp(session=self._session, seq=self._statuses, t_us=at_us)
         self._link.publish(STATUS, encode(stamp), encode(Status(state=State.ACTIVE, reason="played", stream=stream)))
 
@@ -99,7 +99,7 @@ class PlayedRobot:
             return
         who = Holder(source=header.source, session=header.session)
         with self._lock:
-            self._sending.on_judged(CommandAck(who, header.echo.seq, header.compute_us, who), at_us)
+            self._network_core.on_command_ack(CommandAck(who, header.echo.seq, header.compute_us, who), at_us)
         self.answers.append((header.echo.t_us, at_us - header.echo.t_us))
 
 

@@ -177,4 +177,4 @@ class Pictures:
         except WireError:
             return
         self._status_s = time.monotonic()
-        self.clock.hear(stamp.session, stamp.t_us, monotonic_us())
+        self.clock.update(stamp.session, stamp.t_us, monotonic_us())

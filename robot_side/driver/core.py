@@ -26,7 +26,7 @@ from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.kinematics import Odometer, wheel_speeds
-from sightline.robot_side.pipe import CommandAck, Motion
+from sightline.robot_side.pipe import CommandAck, RobotMotion
 from sightline.robot_side.ports import Ranges, WheelAngles
 from sightline.robot_side.safety.gate import SafetyGate
 from sightline.robot_side.safety.guard import RangeGuard
@@ -62,8 +62,8 @@ class DriverCore:
         self.stream = StreamStatus()
         self.tick_late_max_us = 0
         self.network_restarts = 0
-        self.turned_away: Counter[str] = Counter()
-        """By the transport, before the gate could judge it: how often, by reason."""
+        self.rejected_by_transport: Counter[str] = Counter()
+        """How often the transport rejected something before the gate, by reason."""
         self._seqs: dict[str, int] = {}
         self._due_us: dict[str, int] = {}
         self._outbox: list[Message] = []
@@ -71,7 +71,7 @@ class DriverCore:
     # --- what arrives --------------------------------------------------------------------------------------------
 
     def on_issued(self, seq: int, t_us: int, fingerprint: int) -> None:
-        """The network process is about to publish frame `seq`, captured at `t_us`; 0 is no fingerprint."""
+        """The network process is about to publish frame `seq`, captured at `t_us`; 0 stands for no fingerprint."""
         self.gate.issued.add("frame", seq, t_us)
         self.gate.pictures.add(t_us, fingerprint)
 
@@ -84,8 +84,8 @@ class DriverCore:
         except WireError as error:
             self.gate.refuse(message.source, error)
             return None
-        verdict = self.gate.offer(message.source, header, twist, now_us)
-        if header is None or verdict.reason in _CITES_NOTHING_OF_OURS:
+        result = self.gate.offer(message.source, header, twist, now_us)
+        if header is None or result.reason in _CITES_NOTHING_OF_OURS:
             return None
         sender = Holder(source=header.source, session=header.session)
         return CommandAck(sender, header.echo.seq, header.compute_us, self.gate.holder(now_us))
@@ -120,10 +120,10 @@ class DriverCore:
         decision = self.gate.step(now_us)
         return wheel_speeds(self.config.wheels, decision.twist)
 
-    def motion(self) -> Motion:
+    def motion(self) -> RobotMotion:
         """The robot at this moment, for frame headers."""
         applied = self.gate.applied
-        return Motion(
+        return RobotMotion(
             _bounded_pose(self.odometer.pose),
             _bounded(self.odometer.moving),
             (applied.linear_mps, applied.angular_rad_s),
@@ -140,7 +140,7 @@ class DriverCore:
         yield from outbox
 
     def status(self, now_us: int) -> Status:
-        """Everything a person needs to know why the robot moves or does not."""
+        """Everything that an operator needs to know why the robot moves or does not."""
         gate, limits = self.gate, self.config.safety
         return Status(
             state=gate.state,
@@ -150,7 +150,7 @@ class DriverCore:
             frame_age_us=gate.frame_age_us(now_us),
             latency_us=gate.latency_us,
             accepted=gate.accepted,
-            refused=dict(gate.counters + self.turned_away),
+            refused=dict(gate.counters + self.rejected_by_transport),
             last_refusal=gate.last_refusal,
             stream=self.stream,
             auto_arm=gate.arms_itself,
@@ -162,7 +162,7 @@ class DriverCore:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the wheels are told to stand still."""
+        """Whether the commanded wheel speeds are zero."""
         return self.gate.applied == STILL
 
     # --- inside --------------------------------------------------------------------------------------------------

@@ -32,8 +32,8 @@ _log: Final = logging.getLogger(__name__)
 
 # The driver process: owns gate and motors, is the parent of the network process, has no network. Shell.
 #
-# Motors latch, so whoever owns them must outlive every fault beside it. The network process may hang, die or hold its
-# interpreter lock for ever; this loop still reads its own clock 50 times a second and brings the wheels to zero.
+# Motors latch, so the process that owns them must outlive every fault beside it. The network process may hang, die or
+# hold its interpreter lock for ever; this loop still reads its own clock 50 times a second and stops the wheels.
 
 
 _SHUTDOWN_US = 2_000_000
@@ -60,8 +60,8 @@ def run(config: RobotConfig) -> int:
             ending.callback(ranges.close)
         driver = Driver(config, drive, ranges)
         ending.callback(driver.latch_writer.close)
-        ending.callback(driver.child.close)
-        ending.callback(_zero, drive)  # last in, first to run: however the loop ends, the motors are told zero
+        ending.callback(driver.driver_end.close)
+        ending.callback(_zero, drive)  # last in, first to run: however the loop ends, the motors are set to zero
         return driver.loop()
 
 
@@ -71,7 +71,7 @@ def _zero(drive: Drive) -> None:
 
 
 def zero_motors(config: RobotConfig) -> int:
-    """Tell the motors to stand still, without gate or network: for whoever cleans up after a dead driver."""
+    """Set the motors to zero without gate or network, to clean up after a dead driver process."""
     drive = DRIVES.build(config.motors)
     try:
         drive.set(0.0, 0.0)
@@ -88,17 +88,17 @@ class Driver:
         self.latch_writer = LatchWriter(latch)
         self._drive = drive
         self._ranges = ranges
-        self._driving = DriverCore(config, secrets.token_hex(4), stopped=latch.is_set())
-        self._logged_state = self._driving.gate.state
+        self._driver_core = DriverCore(config, secrets.token_hex(4), stopped=latch.is_set())
+        self._logged_state = self._driver_core.gate.state
         self._ending_since_us: int | None = None
-        self._manager = SystemdNotifier()
+        self._systemd_notifier = SystemdNotifier()
         self._watchdog_due_us = self._ticked_us = 0
-        self._obeyed = False
-        self._sight: tuple[float, ...] = ()
-        self._verdicts: list[ipc.CommandAck] = []
+        self._speeds_are_set = False
+        self._scan_layout: tuple[float, ...] = ()
+        self._command_acks: list[ipc.CommandAck] = []
         self._rejection_limiter = RepeatLimiter()
-        self._counted: Counter[str] = Counter()
-        self.child = DriverEnd(config, self._driving.session)
+        self._rejected_by_network: Counter[str] = Counter()
+        self.driver_end = DriverEnd(config, self._driver_core.session)
         for number in EXIT_SIGNALS:
             signal.signal(number, self._on_signal)
         for number in IGNORED_SIGNALS:
@@ -108,41 +108,42 @@ class Driver:
         self._ending_since_us = self._ending_since_us or monotonic_us()
 
     def loop(self) -> int:
-        """Tick at absolute 20 ms deadlines and whenever a command arrives, until the end is asked for and reached."""
-        self._greet()
+        """Tick at absolute 20 ms deadlines and whenever a command arrives, until the end is requested and reached."""
+        self._log_missing()
         deadline_us = monotonic_us()
         while not self._ended():
             self._wait(deadline_us)
             arrived = self._drain()
             now_us = monotonic_us()
             if now_us >= deadline_us:
-                self._driving.tick_late_max_us = max(self._driving.tick_late_max_us, now_us - deadline_us)
+                self._driver_core.tick_late_max_us = max(self._driver_core.tick_late_max_us, now_us - deadline_us)
                 deadline_us = max(deadline_us + TICK_US, now_us)
                 self._tick(now_us, punctual=True)
             elif arrived and now_us - self._ticked_us >= MIN_TICK_US:
                 self._tick(now_us, punctual=False)
             elif arrived:
                 self._answer()
-        self._manager.tell("STOPPING=1")
-        return self.child.exit_code
+        self._systemd_notifier.notify("STOPPING=1")
+        return self.driver_end.exit_code
 
-    def _greet(self) -> None:
-        """What this robot lacks is said before it moves."""
+    def _log_missing(self) -> None:
+        """Log what this robot lacks before it moves."""
         missing = list(request_real_time())
-        for line in [*missing, *([] if self._manager.is_there else [_WARNING])]:
+        for line in [*missing, *([] if self._systemd_notifier.is_active else [_WARNING])]:
             self._log(line)
 
     def _ended(self) -> bool:
-        if self.child.failed_at_start:
+        if self.driver_end.failed_at_start:
             self._ending_since_us = self._ending_since_us or monotonic_us()
         if self._ending_since_us is None:
             return False
-        self._driving.gate.disarm("shutting down")
-        return (self._driving.at_rest and self._obeyed) or monotonic_us() - self._ending_since_us > _SHUTDOWN_US
+        self._driver_core.gate.disarm("shutting down")
+        is_at_rest = self._driver_core.at_rest and self._speeds_are_set
+        return is_at_rest or monotonic_us() - self._ending_since_us > _SHUTDOWN_US
 
     def _wait(self, deadline_us: int) -> None:
         timeout_s = max(0, deadline_us - monotonic_us()) / 1e6
-        readable = [self.child.socket] if self.child.socket else []
+        readable = [self.driver_end.socket] if self.driver_end.socket else []
         select.select(readable, [], [], timeout_s)
 
     def _tick(self, now_us: int, *, punctual: bool) -> None:
@@ -150,24 +151,24 @@ class Driver:
         self._move()
         self._answer()
         if punctual:
-            for message in self._driving.messages(now_us):
-                self.child.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
-            self.child.keep_alive(now_us, self._driving.gate.issued.last_seq("frame") + 1)
-            self._driving.network_restarts = max(0, self.child.restarts)
-            self.latch_writer.want(self._driving.gate.state is State.STOPPED)
-            self._log_state(self._driving.gate.state, self._driving.gate.reason)
+            for message in self._driver_core.messages(now_us):
+                self.driver_end.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
+            self.driver_end.keep_alive(now_us, self._driver_core.gate.issued.last_seq("frame") + 1)
+            self._driver_core.network_restarts = max(0, self.driver_end.restarts)
+            self.latch_writer.want(self._driver_core.gate.state is State.STOPPED)
+            self._log_state(self._driver_core.gate.state, self._driver_core.gate.reason)
             self._feed_watchdog(now_us)
 
     def _answer(self) -> None:
-        """Verdicts, once the wheels obey; motion first, for the frame that a verdict permits tells of it."""
-        self.child.send_aside(ipc.pack_motion(self._driving.motion()))
-        verdicts, self._verdicts = self._verdicts, []
-        for judged in verdicts:
-            self.child.send(ipc.pack_ack(judged))
+        """Send command acks once the wheels are set; motion first, for the frame that an ack permits carries it."""
+        self.driver_end.send_aside(ipc.pack_motion(self._driver_core.motion()))
+        command_acks, self._command_acks = self._command_acks, []
+        for ack in command_acks:
+            self.driver_end.send(ipc.pack_command_ack(ack))
 
     def _feed_watchdog(self, now_us: int) -> None:
         if now_us >= self._watchdog_due_us:
-            self._manager.tell("READY=1\nWATCHDOG=1")
+            self._systemd_notifier.notify("READY=1\nWATCHDOG=1")
             self._watchdog_due_us = now_us + _WATCHDOG_PERIOD_US
 
     def _move(self) -> None:
@@ -177,28 +178,28 @@ class Driver:
         """
         wheels: WheelAngles | None = None
         scan: Ranges | None = None
-        self._obeyed = False
+        self._speeds_are_set = False
         try:
             wheels = self._drive.wheels()
             scan = self._scanned()
-            speeds = self._driving.tick(monotonic_us(), wheels, scan)
+            speeds = self._driver_core.tick(monotonic_us(), wheels, scan)
         except BlindZoneError:  # with the first scan, and without one nothing moves
             raise
         except Exception as error:  # a plug-in is foreign code; a reading may be no number
-            self._driving.gate.fault(f"{error or type(error).__name__}")
+            self._driver_core.gate.fault(f"{error or type(error).__name__}")
             speeds = self._without_sensors()
         try:
             self._drive.set(*speeds)
-            self._obeyed = True
+            self._speeds_are_set = True
         except Exception as error:
-            self._driving.gate.fault(f"{error or type(error).__name__}")
+            self._driver_core.gate.fault(f"{error or type(error).__name__}")
 
     def _without_sensors(self) -> tuple[float, float]:
         """The gate's way to zero; zero at once if the gate cannot be stepped either, for this loop must not end."""
         try:
-            return self._driving.tick(monotonic_us(), None, None)
+            return self._driver_core.tick(monotonic_us(), None, None)
         except Exception as error:
-            self._driving.gate.halt(f"{error or type(error).__name__}")
+            self._driver_core.gate.halt(f"{error or type(error).__name__}")
             return 0.0, 0.0
 
     def _scanned(self) -> Ranges | None:
@@ -206,10 +207,10 @@ class Driver:
         scan = self._ranges.read() if self._ranges else None
         if scan is None:
             return None
-        sight = (scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, float(len(scan.ranges_m)))
-        if sight != self._sight:
-            check_blind_zone(self._driving.config.guard, scan)
-            self._sight = sight
+        scan_layout = (scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, float(len(scan.ranges_m)))
+        if scan_layout != self._scan_layout:
+            check_blind_zone(self._driver_core.config.guard, scan)
+            self._scan_layout = scan_layout
         return scan
 
     def _log_state(self, state: State, reason: str) -> None:
@@ -219,15 +220,15 @@ class Driver:
             self._log(f"{state} ({reason})")  # on a lossy link those two alternate many times a second
 
     def _log(self, line: str) -> None:
-        _log.info("robot %s: %s", self._driving.config.robot, line)
+        _log.info("robot %s: %s", self._driver_core.config.robot, line)
 
     # --- packets of the network process --------------------------------------------------------------------------
 
     def _drain(self) -> bool:
-        """Handle what the child sent; True if a command was among it."""
+        """Handle what the network process sent; True if a command was among it."""
         commanded = False
-        for packet in self.child.packets():
-            with suppress(ValueError, KeyError, struct.error, WireError):  # a broken child is restarted, not obeyed
+        for packet in self.driver_end.packets():
+            with suppress(ValueError, KeyError, struct.error, WireError):  # a broken process is restarted
                 commanded |= self._on_packet(packet)
         return commanded
 
@@ -236,35 +237,35 @@ class Driver:
         if kind is ipc.PacketKind.RAW:
             return self._on_raw(packet)
         if kind is ipc.PacketKind.ISSUED:
-            self._driving.on_issued(*ipc.unpack_issued(packet))
+            self._driver_core.on_issued(*ipc.unpack_issued(packet))
         elif kind is ipc.PacketKind.STREAM:
-            self._driving.stream = decode(StreamStatus, packet[1:])
-        elif kind is ipc.PacketKind.REFUSED:
-            self._on_turned_away(ipc.unpack_rejected(packet))
+            self._driver_core.stream = decode(StreamStatus, packet[1:])
+        elif kind is ipc.PacketKind.REJECTED:
+            self._on_rejected(ipc.unpack_rejected(packet))
         elif kind is ipc.PacketKind.READY:
-            self._counted.clear()
-            self.child.on_ready()
+            self._rejected_by_network.clear()
+            self.driver_end.on_ready()
         return False
 
-    def _on_turned_away(self, counts: dict[str, int]) -> None:
+    def _on_rejected(self, counts: dict[str, int]) -> None:
         """Counts of this network process, which begins at zero; ours go on over its restarts."""
-        more, self._counted = Counter(counts) - self._counted, Counter(counts)
-        self._driving.turned_away += more
+        more, self._rejected_by_network = Counter(counts) - self._rejected_by_network, Counter(counts)
+        self._driver_core.rejected_by_transport += more
         for reason, count in more.items():
-            refusal = LastRejection(source="the network", reason=reason, detail="rejected by the transport")
-            self._log_rejection(refusal, count)
+            rejection = LastRejection(source="the network", reason=reason, detail="rejected by the transport")
+            self._log_rejection(rejection, count)
 
     def _on_raw(self, packet: bytes) -> bool:
-        message, refused_before = ipc.unpack_message(packet), self._driving.gate.last_refusal
+        message, rejection_before = ipc.unpack_message(packet), self._driver_core.gate.last_refusal
         if message.channel is TWIST:
-            judged = self._driving.on_twist(message, monotonic_us())
-            if judged is not None:
-                self._verdicts.append(judged)
+            ack = self._driver_core.on_twist(message, monotonic_us())
+            if ack is not None:
+                self._command_acks.append(ack)
         elif message.channel is REQUEST:
-            self._driving.on_request(message, monotonic_us())
-        refusal = self._driving.gate.last_refusal
-        if refusal is not None and refusal is not refused_before:
-            self._log_rejection(refusal)
+            self._driver_core.on_request(message, monotonic_us())
+        rejection = self._driver_core.gate.last_refusal
+        if rejection is not None and rejection is not rejection_before:
+            self._log_rejection(rejection)
         return True
 
     def _log_rejection(self, rejection: LastRejection, times: int = 1) -> None:

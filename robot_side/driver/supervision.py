@@ -15,9 +15,9 @@ IGNORED_SIGNALS: Final = (signal.SIGTTIN, signal.SIGTTOU)
 """Nor may a terminal that it is in the background of hold it up."""
 
 
-# What the driver asks of the operating system: punctuality, and somebody who watches it. Shell.
+# What the driver process requests of the operating system: punctuality, and a watchdog. Shell.
 #
-# Each part that is not permitted is said once at start; the robot runs without it.
+# Each part that is not permitted is logged once at start; the robot runs without it.
 
 
 _PRIORITY: Final = 50  # above ordinary threads and the kernel's own soft work, below its watchdogs
@@ -25,7 +25,7 @@ _MCL_CURRENT_AND_FUTURE: Final = 3
 
 
 def request_real_time() -> Iterator[str]:
-    """Freeze the garbage collector's survivors, ask for real-time scheduling and locked memory; yields what failed."""
+    """Freeze the garbage collector's survivors, request real-time scheduling and locked memory; yields what failed."""
     gc.collect()
     gc.freeze()
     try:
@@ -46,14 +46,14 @@ class SystemdNotifier:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if address else None
 
     @property
-    def is_there(self) -> bool:
-        """Whether somebody watches."""
+    def is_active(self) -> bool:
+        """Whether a service manager watches."""
         return self._socket is not None
 
-    def tell(self, state: str) -> None:
+    def notify(self, state: str) -> None:
         """Send e.g. READY=1, WATCHDOG=1, STOPPING=1; never waits."""
         if self._socket is not None:
             try:
                 self._socket.sendto(state.encode(), socket.MSG_DONTWAIT, self._address)
             except OSError:
-                return  # whoever watches will notice the silence
+                return  # the watchdog will notice the silence

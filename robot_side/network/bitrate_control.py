@@ -1,7 +1,7 @@
 """Quality and size of the pictures, so that each passes the link in time. Pure.
 
 Down by a factor when the link shows that it is full, up by a little while it is calm. Only cameras that encode
-themselves can follow (`sightline.robot_side.ports.Adjustable`); for the others the wish is no more than that.
+themselves can follow (`sightline.robot_side.ports.Adjustable`); the others ignore the target.
 """
 
 from typing import Final, NamedTuple
@@ -25,12 +25,12 @@ _OVERDUE_FACTOR: Final = 0.5
 _FLOOR_US: Final = 5_000_000
 """Each of the two spans whose lowest delay is kept: a link that has become longer is believed after the second."""
 _LAG_FRAMES: Final = 2
-"""Pictures that were already taken when the wish changed."""
-_JUDGED_BY: Final = 3
-"""Delays by which it is judged whether sending less helped."""
+"""Pictures that were already taken when the target changed."""
+_CHECKED_BY: Final = 3
+"""Delays that show whether sending less helped."""
 _IN_VAIN: Final = 1.05
 _FROM_SCALE_US: Final = 3_000_000
-"""A new size makes vision begin anew, so it is not changed more often."""
+"""A new size makes the vision service begin again, so it is not changed more often."""
 
 
 class EncodingTarget(NamedTuple):
@@ -49,10 +49,10 @@ class _Cut(NamedTuple):
 
 
 class BitrateControl:
-    """Told of what was sent and how it fared; `wish` is what the camera should do next."""
+    """Follows what was sent and how it fared; `target` is what the camera should do next."""
 
     def __init__(self) -> None:
-        self.wish = EncodingTarget()
+        self.target = EncodingTarget()
         self._budget_bytes: float | None = None
         self._bytes = 0.0
         self._frames = 0
@@ -63,10 +63,10 @@ class BitrateControl:
         self._made: _Cut | None = None
         self._since_us: list[int] = []
 
-    # --- what is heard -------------------------------------------------------------------------------------------
+    # --- what arrives ------------------------------------------------------------------------------------------
 
     def on_sent(self, size_bytes: int, now_us: int) -> None:
-        """A picture of this size left; 0 for one whose size is not told, from which nothing is learnt."""
+        """A picture of this size left; 0 for an unknown size, from which nothing is learnt."""
         self._frames += 1
         if self._frames <= _LAG_FRAMES or not size_bytes:
             return
@@ -75,7 +75,7 @@ class BitrateControl:
 
     def on_delay(self, delay_us: int, now_us: int) -> None:
         """A frame took so long, the peer's computing apart, and did not wait behind another."""
-        self._judge_cut(delay_us)
+        self._check_cut(delay_us)
         excess_us = delay_us - self._floor(delay_us, now_us)
         if now_us < self._step_at_us:
             return
@@ -109,12 +109,12 @@ class BitrateControl:
             self._made = _Cut(delay_us, current, us_per_byte) if us_per_byte else None
             self._since_us.clear()
 
-    def _judge_cut(self, delay_us: int) -> None:
+    def _check_cut(self, delay_us: int) -> None:
         """Had bytes been what took so long, then as many as before would now take no longer than they did."""
-        if self._made is None or not self._bytes or self._frames < _LAG_FRAMES + _JUDGED_BY:
+        if self._made is None or not self._bytes or self._frames < _LAG_FRAMES + _CHECKED_BY:
             return
         self._since_us.append(delay_us)
-        if len(self._since_us) < _JUDGED_BY:
+        if len(self._since_us) < _CHECKED_BY:
             return
         cut, self._made = self._made, None
         spared_us = (cut.size_bytes - self._bytes) * cut.us_per_byte
@@ -134,7 +134,7 @@ class BitrateControl:
         """Nearer to the budget, by what the last pictures weighed."""
         if self._budget_bytes is None:
             return
-        quality, scale = self.wish
+        quality, scale = self.target
         share = self._budget_bytes / self._bytes
         if quality == 100 and scale == 100 and share > 1.5:
             self._budget_bytes = None
@@ -151,6 +151,6 @@ class BitrateControl:
             self._set(wish)
 
     def _set(self, wish: EncodingTarget) -> None:
-        if wish != self.wish:
-            self.wish = wish
+        if wish != self.target:
+            self.target = wish
             self._frames, self._bytes = 0, 0.0

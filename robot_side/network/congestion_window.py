@@ -1,8 +1,8 @@
 """How many frames may be in flight, estimated from delays alone. Pure.
 
 A frame sent while nothing is in flight shows the link's own delay. One sent behind another shows the same where the
-link is long, and waits where the link is thin or the peer slow. So the window grows while nobody waits, and what gets
-through while somebody does is what the link carries. Of a link whose rate two tries have shown, no third is made before
+link is long, and waits where the link is thin or the peer slow. So the window grows while no frame waits, and what gets
+through while one does is what the link carries. Of a link whose rate two tries have shown, no third is made before
 long: a camera's own JPEG of 46 kB takes 184 ms at 2 Mbit/s, and one behind it is twice as old.
 """
 
@@ -31,7 +31,7 @@ _ALIKE: Final = 1.15
 _THINNER: Final = 0.8
 """... unless a frame by itself takes less than this share of what it did: then the link carries more than it did."""
 _LEAST: Final = 0.6
-"""Of what the rate says that a frame takes, which a few frames show only roughly; in less it cannot be through."""
+"""Of the time that a frame takes at the rate, which a few frames show only roughly; in less it cannot be through."""
 _LARGE: Final = 2
 """Intervals for which a frame occupies the link: of smaller ones the next may wait, its age grows by less than that."""
 _PEER_BOUND_SHARE: Final = 0.7
@@ -155,7 +155,7 @@ class CongestionWindow:
             self._failed = True
             self._note_rate(full, own_us, now_us)
             self._set(max(1, kept), now_us)
-        self._behind.clear()  # what waited is told once
+        self._behind.clear()  # what waited counts once
         return full
 
     def _note_rate(self, full: LinkCapacity | None, own_us: int, now_us: int) -> None:
@@ -173,7 +173,7 @@ class CongestionWindow:
         return LinkCapacity(sum(one.gap_bytes for one in self._behind) * 1e6 / gap_us, self._waited_us())
 
     def _widen(self, now_us: int) -> None:
-        """More, once it is seen that nobody waits; by doubling until it was once too much."""
+        """More, once no frame waits; by doubling until it was once too much."""
         own_us = self.own_delay_us
         if own_us is None or self._since_change < max(2, self.frames) or now_us < self._grow_at_us:
             return

@@ -19,7 +19,7 @@ from sightline.protocol.messages import (
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.network.bitrate_control import EncodingTarget
 from sightline.robot_side.network.stream import Stream, StreamConfig
-from sightline.robot_side.pipe import CommandAck, Motion
+from sightline.robot_side.pipe import CommandAck, RobotMotion
 from sightline.robot_side.ports import Adjustable, Camera, Picture, scaled_model
 
 _CAMERA_PERIOD_US = 500_000
@@ -29,8 +29,8 @@ class NetworkCore:
     """One network process of one robot session; `first_seq` continues where an earlier process ended."""
 
     def __init__(self, config: StreamConfig, session: str, first_seq: int, max_frame_bytes: int) -> None:
-        self.motion = Motion()
-        self._refused_pictures = 0
+        self.motion = RobotMotion()
+        self._rejected_pictures = 0
         self._stream = Stream(config)
         self._session = session
         self._seq = first_seq
@@ -55,7 +55,7 @@ class NetworkCore:
     def on_camera(self, picture: Picture, now_us: int) -> tuple[FrameHeader, Message] | None:
         """The frame to publish; None, counted, for a picture too large or not newer than the last."""
         if picture.t_us <= self._last_t_us or len(picture.jpeg) > self._max_frame_bytes:
-            self._refused_pictures += 1
+            self._rejected_pictures += 1
             return None
         self._last_t_us = picture.t_us
         self._scale_percent = picture.scale_percent
@@ -76,13 +76,13 @@ class NetworkCore:
             latency_us=motion.latency_us,
         )
 
-    def on_judged(self, judged: CommandAck, now_us: int) -> None:
-        """The driver judged a twist: credit comes back, and goes to who drives."""
-        self._stream.on_holder(judged.holder, now_us)
-        self._answer(judged.sender, judged.seq, judged.compute_us, now_us)
+    def on_command_ack(self, ack: CommandAck, now_us: int) -> None:
+        """The driver process validated a twist: credit comes back, and goes to the holder of the lease."""
+        self._stream.on_holder(ack.holder, now_us)
+        self._answer(ack.sender, ack.seq, ack.compute_us, now_us)
 
     def on_ack(self, message: Message, now_us: int) -> None:
-        """An acknowledgement: credit comes back. Raises WireError for what is none."""
+        """An acknowledgement: credit comes back. Raises WireError for an invalid one."""
         header = decode(AnswerHeader, message.header)
         if header.source == message.source and header.echo.session == self._session:
             who = Holder(source=header.source, session=header.session)
@@ -94,7 +94,7 @@ class NetworkCore:
 
     def adapt(self, camera: Camera) -> None:
         """Pass a new encoding target on to a camera that can follow it; retry while the camera is gone."""
-        target = self._stream.wish
+        target = self._stream.encoding_target
         if target == self._requested or not isinstance(camera, Adjustable):
             return
         try:
@@ -137,7 +137,7 @@ class NetworkCore:
             window=stream.window,
             fps=stream.fps(now_us),
             dropped_commands=dropped_commands,
-            refused_pictures=self._refused_pictures,
+            refused_pictures=self._rejected_pictures,
             calibrated=self._announced is not None and self._announced.calibrated,
             overtaken=stream.overtaken,
             dropped=dict(counted[:MAX_CHANNELS_SHOWN]),

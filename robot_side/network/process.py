@@ -31,7 +31,7 @@ from sightline.robot_side.ports import Camera, Picture
 
 _log: Final = logging.getLogger(__name__)
 
-_ASK_ADDRESS: Final = 0x8915  # SIOCGIFADDR of linux/sockios.h
+_GET_ADDRESS: Final = 0x8915  # SIOCGIFADDR of linux/sockios.h
 _ANYWHERE: Final = ("/0.0.0.0:", "/[::]:")
 
 
@@ -45,10 +45,10 @@ def reachable_endpoints(endpoints: Sequence[str]) -> list[str]:
 def own_addresses() -> list[str]:
     """The IPv4 address of every interface that has one, loopback left out."""
     found: list[str] = []
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as query:
         for _, name in socket.if_nameindex():
             with suppress(OSError):  # an interface without an address
-                reply = fcntl.ioctl(asking.fileno(), _ASK_ADDRESS, struct.pack("256s", name.encode()))
+                reply = fcntl.ioctl(query.fileno(), _GET_ADDRESS, struct.pack("256s", name.encode()))
                 found.append(socket.inet_ntoa(reply[20:24]))
     return [address for address in dict.fromkeys(found) if not address.startswith("127.")]
 
@@ -70,26 +70,26 @@ class Network:
     """The camera loop (main thread), the driver's packets (a thread), the link's callbacks (its thread)."""
 
     def __init__(self, setup: NetworkSetup, driver: NetworkEnd, link: Link, camera: Camera) -> None:
-        self._driver = driver
+        self._network_end = driver
         self._link = link
         self._camera = camera
         config = setup.config
-        self._sending = NetworkCore(config.stream, setup.session, setup.first_seq, config.max_frame_bytes)
+        self._network_core = NetworkCore(config.stream, setup.session, setup.first_seq, config.max_frame_bytes)
         self._lock = threading.Lock()
         self._credit = threading.Event()
         self._camera_fault = ""
-        self._refused_acks: Counter[str] = Counter()
-        self._refused_told: Counter[str] = Counter()
+        self._rejected_acks: Counter[str] = Counter()
+        self._rejected_reported: Counter[str] = Counter()
         self.running = True
 
     def run(self) -> None:
         """Until the driver closes its end."""
-        self._driver.tell(bytes([ipc.PacketKind.READY]))
-        self._link.subscribe(TWIST, self._driver.forward)
-        self._link.subscribe(REQUEST, self._driver.forward)
+        self._network_end.send(bytes([ipc.PacketKind.READY]))
+        self._link.subscribe(TWIST, self._network_end.forward)
+        self._link.subscribe(REQUEST, self._network_end.forward)
         self._link.subscribe(ACK, self._on_ack)
         self._relay = Relay(self._link)
-        threading.Thread(target=self._read_driver, daemon=True).start()
+        threading.Thread(target=self._read_driver, name="driver-pipe", daemon=True).start()
         while self.running:
             self._stream_one()
 
@@ -98,26 +98,26 @@ class Network:
     def _stream_one(self) -> None:
         """Wait for credit, or take an image and publish its frame. The model of the camera is announced before it."""
         picture = self._read_camera() if self._may_capture() else None
-        self._sending.motion = self._driver.motion(self._sending.motion)
+        self._network_core.motion = self._network_end.motion(self._network_core.motion)
         with self._lock:
-            sent = self._sending.on_camera(picture, monotonic_us()) if picture else None
-            camera = self._sending.announce_camera(self._camera.model, monotonic_us())
+            sent = self._network_core.on_camera(picture, monotonic_us()) if picture else None
+            camera = self._network_core.announce_camera(self._camera.model, monotonic_us())
         if camera is not None:
             self._link.publish(camera.channel, camera.header, camera.payload)
         if picture is None or sent is None:
             return
         header, message = sent
-        # The driver must know a frame before anybody can answer it.
+        # The driver process must know a frame before a peer can answer it.
         fingerprint = zlib.crc32(picture.jpeg) if self._camera.live else 0
-        if self._driver.tell_aside(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
+        if self._network_end.send_aside(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
             self._link.publish(message.channel, message.header, message.payload)
 
     def _may_capture(self) -> bool:
         """Whether to take an image now; else wait a little for credit."""
         listening = self._link.has_listener(FRAME)
         with self._lock:
-            due = self._sending.may_capture(monotonic_us(), listening)
-            nap_s = self._sending.wait_us(monotonic_us()) / 1e6
+            due = self._network_core.may_capture(monotonic_us(), listening)
+            nap_s = self._network_core.wait_us(monotonic_us()) / 1e6
         if not due:
             self._credit.wait(min(nap_s, _LONGEST_NAP_S) if listening and nap_s > 0 else _LONGEST_NAP_S)
             self._credit.clear()
@@ -125,7 +125,7 @@ class Network:
 
     def _read_camera(self) -> Picture | None:
         """An image, or None; a camera that is gone is logged once and tried again."""
-        self._sending.adapt(self._camera)
+        self._network_core.adapt(self._camera)
         try:
             picture = self._camera.read(_CAMERA_TIMEOUT_S)
         except HardwareError as error:
@@ -145,8 +145,8 @@ class Network:
         """Until the driver closes its end; then the camera loop ends, or the whole process if it hangs."""
         status_due_us = 0
         try:
-            while packet := self._driver.receive():
-                self._driver.retry()
+            while packet := self._network_end.receive():
+                self._network_end.retry()
                 with suppress(ValueError):  # a message over its bounds: one lost message
                     self._on_packet(packet)
                 now_us = monotonic_us()
@@ -161,9 +161,9 @@ class Network:
 
     def _on_packet(self, packet: bytes) -> None:
         kind = ipc.packet_kind(packet)
-        if kind is ipc.PacketKind.VERDICT:
+        if kind is ipc.PacketKind.COMMAND_ACK:
             with self._lock:
-                self._sending.on_judged(ipc.unpack_ack(packet), monotonic_us())
+                self._network_core.on_command_ack(ipc.unpack_command_ack(packet), monotonic_us())
             self._credit.set()
         elif kind is ipc.PacketKind.PUBLISH:
             message = ipc.unpack_message(packet)
@@ -173,26 +173,26 @@ class Network:
         """Report to the driver how the stream does, and what was rejected before it."""
         missed = getattr(self._camera, "missed_captures", None)  # of cameras that capture by themselves
         with self._lock:
-            status = self._sending.status(
-                now_us, self._driver.dropped_commands, self._link.dropped, missed() if missed else 0
+            status = self._network_core.status(
+                now_us, self._network_end.dropped_commands, self._link.dropped, missed() if missed else 0
             )
-        self._driver.tell(bytes([ipc.PacketKind.STREAM]) + encode(status))
+        self._network_end.send(bytes([ipc.PacketKind.STREAM]) + encode(status))
         self._relay.look()
-        self._report_refused()
+        self._report_rejected()
 
-    def _report_refused(self) -> None:
+    def _report_rejected(self) -> None:
         """What never reached the driver is shown in `status` too."""
         by_link: dict[str, int] = dict(self._link.rejected)  # copied at once: other threads count in it
-        refused = Counter(dict(self._refused_acks)) + Counter(by_link)
-        if refused != self._refused_told and self._driver.tell(ipc.pack_rejected(refused)):
-            self._refused_told = refused
+        rejected = Counter(dict(self._rejected_acks)) + Counter(by_link)
+        if rejected != self._rejected_reported and self._network_end.send(ipc.pack_rejected(rejected)):
+            self._rejected_reported = rejected
 
     def _on_ack(self, message: Message) -> None:
         try:
             with self._lock:
-                self._sending.on_ack(message, monotonic_us())
+                self._network_core.on_ack(message, monotonic_us())
         except WireError as error:
-            self._refused_acks[error.reason] += 1
+            self._rejected_acks[error.reason] += 1
             return
         self._credit.set()
 

@@ -1,9 +1,9 @@
 """When to send a frame: credit, timeouts, rate. Pure.
 
 A frame is captured only while there is credit, so it is young when it leaves and nothing queues behind it. An answer (a
-twist accepted or refused, or an ack) returns credit. The window starts at one frame in flight and widens only for the
-link's own delay (`window.py`), never for a slow detector: with an 80 ms detector one frame in flight is 81-83 ms old
-where two are 141-175. What does not fit through the link in time is encoded smaller (`encoding.py`).
+twist accepted or rejected, or an ack) returns credit. The window starts at one frame in flight and widens only for the
+link's own delay (`congestion_window`), never for a slow detector: with an 80 ms detector one frame in flight is 81-83
+ms old where two are 141-175. What does not fit through the link in time is encoded smaller (`bitrate_control`).
 """
 
 from collections import OrderedDict, deque
@@ -35,7 +35,7 @@ class StreamConfig(Config):
     owner_life_ms: Annotated[int, Field(ge=100, le=10_000)] = 1_000
     """Silence after which another peer's answers may return credit."""
     adapt: bool = True
-    """Whether a camera that encodes itself is told to lower quality and size where the link is thin."""
+    """Whether a camera that encodes itself is set to lower quality and size where the link is thin."""
 
 
 @dataclass(slots=True)
@@ -48,7 +48,7 @@ class _Sent:
 
 
 class Stream:
-    """Decides for one camera. The caller asks `may_capture`, tells `on_sent`, and hands every answer in."""
+    """Decides for one camera. The caller checks `may_capture` and reports to `on_sent` and `on_answer`."""
 
     def __init__(self, config: StreamConfig) -> None:
         self._config = config
@@ -57,8 +57,8 @@ class Stream:
         self._sent_frames: OrderedDict[int, _Sent] = OrderedDict()  # also of frames whose credit has timed out
         self._owner: Holder | None = None
         self._owner_until_us = 0
-        self._window = CongestionWindow(self._interval_us, config.max_window)
-        self._encoding = BitrateControl()
+        self._congestion_window = CongestionWindow(self._interval_us, config.max_window)
+        self._bitrate_control = BitrateControl()
         self._answer_us: float | None = None
         self._spread_us = 0.0
         self._answered_at_us = 0
@@ -72,7 +72,7 @@ class Stream:
     @property
     def window(self) -> int:
         """Frames that may be in flight."""
-        return self._window.frames
+        return self._congestion_window.frames
 
     @property
     def _has_credit(self) -> bool:
@@ -82,14 +82,14 @@ class Stream:
         return len(self._in_flight) < self.window
 
     @property
-    def wish(self) -> EncodingTarget:
+    def encoding_target(self) -> EncodingTarget:
         """How the next picture should be encoded."""
-        return self._encoding.wish if self._config.adapt else EncodingTarget()
+        return self._bitrate_control.target if self._config.adapt else EncodingTarget()
 
     # --- sending -------------------------------------------------------------------------------------------------
 
     def may_capture(self, now_us: int, listening: bool) -> bool:
-        """Whether to take the next picture now: somebody listens, it is time, and there is credit."""
+        """Whether to take the next picture now: a peer listens, it is time, and there is credit."""
         self._expire(now_us)
         if not listening or now_us < self._next_us:
             return False
@@ -113,11 +113,11 @@ class Stream:
         self._held_back = False
         if len(self._sent_frames) > _REMEMBERED:
             self._sent_frames.popitem(last=False)
-        # A tenth of slack: a camera that ticks a hair faster than `max_fps` must not be asked one tick too late.
+        # A tenth of slack: a camera that ticks a hair faster than `max_fps` must not be read one tick too late.
         self._next_us = t_us + self._interval_us * 9 // 10
         self.sent += 1
         self._sent_us.append(now_us)
-        self._encoding.on_sent(size_bytes, now_us)
+        self._bitrate_control.on_sent(size_bytes, now_us)
 
     # --- answers -------------------------------------------------------------------------------------------------
 
@@ -136,7 +136,7 @@ class Stream:
         return bool(answered)
 
     def on_holder(self, holder: Holder | None, now_us: int) -> None:
-        """The lease changed hands: credit goes to who drives."""
+        """The lease changed hands: credit goes to its holder."""
         if holder is not None and holder != self._owner:
             self._hand_over(holder)
             self._owner_until_us = now_us + self._config.owner_life_ms * 1000
@@ -154,7 +154,7 @@ class Stream:
         """A slow successor must not be held to a quick one's times, nor to what the way to that one carried."""
         self._owner = owner
         self._answer_us, self._spread_us, self._overdue = None, 0.0, 0
-        self._window = CongestionWindow(self._interval_us, self._config.max_window)
+        self._congestion_window = CongestionWindow(self._interval_us, self._config.max_window)
 
     def _measure(self, sent: _Sent, passed: list[_Sent], compute_us: int, now_us: int) -> None:
         answer_us = now_us - sent.at_us
@@ -169,11 +169,11 @@ class Stream:
         answered = AckSample(
             delay_us, sent.behind, sent.followed, sent.held_back, gap_us, len(passed), carried, compute_us
         )
-        full = self._window.on_answer(answered, now_us)
+        full = self._congestion_window.on_answer(answered, now_us)
         if full is None:
-            self._encoding.on_delay(delay_us, now_us)
+            self._bitrate_control.on_delay(delay_us, now_us)
         else:
-            self._encoding.on_full(full, now_us)
+            self._bitrate_control.on_full(full, now_us)
 
     def _remember_answer(self, answer_us: int) -> None:
         """Mean and spread, as RFC 6298 keeps them for the same purpose."""
@@ -211,8 +211,8 @@ class Stream:
             self._overdue_at_us = now_us
             self._may_probe = True
             if self._overdue >= _OVERDUE_IN_A_ROW:
-                self._window.on_timeout(now_us)
-                self._encoding.on_overdue(now_us)
+                self._congestion_window.on_timeout(now_us)
+                self._bitrate_control.on_overdue(now_us)
 
     def fps(self, now_us: int) -> float:
         """Frames sent in the last second."""

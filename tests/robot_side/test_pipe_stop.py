@@ -70,7 +70,7 @@ def test_it_is_bounded_and_a_stop_still_finds_a_place(first):
 def test_invalid_requests_are_dropped_when_there_is_no_room():
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     end = NetworkEnd(ours, theirs)
-    while end.tell(b"full"):
+    while end.send(b"full"):
         pass
     end.forward(Message(REQUEST, "operator", b"", b"{"))
     assert end.dropped_commands == 1

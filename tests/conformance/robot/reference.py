@@ -67,9 +67,9 @@ class ReferenceRobot:
 
     def on_twist(self, message):
         """A command."""
-        judged = self.driving.on_twist(message, self.now())
-        if judged is not None:
-            self.sending.on_judged(judged, self.now())
+        ack = self.driving.on_twist(message, self.now())
+        if ack is not None:
+            self.sending.on_command_ack(ack, self.now())
 
     def on_request(self, message):
         """A person's request; its reply leaves at once."""
@@ -80,7 +80,7 @@ class ReferenceRobot:
         try:
             self.sending.on_ack(message, self.now())
         except WireError as error:
-            self.driving.turned_away[error.reason] += 1
+            self.driving.rejected_by_transport[error.reason] += 1
 
     def emit(self, message):
         """What leaves."""

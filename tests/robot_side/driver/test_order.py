@@ -52,7 +52,7 @@ def driver(tmp_path, ends):
     handlers = {number: signal.getsignal(number) for number in (*EXIT_SIGNALS, *IGNORED_SIGNALS)}
     config = RobotConfig(state_dir=tmp_path, safety=SafetyConfig(auto_arm=True))
     made = Driver(config, StillDrive(), None)
-    made.child = ends[0]
+    made.driver_end = ends[0]
     yield made
     made.latch_writer.close()
     for number, handler in handlers.items():
@@ -68,14 +68,14 @@ def answer(session, seq=SEQ, t_us=T_US):
 def test_a_frame_that_is_told_after_its_answer_is_still_read_before_it(ends):
     child, parent = ends
     parent.forward(answer("0a0a0a0a"))
-    parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
+    parent.send_aside(ipc.pack_issued(SEQ, T_US, 0))
     assert [ipc.packet_kind(packet) for packet in child.packets()] == [ipc.PacketKind.ISSUED, ipc.PacketKind.RAW]
 
 
 def test_all_frames_are_read_before_a_portion_of_commands(ends):
     child, parent = ends
     for seq in range(100):
-        assert parent.tell_aside(ipc.pack_issued(seq, T_US, 0))
+        assert parent.send_aside(ipc.pack_issued(seq, T_US, 0))
     for _ in range(80):
         parent.forward(answer("0a0a0a0a"))
     kinds = [ipc.packet_kind(packet) for packet in child.packets()]
@@ -85,7 +85,7 @@ def test_all_frames_are_read_before_a_portion_of_commands(ends):
 
 def test_a_frame_that_leaves_does_not_wake_the_driver(ends):
     child, parent = ends
-    parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
+    parent.send_aside(ipc.pack_issued(SEQ, T_US, 0))
     assert select.select([child.socket], [], [], 0.05)[0] == []
     assert [ipc.packet_kind(packet) for packet in child.packets()] == [ipc.PacketKind.ISSUED]
 
@@ -93,32 +93,32 @@ def test_a_frame_that_leaves_does_not_wake_the_driver(ends):
 def test_a_tick_does_not_wake_the_network_process_and_the_newest_motion_is_what_it_reads(ends):
     child, parent = ends
     for latency_us in (1, 2, 3):
-        child.send_aside(ipc.pack_motion(ipc.Motion(latency_us=latency_us)))
+        child.send_aside(ipc.pack_motion(ipc.RobotMotion(latency_us=latency_us)))
     assert select.select([parent._waited], [], [], 0.05)[0] == []
-    assert parent.motion(ipc.Motion()).latency_us == 3
-    assert parent.motion(ipc.Motion(latency_us=4)).latency_us == 4, "nothing new: the last stays"
+    assert parent.motion(ipc.RobotMotion()).latency_us == 3
+    assert parent.motion(ipc.RobotMotion(latency_us=4)).latency_us == 4, "nothing new: the last stays"
 
 
 def test_motions_that_nobody_reads_hold_nobody_up_and_the_next_are_heard(ends):
     child, parent = ends
     for latency_us in range(5000):
-        child.send_aside(ipc.pack_motion(ipc.Motion(latency_us=latency_us)))
-    assert parent.motion(ipc.Motion()).latency_us < 5000
-    child.send_aside(ipc.pack_motion(ipc.Motion(latency_us=5001)))
-    assert parent.motion(ipc.Motion()).latency_us == 5001
+        child.send_aside(ipc.pack_motion(ipc.RobotMotion(latency_us=latency_us)))
+    assert parent.motion(ipc.RobotMotion()).latency_us < 5000
+    child.send_aside(ipc.pack_motion(ipc.RobotMotion(latency_us=5001)))
+    assert parent.motion(ipc.RobotMotion()).latency_us == 5001
 
 
 def test_the_frame_that_a_verdict_permits_carries_the_latency_of_that_verdict(driver, ends, monkeypatch):
     _, parent = ends
-    driver._driving.gate.arms_itself = False
+    driver._driver_core.gate.arms_itself = False
     told = []
-    monkeypatch.setattr(driver.child, "send_aside", lambda packet: told.append(ipc.unpack_motion(packet)))
-    monkeypatch.setattr(driver.child, "send", lambda packet: told.append(ipc.unpack_ack(packet)))
-    driver._driving.gate.latency_us = None
+    monkeypatch.setattr(driver.driver_end, "send_aside", lambda packet: told.append(ipc.unpack_motion(packet)))
+    monkeypatch.setattr(driver.driver_end, "send", lambda packet: told.append(ipc.unpack_command_ack(packet)))
+    driver._driver_core.gate.latency_us = None
     monkeypatch.setattr("sightline.robot_side.driver.process.monotonic_us", lambda: T_US + 4_000)
     _arm(driver)
-    parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
-    parent.forward(answer(driver._driving.session))
+    parent.send_aside(ipc.pack_issued(SEQ, T_US, 0))
+    parent.forward(answer(driver._driver_core.session))
     assert driver._drain()
     driver._tick(T_US + 4_000, punctual=False)
     motion, judged = told
@@ -127,11 +127,11 @@ def test_the_frame_that_a_verdict_permits_carries_the_latency_of_that_verdict(dr
 
 def test_a_verdict_is_told_though_the_next_tick_is_not_due(driver, ends):
     _, parent = ends
-    parent.tell_aside(ipc.pack_issued(SEQ, T_US, 0))
-    parent.forward(answer(driver._driving.session))
+    parent.send_aside(ipc.pack_issued(SEQ, T_US, 0))
+    parent.forward(answer(driver._driver_core.session))
     assert driver._drain()
     driver._answer()
-    assert ipc.unpack_ack(parent.receive()).seq == SEQ
+    assert ipc.unpack_command_ack(parent.receive()).seq == SEQ
     driver._answer()
     assert select.select([parent._waited], [], [], 0.05)[0] == [], "once"
 
@@ -140,4 +140,4 @@ def _arm(driver):
     """Bring the gate to HOLD as its own table would; how it arms is tested with the gate."""
     from sightline.robot_side.safety.states import Event
 
-    driver._driving.gate._go(Event.ARM, "armed for the test")
+    driver._driver_core.gate._go(Event.ARM, "armed for the test")

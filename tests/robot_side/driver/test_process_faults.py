@@ -77,14 +77,14 @@ def test_a_reading_that_is_no_number_stops_the_robot_not_the_loop(driver, readin
     BrokenDrive.reading = reading
     for tick in range(5):
         driver._tick(1_000_000 + tick * 20_000, punctual=False)
-        list(driver._driving.messages(1_000_000 + tick * 20_000))
+        list(driver._driver_core.messages(1_000_000 + tick * 20_000))
     assert BrokenDrive.told == (0.0, 0.0)
 
 
 def test_a_gate_that_cannot_be_stepped_is_a_fault_with_the_wheels_at_zero(driver, monkeypatch):
     """Neither with the sensors nor without: nothing that it holds may end the loop."""
-    driver._driving.gate.applied = Twist(linear_mps=0.3, angular_rad_s=0.0)
-    driver._driving.gate._ramp.force(driver._driving.gate.applied)
+    driver._driver_core.gate.applied = Twist(linear_mps=0.3, angular_rad_s=0.0)
+    driver._driver_core.gate._ramp.force(driver._driver_core.gate.applied)
     driver._tick(20_000, punctual=False)
     assert BrokenDrive.told != (0.0, 0.0)
 
@@ -92,10 +92,10 @@ def test_a_gate_that_cannot_be_stepped_is_a_fault_with_the_wheels_at_zero(driver
         raise ValueError("no such twist")
 
     with monkeypatch.context() as broken:
-        broken.setattr(driver._driving, "tick", breaks)
+        broken.setattr(driver._driver_core, "tick", breaks)
         driver._tick(40_000, punctual=False)
         assert BrokenDrive.told == (0.0, 0.0)
-        assert driver._driving.gate.state == "FAULT" and "no such twist" in driver._driving.gate.reason
+        assert driver._driver_core.gate.state == "FAULT" and "no such twist" in driver._driver_core.gate.reason
     driver._tick(60_000, punctual=False)
     assert BrokenDrive.told == (0.0, 0.0), "it does not take up the speed of before"
 
@@ -105,12 +105,12 @@ def test_a_drive_that_raises_anything_is_a_fault(driver, error):
     driver._tick(20_000, punctual=False)
     BrokenDrive.fails = error
     driver._tick(40_000, punctual=False)
-    assert driver._driving.gate.state == "FAULT" and not driver._obeyed
+    assert driver._driver_core.gate.state == "FAULT" and not driver._speeds_are_set
 
 
 @pytest.mark.parametrize("packet", [b"\xff", b"\x01", b"\x02", b"\x03{", bytes([ipc.PacketKind.RAW]) + b"x" * 40])
 def test_a_packet_that_is_none_is_dropped(driver, packet):
-    driver.child.packets = lambda: iter([packet])
+    driver.driver_end.packets = lambda: iter([packet])
     assert driver._drain() is False
 
 

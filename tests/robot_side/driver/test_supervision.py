@@ -42,8 +42,8 @@ def test_the_driver_says_ready_and_feeds_the_watchdog_from_its_loop(tmp_path, mo
 def test_without_a_manager_nothing_is_told(monkeypatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     manager = SystemdNotifier()
-    manager.tell("READY=1")
-    assert not manager.is_there
+    manager.notify("READY=1")
+    assert not manager.is_active
 
 
 def test_motors_are_zeroed_without_gate_or_network(tmp_path):

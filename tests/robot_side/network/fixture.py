@@ -153,7 +153,7 @@ def run(out, back, *, seconds=20.0, compute_us=3_000, camera=None, config=None, 
             look(at)
         if now % FRAME_US < 1000 and stream.may_capture(now, listening=True):
             state["captures"] += 1
-            size = camera.bytes_at(stream.wish)
+            size = camera.bytes_at(stream.encoding_target)
             stream.on_sent(state["seq"], now, now, size)
             at = out.send(size, now)
             if at is not None:

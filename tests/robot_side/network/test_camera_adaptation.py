@@ -66,7 +66,7 @@ class Core(NetworkCore):
 
     def follow(self, camera, *target):
         """Pass `target` on, and return the share of quality and of size that the status shows."""
-        self._stream._encoding.wish = EncodingTarget(*target)
+        self._stream._bitrate_control.target = EncodingTarget(*target)
         self.adapt(camera)
         status = self.status(0)
         return status.quality_percent, status.scale_percent

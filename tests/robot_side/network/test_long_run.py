@@ -41,9 +41,9 @@ class LongRun:
 
     def _on_twist(self, message: Message) -> None:
         before = self.driving.gate.accepted
-        judged = None if self._cut() else self.driving.on_twist(message, self.network.now_us)
-        if judged is not None:
-            self.sending.on_judged(judged, self.network.now_us)
+        ack = None if self._cut() else self.driving.on_twist(message, self.network.now_us)
+        if ack is not None:
+            self.sending.on_command_ack(ack, self.network.now_us)
         if self.driving.gate.accepted > before:
             self.accepted_us = self.network.now_us
 

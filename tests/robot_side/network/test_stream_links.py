@@ -64,7 +64,7 @@ def test_200_ms_round_trip(rate_bit_s):
 def test_40_ms_round_trip_on_a_fast_link():
     seen = course(20_000)
     assert seen.p(50) <= 55 and seen.fps(2, 20) >= 28
-    assert max(seen.windows) <= 2 and seen.stream.wish == (100, 100)
+    assert max(seen.windows) <= 2 and seen.stream.encoding_target == (100, 100)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -143,21 +143,21 @@ def test_1_mbit_that_both_directions_share(seed):
 @pytest.mark.parametrize("leg_us", [500, 20_000])
 def test_a_slow_detector_is_no_reason_for_worse_pictures(compute_us, leg_us):
     seen = run(*legs(leg_us), compute_us=compute_us)
-    assert seen.stream.wish == (100, 100)
+    assert seen.stream.encoding_target == (100, 100)
     assert seen.p(95) <= compute_us / 1000 + 2 * leg_us / 1000 + 45
 
 
 def test_a_way_that_becomes_longer_is_no_reason_for_worse_pictures_for_long():
     out, back = legs(5_000, 5e7)
     near = run(out, back, seconds=5.0)
-    assert near.stream.wish == (100, 100)
+    assert near.stream.encoding_target == (100, 100)
     stream = near.stream
     now_us, seq = 5_000_000, 10_000
     for _ in range(300):  # 100 ms more from one moment on, and no byte less helps
-        stream.on_sent(seq, now_us, now_us, Camera().bytes_at(stream.wish))
+        stream.on_sent(seq, now_us, now_us, Camera().bytes_at(stream.encoding_target))
         stream.on_answer(VISION, seq, 0, now_us + 120_000)
         now_us, seq = now_us + 133_333, seq + 1
-    assert stream.wish == (100, 100)
+    assert stream.encoding_target == (100, 100)
 
 
 def test_the_wish_stays_within_what_cameras_are_promised():
@@ -168,15 +168,15 @@ def test_the_wish_stays_within_what_cameras_are_promised():
     for seq in range(1, 400):  # nothing is ever answered again
         now_us += 100_000
         stream.may_capture(now_us, listening=True)
-        stream.on_sent(seq, now_us, now_us, Camera().bytes_at(stream.wish))
-        assert LEAST_QUALITY_PERCENT <= stream.wish.quality_percent <= 100
-        assert stream.wish.scale_percent in SCALES_PERCENT
-    assert stream.wish.scale_percent == SCALES_PERCENT[-1] and stream.window == 1
+        stream.on_sent(seq, now_us, now_us, Camera().bytes_at(stream.encoding_target))
+        assert LEAST_QUALITY_PERCENT <= stream.encoding_target.quality_percent <= 100
+        assert stream.encoding_target.scale_percent in SCALES_PERCENT
+    assert stream.encoding_target.scale_percent == SCALES_PERCENT[-1] and stream.window == 1
 
 
 def test_not_adapted_where_the_owner_said_so():
     stream = run(*legs(5_000, 1e6), config=StreamConfig(adapt=False)).stream
-    assert stream.wish == (100, 100)
+    assert stream.encoding_target == (100, 100)
 
 
 def test_answers_of_others_change_nothing():
@@ -185,7 +185,7 @@ def test_answers_of_others_change_nothing():
     for seq in range(25):  # less than the owner's life
         stream.on_sent(seq, seq * 33_333, seq * 33_333, 46_000)
         stream.on_answer(NEVER_BACK, seq, 0, seq * 33_333 + 30_000)
-    assert stream.window == 1 and stream.wish == (100, 100)
+    assert stream.window == 1 and stream.encoding_target == (100, 100)
 
 
 def test_overtaken_frames_are_counted():

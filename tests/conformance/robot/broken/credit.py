@@ -47,9 +47,9 @@ def refused_twists_return_nothing(robot):
 
     def around(inner, message):
         before = gate.counters["OUT_OF_ORDER"]
-        judged = robot.driving.on_twist(message, robot.now())
-        if judged is not None and gate.counters["OUT_OF_ORDER"] == before:
-            robot.sending.on_judged(judged, robot.now())
+        ack = robot.driving.on_twist(message, robot.now())
+        if ack is not None and gate.counters["OUT_OF_ORDER"] == before:
+            robot.sending.on_command_ack(ack, robot.now())
 
     wrap(robot, "on_twist", around)
 
