@@ -15,7 +15,7 @@ from onnx import TensorProto, helper, numpy_helper
 from sightline.sim.scenes.model import HEIGHT_PX, LABELS, WIDTH_PX
 from sightline.training.network import (
     BRIGHTNESS,
-    COLOURS,
+    COLORS,
     DARKEST,
     GEOMETRY,
     LOOKED_AT,
@@ -29,10 +29,10 @@ from sightline.training.network import (
 
 OPSET: Final = 17
 IR_VERSION: Final = 8
-"""What runtimes of opset 17 read."""
+"""The version that runtimes of opset 17 read."""
 MOST_BOXES: Final = 32
 SAME_BOX: Final = 0.5
-"""Of two boxes that overlap by more (intersection by union), only the better is kept: the other's score becomes 0."""
+"""Overlap (intersection over union) of two boxes above which the score of the worse one becomes 0."""
 _LARGEST: Final = 3.2  # of a log size: 390 pixels; keeps exp() finite on any picture
 
 _NO_PEAK: Final = -30.0
@@ -82,10 +82,10 @@ def weights_in(data: bytes) -> Weights:
     try:
         model = onnx.load_from_string(data)
     except DecodeError:
-        raise ValueError("it is no ONNX model") from None
+        raise ValueError("it is not an ONNX model") from None
     held = {one.name: numpy_helper.to_array(one) for one in model.graph.initializer}
     weights: Weights = {}
-    channels = {"image": COLOURS}
+    channels = {"image": COLORS}
     for layer in network():
         channels[layer.name] = layer.channels
         if layer.kind in ("add", "add-up"):
@@ -96,9 +96,9 @@ def weights_in(data: bytes) -> Weights:
         if weight.size != np.prod(shape) or bias.size != layer.channels:
             raise ValueError(f"it has no layer `{layer.name}` of {layer.channels} channels")
         if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
-            raise ValueError(f"its layer `{layer.name}` holds what is no number")
+            raise ValueError(f"its layer `{layer.name}` has weights that are not finite")
         if layer.takes[0] == "image":
-            weight = weight.reshape(layer.channels, layer.kernel, layer.kernel, COLOURS).transpose(0, 3, 1, 2)
+            weight = weight.reshape(layer.channels, layer.kernel, layer.kernel, COLORS).transpose(0, 3, 1, 2)
         weights[f"{layer.name}.weight"], weights[f"{layer.name}.bias"] = weight.reshape(shape), bias
     return weights
 
@@ -115,7 +115,7 @@ def _image(graph: Graph) -> str:
     graph.add("ReduceMean", ["image.few.float"], "image.mean", keepdims=0)
     graph.add("Max", ["image.mean", graph.constant("darkest", 255 * DARKEST)], "image.level")
     graph.add("Div", [graph.constant("brightness", BRIGHTNESS), "image.level"], "image.gain")
-    plane = graph.constant("plane", [1, 1, HEIGHT_PX, COLOURS * WIDTH_PX], np.int64)
+    plane = graph.constant("plane", [1, 1, HEIGHT_PX, COLORS * WIDTH_PX], np.int64)
     graph.add("Reshape", ["image", plane], "image.plane")
     return graph.add("DequantizeLinear", ["image.plane", "image.gain"], "picture")
 
@@ -133,16 +133,16 @@ def _layer(graph: Graph, layer: Layer, weights: Weights) -> str:
 
 
 def _convolution(graph: Graph, layer: Layer, source: str, weights: Weights, name: str) -> None:
-    """The picture's own goes over colours beside each other in place of colours behind each other."""
+    """The picture's own goes over colors beside each other in place of colors behind each other."""
     weight, bias = weights[f"{layer.name}.weight"], weights[f"{layer.name}.bias"]
-    side, colours = weight.shape[2], 1
+    side, colors = weight.shape[2], 1
     if source == "image":
-        source, colours = "picture", COLOURS
-        weight = weight.transpose(0, 2, 3, 1).reshape(layer.channels, 1, side, side * colours)
+        source, colors = "picture", COLORS
+        weight = weight.transpose(0, 2, 3, 1).reshape(layer.channels, 1, side, side * colors)
     takes = [source, graph.constant(f"{layer.name}.weight", weight), graph.constant(f"{layer.name}.bias", bias)]
     around, groups = (side - 1) // 2, layer.channels if layer.kind == "depthwise" else 1
-    graph.add("Conv", takes, name, kernel_shape=[side, side * colours], strides=[layer.stride, layer.stride * colours],
-              pads=[around, around * colours] * 2, group=groups)
+    graph.add("Conv", takes, name, kernel_shape=[side, side * colors], strides=[layer.stride, layer.stride * colors],
+              pads=[around, around * colors] * 2, group=groups)
 
 
 def _doubled(graph: Graph, name: str) -> str:
@@ -158,7 +158,7 @@ def _decoded(graph: Graph, head: str) -> None:
     _split(graph, head, [*maps, "rest"], [*[1] * len(LABELS), GEOMETRY], axis=1)
     graph.add("Max", maps, "best")
     graph.add("MaxPool", ["best"], "around", kernel_shape=[3, 3], pads=[1, 1, 1, 1], strides=[1, 1])
-    # A peak is no smaller than any cell around it; what is none counts as less than any peak.
+    # A peak is no smaller than any cell around it; all other cells count as less than any peak.
     graph.add("GreaterOrEqual", ["best", "around"], "is_peak")
     graph.add("Where", ["is_peak", "best", graph.constant("no_peak", _NO_PEAK)], "peaks")
     _shaped(graph, "peaks", "peaks.flat", [rows * columns])

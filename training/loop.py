@@ -25,7 +25,7 @@ from sightline.training.export import shifted
 from sightline.training.network import (
     AGAINST,
     BRIGHTNESS,
-    COLOURS,
+    COLORS,
     DARKEST,
     LOOKED_AT,
     OUTPUTS,
@@ -47,7 +47,7 @@ class Network(nn.Module):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__()
         self.layers = network()
-        channels = {"image": COLOURS}
+        channels = {"image": COLORS}
         for layer in self.layers:
             channels[layer.name] = layer.channels
             made = _module(layer, channels[layer.takes[0]])
@@ -71,9 +71,9 @@ class Network(nn.Module):  # type: ignore[misc]
 
 
 def begin_from(network: Network, weights: Weights, images: Any) -> None:
-    """Give a new network what `folded` gave, and each normalisation what it sees on these pictures, uint8 (N, 3, H, W):
-    what comes out stays the same. The maps of `TAUGHT` are not among the weights and begin anew; the thresholds that a
-    file's head has worked in are learned away."""
+    """Give a new network the weights of `folded`, and each normalization its statistics on these pictures, uint8 (N, 3,
+    H, W): the output stays the same. The maps of `TAUGHT` are not among the weights and begin at random; the thresholds
+    worked into a file's head are learned away."""
     hooks = []
     with torch.no_grad():
         for layer in network.layers:
@@ -86,15 +86,15 @@ def begin_from(network: Network, weights: Weights, images: Any) -> None:
                 continue
             module[0].weight.copy_(weight)
             module[1].bias.copy_(bias)
-            hooks.append(module[1].register_forward_hook(partial(_settle, module[0])))
+            hooks.append(module[1].register_forward_hook(partial(_calibrate_normalization, module[0])))
         network.eval()(images)
         network.train()
     for hook in hooks:
         hook.remove()
 
 
-def _settle(convolution: Any, normal: Any, given: tuple[Any], _: Any) -> None:
-    """Let the normalisation undo what it does to these values, and the convolution's weights be as large as it expects.
+def _calibrate_normalization(convolution: Any, normal: Any, given: tuple[Any], _: Any) -> None:
+    """Let the normalization undo its own effect on these values, with the convolution's weights at the size it expects.
     """
     mean, variance = given[0].mean((0, 2, 3)), given[0].var((0, 2, 3))
     spread = (variance + normal.eps).sqrt()
@@ -106,7 +106,7 @@ def _settle(convolution: Any, normal: Any, given: tuple[Any], _: Any) -> None:
 
 
 def _key(layer: Layer) -> str:
-    """What PyTorch calls it: modules have attributes of their own, such as `half`."""
+    """Return the layer's name in PyTorch: modules have attributes of their own, such as `half`."""
     return "layer_" + layer.name.replace(".", "_")
 
 
@@ -127,7 +127,7 @@ def _module(layer: Layer, channels: int) -> Any:
 
 
 def folded(state: dict[str, Any]) -> Weights:
-    """Every convolution's weight and bias, with the batch normalisation after it worked in, and `AGAINST`."""
+    """Every convolution's weight and bias, with the batch normalization after it worked in, and `AGAINST`."""
     weights: Weights = {}
     values = {name: value.detach().cpu().double().numpy().copy() for name, value in state.items()}
     for layer in network():
@@ -152,23 +152,23 @@ _PREPARED: Final = 3  # batches that wait
 _AVERAGED: Final = 0.998
 _GEOMETRY_WEIGHT: Final = 1.0
 _TAUGHT_WEIGHT: Final = 0.5
-_MEETING: Final = "meeting"
-_MET_WITHIN: Final = timedelta(minutes=3)
-"""All processes there, and each step's gradients: a machine that swaps needs a while."""
+_RENDEZVOUS: Final = "rendezvous"
+_JOIN_TIMEOUT: Final = timedelta(minutes=3)
+"""For all processes to join, and for each step's gradients: a machine that swaps needs a while."""
 CHECKPOINT: Final = "checkpoint.pt"
 _CHECKPOINT_EVERY: Final = 100
-_SAY_EVERY: Final = 50
+_LOG_EVERY: Final = 50
 
 
 def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
-          say: Callable[[str], None]) -> Weights:
-    """Train, or go on from the checkpoint in `folder`; the averaged weights, normalisation folded in. More than one
+          log: Callable[[str], None]) -> Weights:
+    """Train, or go on from the checkpoint in `folder`; the averaged weights, normalization folded in. More than one
     process only on the CPU."""
     if training.jobs == 1:
-        return _trained(scenes, training, device, folder, say)
-    _checkpoint(folder / CHECKPOINT, _made_by(scenes, training), device)  # what it cannot go on from is said once
+        return _trained(scenes, training, device, folder, log)
+    _checkpoint(folder / CHECKPOINT, _made_by(scenes, training), device)  # one error for that of another training
     with _helpers(scenes, training, folder):
-        return _trained(scenes, training, device, folder, say)
+        return _trained(scenes, training, device, folder, log)
 
 
 def start_from(weights: Weights, scenes: DrawnScenes, training: Training, folder: Path) -> None:
@@ -184,14 +184,14 @@ def start_from(weights: Weights, scenes: DrawnScenes, training: Training, folder
 @contextmanager
 def _helpers(scenes: DrawnScenes, training: Training, folder: Path) -> Iterator[None]:
     """This process and `jobs` - 1 others, each with its share of every batch, for as long as the context lasts."""
-    (folder / _MEETING).unlink(missing_ok=True)
+    (folder / _RENDEZVOUS).unlink(missing_ok=True)
     made = torch.multiprocessing.get_context("spawn")
-    helpers = [made.Process(target=_help, args=(rank, scenes, training, folder), daemon=True)
+    helpers = [made.Process(target=_run_helper, args=(rank, scenes, training, folder), daemon=True)
                for rank in range(1, training.jobs)]
     for one in helpers:
         one.start()
     try:
-        _meet(0, training, folder)
+        _join_group(0, training, folder)
         yield
     except RuntimeError as error:
         for one in helpers:
@@ -208,50 +208,50 @@ def _helpers(scenes: DrawnScenes, training: Training, folder: Path) -> Iterator[
             one.join()
 
 
-def _help(rank: int, scenes: DrawnScenes, training: Training, folder: Path) -> None:
-    """All that a helper does."""
+def _run_helper(rank: int, scenes: DrawnScenes, training: Training, folder: Path) -> None:
+    """Run one helper process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends the others
-    _meet(rank, training, folder)
+    _join_group(rank, training, folder)
     _trained(scenes, training, "cpu", folder, None)
 
 
-def _meet(rank: int, training: Training, folder: Path) -> None:
-    """Over a file, and on this machine only."""
+def _join_group(rank: int, training: Training, folder: Path) -> None:
+    """Join the group of processes over a file, on this machine only."""
     if sys.platform == "linux":
         os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
-    meeting = (folder / _MEETING).resolve().as_uri()
-    torch.distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=training.jobs,
-                                         timeout=_MET_WITHIN)
+    rendezvous = (folder / _RENDEZVOUS).resolve().as_uri()
+    torch.distributed.init_process_group("gloo", init_method=rendezvous, rank=rank, world_size=training.jobs,
+                                         timeout=_JOIN_TIMEOUT)
 
 
 def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
-             say: Callable[[str], None] | None) -> Weights:
-    """What each process does; only the one with `say` keeps checkpoints."""
+             log: Callable[[str], None] | None) -> Weights:
+    """Train in one process; only the one with `log` writes checkpoints."""
     torch.set_num_threads(1)  # two are slower on shared cores: the layers are small
     torch.manual_seed(training.seed)
     state = _State(scenes, training, torch.device(device))
     checkpoint = folder / CHECKPOINT
     begin = state.load(checkpoint)
-    if begin and say is not None:
-        say(f"goes on at step {begin} of {training.steps}")
+    if begin and log is not None:
+        log(f"goes on at step {begin} of {training.steps}")
     for step, batch in enumerate(_batches(scenes, training, begin), start=begin):
         loss = state.learn(step, batch)
-        if say is None:
+        if log is None:
             continue
-        if (step + 1) % _SAY_EVERY == 0:
-            say(f"step {step + 1} of {training.steps}: loss {loss:.3f}")
+        if (step + 1) % _LOG_EVERY == 0:
+            log(f"step {step + 1} of {training.steps}: loss {loss:.3f}")
         if (step + 1) % _CHECKPOINT_EVERY == 0 or step + 1 == training.steps:
             state.save(checkpoint, step + 1)
     return folded(state.average)
 
 
 def _made_by(scenes: DrawnScenes, training: Training) -> str:
-    """All that a checkpoint has to be of for a training to go on from it."""
+    """Describe the training that a checkpoint belongs to."""
     return json.dumps({**asdict(training), "scenes": scenes.digest()})
 
 
 def _checkpoint(path: Path, made_by: str, device: Any) -> dict[str, Any] | None:
-    """What is kept there; None if nothing is. Raises ConfigError for a checkpoint of another training."""
+    """Read the checkpoint, if there is one. Raises ConfigError for a checkpoint of another training."""
     if not path.exists():
         return None
     kept: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
@@ -262,14 +262,14 @@ def _checkpoint(path: Path, made_by: str, device: Any) -> dict[str, Any] | None:
 
 
 class _State:
-    """Network, optimiser and average."""
+    """Network, optimizer and average."""
 
     def __init__(self, scenes: DrawnScenes, training: Training, device: Any) -> None:
         self._training, self._made_by = training, _made_by(scenes, training)
         self._device = device
         self.network = Network().to(device=device, memory_format=torch.channels_last).train()
-        self._optimiser = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay)
-        self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimiser, training.rate_at)
+        self._optimizer = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay)
+        self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimizer, training.rate_at)
         self.average = self._copied()
 
     def _copied(self) -> dict[str, Any]:
@@ -284,11 +284,11 @@ class _State:
     def learn(self, step: int, batch: list[Sample]) -> float:
         """One step; its loss."""
         loss = _loss(self.network(self._on_device([one.image for one in batch])), batch, self._on_device)
-        self._optimiser.zero_grad()
+        self._optimizer.zero_grad()
         loss.backward()
-        self._agree()
+        self._average_gradients()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
-        self._optimiser.step()
+        self._optimizer.step()
         self._schedule.step()
         share = min(_AVERAGED, (step + 1) / (step + 10))
         for name, value in self.network.state_dict().items():
@@ -296,7 +296,7 @@ class _State:
             self.average[name] = old.lerp(value.detach(), 1 - share) if value.is_floating_point() else value.clone()
         return float(loss.detach())
 
-    def _agree(self) -> None:
+    def _average_gradients(self) -> None:
         """Gradients become the mean of all processes', so that all networks stay the same."""
         if not torch.distributed.is_initialized():
             return
@@ -313,7 +313,7 @@ class _State:
         """Written beside and moved, so that a cut leaves the one before."""
         torch.save({
             "training": self._made_by, "step": step, "network": self.network.state_dict(),
-            "average": self.average, "optimiser": self._optimiser.state_dict(), "schedule": self._schedule.state_dict(),
+            "average": self.average, "optimiser": self._optimizer.state_dict(), "schedule": self._schedule.state_dict(),
         }, path.with_suffix(".part"))
         path.with_suffix(".part").replace(path)
 
@@ -324,7 +324,7 @@ class _State:
             return 0
         self.network.load_state_dict(kept["network"])
         self.average = kept["average"]
-        self._optimiser.load_state_dict(kept["optimiser"])
+        self._optimizer.load_state_dict(kept["optimiser"])
         self._schedule.load_state_dict(kept["schedule"])
         return int(kept["step"])
 
@@ -333,11 +333,11 @@ def _loss(given: Any, batch: list[Sample], on_device: Callable[[list[Any]], Any]
     """Focal loss on the heat maps, distances on the geometry of the middle cells."""
     geometry = given[:, len(LABELS) : OUTPUTS]
     wanted, counts = on_device([one.heat for one in batch]), on_device([one.counts for one in batch])[:, None]
-    asked = _focal(given[:, : len(LABELS)], wanted[:, :-TAUGHT], counts)
+    labels = _focal(given[:, : len(LABELS)], wanted[:, :-TAUGHT], counts)
     taught = _focal(given[:, OUTPUTS:], wanted[:, -TAUGHT:], counts)
     sure = on_device([one.sure for one in batch])[:, None]
     off = (geometry - on_device([one.geometry for one in batch])).abs() * sure
-    return asked + _TAUGHT_WEIGHT * taught + _GEOMETRY_WEIGHT * off.sum() / sure.sum().clamp(min=1.0)
+    return labels + _TAUGHT_WEIGHT * taught + _GEOMETRY_WEIGHT * off.sum() / sure.sum().clamp(min=1.0)
 
 
 def _focal(heat: Any, wanted: Any, counts: Any) -> Any:
@@ -368,7 +368,7 @@ def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> lis
             for place in range(rank * share, (rank + 1) * share)]
 
 
-# `sightline train`: scenes, training, thresholds, ONNX file, judgement, model card. Shell (files).
+# `sightline train`: scenes, training, thresholds, ONNX file, score, model card. Shell (files).
 
 
 MODEL, CARD = "sightline.onnx", "sightline.md"
@@ -376,7 +376,7 @@ MODEL, CARD = "sightline.onnx", "sightline.md"
 
 @dataclass(frozen=True, slots=True)
 class TrainOptions:
-    """What `sightline train` was asked for."""
+    """Options of `sightline train`."""
 
     out: Path
     scenes: int
@@ -388,21 +388,21 @@ class TrainOptions:
     judged: int
     """Scenes of each column that the model card's table is of."""
     start: Weights | None = None
-    """What the last round begins from, in place of the rounds before it."""
+    """Weights that the last round begins from, in place of the rounds before it."""
 
 
-def run_training(options: TrainOptions, say: Callable[[str], None], progress: Progress) -> Path:
+def run_training(options: TrainOptions, log: Callable[[str], None], progress: Progress) -> Path:
     """Everything, in order; the model's path. What a run that was cut left in the folder is gone on with."""
     with progress(options.scenes, "scenes") as advance:
         scenes = drawn_scenes(options.out, options.scenes, options.jobs, advance)
     if options.start is not None:
         start_from(options.start, scenes, options.training, options.out)
-    weights = train(scenes, options.training, options.device, options.out, say)
-    say("thresholds are being chosen on scenes of other seeds")
+    weights = train(scenes, options.training, options.device, options.out, log)
+    log("thresholds are being chosen on scenes of other seeds")
     thresholds = chosen_thresholds(options.out / "unchosen.onnx", weights, options.validated, options.jobs, progress)
     model = options.out / MODEL
     written(model, shifted(weights, thresholds))
-    say(f"{model}: {model.stat().st_size} bytes; it is being judged on scenes that nothing was trained on")
+    log(f"{model}: {model.stat().st_size} bytes; it is being scored on scenes of no training")
     report = final_report(model, options.judged, progress)
     digest = hashlib.sha256(model.read_bytes()).hexdigest()
     parameters = sum(int(one.size) for one in weights.values())

@@ -20,8 +20,8 @@ GEOMETRY: Final = 4
 """Middle off the cell's by x, by y, in cells; log width, log height."""
 OUTPUTS: Final = len(LABELS) + GEOMETRY
 TAUGHT: Final = 1
-"""Heat maps of things that nobody asks for: to tell those from the others is learned the better for naming them. Left
-out of the ONNX file ..."""
+"""Heat maps of distractors: the network separates them better from the others if it has to name them. Left out of the
+ONNX file ..."""
 AGAINST: Final = 0.5
 """... but for this share, by which what looks like one of those looks less like a ball. Found on the scenes that choose
 thresholds: of 0, 0.3, 0.4, 0.5 and 0.65 the most hits at 3 % of false alarms, 4 to 7 points more than 0. Lights and
@@ -32,7 +32,7 @@ DARKEST: Final = 0.03
 """... unless it is darker than this, which would scale up mere noise."""
 LOOKED_AT: Final = 16
 """Each sixteenth row is enough to know how bright a picture is."""
-COLOURS: Final = 3
+COLORS: Final = 3
 
 Kind = Literal["conv", "depthwise", "add", "add-up", "head"]
 

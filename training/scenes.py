@@ -36,9 +36,9 @@ from sightline.training.network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
 from sightline.training.schedule import SceneRange
 
 _SLICE: Final = 100
-"""Scenes that one process draws before it says so."""
+"""Scenes that one process draws between two reports of progress."""
 _TRIED: Final = 4
-"""Of each kind, whether kept scenes are still what would be drawn."""
+"""Scenes of each kind that are drawn again, to check that the stored ones are still valid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,15 +49,15 @@ class DrawnScenes:
     truths: tuple[tuple[LabelledBox, ...], ...]
     unclear: tuple[tuple[Box, ...], ...]
     others: tuple[tuple[Box, ...], ...]
-    """What stands about and is not asked for."""
+    """Boxes of distractors: things without a label."""
 
     def digest(self) -> str:
-        """Other scenes have another: how many, what is in them, the first picture."""
-        told = json.dumps([len(self.truths), [[one.label, one.box] for row in self.truths for one in row]])
-        return hashlib.sha256(told.encode() + self.pictures[0].tobytes()).hexdigest()[:16]
+        """Hash the scenes: their number, their truths, the first picture."""
+        content = json.dumps([len(self.truths), [[one.label, one.box] for row in self.truths for one in row]])
+        return hashlib.sha256(content.encode() + self.pictures[0].tobytes()).hexdigest()[:16]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pictures on disk are opened again by who gets them, not copied."""
+        """Pickle pictures on disk by name: the receiver opens them again."""
         pictures = self.pictures.filename if isinstance(self.pictures, np.memmap) else self.pictures
         return _reopened, (pictures, self.truths, self.unclear, self.others)
 
@@ -69,13 +69,13 @@ def _reopened(pictures: Any, *rest: Any) -> DrawnScenes:
 def drawn_scenes(folder: Path, count: int, jobs: int, advance: Callable[[int], None]) -> DrawnScenes:
     """Scenes of the seeds 0 to `count`, drawn now or taken from `folder`, where they were drawn before."""
     if not 0 < count <= VALIDATED_FROM:
-        raise ConfigError(f"--scenes {count}: 1 to {VALIDATED_FROM}; seeds from there on validate and judge")
+        raise ConfigError(f"--scenes {count}: 1 to {VALIDATED_FROM}; seeds from there on validate and score")
     pictures, notes = folder / "scenes.npy", folder / "scenes.json"
     if _would_be_the_same(pictures, notes, count):
         advance(count)
     else:
         folder.mkdir(parents=True, exist_ok=True)
-        notes.unlink(missing_ok=True)  # what is drawn is no longer what it says
+        notes.unlink(missing_ok=True)  # it no longer describes the drawn scenes
         _draw_all(pictures, notes, count, jobs, advance)
     rows = json.loads(notes.read_text("utf-8"))
     truths = tuple(tuple(_truth(one) for one in row["truths"]) for row in rows)
@@ -84,7 +84,7 @@ def drawn_scenes(folder: Path, count: int, jobs: int, advance: Callable[[int], N
 
 
 def _would_be_the_same(pictures: Path, notes: Path, count: int) -> bool:
-    """Whether they were drawn whole, as many, and as they would be now: the first of each kind are, and compared."""
+    """Check that they were drawn whole, as many, and as they would be now: the first of each kind are compared."""
     if not notes.exists() or not pictures.exists() or len(json.loads(notes.read_text("utf-8"))) != count:
         return False
     drawn = np.load(pictures, mmap_mode="r")
@@ -135,7 +135,7 @@ CUT_PX: Final = (192, 160)
 WHOLE_PX: Final = (WIDTH_PX, HEIGHT_PX)
 _LEAST_LEFT: Final = 0.4  # of an object's box after the cut; with less left it is neither right nor wrong
 _NEW: Final = 0.5  # of the samples of a harder round: drawn from the scenes that it adds alone
-_AROUND_OTHERS: Final = 0.3  # of those samples: cut around what nobody asks for, where others are around objects
+_AROUND_OTHERS: Final = 0.3  # of those samples: cut around distractors, where others are around objects
 _SPREAD: Final = 0.09  # standard deviation of the bump on the heat map, by the object's side
 _LEAST_SPREAD: Final = 0.6  # cells
 _SURE: Final = 0.4  # of the bump: cells from there up learn where the object's edges are
@@ -145,7 +145,7 @@ Array = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One picture BGR (3, H, W) and what is wanted of it."""
+    """One picture BGR (3, H, W) and its wanted output."""
 
     image: npt.NDArray[np.uint8]
     heat: Array
@@ -155,7 +155,7 @@ class Sample:
     sure: Array
     """(H/4, W/4): how much a cell's geometry counts."""
     counts: Array
-    """(H/4, W/4): 0 where nobody can say what is right."""
+    """(H/4, W/4): 0 where the right output is not known."""
 
 
 def sample(scenes: DrawnScenes, shown: SceneRange, numbers: tuple[int, int, int], size_px: tuple[int, int]) -> Sample:
@@ -180,10 +180,10 @@ def _plain(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, l
 
 
 def _harder(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, list[Box], Column]:
-    """The same, with more of the newest scenes, of what nobody asks for, of bad pictures."""
+    """The same, with more of the newest scenes, of distractors, of bad pictures."""
     number = int(draw.integers(shown.newest if draw.random() < _NEW else 0, shown.known))
-    asked = [one.box for one in scenes.truths[number]]
-    around = list(scenes.others[number]) if draw.random() < _AROUND_OTHERS else asked
+    labelled = [one.box for one in scenes.truths[number]]
+    around = list(scenes.others[number]) if draw.random() < _AROUND_OTHERS else labelled
     return number, around, DEFECTS[int(draw.integers(len(DEFECTS)))]
 
 
@@ -270,7 +270,7 @@ def _bumped(heat: Array, box: Box) -> tuple[Array, tuple[int, int]]:
 
 
 def _edges(box: Box, shape: tuple[int, ...]) -> tuple[Array, Array, float, float]:
-    """What cells learn of a box: its middle off theirs by x (a row) and y (a column), log width, log height."""
+    """Targets of the cells for a box: offset of its middle by x (a row) and y (a column), log width, log height."""
     x, y = (box[0] + box[2]) / 2 / STRIDE, (box[1] + box[3]) / 2 / STRIDE
     off_x, off_y = x - (np.arange(shape[1]) + 0.5), y - (np.arange(shape[0])[:, None] + 0.5)
     return off_x, off_y, math.log((box[2] - box[0]) / SIZE_PX), math.log((box[3] - box[1]) / SIZE_PX)

@@ -1,4 +1,4 @@
-"""What decides the outcome of a training: learning rate, scenes and crops by step. Pure."""
+"""Learning rate, scenes and crops by step, which decide the outcome of a training. Pure."""
 
 import math
 from dataclasses import dataclass
@@ -7,10 +7,10 @@ from typing import Final
 _WARM_UP: Final = 100
 """Steps, at the begin of each round."""
 _LEAST_RATE: Final = 0.01
-"""Of a round's highest, at its end."""
+"""Learning rate at the end of a round, as a share of its highest."""
 LEAST_SHARE: Final = 1 / 4
-"""Of the first round's rate, for any round's highest: that of the third. The model that ships had an eighth in rounds
-four and five, and a quarter in the sixth, which made the network smaller."""
+"""Highest rate of any round, at least, as a share of the first round's: that of the third. The model that ships had an
+eighth in rounds four and five, and a quarter in the sixth, which made the network smaller."""
 WHOLE_FROM: Final = 0.8
 """From this part of a round on, whole pictures in place of cut-outs."""
 
@@ -26,12 +26,12 @@ class SceneRange:
     newest: int
     known: int
     harder: bool = False
-    """Whether newer scenes, other things than asked for, and bad pictures are shown more than by chance."""
+    """True to show newer scenes, distractors and bad pictures more often than by chance."""
 
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """What stands in the model card."""
+    """The settings in the model card."""
 
     rounds: tuple[int, ...]
     """Steps of each. A round has the learning rate up and down again, half as high as the round before but
@@ -47,7 +47,7 @@ class Training:
 
     @property
     def steps(self) -> int:
-        """Of all rounds."""
+        """Steps of all rounds."""
         return sum(self.rounds)
 
     @property
@@ -71,7 +71,7 @@ class Training:
         return SceneRange(min(known - 1, scenes * number // len(self.rounds)), known, number >= _HARDER_FROM)
 
     def whole_at(self, step: int) -> bool:
-        """Whether whole pictures are shown, half as many."""
+        """True where whole pictures are shown, half as many."""
         _, within, steps = self._place(step)
         return within >= WHOLE_FROM * steps
 

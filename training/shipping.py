@@ -47,10 +47,10 @@ from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format,
 from sightline.vision_side.detect.registry import build_detector
 
 MOST_FALSE: Final = 0.02
-"""Of false alarms and of wrong objects, in every column. A judge allows 5 of a hundred frames without a ball: what is
-at 2 % by nature has more than that once in sixty such hundreds, at 3 % once in twelve."""
+"""Share of false alarms and of wrong objects, in every column. An acceptance test allows 5 of a hundred frames without
+a ball: a detector with 2 % exceeds that once in sixty such hundreds, one with 3 % once in twelve."""
 _TRIED: Final = tuple(round(float(one), 2) for one in np.arange(0.06, 0.95, 0.01))
-_OTHERWISE: Final = 0.3  # for a label that no scene showed
+_DEFAULT_THRESHOLD: Final = 0.3  # for a label that no scene showed
 
 
 def ball_threshold(columns: Mapping[str, Sequence[FrameResult]]) -> float:
@@ -72,9 +72,9 @@ def label_threshold(found: LabelMatches) -> float:
     """The score with the best balance of found objects and right answers, the former twice as important (F2; van
     Rijsbergen, Information Retrieval, 1979): legs or a light that is overlooked is worse than one too many."""
     if not found.objects or not found.marks:
-        return _OTHERWISE
+        return _DEFAULT_THRESHOLD
     marks = sorted(found.marks, reverse=True)
-    right, best, chosen = 0, 0.0, _OTHERWISE
+    right, best, chosen = 0, 0.0, _DEFAULT_THRESHOLD
     for count, (score, is_right) in enumerate(marks, start=1):
         right += is_right
         balance = 5 * right / (count + 4 * found.objects)
@@ -108,7 +108,7 @@ def card_text(card: Card) -> str:
         f"Finds {', '.join(f'`{label}`' for label in LABELS)} in a picture: a heat-map network of {card.parameters} "
         f"numbers, {card.size_bytes} bytes, ONNX opset {OPSET}.", "",
         f"SHA-256 `{card.sha256}`", "", *_input(), "", "## How it was made", "", *_made(card), "",
-        "## How good it is", "", *_judged(card), "",
+        "## How good it is", "", *_scored(card), "",
         "## What it is not", "",
         "It has only ever seen drawn scenes: balls, boxes, traffic lights of three lamps, legs as two cylinders. Try "
         "it on your own robot's pictures (`sightline vision --shadow onnx`) before you let it drive.", "",
@@ -153,7 +153,7 @@ def _families(names: Sequence[str]) -> str:
     return ", ".join(dict.fromkeys(names))
 
 
-def _judged(card: Card) -> list[str]:
+def _scored(card: Card) -> list[str]:
     report = card.report
     last = report.first_seed + report.frames - 1
     return [
@@ -172,18 +172,18 @@ def _demanded(report: Report) -> list[str]:
     return [f"{kept}; these are not:", "", "```", *check_lines(broken), "```"] if broken else [f"{kept}."]
 
 
-# Trained weights into the file that ships: thresholds chosen, golden answer kept, judged. Shell (files, processes).
+# Trained weights into the file that ships: thresholds, golden answer, score. Shell (files, processes).
 
 
 COUNTS_FROM: Final = 0.5
 """The score from which a detection counts, once each label's threshold has been worked into the model."""
 Progress = Callable[[int, str], AbstractContextManager[Callable[[int], None]]]
-"""Of how many, and of what; what it gives is told of each few that are done."""
+"""Takes a total and a noun; the context's function takes the number of those done since its last call."""
 
 _ALL: Final = 0.02  # scores below are noise, and are not looked at when thresholds are chosen
 _LABELS: Final = (*COLUMNS.values(), THINGS)
 _SLICE: Final = 100
-"""Scenes that one process looks at before it says so."""
+"""Scenes that one process detects in between two reports of progress."""
 
 
 def written(path: Path, weights: Weights) -> None:
@@ -207,30 +207,30 @@ def chosen_thresholds(path: Path, weights: Weights, frames: int, jobs: int, prog
     slices = [range(first, min(first + _SLICE, last)) for first in range(VALIDATED_FROM, last, _SLICE)]
     balls: dict[str, list[FrameResult]] = {name: [] for name in COLUMNS}
     found = {label: LabelMatches() for label in LABELLED}
-    with progress(frames * len(_LABELS), "scenes that choose") as advance, worker_pool(jobs) as pool:
+    with progress(frames * len(_LABELS), "scenes for the thresholds") as advance, worker_pool(jobs) as pool:
         for done in as_completed([pool.submit(_seen, path, column, one) for column in _LABELS for one in slices]):
-            column, verdicts, marks = done.result()
+            column, results, marks = done.result()
             if column in balls:
-                balls[column] += verdicts
+                balls[column] += results
             for label, more in marks.items():
                 found[label].take(more)
-            advance(len(verdicts))
+            advance(len(results))
     return tuple(ball_threshold(balls) if label == "ball" else label_threshold(found[label]) for label in LABELS)
 
 
 def _seen(path: Path, column: Column, seeds: Sequence[int]) -> tuple[str, list[FrameResult], dict[str, LabelMatches]]:
-    """The column's name, what is to be said of each scene's ball, and of lights and legs where those are asked for."""
-    verdicts, found = [], {label: LabelMatches() for label in LABELLED if column == THINGS}
+    """Return the column's name, each scene's result for the ball, and the matches of lights and legs in `THINGS`."""
+    results, found = [], {label: LabelMatches() for label in LABELLED if column == THINGS}
     for seen in shown(column, seeds, [_subject(path)], 1):
-        verdicts.append(scene_result(seen.answers[0], seen.scene))
+        results.append(scene_result(seen.answers[0], seen.scene))
         for label, marks in found.items():
             marks.add(label, detections(seen.answers[0]), seen.scene)
-    return column.name, verdicts, found
+    return column.name, results, found
 
 
 def final_report(path: Path, frames: int, progress: Progress) -> Report:
-    """On the seeds that only judges use."""
-    with progress(int((len(COLUMNS) + LIGHT_SHARE) * frames), "scenes that judge") as advance:
+    """Score the model on the seeds that no training and no choice uses."""
+    with progress(int((len(COLUMNS) + LIGHT_SHARE) * frames), "scenes for the score") as advance:
         return score_scenes([_subject(path)], frames, each=lambda _: advance(1))
 
 

@@ -56,10 +56,10 @@ def test_a_training_that_was_cut_ends_as_if_it_had_not_been(tmp_path, monkeypatc
     def fall(line):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sightline.training.loop._SAY_EVERY", 3)
+    monkeypatch.setattr("sightline.training.loop._LOG_EVERY", 3)
     with pytest.raises(KeyboardInterrupt):
         train(scenes(), training, "cpu", cut, fall)
-    monkeypatch.setattr("sightline.training.loop._SAY_EVERY", 100)
+    monkeypatch.setattr("sightline.training.loop._LOG_EVERY", 100)
     said = []
     resumed = train(scenes(), training, "cpu", cut, said.append)
     assert said == ["goes on at step 2 of 4"]
