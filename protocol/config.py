@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 PLUGIN_ERRORS: Final = (Exception, SystemExit)
-"""What a plug-in's own code may raise: `sys.exit` in it is to end itself, not the service around it."""
+"""Errors of a plug-in's own code: `sys.exit` in it is to end itself, not the service around it."""
 _LONGEST_DETAIL: Final = 160
 _log: Final = logging.getLogger(__name__)
 _HERE: Final = Path(__file__).resolve().parent
@@ -171,7 +171,7 @@ def _old_packages_missing() -> Iterator[None]:
 
 
 def _why(error: BaseException, kind: str) -> str:
-    """What failed; for a module that moved, its new name."""
+    """Return what failed; for a module that moved, its new name."""
     if isinstance(error, ModuleNotFoundError) and error.name and _OLD_MODULE.fullmatch(error.name):
         named = next(filter(None, map(_OLD_MODULE.search, (*_lines(error.__traceback__), kind))), None)
         if named is not None:

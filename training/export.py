@@ -158,7 +158,7 @@ def _decoded(graph: Graph, head: str) -> None:
     _split(graph, head, [*maps, "rest"], [*[1] * len(LABELS), GEOMETRY], axis=1)
     graph.add("Max", maps, "best")
     graph.add("MaxPool", ["best"], "around", kernel_shape=[3, 3], pads=[1, 1, 1, 1], strides=[1, 1])
-    # A peak is no smaller than any cell around it; all other cells count as less than any peak.
+    # A peak is at least as large as any cell around it; all other cells count as less than any peak.
     graph.add("GreaterOrEqual", ["best", "around"], "is_peak")
     graph.add("Where", ["is_peak", "best", graph.constant("no_peak", _NO_PEAK)], "peaks")
     _shaped(graph, "peaks", "peaks.flat", [rows * columns])

@@ -37,18 +37,18 @@ class _NotifyingLink(LinkWrapper):
 
 
 class Fleet:
-    """A service for each robot that is heard. One turn gives every robot with something new its turn.
+    """A service for each robot that is received. One turn gives every robot with something new its turn.
 
     With a detector that waits for another service, each robot has its own detector and thread: an answer that one of
     them waits for keeps no other waiting.
     """
 
     def __init__(
-        self, config: VisionConfig, fleet_link: FleetLink, say: LogLine, detector: Detector | None = None
+        self, config: VisionConfig, fleet_link: FleetLink, report: LogLine, detector: Detector | None = None
     ) -> None:
         """`detector`, that of `config` if None, serves every robot, or the first of those that each have their own."""
-        self._config, self._fleet_link, self._say = config, fleet_link, say
-        self._apart = waits_for_service(config)
+        self._config, self._fleet_link, self._report = config, fleet_link, report
+        self._waits_for_service = waits_for_service(config)
         self._detector = detector or configured_detector(config)
         self._bell, self._ending = threading.Event(), threading.Event()
         self._threads: list[threading.Thread] = []
@@ -57,7 +57,7 @@ class Fleet:
         fleet_link.on_new_robot(self._bell.set)
 
     def serve(self, ending: threading.Event) -> None:
-        """Until `ending` is set."""
+        """Serve until `ending` is set."""
         try:
             while not ending.is_set():
                 self._bell.wait(_LONGEST_WAIT_S)
@@ -69,37 +69,40 @@ class Fleet:
             raise self._failed
         for robot, service in self.services.items():
             skipped = dict(service.skipped) or "none"
-            self._say(f"vision: {robot}: ended after {service.answered} frames; skipped: {skipped}")
+            self._report(f"vision: {robot}: ended after {service.answered} frames; skipped: {skipped}")
 
     def counts(self) -> list[Counts]:
-        """What is done so far for each robot; from any thread."""
+        """Count the frames of each robot so far; from any thread."""
         return [service.counts() for service in list(self.services.values())]
 
     def turn(self) -> None:
-        """Welcome who is new, and answer at most one frame of each robot that has no thread of its own: whatever came
-        meanwhile waits one round, whoever sends more."""
+        """Add new robots, and answer at most one frame of each robot without a thread of its own.
+
+        So no robot waits longer than one round, however many frames another one sends.
+        """
         for robot in self._fleet_link.robots():
             if robot not in self.services:
-                self._welcome(robot)
-            if not self._apart:
+                self._add_robot(robot)
+            if not self._waits_for_service:
                 self.services[robot].turn(0.0)
         if self._failed is not None:
             raise self._failed
 
-    def _welcome(self, robot: str) -> None:
+    def _add_robot(self, robot: str) -> None:
         config = self._config.model_copy(update={"robot": robot})
         link = self._fleet_link.link(robot)
-        if not self._apart:
+        if not self._waits_for_service:
             notifying = _NotifyingLink(link, self._bell)
-            self.services[robot] = open_service(config, notifying, self._of(robot), self._detector)
+            self.services[robot] = open_service(config, notifying, self._report_of(robot), self._detector)
             return
         own = configured_detector(config) if self.services else None
-        service = self.services[robot] = open_service(config, link, self._of(robot), own or self._detector)
-        self._threads.append(threading.Thread(target=self._serve_one, args=(service, own), name=robot, daemon=True))
-        self._threads[-1].start()
+        service = self.services[robot] = open_service(config, link, self._report_of(robot), own or self._detector)
+        thread = threading.Thread(target=self._serve_one, args=(service, own), name=f"vision {robot}", daemon=True)
+        self._threads.append(thread)
+        thread.start()
 
     def _serve_one(self, service: Service, own: Detector | None) -> None:
-        """What a robot's thread does, its `own` detector closed at its end. What fails ends all."""
+        """Run a robot's thread, and close its `own` detector at the end. An error ends the whole fleet."""
         try:
             with ExitStack() as ending:
                 ending.callback(close_detector, own)
@@ -110,11 +113,11 @@ class Fleet:
             self._bell.set()
 
     def _end(self) -> None:
-        """Robots' threads end together; one whose detector hangs is left behind."""
+        """End the robots' threads together; one whose detector hangs is left behind."""
         self._ending.set()
         until_s = time.monotonic() + _LONGEST_WAIT_S + self._config.detector.deadline_s
         for thread in self._threads:
             thread.join(max(0.0, until_s - time.monotonic()))
 
-    def _of(self, robot: str) -> LogLine:
-        return lambda line: self._say(line.replace("vision: ", f"vision: {robot}: ", 1))
+    def _report_of(self, robot: str) -> LogLine:
+        return lambda line: self._report(line.replace("vision: ", f"vision: {robot}: ", 1))
