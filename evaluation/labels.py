@@ -25,9 +25,8 @@ def boxes_message(
     header: FrameHeader, labels: Iterable[dict[str, Any]], size: CameraModel | JpegSize, session: str, seq: int
 ) -> tuple[bytes, bytes]:
     """Header and payload for the channel `detections`: the labels of the frame of `header`, in pixels of its `size`."""
-    echo = Echo(channel="frame", session=header.session, seq=header.seq, t_us=header.t_us)
     boxes = tuple(DetectedBox.model_validate(one) for one in labels)
-    stamp = DetectionsHeader(source=SOURCE, session=session, seq=seq, echo=echo)
+    stamp = DetectionsHeader(source=SOURCE, session=session, seq=seq, echo=Echo.of(header))
     return encode(stamp), encode(Detections(width_px=size.width_px, height_px=size.height_px, boxes=boxes))
 
 

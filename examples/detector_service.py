@@ -57,9 +57,8 @@ def answer(message: Message, seq: int) -> tuple[bytes, bytes]:
     started_ns = time.perf_counter_ns()
     frame = decode(FrameHeader, message.header)
     found = boxes_of(message.payload)
-    echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
     compute_us = (time.perf_counter_ns() - started_ns) // 1000
-    header = DetectionsHeader(source=SOURCE, session=SESSION, seq=seq, echo=echo, compute_us=compute_us)
+    header = DetectionsHeader(source=SOURCE, session=SESSION, seq=seq, echo=Echo.of(frame), compute_us=compute_us)
     return encode(header), encode(found)
 
 

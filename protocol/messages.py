@@ -94,6 +94,12 @@ class Echo(WireModel):
     seq: Counter = Field(description="as in that message")
     t_us: Microseconds = Field(description="as in that message")
 
+    @classmethod
+    def of(cls, stamp: Stamp) -> Self:
+        """Name the frame or the status that has this header."""
+        channel: Literal["frame", "status"] = "frame" if isinstance(stamp, FrameHeader) else "status"
+        return cls(channel=channel, session=stamp.session, seq=stamp.seq, t_us=stamp.t_us)
+
 
 class RequestId(WireModel):
     """Names a requested mission: the requester's session, and the id in the payload."""

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 
-from sightline.protocol import VERSION
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, RequestId, ScanHeader, Twist
 from sightline.vision_side.config import VisionConfig
@@ -196,19 +195,6 @@ def answer_header(
     frame: FrameHeader, session: str, seq: int, compute_us: int = 0, answer: PipelineAnswer | None = None
 ) -> AnswerHeader:
     """The header of the answer to `frame`, naming it field for field, and what else `answer` went by."""
-    echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
     scan, mission = (answer.scan, answer.request) if answer else (None, None)
-    return AnswerHeader(source=SOURCE, session=session, seq=seq, echo=echo, compute_us=compute_us, scan=scan,
+    return AnswerHeader(source=SOURCE, session=session, seq=seq, echo=Echo.of(frame), compute_us=compute_us, scan=scan,
                         mission=mission)
-
-
-def encode_answer(
-    frame: FrameHeader, session: str, seq: int, compute_us: int, answer: PipelineAnswer | None = None
-) -> bytes:
-    """`encode(answer_header(...))` byte for byte, without the models: every part of it was checked when it came in."""
-    scan, mission = (answer.scan, answer.request) if answer else (None, None)
-    by_scan = "" if scan is None else f',"scan":{scan}'
-    by_mission = "" if mission is None else f',"mission":{{"session":"{mission.session}","id":{mission.id}}}'
-    return (f'{{"v":{VERSION},"source":"{SOURCE}","session":"{session}","seq":{seq},"echo":{{"channel":"frame",'
-            f'"session":"{frame.session}","seq":{frame.seq},"t_us":{frame.t_us}}},"compute_us":{compute_us}'
-            f'{by_scan}{by_mission}}}').encode()

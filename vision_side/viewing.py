@@ -174,11 +174,10 @@ class ViewPublisher:
 
     def _header(self, channel: Channel, job: _Job) -> bytes:
         frame = job.shown.header
-        echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
         self._seqs[channel] += 1
         compute_us = (time.perf_counter_ns() - job.started_ns) // 1000
-        return encode(DetectionsHeader(source=SOURCE, session=self._session, seq=self._seqs[channel], echo=echo,
-                                       compute_us=max(0, compute_us)))
+        return encode(DetectionsHeader(source=SOURCE, session=self._session, seq=self._seqs[channel],
+                                       echo=Echo.of(frame), compute_us=max(0, compute_us)))
 
 
 def _encoded(picture: NDArray[np.uint8], quality: int, most_bytes: int) -> bytes | None:

@@ -113,8 +113,8 @@ class MissionClient:
         """
         self._id += 1
         request = request_of(self._id, name, waypoints, options or {})
-        stamp = self.operator.wait_report().stamp  # of now: what is said again later is as old as when it was asked
-        echo = Echo(channel="status", session=stamp.session, seq=stamp.seq, t_us=stamp.t_us)
+        # Of now: a request that is repeated later is as old as its first sending.
+        echo = Echo.of(self.operator.wait_report().stamp)
         mine = RequestId(session=self._session, id=self._id)
         deadline_s = time.monotonic() + PATIENCE_S
         while (left_s := deadline_s - time.monotonic()) > 0:

@@ -35,8 +35,7 @@ class Viewer:
             return False
         if self._is_silent:
             return True
-        echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
-        header = AnswerHeader(source=self._role, session=self._session, seq=self._seq, echo=echo)
+        header = AnswerHeader(source=self._role, session=self._session, seq=self._seq, echo=Echo.of(frame))
         self._seq += 1
         self._link.publish(ACK, encode(header), b"")
         return True

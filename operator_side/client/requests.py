@@ -123,10 +123,7 @@ class Operator:
 
     def _send(self, verb: Verb, report: Report | None) -> None:
         self._seq += 1
-        echo = None
-        if report is not None:
-            stamp = report.stamp
-            echo = Echo(channel="status", session=stamp.session, seq=stamp.seq, t_us=stamp.t_us)
+        echo = None if report is None else Echo.of(report.stamp)
         header = RequestHeader(source=SOURCE, session=self._session, seq=self._seq, echo=echo)
         self._link.publish(REQUEST, encode(header), encode(Request(id=self._id, verb=verb)), SOURCE)
 

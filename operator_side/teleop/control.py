@@ -291,7 +291,7 @@ class Teleop:
             frame = decode(FrameHeader, message.header)
         except WireError:
             return
-        self._echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
+        self._echo = Echo.of(frame)
         self._unanswered = True
 
     def on_status(self, message: Message, now_us: int) -> None:
@@ -438,10 +438,7 @@ class Teleop:
     def _request(self, verb: Verb) -> Message:
         self._id += 1
         self._seq += 1
-        echo = None
-        if self.report is not None:
-            stamp = self.report.stamp
-            echo = Echo(channel="status", session=stamp.session, seq=stamp.seq, t_us=stamp.t_us)
+        echo = None if self.report is None else Echo.of(self.report.stamp)
         header = RequestHeader(source=SOURCE, session=self.session, seq=self._seq, echo=echo)
         return self._message(REQUEST, encode(header), encode(Request(id=self._id, verb=verb)))
 

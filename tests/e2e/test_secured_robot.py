@@ -60,7 +60,7 @@ def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, ro
             if message is None:
                 continue
             frame = decode(FrameHeader, message.header)
-            echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
+            echo = Echo.of(frame)
             answer = AnswerHeader(source="vision", session=session, seq=answered, echo=echo)
             rogue.publish(TWIST, encode(answer), b"0.4000|0.0000", "vision")
             answered += 1

@@ -1,6 +1,7 @@
 """The pipeline: deterministic, never raising, and quiet when there is no picture."""
 
 import ast
+import json
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from sightline.protocol.messages import STILL, AnswerHeader, FrameHeader, Reques
 from sightline.protocol.text import format_twist
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.registry import configured_detector
-from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header, encode_answer
+from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header
 from tests.fixtures.vision.vision import Rig, camera, eight, jpeg_of, scene
 
 MODEL = camera()
@@ -148,7 +149,15 @@ ANSWERS = st.none() | st.builds(
 
 
 @given(SESSIONS, SESSIONS, st.tuples(COUNTS, COUNTS, COUNTS, COUNTS), ANSWERS)
-def test_the_quick_answer_header_is_that_of_the_model(robot, vision, counts, answer) -> None:
+def test_encoded_answer_header_fits_and_has_the_fields_of_frame_and_answer(robot, vision, counts, answer) -> None:
     frame = FrameHeader(session=robot, seq=counts[0], t_us=counts[1])
-    quick = encode_answer(frame, vision, *counts[2:], answer)
-    assert quick == encode(answer_header(frame, vision, *counts[2:], answer)) and len(quick) <= MAX_HEADER_BYTES
+    encoded = encode(answer_header(frame, vision, *counts[2:], answer))
+    expected = {
+        "v": 1, "source": "vision", "session": vision, "seq": counts[2],
+        "echo": {"channel": "frame", "session": robot, "seq": counts[0], "t_us": counts[1]}, "compute_us": counts[3],
+    }  # fmt: skip
+    if answer and answer.scan is not None:
+        expected["scan"] = answer.scan
+    if answer and answer.request is not None:
+        expected["mission"] = {"session": answer.request.session, "id": answer.request.id}
+    assert list(json.loads(encoded).items()) == list(expected.items()) and len(encoded) <= MAX_HEADER_BYTES

@@ -338,5 +338,4 @@ def _box(one: Detection) -> DetectedBox:
 
 
 def _stamp(frame: FrameHeader, session: str, seq: int, compute_us: int) -> bytes:
-    echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
-    return encode(DetectionsHeader(source=ROLE, session=session, seq=seq, echo=echo, compute_us=compute_us))
+    return encode(DetectionsHeader(source=ROLE, session=session, seq=seq, echo=Echo.of(frame), compute_us=compute_us))

@@ -180,9 +180,7 @@ class MissionChannel:
         if report is None:
             return
         self._reports += 1
-        echo = None
-        if frame is not None:
-            echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
+        echo = None if frame is None else Echo.of(frame)
         header = DetectionsHeader(source=SOURCE, session=self._session, seq=self._reports, echo=echo)
         self._link.publish(REPORT, encode(header), encode(report), SOURCE)
 

@@ -10,7 +10,7 @@ from typing import Final, TypeVar
 
 from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MAX_HEADER_BYTES, TWIST
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.codec import decode
+from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import CameraModel, FrameHeader, Stamp
 from sightline.protocol.text import format_twist
@@ -19,7 +19,7 @@ from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import attach_detector
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.registry import configured_detector
-from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, encode_answer
+from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header
 from sightline.vision_side.serving.mission_channel import NO_FRAMES, MissionChannel
 from sightline.vision_side.tracking.locate import REMEMBERED, BoxReader
 from sightline.vision_side.viewing import ViewPublisher
@@ -256,7 +256,7 @@ class Service:
         self.answered += 1
         self.steered += answer.twist is not None
         self._newest = (compute_us, header.latency_us)
-        stamp = encode_answer(header, self._session, self.answered, compute_us, answer)
+        stamp = encode(answer_header(header, self._session, self.answered, compute_us, answer))
         if answer.twist is None:
             self._link.publish(ACK, stamp, b"")
         else:

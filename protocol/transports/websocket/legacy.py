@@ -162,7 +162,7 @@ def _echo(header: bytes) -> Echo | None:
         frame = decode(FrameHeader, header)
     except WireError:
         return None
-    return Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
+    return Echo.of(frame)
 
 
 class LegacyToRobot:

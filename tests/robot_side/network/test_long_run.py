@@ -54,7 +54,7 @@ class LongRun:
         x, y, yaw = header.pose
         bearing = math.remainder(math.atan2(2.0 - y, -x) - yaw, math.tau)
         twist = Twist(linear_mps=0.4, angular_rad_s=max(-2.0, min(2.0, 1.5 * bearing)))
-        echo = Echo(channel="frame", session=header.session, seq=header.seq, t_us=header.t_us)
+        echo = Echo.of(header)
         answer = AnswerHeader(source="vision", session="0000bbbb", seq=self.answers, echo=echo)
         self.answers += 1
         self.vision.publish(TWIST, encode(answer), format_twist(twist))

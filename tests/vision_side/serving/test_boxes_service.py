@@ -259,7 +259,7 @@ class Eyes:
         del self._recent[:-40]
         frame = self._recent[max(0, len(self._recent) - 1 - self.late_by)]
         self.found += 1
-        echo = Echo(channel="frame", session=frame.session, seq=frame.seq, t_us=frame.t_us)
+        echo = Echo.of(frame)
         header = DetectionsHeader(source="guest", session="77777777", seq=self.found, echo=echo)
         box = DetectedBox(label="person", score=0.9, x1_px=7.0, y1_px=6.0, x2_px=9.0, y2_px=12.0)
         self._link.publish(DETECTIONS, encode(header), encode(Detections(width_px=16, height_px=16, boxes=(box,))))
