@@ -48,7 +48,7 @@ def register(app: typer.Typer) -> None:
         epilog="Example: sightline detector --serve onnx:ball.onnx --listen tcp/0.0.0.0:7447",
     )  # fmt: skip
     group.command(name="list", epilog="Example: sightline detector list --json")(list_detectors)
-    group.command(epilog="Example: sightline detector check my_detector:Mine --set min_score=0.5")(check)
+    group.command(epilog="Example: sightline detector check my_detector:BrightestSpot")(check)
     app.add_typer(group, name="detector")
 
 
