@@ -30,7 +30,7 @@ _MAX_BUFFERED_BYTES: Final = 2_000_000
 _PATIENCE_S: Final = 3.0
 
 
-class Frame(NamedTuple):
+class RawFrame(NamedTuple):
     """One WebSocket frame as it came, unmasked."""
 
     fin: bool
@@ -48,7 +48,7 @@ def frame_bytes(opcode: int, data: bytes, *, fin: bool = True, masked: bool = Tr
     return head + (mask + xor(data, mask) if masked else data)
 
 
-def take_frame(data: bytes) -> tuple[Frame, bytes] | None:
+def take_frame(data: bytes) -> tuple[RawFrame, bytes] | None:
     """Return the first frame in `data` and the rest; None while the frame is not complete."""
     if len(data) < 2:
         return None
@@ -61,7 +61,7 @@ def take_frame(data: bytes) -> tuple[Frame, bytes] | None:
     if len(data) < end:
         return None
     body = data[at + masked : end]
-    return Frame(bool(data[0] & 0x80), data[0] & 0x0F, xor(body, data[at : at + 4]) if masked else body), data[end:]
+    return RawFrame(bool(data[0] & 0x80), data[0] & 0x0F, xor(body, data[at : at + 4]) if masked else body), data[end:]
 
 
 def xor(data: bytes, mask: bytes) -> bytes:
@@ -107,7 +107,7 @@ class RawConnection:
 
     # --- receiving -----------------------------------------------------------------------------------------------
 
-    def frame(self, within_s: float) -> Frame | None:
+    def frame(self, within_s: float) -> RawFrame | None:
         """Return the next frame except pings; None when none comes, or the connection has ended."""
         deadline_s = time.monotonic() + within_s
         while True:
@@ -123,7 +123,7 @@ class RawConnection:
             if self.answers_pings:
                 self.send(PONG, frame.data)
 
-    def frame_that(self, wanted: Callable[[Frame], bool], within_s: float) -> Frame | None:
+    def frame_that(self, wanted: Callable[[RawFrame], bool], within_s: float) -> RawFrame | None:
         """Return the next frame for which `wanted` holds; None when none comes."""
         deadline_s = time.monotonic() + within_s
         while (left_s := deadline_s - time.monotonic()) > 0 and not self._ended:

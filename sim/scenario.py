@@ -95,7 +95,7 @@ Amounts = Annotated[tuple[Amount, Amount], AfterValidator(_ordered)]
 """A span of what cannot be negative."""
 
 
-class Legs(Config):
+class LegShape(Config):
     """A person from the knees down: two upright cylinders that walk. A foot stands, or swings twice as fast."""
 
     apart_m: Side = 0.20
@@ -121,7 +121,7 @@ class Thing(Config):
     """Of a box: along, across, up."""
     height_m: Side = 0.4
     """Of a cylinder or a leg."""
-    legs: Legs = Legs()
+    legs: LegShape = LegShape()
     color: Color = (0.95, 0.78, 0.05)
 
     @property

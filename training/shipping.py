@@ -40,7 +40,7 @@ from sightline.training.export import MOST_BOXES, OPSET, onnx_bytes
 from sightline.training.network import Weights
 from sightline.training.schedule import LEAST_SHARE, WHOLE_FROM, Training
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.onnx.engine import open_engine
 from sightline.vision_side.detect.onnx.self_test import KEY, golden_picture, golden_text
 from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
@@ -192,7 +192,7 @@ def written(path: Path, weights: Weights) -> None:
     path.write_bytes(onnx_bytes(weights, properties))
     engine = open_engine(path, "cpu", 1)
     form = model_format(engine.header, (), "auto")
-    picture = Picture(golden_picture(), 1)
+    picture = DecodedImage(golden_picture(), 1)
     pixels, fitting = fit_picture(picture, form)
     found = read_outputs(engine.run(pixels), form, fitting, picture, COUNTS_FROM)
     beside = path.with_suffix(".part")

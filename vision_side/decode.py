@@ -1,4 +1,4 @@
-"""JPEG bytes -> `Picture`, bounded before any decoder sees them. Pure."""
+"""JPEG bytes -> `DecodedImage`, bounded before any decoder sees them. Pure."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ _SEGMENTS = frozenset(bytes([0xFF, one]) for one in (0xC0, 0xC1, 0xC4, 0xDB, 0xD
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class DecodedImage:
     """Decoded pixels, valid until the next decode. `scale` turns their pixels into those of the encoded picture."""
 
     bgr: NDArray[np.uint8]
@@ -37,10 +37,10 @@ class Decoder:
         self._max_pixels = max_pixels
         scale = 2 if width_px * height_px >= HALF_SCALE_FROM_PIXELS else 1
         rows, columns = -(-height_px // scale), -(-width_px // scale)
-        self._picture = Picture(_cached_pixels(rows, columns), scale)
+        self._picture = DecodedImage(_cached_pixels(rows, columns), scale)
         self._checked_head: bytes | None = None
 
-    def decode(self, jpeg: bytes) -> Picture:
+    def decode(self, jpeg: bytes) -> DecodedImage:
         """The pixels of `jpeg`. Raises WireError MALFORMED for anything that is not a picture of the camera's size."""
         self.check(jpeg)
         self._fill(jpeg)

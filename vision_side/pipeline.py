@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, RequestId, ScanHeader, Twist
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.decode import Decoder, Picture
+from sightline.vision_side.decode import DecodedImage, Decoder
 from sightline.vision_side.detect.plugin_calls import checked_results
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Detector
 from sightline.vision_side.missions.port import Plan, RangeScan, View
@@ -13,7 +13,6 @@ from sightline.vision_side.missions.registry import MissionSpec, configured_miss
 from sightline.vision_side.missions.switch import MissionSwitch
 from sightline.vision_side.tracking.prediction import LatencyEstimator
 
-Detections = tuple[Detection, ...]
 SOURCE = "vision"
 NO_ANSWER = "NO_ANSWER"
 """In `skipped`: the detector did not answer the frame, in time or at all."""
@@ -38,7 +37,7 @@ class Observation:
     """
 
     phase: str
-    detections: Detections = ()
+    detections: tuple[Detection, ...] = ()
     target: Detection | None = None
     bearing_rad: float | None = None
     distance_m: float | None = None
@@ -144,7 +143,7 @@ class Pipeline:
             return self._skip(NO_ANSWER, result, "no answer")
         return self._answer(frame.header, result.detections, picture, result)
 
-    def follow(self, header: FrameHeader, detections: Detections) -> PipelineAnswer:
+    def follow(self, header: FrameHeader, detections: tuple[Detection, ...]) -> PipelineAnswer:
         """Answer the frame of `header`, in which another service found `detections`; empty is "saw nothing"."""
         if not self._is_new(header):
             return self._skip("OUT_OF_ORDER", "what was looked at is not newer than the last")
@@ -163,7 +162,7 @@ class Pipeline:
         return PipelineAnswer(None, seen, None, self.mission.name, self._request, skipped=skipped)
 
     def _answer(
-        self, header: FrameHeader, detections: Detections, picture: Picture | None,
+        self, header: FrameHeader, detections: tuple[Detection, ...], picture: DecodedImage | None,
         result: DetectionResult | None = None,
     ) -> PipelineAnswer:
         dt_s = self._tick(header)
@@ -187,7 +186,7 @@ class Pipeline:
         return self._scan
 
 
-def _seen(plan: Plan, detections: Detections) -> Observation:
+def _seen(plan: Plan, detections: tuple[Detection, ...]) -> Observation:
     return Observation(plan.phase, detections, plan.target, plan.bearing_rad, plan.distance_m, plan.note, plan.done)
 
 

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from typing import Any, Final, Self
 
 from sightline.conformance.case import Bench, Suite
-from sightline.conformance.raw_peers import BINARY, CLOSE, CONTINUED, PING, PONG, TEXT, Frame, RawConnection
+from sightline.conformance.raw_peers import BINARY, CLOSE, CONTINUED, PING, PONG, TEXT, RawConnection, RawFrame
 from sightline.conformance.vision.images import CAMERA as LENS
 from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import CAMERA, FRAME, Channel
@@ -99,7 +99,7 @@ class AcceptedClient(RawConnection):
         self.write(b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
                    b"Sec-WebSocket-Accept: " + token + b"\r\n" + chosen + b"\r\n")
 
-    def frame(self, within_s: float) -> Frame | None:
+    def frame(self, within_s: float) -> RawFrame | None:
         """Return the next frame except pings; a close frame is answered and ends the connection."""
         frame = super().frame(within_s)
         if frame is not None and frame.opcode == CLOSE:
@@ -288,7 +288,7 @@ def answers_pings(bench: Bench) -> None:
     with server_of(bench) as server:
         client = met(bench, server)
         client.send(PING, b"are you there")
-        pong = Frame(True, PONG, b"are you there")
+        pong = RawFrame(True, PONG, b"are you there")
         bench.expect(client.frame_that(lambda one: one == pong, _ANSWER_S), "no pong came")
 
 

@@ -115,13 +115,13 @@ def install(
     typer.echo(f"{planned.path} is in place and runs; look at it with: systemctl status {planned.path.stem}")
 
 
-def _beside(service: str, program: Path, file: Path) -> units.Plan | None:
+def _beside(service: str, program: Path, file: Path) -> units.InstallPlan | None:
     """Raises ConfigError where the service could not begin with this file."""
     loaded = load_service(service, file=str(file), environ={}).config
     return units.drop_in(loaded, program, file, units.UNIT_DIR) if isinstance(loaded, RobotConfig) else None
 
 
-def _show(planned: units.Plan, beside: units.Plan | None) -> None:
+def _show(planned: units.InstallPlan, beside: units.InstallPlan | None) -> None:
     typer.echo(planned.text, nl=False)
     typer.echo(f"nothing is written; with --yes: this goes to {planned.path} and begins", err=True)
     if beside is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from sightline.operator_side.cockpit.metrics import counter, gauge, serving
 from sightline.protocol.errors import ConfigError
-from sightline.vision_side.serving.service import Counts, CountsNow, Observe
+from sightline.vision_side.serving.service import CountsNow, Observe, ServiceCounts
 
 if TYPE_CHECKING:
     from sightline.operator_side.cockpit.metrics import Family
@@ -36,7 +36,7 @@ class VisionMetrics:
         """All that is known now, by robot."""
         rows = self._now()
 
-        def each(value: Callable[[Counts], float]) -> dict[tuple[str, ...], float]:
+        def each(value: Callable[[ServiceCounts], float]) -> dict[tuple[str, ...], float]:
             return {(one.robot,): value(one) for one in rows}
 
         yield gauge("vision_hears", "whether frames come", each(lambda one: float(one.heard)), "robot")

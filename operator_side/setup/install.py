@@ -23,7 +23,7 @@ _DROP_INS_PINS = "gpio_low 10 9 8 7 17"
 
 
 @dataclass(frozen=True)
-class Plan:
+class InstallPlan:
     """One file of systemd: where it goes and what it says."""
 
     service: str
@@ -31,7 +31,7 @@ class Plan:
     text: str
 
 
-def plan(service: str, program: Path, config: Path, user: str, unit_dir: Path = UNIT_DIR) -> Plan:
+def plan(service: str, program: Path, config: Path, user: str, unit_dir: Path = UNIT_DIR) -> InstallPlan:
     """The unit of `service`, for this machine's paths.
 
     Raises ConfigError for a service that has none, or for a path or user that systemd would misread.
@@ -44,10 +44,10 @@ def plan(service: str, program: Path, config: Path, user: str, unit_dir: Path = 
     name = f"sightline-{service}.service"
     unit = files(f"sightline.{service}_side").joinpath("systemd", name).read_text()
     unit = unit.replace("User=sightline", f"User={user}")
-    return Plan(service, unit_dir / name, _fitted(unit, service, program, config))
+    return InstallPlan(service, unit_dir / name, _fitted(unit, service, program, config))
 
 
-def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UNIT_DIR) -> Plan | None:
+def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UNIT_DIR) -> InstallPlan | None:
     """What puts the pins of a robot whose drive is `gpio` low, beside its unit; None for another drive.
 
     Raises ConfigError where the drive's own options are wrong.
@@ -62,7 +62,7 @@ def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UN
         .read_text()
         .replace(_DROP_INS_PINS, f"gpio_low {pins}")
     )
-    return Plan("robot", drop_in_path(unit_dir), _fitted(text, "robot", program, config))
+    return InstallPlan("robot", drop_in_path(unit_dir), _fitted(text, "robot", program, config))
 
 
 def drop_in_path(unit_dir: Path = UNIT_DIR) -> Path:
@@ -80,7 +80,7 @@ def _fitted(unit: str, service: str, program: Path, config: Path) -> str:
     return "\n".join(line for line in fitted.splitlines() if line[:1] != "#") + "\n"
 
 
-def write(planned: Plan, beside: Plan | None = None) -> None:
+def write(planned: InstallPlan, beside: InstallPlan | None = None) -> None:
     """Put the unit in place, and what belongs beside it, and begin it, now and at every start of the machine. One that
     runs already begins anew: with other pins than those that are put low at its end it must not go on.
 
@@ -92,7 +92,7 @@ def write(planned: Plan, beside: Plan | None = None) -> None:
         _systemctl(command)
 
 
-def _put(planned: Plan) -> None:
+def _put(planned: InstallPlan) -> None:
     try:
         if planned.path.name == _DROP_IN:
             planned.path.parent.mkdir(exist_ok=True)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from sightline.sim.scenario import LIT, Color, Legs, Light, Part, State, color_of
+from sightline.sim.scenario import LIT, Color, LegShape, Light, Part, State, color_of
 from sightline.sim.scenes.model import (
     HEIGHT_PX,
     MOST_HIDDEN,
@@ -210,7 +210,7 @@ def _placed(part: Part, model: Light, one: Solid) -> tuple[float, float, float]:
 
 def _feet(one: Solid) -> list[tuple[float, float, float]]:
     """Middles of both legs."""
-    walk, (x, y, z) = Legs(), one.at_m
+    walk, (x, y, z) = LegShape(), one.at_m
     cos, sin = math.cos(one.turn_rad), math.sin(one.turn_rad)
     feet = []
     for is_left in (True, False):

@@ -12,7 +12,7 @@ import numpy as np
 
 from sightline.protocol.messages import CameraModel, FrameHeader
 from sightline.protocol.text import MAX_TWIST_BYTES, format_twist
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.port import Circle, Detection
 from sightline.vision_side.missions.port import Plan, RangeScan, View
 from sightline.vision_side.missions.registry import MissionSpec
@@ -64,7 +64,8 @@ def views(seed: int, frames: int) -> Iterator[View]:
         pose = _moved(rng, pose)
         bgr = pixels.integers(0, 256, (240, 320, 3), np.uint8) if seq % 3 else np.zeros((240, 320, 3), np.uint8)
         yield View(_header(rng, seq, t_us, pose), dt_s, rng.uniform(0.03, 0.43), CAMERA, _detections(rng),
-                   Picture(bgr, 1) if rng.random() < 0.8 else None, _scan(rng, t_us) if rng.random() < 0.8 else None)
+                   DecodedImage(bgr, 1) if rng.random() < 0.8 else None,
+                   _scan(rng, t_us) if rng.random() < 0.8 else None)
 
 
 def _blind(seed: int, frames: int) -> Iterator[View]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sightline.protocol.errors import WireError
 from sightline.vision_side.config import HsvRange
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.hsv import color_table
 from sightline.vision_side.detect.per_robot import PerSession
 from sightline.vision_side.detect.plugin_calls import DetectorWrapper
@@ -69,7 +69,7 @@ class ColorFilter(DetectorWrapper):
         kept = tuple(one for one in result.detections if self._share(picture, one) >= LEAST_SHARE)
         return result if len(kept) == len(result.detections) else replace(result, detections=kept)
 
-    def _share(self, picture: Picture, one: Detection) -> float:
+    def _share(self, picture: DecodedImage, one: Detection) -> float:
         """How much of the box's middle has the colour."""
         columns = _middle(one.x1_px, one.x2_px, picture.scale, picture.bgr.shape[1])
         rows = _middle(one.y1_px, one.y2_px, picture.scale, picture.bgr.shape[0])

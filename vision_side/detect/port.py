@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from sightline.protocol.messages import FrameHeader
-from sightline.vision_side.decode import Decoder, Picture
+from sightline.vision_side.decode import DecodedImage, Decoder
 
 LONGEST_LABEL: Final = 64
 """As on the wire (`DetectedBox.label`), in characters."""
@@ -93,7 +93,7 @@ class DetectFrame:
     __slots__ = ("_decoder", "_picture", "goes_by", "header", "height_px", "jpeg", "robot", "width_px")
 
     def __init__(
-        self, robot: str, header: FrameHeader, jpeg: bytes, decoder: Decoder, picture: Picture | None = None
+        self, robot: str, header: FrameHeader, jpeg: bytes, decoder: Decoder, picture: DecodedImage | None = None
     ) -> None:
         """`decoder` is the robot's, and `picture` what it made of `jpeg`, if it did; valid until it decodes another."""
         self.robot = robot
@@ -104,14 +104,14 @@ class DetectFrame:
         self._picture = picture
         self.goes_by: LabelTest = _any_label  # that of the robot's mission, where the pipeline knows one
 
-    def picture(self) -> Picture:
+    def picture(self) -> DecodedImage:
         """The pixels. Raises WireError MALFORMED for what is no picture of the camera's size."""
         if self._picture is None:
             self._picture = self._decoder.decode(self.jpeg)
         return self._picture
 
     @property
-    def decoded(self) -> Picture | None:
+    def decoded(self) -> DecodedImage | None:
         """The pixels, if somebody asked for them already."""
         return self._picture
 

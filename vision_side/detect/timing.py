@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from sightline.protocol.errors import WireError
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.port import (
     DetectFrame,
     Detection,
@@ -15,7 +15,7 @@ from sightline.vision_side.detect.port import (
 )
 
 
-def _picture_of(frame: DetectFrame) -> Picture | None:
+def _picture_of(frame: DetectFrame) -> DecodedImage | None:
     try:
         return frame.picture()
     except WireError:
@@ -28,7 +28,7 @@ def _inside(frame: DetectFrame, found: Sequence[Detection]) -> list[Detection]:
 
 
 def timed_together(
-    frames: Sequence[DetectFrame], maker: Maker, look: Callable[[Sequence[Picture]], list[Sequence[Detection]]]
+    frames: Sequence[DetectFrame], maker: Maker, look: Callable[[Sequence[DecodedImage]], list[Sequence[Detection]]]
 ) -> list[DetectionResult | None]:
     """The same of several pictures at once, each with its share of the time."""
     pictures = [_picture_of(frame) for frame in frames]
@@ -41,7 +41,7 @@ def timed_together(
 
 
 def timed(
-    frame: DetectFrame, maker: Maker, look: Callable[[Picture], Sequence[Detection]]
+    frame: DetectFrame, maker: Maker, look: Callable[[DecodedImage], Sequence[Detection]]
 ) -> DetectionResult | None:
     """What `look` finds in the picture of `frame`, and how long it looked; None for what is no picture."""
     return timed_together([frame], maker, lambda pictures: [look(one) for one in pictures])[0]

@@ -19,7 +19,7 @@ from sightline.vision_side.config import (
 from sightline.vision_side.detect.port import Detection, is_followable
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.tracking.locate import Sighting, locate_box, locate_sphere
-from sightline.vision_side.tracking.prediction import Motion, MotionPredictor
+from sightline.vision_side.tracking.prediction import MotionPredictor, PredictedMotion
 from sightline.vision_side.tracking.steering import Aim, Search, Steer
 from sightline.vision_side.tracking.track import Target, Track, from_odometry
 
@@ -127,7 +127,7 @@ class Follow:
         return Plan(STILL, "lost") if twist is None else Plan(twist, "searching")
 
 
-def aim_at(target: Target, robot: Motion, camera: CameraModel, ahead_s: float) -> Aim:
+def aim_at(target: Target, robot: PredictedMotion, camera: CameraModel, ahead_s: float) -> Aim:
     """`target`, `ahead_s` from now, about the lens of `robot`."""
     x, y = from_odometry(robot.pose, target.x_m + target.vx_mps * ahead_s, target.y_m + target.vy_mps * ahead_s)
     vx, vy = from_odometry((0.0, 0.0, robot.pose[2]), target.vx_mps, target.vy_mps)

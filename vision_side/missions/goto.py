@@ -12,7 +12,7 @@ from sightline.vision_side.config import LatencyConfig
 from sightline.vision_side.missions.planner import CELL_M, Costmap, Planner, Point
 from sightline.vision_side.missions.port import Plan, RangeScan, View
 from sightline.vision_side.missions.ranges import Points, PoseMemory, about_robot, echoes, in_odometry
-from sightline.vision_side.tracking.prediction import Motion, MotionPredictor
+from sightline.vision_side.tracking.prediction import MotionPredictor, PredictedMotion
 from sightline.vision_side.tracking.track import to_odometry
 
 _STILL_MPS = 1e-6
@@ -251,7 +251,7 @@ class Goto:
         twist = self._braked(then.pose, -creep if backs else creep, max(-_SHY_RAD_S, min(_SHY_RAD_S, 2 * turn_rad)))
         return Plan(twist, "backing out" if backs else "going out", self._score())
 
-    def _room(self, then: Motion) -> Point | None:
+    def _room(self, then: PredictedMotion) -> Point | None:
         """Where to creep straight to before a turn: away from what the robot's corners would come too near to.
 
         That is judged where the robot could come to rest: one that still rolls towards a wall must not turn yet.
@@ -267,7 +267,7 @@ class Goto:
             return None
         return to_odometry(pose, -math.copysign(0.1, x), 0.0)
 
-    def _then(self, view: View) -> Motion:
+    def _then(self, view: View) -> PredictedMotion:
         """The robot when the command acts."""
         header = view.header
         return self._foretelling.motion(header.t_us, header.pose, header.moving, header.applied)
@@ -312,7 +312,7 @@ class Goto:
         arriving = max(0.03, min(braking_mps(goal_m, 0.1, config.brake_mps2 / 2), 2.0 * goal_m))
         return min(arriving, fade * config.max_linear_mps, fade * max(sight_mps, config.creep_mps))
 
-    def _sight_mps(self, then: Motion) -> float:
+    def _sight_mps(self, then: PredictedMotion) -> float:
         """What may stand just beyond the sensors' reach must still be left at the clearance.
 
         The reach is counted from where the newest scan was taken, so speed gives way when scans are late or lost.

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from sightline.protocol.config import Config
 from sightline.vision_side.config import Fraction, HsvRange
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.hsv import color_table, sharp_outline
 from sightline.vision_side.detect.port import Detection
 
@@ -59,7 +59,7 @@ class LampConfig(Config):
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
+class DetectedLight:
     """One light: its colour, and its box in pixels of the encoded picture."""
 
     colour: str
@@ -74,7 +74,7 @@ class HousingLightReader:
         self._ranges = _ranges(config)
         self._lit = color_table(tuple(self._ranges.values()))
 
-    def read(self, picture: Picture, not_these: Iterable[Detection] = ()) -> list[Light]:  # noqa: ARG002
+    def read(self, picture: DecodedImage, not_these: Iterable[Detection] = ()) -> list[DetectedLight]:  # noqa: ARG002
         """Every housing in view, largest first; the colour is unknown where place and hue do not agree."""
         bgr = balanced(picture.bgr)
         bright = bgr.max(axis=2)
@@ -129,14 +129,14 @@ class HousingLightReader:
                             dark[max(0, top) : bottom, right + 1 : right + margin]])
         return bool(inside.size) and inside.mean() > 0.2 and (not beside.size or beside.mean() < 0.4)
 
-    def _light(self, bgr: Bgr, bright: Bgr, box: Box, scale: int) -> Light:
+    def _light(self, bgr: Bgr, bright: Bgr, box: Box, scale: int) -> DetectedLight:
         lamps = [self._lamp(bgr, bright, box, place) for place in (-1, 0, 1)]
         shine = [one[0] for one in lamps]
         order = sorted(range(3), key=lambda one: shine[one], reverse=True)
         best = order[0]
         stands_out = shine[best] > self._config.contrast * shine[order[1]]
         sure = stands_out and _is(lamps[best][1], self._ranges[COLOURS[best]])
-        return Light(COLOURS[best] if sure else UNKNOWN, _detection(box, scale, "light"))
+        return DetectedLight(COLOURS[best] if sure else UNKNOWN, _detection(box, scale, "light"))
 
     def _lamp(self, bgr: Bgr, bright: Bgr, box: Box, place: int) -> tuple[float, NDArray[np.float64]]:
         """How bright the lamp at `place` (-1 top, 0 middle, 1 bottom) is, and its colour (B, G, R)."""
@@ -161,7 +161,7 @@ class BoxLightReader:
         self._config = config
         self._tables = {name: color_table((one,)) for name, one in _ranges(config).items()}
 
-    def read(self, picture: Picture, not_these: Iterable[Detection] = ()) -> list[Light]:
+    def read(self, picture: DecodedImage, not_these: Iterable[Detection] = ()) -> list[DetectedLight]:
         """Every box of one of the three colours, largest first, but for `not_these`."""
         codes = cv2.cvtColor(balanced(picture.bgr), cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
         others = [_middle(one) for one in not_these]
@@ -170,10 +170,12 @@ class BoxLightReader:
         own = [one for one in lights if not any(_holds(one.box, spot) for spot in others)]
         return sorted(own, key=lambda one: one.box.y2_px - one.box.y1_px, reverse=True)
 
-    def _boxes(self, codes: NDArray[np.uint16], colour: str, table: NDArray[np.uint8], picture: Picture) -> list[Light]:
+    def _boxes(
+        self, codes: NDArray[np.uint16], colour: str, table: NDArray[np.uint8], picture: DecodedImage
+    ) -> list[DetectedLight]:
         mask = cv2.morphologyEx(cv2.LUT(codes, table), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
         shapes, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        lights: list[Light] = []
+        lights: list[DetectedLight] = []
         for rough in sorted(shapes, key=len, reverse=True)[:_MAX_SHAPES]:
             sharp = sharp_outline(picture.bgr, mask, cv2.boundingRect(rough))
             shape = rough if sharp is None else sharp
@@ -181,7 +183,7 @@ class BoxLightReader:
             is_box = cv2.contourArea(shape) > 0.7 * (width - 1) * (height - 1)
             if height >= self._config.min_height_px and is_box and 0.4 < width / height < 2.0:
                 box = (float(x), float(y), float(x + width), float(y + height))
-                lights.append(Light(colour, _detection(box, picture.scale, "light")))
+                lights.append(DetectedLight(colour, _detection(box, picture.scale, "light")))
         return lights
 
 

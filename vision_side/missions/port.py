@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sightline.protocol.messages import CameraModel, FrameHeader, Twist
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.port import Detection
 
 
@@ -44,7 +44,7 @@ class View:
     camera: CameraModel
     detections: tuple[Detection, ...]
     """Empty means "saw nothing"."""
-    picture: Picture | None = None
+    picture: DecodedImage | None = None
     """Decoded pixels, valid during the step only; None where somebody else looked at the frame."""
     scan: RangeScan | None = None
     """The newest that came before the frame was answered; its age is `header.t_us - scan.t_us`."""

@@ -11,10 +11,10 @@ from sightline.protocol.messages import STILL, CameraModel, Pose, Twist
 from sightline.vision_side.config import BoxesConfig, LatencyConfig
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.lane import Lane, LaneConfig, Line
-from sightline.vision_side.missions.lights import UNKNOWN, BoxLightReader, HousingLightReader, LampConfig, Light
+from sightline.vision_side.missions.lights import UNKNOWN, BoxLightReader, DetectedLight, HousingLightReader, LampConfig
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.tracking.locate import locate_box
-from sightline.vision_side.tracking.prediction import Motion, MotionPredictor
+from sightline.vision_side.tracking.prediction import MotionPredictor, PredictedMotion
 from sightline.vision_side.tracking.track import to_odometry
 
 _FRAMES = 2  # a colour that lets go must be seen this often, one after the other; one that stops counts at once
@@ -178,7 +178,7 @@ class TrafficLight:
 
     # --- the light -----------------------------------------------------------------------------------------------
 
-    def _look(self, lights: list[Light], line: Line, view: View) -> None:
+    def _look(self, lights: list[DetectedLight], line: Line, view: View) -> None:
         """Which of the lights is the next, what it shows, and where it is."""
         pose = view.header.pose
         if self._light and self._left_m(line, self._light, pose) < -self._config.stop.cleared_m:
@@ -195,7 +195,7 @@ class TrafficLight:
         if self._light:
             self._stop.see(shown, view.dt_s)
 
-    def _light_place(self, one: Light, pose: Pose) -> Place | None:
+    def _light_place(self, one: DetectedLight, pose: Pose) -> Place | None:
         """Its middle: what is measured is the face towards the robot, half its depth nearer."""
         lamp, is_box = self._config.lamp, self.reader is BoxLightReader
         height_m = lamp.box_height_m if is_box else lamp.housing_height_m
@@ -260,7 +260,7 @@ class TrafficLight:
             return "driving"
         return "waiting" if linear < 0.01 else "stopping"
 
-    def _steered(self, line: Line, then: Motion, linear: float) -> Twist:
+    def _steered(self, line: Line, then: PredictedMotion, linear: float) -> Twist:
         """Along the arc that meets the lane's middle ahead; on the spot where that lies far to the side."""
         look_m, limit = self._config.look_ahead_m, self._config.max_angular_rad_s
         x, y = line.at(line.along_m(then.pose[0], then.pose[1]) + look_m)

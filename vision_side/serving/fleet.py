@@ -16,7 +16,7 @@ from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.registry import configured_detector, waits_for_service
-from sightline.vision_side.serving.service import Counts, LogLine, Service, open_service
+from sightline.vision_side.serving.service import LogLine, Service, ServiceCounts, open_service
 
 _LONGEST_WAIT_S = 0.2
 
@@ -71,7 +71,7 @@ class Fleet:
             skipped = dict(service.skipped) or "none"
             self._report(f"vision: {robot}: ended after {service.answered} frames; skipped: {skipped}")
 
-    def counts(self) -> list[Counts]:
+    def counts(self) -> list[ServiceCounts]:
         """Count the frames of each robot so far; from any thread."""
         return [service.counts() for service in list(self.services.values())]
 

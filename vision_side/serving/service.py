@@ -26,7 +26,7 @@ from sightline.vision_side.viewing import ViewPublisher
 
 
 @dataclass(frozen=True, slots=True)
-class Counts:
+class ServiceCounts:
     """Counters only grow. Times are of the newest frame; None where nobody has said any."""
 
     robot: str
@@ -44,7 +44,7 @@ class Counts:
     """Capture to accepted command, as the robot measured it."""
 
 
-CountsNow = Callable[[], list[Counts]]
+CountsNow = Callable[[], list[ServiceCounts]]
 Observe = Callable[[CountsNow], None]
 """Told, once, how to look at the counts of every robot."""
 
@@ -191,10 +191,10 @@ class Service:
             self._tell("link", f"no frames from robot {self._config.robot} at {endpoints_text(self._config)}; is "
                                "`sightline robot` running there, with this robot id?")
 
-    def counts(self) -> Counts:
+    def counts(self) -> ServiceCounts:
         """What is done so far; from any thread."""
         heard, (compute_us, latency_us) = time.monotonic() - self._heard_s <= _SILENCE_S, self._newest
-        return Counts(self._config.robot, heard and self.answered > 0, self.answered, self.steered,
+        return ServiceCounts(self._config.robot, heard and self.answered > 0, self.answered, self.steered,
                       dict(self.skipped.copy()), self._frames.dropped, compute_us, latency_us)
 
     def _look_at_camera(self) -> None:

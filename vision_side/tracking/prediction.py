@@ -17,7 +17,7 @@ _REMEMBERED = 64  # commands: two seconds at 30 fps, five times the longest late
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class PredictedMotion:
     """Pose in the odometry frame and twist about the robot."""
 
     pose: Pose
@@ -74,13 +74,15 @@ class MotionPredictor:
                 return linear, angular
         return None
 
-    def motion(self, t_us: int, pose: Pose, moving: tuple[float, float], applied: tuple[float, float]) -> Motion:
+    def motion(
+        self, t_us: int, pose: Pose, moving: tuple[float, float], applied: tuple[float, float]
+    ) -> PredictedMotion:
         """The robot at `t_us` plus the latency, if it carries out what is under way.
 
         A robot that is held (applies nothing though it was told to move) is expected to stay where it is.
         """
         if self._is_held(t_us, applied):
-            return Motion(pose, 0.0, 0.0)
+            return PredictedMotion(pose, 0.0, 0.0)
         (x, y, yaw), (linear, angular) = pose, moving
         for length_s, goal in self._under_way(t_us, moving):
             steps = max(1, round(length_s / _STEP_S))
@@ -91,7 +93,7 @@ class MotionPredictor:
                 middle = yaw + angular * step_s / 2
                 x, y = x + linear * math.cos(middle) * step_s, y + linear * math.sin(middle) * step_s
                 yaw += angular * step_s
-        return Motion((x, y, yaw), linear, angular)
+        return PredictedMotion((x, y, yaw), linear, angular)
 
     def _under_way(self, t_us: int, moving: tuple[float, float]) -> list[tuple[float, tuple[float, float]]]:
         """(seconds, twist) of what the wheels follow from `t_us` until a command computed now acts, oldest first."""

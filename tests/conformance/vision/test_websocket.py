@@ -10,7 +10,7 @@ import pytest
 
 from sightline.conformance.benches import TO_ROBOT, LiveBench
 from sightline.conformance.case import Access
-from sightline.conformance.raw_peers import Frame, take_frame
+from sightline.conformance.raw_peers import RawFrame, take_frame
 from sightline.conformance.runner import Outcome, run_case
 from sightline.conformance.vision.cases import CASES
 from sightline.protocol.transports.open import open_link
@@ -113,4 +113,4 @@ def test_the_raw_codec_reads_frames_of_any_length_at_any_cut(size):
     whole = b"\x82" + length + mask + masked
     for cut in {0, 1, 2, 3, 5, 9, 13, len(whole) // 2, len(whole) - 1} & set(range(len(whole))):
         assert take_frame(whole[:cut]) is None
-    assert take_frame(whole + b"next") == (Frame(True, 2, payload), b"next")
+    assert take_frame(whole + b"next") == (RawFrame(True, 2, payload), b"next")

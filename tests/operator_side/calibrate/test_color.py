@@ -20,7 +20,7 @@ from sightline.operator_side.calibrate.color import (
 )
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import HsvConfig, HsvRange
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from tests.fixtures.vision.vision import camera, scene
 
@@ -74,9 +74,9 @@ def test_a_colour_on_both_sides_of_red_is_two_ranges(hue_deg, count):
 def test_vision_follows_by_what_was_picked():
     ranges = pick(ball_picture(210), BALL)
     detector = HsvDetector(HsvConfig(ranges=ranges))
-    found = detector.detect(Picture(ball_picture(210, 1.2, -0.1, seed=9), 1))
+    found = detector.detect(DecodedImage(ball_picture(210, 1.2, -0.1, seed=9), 1))
     assert len(found) == 1 and found[0].circle is not None
-    assert detector.detect(Picture(ball_picture(50), 1)) == ()
+    assert detector.detect(DecodedImage(ball_picture(50), 1)) == ()
 
 
 @pytest.mark.parametrize(("picture", "words"), [

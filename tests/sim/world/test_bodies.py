@@ -14,7 +14,7 @@ import simplejpeg
 
 from sightline.protocol.errors import ConfigError
 from sightline.sim.robot import load_robot
-from sightline.sim.scenario import LIT, Legs, Light, Phase, color_of, load_scenario
+from sightline.sim.scenario import LIT, LegShape, Light, Phase, color_of, load_scenario
 from sightline.sim.toml_file import laid_over
 from sightline.sim.world.bodies import PathMover
 from sightline.sim.world.start import goals_seen
@@ -26,7 +26,7 @@ from tests.fixtures.sim import robot_with
 
 @given(st.floats(0, 50), st.floats(0.2, 1.5))
 def test_one_foot_stands_while_the_other_swings_twice_as_fast(way_m, stride_m):
-    legs, step_m = Legs(stride_m=stride_m), 1e-4
+    legs, step_m = LegShape(stride_m=stride_m), 1e-4
     speeds = [1 + (legs.ahead_m(way_m + step_m, left) - legs.ahead_m(way_m, left)) / step_m for left in (True, False)]
     at_a_turn = min((way_m / stride_m * 2) % 1, 1 - (way_m / stride_m * 2) % 1) < 2 * step_m / stride_m + 1e-6
     assert at_a_turn or sorted(round(speed, 3) for speed in speeds) == [0.0, 2.0]

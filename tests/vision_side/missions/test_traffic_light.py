@@ -8,7 +8,7 @@ import pytest
 
 from sightline.protocol.messages import FrameHeader
 from sightline.sim.scenario import look_named
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.missions.goto import Footprint
 from sightline.vision_side.missions.lane import Lane, LaneConfig
 from sightline.vision_side.missions.lights import COLOURS, UNKNOWN, BoxLightReader, HousingLightReader, LampConfig
@@ -56,7 +56,7 @@ def test_noise_is_no_light_and_breaks_nothing() -> None:
     draw = np.random.default_rng(3)
     for reader in (HousingLightReader(LampConfig()), BoxLightReader(LampConfig())):
         for picture in (draw.integers(0, 256, (120, 160, 3)), np.zeros((120, 160, 3)), np.full((120, 160, 3), 255)):
-            assert reader.read(Picture(picture.astype(np.uint8), 1)) == []
+            assert reader.read(DecodedImage(picture.astype(np.uint8), 1)) == []
 
 
 # --- the line ----------------------------------------------------------------------------------------------------
@@ -187,6 +187,6 @@ def test_without_a_picture_or_a_block_nothing_moves() -> None:
     mission = TrafficLight(TrafficLight.Config(), LENS)
     header = FrameHeader(session="0000abcd", seq=1, t_us=0)
     assert mission.step(View(header, 0.0, 0.05, LENS, (), None)).phase == "no picture"
-    blank = Picture(np.full((240, 320, 3), 120, np.uint8), 1)
+    blank = DecodedImage(np.full((240, 320, 3), 120, np.uint8), 1)
     plan = mission.step(View(header, 0.0, 0.05, LENS, (), blank))
     assert plan.phase == "no lane" and plan.twist.linear_mps == plan.twist.angular_rad_s == 0.0

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from sightline.protocol.config import Config as Settings
 from sightline.vision_side.config import HsvConfig
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.hsv import HsvDetector, Region, codes_565, colors_565
 from sightline.vision_side.detect.port import Circle, Detection, Label
 
@@ -194,7 +194,7 @@ class AdaptiveTracker:
         self._seen_us = 0
         self._last_us: int | None = None
 
-    def detect(self, picture: Picture, t_us: int) -> tuple[Detection, ...]:
+    def detect(self, picture: DecodedImage, t_us: int) -> tuple[Detection, ...]:
         """The thing, or nothing, in a picture captured at `t_us`."""
         dt_s = max(0.0, (t_us - self._last_us) / 1e6) if self._last_us is not None else 0.0
         self._last_us = t_us
@@ -207,7 +207,7 @@ class AdaptiveTracker:
         self._learn(picture, found, dt_s)
         return (found,)
 
-    def _follow(self, track: PixelTrack, picture: Picture, dt_s: float) -> Detection | None:
+    def _follow(self, track: PixelTrack, picture: DecodedImage, dt_s: float) -> Detection | None:
         """The nearest to where it should be, of its colour and about its size."""
         track.advance(dt_s)
         region = self._region(picture, track)
@@ -219,7 +219,7 @@ class AdaptiveTracker:
             track.correct(_circle(best))
         return best
 
-    def _region(self, picture: Picture, track: PixelTrack) -> Region | None:
+    def _region(self, picture: DecodedImage, track: PixelTrack) -> Region | None:
         """Around where it should be, with what has its colour marked."""
         if self._chroma is None:
             return None
@@ -231,7 +231,7 @@ class AdaptiveTracker:
             return None
         return Region(part, self._chroma.mask(part, self._config.color_sigmas), (columns.start, rows.start))
 
-    def _acquire(self, picture: Picture, t_us: int, dt_s: float) -> Detection | None:
+    def _acquire(self, picture: DecodedImage, t_us: int, dt_s: float) -> Detection | None:
         """The largest of the configured colour, once it was at one place for some pictures in a row."""
         known = self._chroma if t_us - self._seen_us <= self._config.remembered_s * 1e6 else None
         found = next((one for one in self._everywhere.detect(picture) if self._is_it(picture, one, known)), None)
@@ -250,11 +250,11 @@ class AdaptiveTracker:
         self._track, self._candidate, self._chroma = track, None, known
         return found
 
-    def _is_it(self, picture: Picture, found: Detection, known: ColorModel | None) -> bool:
+    def _is_it(self, picture: DecodedImage, found: Detection, known: ColorModel | None) -> bool:
         pixels = _pixels(picture, _circle(found))
         return len(pixels) > 0 and (known is None or known.distance(pixels) <= self._config.color_sigmas)
 
-    def _learn(self, picture: Picture, found: Detection, dt_s: float) -> None:
+    def _learn(self, picture: DecodedImage, found: Detection, dt_s: float) -> None:
         pixels = _pixels(picture, _circle(found))
         if not len(pixels):
             return
@@ -278,7 +278,7 @@ def _cut(low_px: float, high_px: float, scale: int, size: int) -> slice:
     return slice(first, min(size, max(first, math.ceil(high_px / scale))))
 
 
-def _pixels(picture: Picture, circle: Circle) -> NDArray[np.uint8]:
+def _pixels(picture: DecodedImage, circle: Circle) -> NDArray[np.uint8]:
     """Some of the pixels (N, 3) well within the circle."""
     reach = circle.radius_px * _CORE
     rows = _cut(circle.cy_px - reach, circle.cy_px + reach, picture.scale, picture.bgr.shape[0])

@@ -6,7 +6,7 @@ from typing import Final
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.config import HsvConfig
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.adaptive import AdaptiveConfig, AdaptiveTracker
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.per_robot import PerSession
@@ -34,7 +34,7 @@ class Hsv:
         """A result for each; it takes well under a millisecond, whatever the deadline."""
         return [timed(frame, self.maker, self._largest) for frame in frames]
 
-    def _largest(self, picture: Picture) -> tuple[Detection, ...]:
+    def _largest(self, picture: DecodedImage) -> tuple[Detection, ...]:
         return self._hsv_detector.detect(picture)[:MAX_DETECTED_BOXES]
 
 

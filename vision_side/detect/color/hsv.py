@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sightline.vision_side.config import HsvConfig, HsvRange
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.port import Circle, Detection
 
 COARSE = 4
@@ -226,12 +226,12 @@ class HsvDetector:
         self._label = label
         self._mask = ColorMask(config.ranges)
 
-    def detect(self, picture: Picture) -> tuple[Detection, ...]:
+    def detect(self, picture: DecodedImage) -> tuple[Detection, ...]:
         """What has the colour, and the shape if one is asked for, largest first."""
         region = self._mask.region(picture.bgr)
         return () if region is None else self.measure(picture, region)
 
-    def measure(self, picture: Picture, region: Region) -> tuple[Detection, ...]:
+    def measure(self, picture: DecodedImage, region: Region) -> tuple[Detection, ...]:
         """What is in `region` of `picture`, whoever marked it, and has the shape; largest first."""
         outlines, _ = cv2.findContours(region.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         longest = sorted(outlines, key=len, reverse=True)[: self._config.max_contours]
@@ -239,7 +239,7 @@ class HsvDetector:
         found = [look(picture, region, outline) for outline in longest]
         return tuple(sorted((one for one in found if one), key=_radius, reverse=True))
 
-    def _thing(self, picture: Picture, region: Region, outline: Pixels) -> Detection | None:
+    def _thing(self, picture: DecodedImage, region: Region, outline: Pixels) -> Detection | None:
         """The box around whatever it is; None if it is too small."""
         box = cv2.boundingRect(outline)
         if min(box[2], box[3]) < 2 * self._config.min_radius_px:
@@ -250,7 +250,7 @@ class HsvDetector:
         right, bottom = left + width, top + height
         return Detection(left * scale, top * scale, right * scale, bottom * scale, 1.0, self._label)
 
-    def _disc(self, picture: Picture, region: Region, outline: Pixels) -> Detection | None:
+    def _disc(self, picture: DecodedImage, region: Region, outline: Pixels) -> Detection | None:
         """The disc that `outline` encloses, or None if it is too small or not round."""
         box = cv2.boundingRect(outline)
         if max(box[2], box[3]) < 2 * self._config.min_radius_px:

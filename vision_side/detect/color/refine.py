@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.hsv import (
     Box,
     Fit,
@@ -32,7 +32,7 @@ _LEAST_EDGE: Final = 0.4  # of the outline on the circle; the rest may be hidden
 _OFF: Final = 0.4  # radii: a circle further from the box's middle, or so much larger or smaller, is another thing's
 
 
-def refined(picture: Picture, one: Detection) -> Detection:
+def refined(picture: DecodedImage, one: Detection) -> Detection:
     """`one` with the circle and the outline that the picture shows; `one` itself where it shows none."""
     scale = picture.scale
     box = np.array([one.x1_px, one.y1_px, one.x2_px, one.y2_px]) / scale

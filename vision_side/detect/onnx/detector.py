@@ -17,7 +17,7 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.vision_side.config import Device
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.refine import refined
 from sightline.vision_side.detect.onnx.engine import Engine, OnnxHeader, open_engine
 from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
@@ -118,14 +118,14 @@ class OnnxDetector:
                               f"{fewer}: {str(error)[:120]}")
         return results
 
-    def _detections(self, pictures: Sequence[Picture]) -> list[Sequence[Detection]]:
+    def _detections(self, pictures: Sequence[DecodedImage]) -> list[Sequence[Detection]]:
         together = _found(self._engine, pictures, self._form, self._min_score)
         return [tuple(refined(picture, one) if one.label in self._refine else one for one in found)
                 for picture, found in zip(pictures, together, strict=True)]
 
     def _warm_up(self, model: "OnnxModel", config: Config) -> None:
         """Run warm, on the known picture, and compare: with the metadata's answer, or with itself on the CPU."""
-        picture, path, expected = Picture(golden_picture(), 1), model.path, model.expected
+        picture, path, expected = DecodedImage(golden_picture(), 1), model.path, model.expected
         form, least = model.own_form, model.own_min_score
         try:
             for _ in range(_WARM_UP):
@@ -181,7 +181,7 @@ def read_onnx_model(config: OnnxDetector.Config) -> OnnxModel:
 
 
 def _found(
-    engine: Engine, pictures: Sequence[Picture], form: ModelFormat, min_score: float
+    engine: Engine, pictures: Sequence[DecodedImage], form: ModelFormat, min_score: float
 ) -> list[tuple[Detection, ...]]:
     """Return the detections of each picture; more than one only where form and engine take them."""
     fitted = [fit_picture(picture, form) for picture in pictures]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sightline.protocol.messages import MAX_DETECTED_BOXES
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor
 from sightline.vision_side.detect.port import Detection, clean_label, clipped
 
@@ -116,7 +116,7 @@ def own_labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(clean_label(str(one)) for one in found)
 
 
-def fit_picture(picture: Picture, form: ModelFormat) -> tuple[NDArray[Any], Letterbox]:
+def fit_picture(picture: DecodedImage, form: ModelFormat) -> tuple[NDArray[Any], Letterbox]:
     """The input, the picture in its middle, and where it lies there."""
     bgr: NDArray[Any] = picture.bgr
     rows, columns = form.size or tuple(-(-one // _STEP_PX) * _STEP_PX for one in bgr.shape[:2])
@@ -138,7 +138,7 @@ def fit_picture(picture: Picture, form: ModelFormat) -> tuple[NDArray[Any], Lett
 
 
 def read_outputs(
-    outputs: Arrays, form: ModelFormat, letterbox: Letterbox, picture: Picture, min_score: float
+    outputs: Arrays, form: ModelFormat, letterbox: Letterbox, picture: DecodedImage, min_score: float
 ) -> tuple[Detection, ...]:
     """Return the detections, surest first, in pixels of the encoded picture.
 

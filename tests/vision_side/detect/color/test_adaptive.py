@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sightline.vision_side.config import HsvConfig
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.adaptive import AdaptiveConfig, AdaptiveTracker, ColorModel, PixelTrack
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.port import Circle
@@ -15,13 +15,13 @@ FRAME_US = 33_333
 
 
 def room(*balls: tuple[float, float, float], light: tuple[float, float, float] = (1, 1, 1), gain: float = 1.0,
-         colour: tuple[int, int, int] = YELLOW, seed: int = 1, scale: int = 1) -> Picture:
+         colour: tuple[int, int, int] = YELLOW, seed: int = 1, scale: int = 1) -> DecodedImage:
     """A grey room with balls (x, y, radius); `light` is the part of blue, green and red."""
     bgr = np.full((240, 320, 3), (140, 150, 155), np.float32)
     for x, y, radius in balls:
         cv2.circle(bgr, (round(x * 16), round(y * 16)), round(radius * 16), colour, -1, cv2.LINE_AA, 4)
     bgr = bgr * np.array(light, np.float32) * gain + np.random.default_rng(seed).normal(0, 2, bgr.shape)
-    return Picture(np.clip(bgr, 0, 255).astype(np.uint8), scale)
+    return DecodedImage(np.clip(bgr, 0, 255).astype(np.uint8), scale)
 
 
 class Course:
@@ -31,7 +31,7 @@ class Course:
         self.eye = AdaptiveTracker(config or AdaptiveConfig())
         self.t_us = 0
 
-    def see(self, picture: Picture):
+    def see(self, picture: DecodedImage):
         self.t_us += FRAME_US
         found = self.eye.detect(picture, self.t_us)
         return found[0].circle if found else None
@@ -113,7 +113,7 @@ def test_no_picture_makes_it_raise(seed: int) -> None:
         bgr = rng.integers(0, 256, (rows, columns, 3), np.uint8) if kind else np.zeros((rows, columns, 3), np.uint8)
         if kind == 2:
             bgr[:] = YELLOW
-        course.see(Picture(bgr, 1))
+        course.see(DecodedImage(bgr, 1))
         course.see(room((160, 120, 20)))
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sightline.protocol.messages import CameraModel
 from sightline.vision_side.config import HsvConfig, HsvRange
-from sightline.vision_side.decode import Decoder, Picture
+from sightline.vision_side.decode import DecodedImage, Decoder
 from sightline.vision_side.detect.color.hsv import HsvDetector, color_table, fit_circle, fit_round_part
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.tracking.locate import locate_sphere
@@ -122,7 +122,7 @@ def test_speckle_neither_costs_nor_detects() -> None:
     picture = np.full((480, 640, 3), 140, np.uint8)
     picture[rng.random((480, 640)) < 0.2] = (13, 199, 242)
     config = HsvConfig(max_contours=4)
-    assert len(HsvDetector(config).detect(Picture(picture, 1))) <= 4
+    assert len(HsvDetector(config).detect(DecodedImage(picture, 1))) <= 4
 
 
 @settings(max_examples=40, deadline=None)
@@ -131,7 +131,7 @@ def test_no_picture_makes_the_detector_raise(seed: int, rows: int, columns: int)
     rng = np.random.default_rng(seed)
     colours = np.array([(13, 199, 242), (140, 140, 140), (0, 0, 0)], np.uint8)
     blocks = colours[rng.integers(0, 3, (rows // 4 + 1, columns // 4 + 1))].repeat(4, 0).repeat(4, 1)
-    for one in HsvDetector(HsvConfig()).detect(Picture(np.ascontiguousarray(blocks[:rows, :columns]), 1)):
+    for one in HsvDetector(HsvConfig()).detect(DecodedImage(np.ascontiguousarray(blocks[:rows, :columns]), 1)):
         assert 0 <= one.x1_px < one.x2_px <= columns
         assert 0 <= one.y1_px < one.y2_px <= rows
         locate_sphere(one, camera(), 0.1)
@@ -177,7 +177,7 @@ def test_the_smallest_disc_is_found_wherever_it_lies(size: tuple[int, int], at: 
         picture = np.full((size[1], size[0], 3), 140, np.uint8)
         middle = ((100 + at) * scale, (60 + row) * scale)
         cv2.circle(picture, middle, round(4 * scale), (13, 199, 242), -1)
-        found = HsvDetector(config).detect(Picture(np.ascontiguousarray(picture[::scale, ::scale]), scale))
+        found = HsvDetector(config).detect(DecodedImage(np.ascontiguousarray(picture[::scale, ::scale]), scale))
         assert len(found) == 1
         assert (found[0].x1_px + found[0].x2_px) / 2 == pytest.approx(middle[0], abs=1.5 * scale)
         assert (found[0].y1_px + found[0].y2_px) / 2 == pytest.approx(middle[1], abs=1.5 * scale)

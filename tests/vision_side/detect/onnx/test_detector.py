@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import FrameHeader
-from sightline.vision_side.decode import Decoder, Picture
+from sightline.vision_side.decode import DecodedImage, Decoder
 from sightline.vision_side.detect.onnx.detector import OnnxDetector
 from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor, open_engine
 from sightline.vision_side.detect.onnx.self_test import difference, golden_picture, golden_text, read_golden
@@ -23,7 +23,7 @@ from tests.fixtures.vision.onnx import brightness_model, model, node, part, tens
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 400.0, 300.0]]
-PICTURE = Picture(np.full((240, 320, 3), 128, np.uint8), 1)
+PICTURE = DecodedImage(np.full((240, 320, 3), 128, np.uint8), 1)
 
 
 @pytest.fixture(autouse=True)
@@ -275,7 +275,7 @@ def test_a_million_boxes_and_other_shapes_are_refused() -> None:
 def test_floats_are_planes_of_red_green_blue() -> None:
     bgr = np.zeros((64, 64, 3), np.uint8)
     bgr[:] = (0, 51, 255)
-    pixels, _ = fit_picture(Picture(bgr, 1), ModelFormat(True, True, (64, 64), "yolo", (), "float32"))
+    pixels, _ = fit_picture(DecodedImage(bgr, 1), ModelFormat(True, True, (64, 64), "yolo", (), "float32"))
     assert pixels.shape == (1, 3, 64, 64) and pixels.dtype == np.float32
     assert pixels[0, :, 0, 0] == pytest.approx([1.0, 0.2, 0.0])
 
@@ -301,7 +301,7 @@ def _true_centre(picture: np.ndarray) -> tuple[float, float]:
 def test_a_golden_output_that_differs_ends_it(tmp_path: Path) -> None:
     good = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], size=(240, 320))
     eye = detector(good, min_score=0.1, refine=())
-    (found,) = eye._detections([Picture(golden_picture(), 1)])
+    (found,) = eye._detections([DecodedImage(golden_picture(), 1)])
     again = brightness_model(tmp_path / "g.onnx", BOXES, [0, 1], golden=golden_text(found))
     assert detector(again, min_score=0.1).maker.device == "cpu"
     other = golden_text([Detection(1, 1, 9, 9, 0.99, "ball")])

@@ -11,7 +11,7 @@ from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import FrameHeader
 from sightline.vision_side.config import DetectorConfig, VisionConfig
-from sightline.vision_side.decode import Decoder, Picture
+from sightline.vision_side.decode import DecodedImage, Decoder
 from sightline.vision_side.detect.onnx.detector import SHIPPED
 from sightline.vision_side.detect.onnx.engine import open_engine
 from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
@@ -65,7 +65,7 @@ def test_it_sees_what_it_sees_on_the_cpu(on_gpu):
 
 def test_it_gives_there_what_it_gave_where_it_was_made():
     engine = open_engine(SHIPPED, GPU, 1)
-    form, picture = model_format(engine.header, (), "auto"), Picture(golden_picture(), 1)
+    form, picture = model_format(engine.header, (), "auto"), DecodedImage(golden_picture(), 1)
     pixels, fitting = fit_picture(picture, form)
     found = read_outputs(engine.run(pixels), form, fitting, picture, 0.5)
     assert found and difference(read_golden(engine.header.metadata[KEY]), found, 0.5) == ""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sightline.protocol.errors import HardwareError
-from sightline.vision_side.decode import Picture
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.onnx import detector as onnx_detector
 from sightline.vision_side.detect.onnx.self_test import golden_picture, golden_text
 from sightline.vision_side.detect.port import NO_DEADLINE, Detection
@@ -73,7 +73,7 @@ def test_the_real_runtime_can_be_told_to_stay_where_it_is(tmp_path: Path) -> Non
 
 def test_a_golden_output_is_of_the_models_own_labels_and_least_score(tmp_path: Path) -> None:
     plain = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], min_score="0.1"), refine=())
-    (found,) = plain._detections([Picture(golden_picture(), 1)])
+    (found,) = plain._detections([DecodedImage(golden_picture(), 1)])
     assert 0.3 < found[0].score < 0.6
     golden = golden_text(found)
     named = detector(brightness_model(tmp_path / "g.onnx", BOXES, [0, 1], golden=golden), names=("a", "b"))
