@@ -3,10 +3,10 @@
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from statistics import median
 from typing import Final
 
+from sightline.evaluation.checks import Check, at_most
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
 from sightline.protocol.text import format_twist, parse_twist
@@ -36,23 +36,10 @@ _ANSWER = AnswerHeader(
 _TWIST = Twist(linear_mps=0.2, angular_rad_s=-0.35)
 
 
-@dataclass(frozen=True, slots=True)
-class CodecCost:
-    """Median time of one encode and one decode, in microseconds, beside the bound."""
-
-    name: str
-    median_us: float
-    bound_us: float = CODEC_BOUND_US
-
-    @property
-    def ok(self) -> bool:
-        """Whether it is within its bound."""
-        return self.median_us <= self.bound_us
-
-
-def measure_codec() -> list[CodecCost]:
+def measure_codec() -> list[Check]:
     """Medians over 200 rounds of 50 calls in a hot loop; after idling 33 ms the same calls cost several times more."""
-    return [CodecCost("frame header", _median_us(_frame)), CodecCost("answer header and twist", _median_us(_answer))]
+    took_us = {"frame header": _median_us(_frame), "answer header and twist": _median_us(_answer)}
+    return [at_most(name, one_us, "us", CODEC_BOUND_US) for name, one_us in took_us.items()]
 
 
 def _frame() -> None:

@@ -1,7 +1,8 @@
-"""A check: name, value, unit, bound, verdict; how checks are made, printed and returned as an exit code. Pure."""
+"""A check: one figure and its bound; how checks are made, printed and reduced to the worst of several runs. Pure."""
 
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
 
 _WHOLE_FROM: Final = 999.5  # three digits of what is more have an exponent
 
@@ -14,7 +15,6 @@ def number(value: float | None) -> str:
 
 
 
-
 @dataclass(frozen=True, slots=True)
 class Check:
     """One demanded figure: at most `bound`, or at least, where the name begins so."""
@@ -24,10 +24,28 @@ class Check:
     unit: str
     bound: float
     ok: bool
-def check_line(check: Check) -> str:
-    """One check: name, value, unit, bound, verdict."""
-    verdict = "ok" if check.ok else "FAIL"
-    return f"{check.name:<22} {number(check.value):>8} {check.unit:<6} bound {number(check.bound):>6}  {verdict}"
+
+
+def check_lines(checks: Sequence[Check]) -> list[str]:
+    """A line for each: name, value, unit, bound, result."""
+    width = max((len(check.name) for check in checks), default=0)
+    return [
+        f"{check.name:<{width}} {_value(check):>8} {check.unit:<6} bound {number(check.bound):>6}  "
+        f"{'ok' if check.ok else 'FAIL'}"
+        for check in checks
+    ]
+
+
+def _value(check: Check) -> str:
+    """With more digits where three would hide why it fails."""
+    text = number(check.value)
+    return text if check.value is None or check.ok or text != number(check.bound) else f"{check.value:g}"
+
+
+def to_dict(checks: Iterable[Check]) -> dict[str, Any]:
+    """The part of a command's `--json` that every command with checks has."""
+    listed = [asdict(check) for check in checks]
+    return {"ok": all(check["ok"] for check in listed), "checks": listed}
 
 
 def at_most(name: str, value: float | None, unit: str, bound: float) -> Check:
@@ -38,3 +56,17 @@ def at_most(name: str, value: float | None, unit: str, bound: float) -> Check:
 def at_least(name: str, value: float, unit: str, bound: float) -> Check:
     """A figure that must reach its bound."""
     return Check(name, value, unit, bound, value >= bound)
+
+
+def worst_checks(runs: Iterable[Sequence[Check]]) -> list[Check]:
+    """Of each name the worst of several runs: the farthest outside its bound, or the nearest inside."""
+    by_name: dict[str, list[Check]] = {}
+    for checks in runs:
+        for check in checks:
+            by_name.setdefault(check.name, []).append(check)
+    return [max(checks, key=_badness) for checks in by_name.values()]
+
+
+def _badness(check: Check) -> tuple[bool, float]:
+    away = float("inf") if check.value is None else abs(check.value - check.bound)
+    return (True, away) if not check.ok else (False, -away)

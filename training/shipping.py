@@ -9,13 +9,13 @@ from typing import Final
 
 import numpy as np
 
+from sightline.evaluation.checks import check_lines
 from sightline.evaluation.processes import worker_pool
 from sightline.evaluation.score.detector_report import (
     LABELLED,
     LIGHT_SHARE,
     Report,
     Subject,
-    check_lines,
     detections,
     detector_checks,
     markdown,

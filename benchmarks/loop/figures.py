@@ -316,4 +316,3 @@ def _loaded(ours: Figures, delay_ms: float) -> list[Check]:
 
 def _over(value: float | None, other: float | None) -> float | None:
     return None if value is None or other is None else value - other
-

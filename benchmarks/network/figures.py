@@ -1,6 +1,6 @@
 """Figures and bounds of a network case, and of what its wheels were told. Pure."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 from sightline.benchmarks.loop.figures import percentile
 from sightline.benchmarks.network.cases import HOLD_AGE_MS, Case
 from sightline.benchmarks.network.watch import NOTED
-from sightline.evaluation.checks import Check, at_most
+from sightline.evaluation.checks import Check, at_least, at_most, worst_checks
 from sightline.robot_side.safety.limits import TICK_US, SafetyConfig, stop_bound
 
 _LATE_US: Final = 2 * TICK_US
@@ -201,7 +201,7 @@ def network_checks(row: Case, figures: Sequence[NetworkFigures]) -> Iterator[Che
     if row.p95_ms is not None:
         yield at_most("age p95", last.p95_ms, "ms", row.p95_ms)
     if row.least_fps is not None:
-        yield Check("answered", last.fps, "fps", row.least_fps, last.fps >= row.least_fps)
+        yield at_least("answered", last.fps, "fps", row.least_fps)
     if row.most_holds is not None:
         yield at_most("holds", float(len(last.holds_s)), "", float(row.most_holds))
     if row.longest_hold_s is not None:
@@ -211,21 +211,7 @@ def network_checks(row: Case, figures: Sequence[NetworkFigures]) -> Iterator[Che
     yield at_most("oldest executed", max(one.executed_ms for one in figures), "ms", HOLD_AGE_MS)
 
 
-def worst_of(checks: Iterable[Check]) -> Check:
-    """Of one demand in several runs, the run that did worst: the farthest outside its bound, or the nearest inside."""
-    return max(checks, key=_badness)
-
-
-def _badness(check: Check) -> tuple[bool, float]:
-    away = float("inf") if check.value is None else abs(check.value - check.bound)
-    return (True, away) if not check.ok else (False, -away)
-
-
 def worst_of_seeds(name: str, runs: Sequence[Sequence[Check]]) -> list[Check]:
     """The demands on the row `name`, each as the seed fared that did worst."""
     label = f"{name}, worst of {len(runs)} seeds" if len(runs) > 1 else name
-    demands: dict[str, list[Check]] = {}
-    for checks in runs:
-        for check in checks:
-            demands.setdefault(check.name, []).append(check)
-    return [replace(worst_of(checks), name=f"{label}: {what}") for what, checks in demands.items()]
+    return [replace(check, name=f"{label}: {check.name}") for check in worst_checks(runs)]

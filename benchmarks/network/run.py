@@ -29,7 +29,7 @@ from sightline.benchmarks.network.stage import (
     start_robot,
     start_vision,
 )
-from sightline.evaluation.checks import Check, at_most
+from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.processes import terminated_like_interrupted
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError
@@ -113,7 +113,7 @@ def _course(row: Case, stage: Stage) -> NetworkRun:
         crew.end()
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
     figures = tuple(figures_of(notes, stretch) for stretch in stretches)
-    harmed = Check("injected", float(injected), "", 1.0, injected >= 1)
+    harmed = at_least("injected", float(injected), "", 1.0)
     return NetworkRun(
         row, stage.seed, injected, figures, (harmed, *network_checks(row, figures), *_wheel_checks(stage, notes))
     )

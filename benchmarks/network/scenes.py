@@ -19,7 +19,7 @@ from sightline.benchmarks.network.figures import WheelCommand, moves_again_s, re
 from sightline.benchmarks.network.robots import Settings
 from sightline.benchmarks.network.stage import EVERYWHERE, BenchWire, NetworkRun, Stage, start_robot, start_vision
 from sightline.benchmarks.network.stop_client import RESET, STOPPED
-from sightline.evaluation.checks import Check, at_most
+from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.evidence import REQUESTED, MotorRow, measure_stop, moved_on_old_sight, wheel_mps
 from sightline.evaluation.faults.fixture import ROBOT, RobotFixture, Setup
 from sightline.protocol.clock import monotonic_us
@@ -225,9 +225,9 @@ def _stream_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: tuple[int,
 def _uplink_run(row: Case, stage: Stage, injected: int, streams: Sequence[tuple[float, float]]) -> NetworkRun:
     (alone_bytes, alone_fps), (crowded_bytes, crowded_fps) = streams
     checks = (
-        Check("injected", float(injected), "", 1.0, injected >= 1),
+        at_least("injected", float(injected), "", 1.0),
         at_most("bytes from the robot, over one stream", crowded_bytes / max(1.0, alone_bytes), "times", MOST_SHARE),
-        Check("frames while crowded", crowded_fps, "fps", UPLINK_LEAST_FPS, crowded_fps >= UPLINK_LEAST_FPS),
+        at_least("frames while crowded", crowded_fps, "fps", UPLINK_LEAST_FPS),
     )
     facts = {"alone_bytes_per_frame": alone_bytes, "crowded_bytes_per_frame": crowded_bytes, "alone_fps": alone_fps}
     return NetworkRun(row, stage.seed, injected, (), checks, facts)
@@ -275,7 +275,7 @@ def fleet(row: Case, stage: Stage) -> NetworkRun:
         injected = wire.shape(LinkShapes()) - before
         crew.end()
     answers = json.loads(settings.notes.read_text("utf-8"))
-    harmed = Check("injected", float(injected), "", 1.0, injected >= 1)
+    harmed = at_least("injected", float(injected), "", 1.0)
     return NetworkRun(row, stage.seed, injected, (), (harmed, *fleet_checks(answers, begin_us, end_us)))
 
 
@@ -290,8 +290,8 @@ def fleet_checks(
     known = [one for one in p95_ms if one is not None]
     oldest_ms = max(known) if known and len(known) == len(p95_ms) else None
     return (
-        Check("robots", float(len(answers)), "", float(ROBOTS), len(answers) >= ROBOTS),
-        Check("answered, least", least_fps, "fps", FLEET_LEAST_FPS, least_fps >= FLEET_LEAST_FPS),
+        at_least("robots", float(len(answers)), "", float(ROBOTS)),
+        at_least("answered, least", least_fps, "fps", FLEET_LEAST_FPS),
         at_most("age p95, worst robot", oldest_ms, "ms", MOST_P95_MS),
     )
 
@@ -332,7 +332,7 @@ def _medium_run(row: Case, stage: Stage, rig: RobotFixture) -> NetworkRun:
     told_us = [one.t_us for one in rig.noted("person", REQUESTED)]
     rows = rig.motors()
     checks = (
-        Check("injected", float(injected), "", 1.0, injected >= 1),
+        at_least("injected", float(injected), "", 1.0),
         *stop_checks_of(rows, told_us, [one.t_us for one in rig.noted("person", RESET)]),
         reported_check(told_us, [one.frame_us for one in rig.noted("person", STOPPED)]),
         at_most("moved on frames over 400 ms", moved_on_old_sight(rows, rig.sent(), None), "lines", 0),

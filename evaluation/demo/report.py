@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from sightline.evaluation.checks import Check, check_line
+from sightline.evaluation.checks import Check, at_most, check_lines, to_dict
 from sightline.evaluation.demo.run import RECORDING, DemoRun
 from sightline.evaluation.demo.shaped_vision import INJECTED
 from sightline.evaluation.processes import last_line
@@ -38,8 +38,7 @@ class DemoReport:
         """What `--json` prints and score.json holds."""
         options = self.run.options
         return {
-            "ok": self.ok,
-            "checks": [asdict(check) for check in self.checks],
+            **to_dict(self.checks),
             "score": asdict(self.score),
             "scenario": options.scenario, "seed": options.seed, "latency_ms": options.latency_ms, "loss": options.loss,
             "replayed": asdict(self.replayed), "injected": self.injected,
@@ -108,15 +107,15 @@ def _checks(run: DemoRun, result: Score) -> list[Check]:
         return checks_of(run.options.scenario, result, run.options.latency_ms, REAL_TIME_FACTOR)
     unseen = 100 * sum(not sample.visible for sample in run.samples) / len(run.samples)
     return [
-        Check("out of view", unseen, "%", 0.0, unseen == 0),
-        Check("wall_contacts", result.wall_contacts, "steps", 0.0, result.wall_contacts == 0),
+        at_most("out of view", unseen, "%", 0.0),
+        at_most("wall_contacts", result.wall_contacts, "steps", 0.0),
     ]
 
 
 def summary(judged: DemoReport) -> list[str]:
     """The closing lines: the score with its bounds, where everything lies, what to try next."""
     run, replayed = judged.run, judged.replayed
-    lines = [check_line(check) for check in judged.checks]
+    lines = check_lines(judged.checks)
     lines.append(_replay_line(replayed))
     if run.dropped_by_recorder:
         lines.append(f"the recorder dropped {run.dropped_by_recorder} messages: the disk was too slow")

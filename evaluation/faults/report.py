@@ -4,12 +4,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from sightline.evaluation.checks import Check, number
+from sightline.evaluation.checks import Check, number, worst_checks
 from sightline.evaluation.faults.runner import Outcome
 
 Results = Sequence[Sequence[Outcome]]
-_LOWEST_IS_WORST: Final = ("injected", "drives again", "sent", "speed kept", "commands after it", "reset refused",
-                           "next driver after", "came", "admitted", "pictures seen", "ticks")
 _COUNTED_FROM: Final = 1000
 
 
@@ -17,21 +15,6 @@ def passed(results: Results) -> bool:
     """Whether something ran, and all that ran is within bounds; rows that could not run here do not count."""
     ran = [outcome for outcomes in results for outcome in outcomes if not outcome.skipped]
     return bool(ran) and all(outcome.ok for outcome in ran)
-
-
-def worst_checks(outcomes: Iterable[Outcome]) -> list[Check]:
-    """Of each figure the worst run; one that never happened is worst of all."""
-    by_name: dict[str, list[Check]] = {}
-    for outcome in outcomes:
-        for check in outcome.checks:
-            by_name.setdefault(check.name, []).append(check)
-    return [max(checks, key=_badness) for checks in by_name.values()]
-
-
-def _badness(check: Check) -> tuple[bool, float]:
-    if check.value is None:
-        return True, float("inf")
-    return not check.ok, -check.value if check.name in _LOWEST_IS_WORST else check.value
 
 
 def run_line(outcome: Outcome) -> str:
@@ -72,7 +55,7 @@ def to_dict(results: Results) -> dict[str, Any]:
     checks = [
         asdict(check) | {"name": f"{outcomes[0].row.id}: {check.name}"}
         for outcomes in results
-        for check in worst_checks(outcomes)
+        for check in worst_checks(one.checks for one in outcomes)
     ]
     rows = [
         {

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
-from sightline.evaluation.checks import Check
+from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.score.detectors import (
     BALL_LABELS,
     Figures,
@@ -245,16 +245,14 @@ def _of_column(column: str, one: Figures) -> Iterator[Check]:
     for what, share in (("wrong object", one.wrong_object), ("false alarms", one.false_alarms)):
         yield Check(f"{what}, {column}", _percent(share), "%", _percent(MOST_WRONG), share <= MOST_WRONG)
     if column == CLEAN:
-        centre_px = one.centre_p50_px
-        is_near = centre_px is not None and centre_px <= CENTRE_PX
-        yield Check(f"centre p50, {column}", centre_px, "px", CENTRE_PX, is_near)
+        yield at_most(f"centre p50, {column}", one.centre_p50_px, "px", CENTRE_PX)
 
 
 def _of_label(label: str, found: tuple[int, float | None] | None) -> Iterator[Check]:
     """None: the detector found neither lights nor legs anywhere."""
     yield _least(f"AP50, {label}", found[1] if found else None, LEAST_AP50)
     if found:
-        yield Check(f"least objects, {label}", found[0], "", LEAST_OBJECTS, found[0] >= LEAST_OBJECTS)
+        yield at_least(f"least objects, {label}", found[0], "", LEAST_OBJECTS)
 
 
 def _least(what: str, share: float | None, bound: float) -> Check:
@@ -307,17 +305,6 @@ def markdown(report: Report) -> str:
     """For a page."""
     lines = [_line(_HEAD), _line(["---"] * len(_HEAD)), *(_line(row) for row in rows(report))]
     return "\n".join([*lines, "", *(f"- {line}" for line in precision_lines(report))])
-
-
-def check_lines(checks: Sequence[Check]) -> list[str]:
-    """One a line: what, its value, the bound, the verdict."""
-    width = max((len(check.name) for check in checks), default=0)
-    return [f"{check.name.ljust(width)}  {_value(check):>9}  bound {check.bound:g} {check.unit}".rstrip()
-            + ("  ok" if check.ok else "  FAIL") for check in checks]
-
-
-def _value(check: Check) -> str:
-    return "never" if check.value is None else f"{round(check.value, 2):g} {check.unit}".rstrip()
 
 
 def silence_lines(report: Report) -> list[str]:

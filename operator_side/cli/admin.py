@@ -12,6 +12,7 @@ from typing import Annotated
 
 import typer
 
+from sightline.operator_side.cli.options import print_result
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.doctor.finding import Finding, as_object
 from sightline.operator_side.preflight import needs
@@ -155,13 +156,9 @@ def doctor(
         found.append(finding)
         if not as_json:
             typer.echo(finding.line)
-    report = as_object(found)
-    if as_json:
-        typer.echo(json.dumps(report))
-    else:
-        bad = sum(one.ok is False for one in found)
-        typer.echo(f"{bad} of {len(found)} need mending" if bad else "nothing wrong found")
-    return 0 if report["ok"] else 5
+    bad = sum(one.ok is False for one in found)
+    last = f"{bad} of {len(found)} need mending" if bad else "nothing wrong found"
+    return print_result(as_object(found), [last], as_json)
 
 
 def _findings(robot: str, peer: str | None, camera: str | None, sets: list[str], secure: str) -> Iterator[Finding]:

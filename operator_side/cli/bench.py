@@ -2,7 +2,7 @@
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sightline.operator_side.cli.options import CHECK_FAILED, Json, numbers
+from sightline.operator_side.cli.options import Json, numbers, print_result
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
     from sightline.benchmarks.loop.race import Race
     from sightline.benchmarks.network.stage import NetworkRun
     from sightline.evaluation.checks import Check
@@ -29,35 +27,34 @@ def register(app: typer.Typer) -> None:
     group.command(epilog="Example: sightline bench gate")(gate)
     group.command(epilog="Example: sightline bench pipeline")(pipeline)
     group.command(epilog="Example: sightline bench demo --scenario circle --seeds 201,202,203")(demo)
-    register_loop_benches(group)
-    register_network_bench(group)
-    register_detector_benches(group)
+    group.command(epilog="Example: sightline bench loop --detector-delay-ms 80 --seconds 20 --out runs/loop")(loop)
+    group.command(epilog="Example: sightline bench watchers --viewers 10 --seconds 20")(watchers)
+    group.command(epilog="Example: sightline bench network --only radio --seeds 1,2,3,4,5 --seconds 60")(network)
+    group.command(epilog="Example: sightline bench detector oip+http://127.0.0.1:8000/ball_jpeg")(detector)
+    group.command(epilog="Example: sightline bench streams --streams 40 --seconds 60")(streams)
     app.add_typer(group, name="bench")
 
 
 def codec(*, as_json: Json = False) -> int:
     """Encode and decode a frame header and a twist."""
     from sightline.benchmarks.costs import measure_codec
-    from sightline.evaluation.checks import Check
 
-    costs = measure_codec()
-    return print_checks([Check(cost.name, cost.median_us, "us", cost.bound_us, cost.ok) for cost in costs], as_json)
+    return _print_checks(measure_codec(), as_json)
 
 
 def gate(*, as_json: Json = False) -> int:
     """Judge one command and decide one step, as the driver does."""
     from sightline.benchmarks.costs import GATE_BOUND_US, measure_gate
-    from sightline.evaluation.checks import Check
+    from sightline.evaluation.checks import at_most
 
-    took_us = measure_gate()
-    return print_checks([Check("offer and step", took_us, "us", GATE_BOUND_US, took_us <= GATE_BOUND_US)], as_json)
+    return _print_checks([at_most("offer and step", measure_gate(), "us", GATE_BOUND_US)], as_json)
 
 
 def pipeline(*, as_json: Json = False) -> int:
     """Picture in, command out: decode, detect, track, steer. And the learned detector's network."""
     with needs("vision"):
         from sightline.benchmarks.pipeline import LEARNED_BOUND_US, time_learned, time_steps
-    from sightline.evaluation.checks import Check
+    from sightline.evaluation.checks import Check, at_most
 
     checks = []
     for one in time_steps():
@@ -67,16 +64,16 @@ def pipeline(*, as_json: Json = False) -> int:
             f"decode {one.decode_us:.0f})",
             one.median_us, "us", one.bound_us, one.median_us <= one.bound_us and one.phase == "tracking",
         ))
-        checks.append(Check(f"hsv at {size}, decoding included, hot (best round {one.hsv_alone_us:.0f})",
-                            one.hsv_us, "us", one.bound_us, one.hsv_us <= one.bound_us))
-    eyes = time_learned()
-    checks.append(Check(
-        f"onnx at 320x240, network only, hot (best round {eyes.alone_us:.0f}, from JPEG to boxes {eyes.whole_us:.0f}, "
-        f"decode {eyes.decode_us:.0f}; {eyes.engine})",
-        eyes.network_us, "us", LEARNED_BOUND_US, eyes.network_us <= LEARNED_BOUND_US,
+        checks.append(at_most(f"hsv at {size}, decoding included, hot (best round {one.hsv_alone_us:.0f})",
+                              one.hsv_us, "us", one.bound_us))
+    learned = time_learned()
+    checks.append(at_most(
+        f"onnx at 320x240, network only, hot (best round {learned.alone_us:.0f}, "
+        f"from JPEG to boxes {learned.whole_us:.0f}, decode {learned.decode_us:.0f}; {learned.engine})",
+        learned.network_us, "us", LEARNED_BOUND_US,
     ))
-    checks.append(Check("pictures in which onnx finds no ball", eyes.missed, "", 0, eyes.missed == 0))
-    return print_checks(checks, as_json)
+    checks.append(at_most("pictures in which onnx finds no ball", learned.missed, "", 0))
+    return _print_checks(checks, as_json)
 
 
 def demo(
@@ -99,27 +96,16 @@ def demo(
         load_scenario(name)
     wanted, kinds = numbers("--seeds", seeds, int), Kinds(AT_LEAST, EXACT)
     figures = measure_demos(names, wanted, seconds, kinds, lambda line: typer.echo(line, err=True))
-    ok = all(figure.ok for figure in figures)
-    if as_json:
-        checks = [{**asdict(figure), "value": figure.worst} for figure in figures]
-        typer.echo(json.dumps({"ok": ok, "checks": checks}))
-    for one in () if as_json else figures:
-        said = "ok" if one.ok else "FAIL"
-        typer.echo(f"{one.name:44} median {number(one.median)}  worst {number(one.worst)} {one.unit}"
-                   f"  bound {number(one.bound)}  {said}")
-    return 0 if ok else CHECK_FAILED
+    checks = [{**asdict(figure), "value": figure.worst} for figure in figures]
+    lines = [f"{one.name:44} median {number(one.median)}  worst {number(one.worst)} {one.unit}"
+             f"  bound {number(one.bound)}  {'ok' if one.ok else 'FAIL'}" for one in figures]
+    return print_result({"ok": all(figure.ok for figure in figures), "checks": checks}, lines, as_json)
 
 
-def print_checks(checks: "Sequence[Check]", as_json: bool) -> int:
-    """Print them, and return the exit code."""
-    from sightline.evaluation.checks import check_line
+def _print_checks(checks: "Sequence[Check]", as_json: bool) -> int:
+    from sightline.evaluation.checks import check_lines, to_dict
 
-    ok = all(check.ok for check in checks)
-    if as_json:
-        typer.echo(json.dumps({"ok": ok, "checks": [asdict(check) for check in checks]}))
-    else:
-        typer.echo("\n".join(check_line(check) for check in checks))
-    return 0 if ok else CHECK_FAILED
+    return print_result(to_dict(checks), check_lines(checks), as_json)
 
 
 # `sightline bench loop` and `bench watchers`: is the whole loop fresh, and does it stay so? Shell.
@@ -130,12 +116,6 @@ _ALONE = (
     "transport alone costs, without credit, age or a gate; shown, not judged."
 )
 Transport = Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")]
-
-
-def register_loop_benches(group: typer.Typer) -> None:
-    """Add the commands to the `bench` group."""
-    group.command(epilog="Example: sightline bench loop --detector-delay-ms 80 --seconds 20 --out runs/loop")(loop)
-    group.command(epilog="Example: sightline bench watchers --viewers 10 --seconds 20")(watchers)
 
 
 def loop(
@@ -156,6 +136,7 @@ def loop(
     with needs("bench"):
         from sightline.benchmarks.loop.figures import LoopSetting, peers_of, size_of
         from sightline.benchmarks.loop.race import run_race
+        from sightline.evaluation.checks import check_lines
 
         if peers != "none":
             import zmq  # noqa: F401  # a peer's need; said here, not by a process that dies
@@ -163,17 +144,11 @@ def loop(
     setting = LoopSetting(
         Path(), width_px, height_px, fps, transport, detector_delay_ms, overload, seconds=seconds, peers=peers_of(peers)
     )
-    from sightline.evaluation.checks import check_line
-
     race = run_race(setting, lambda line: typer.echo(line, err=True))
     result = _race_result(race)
     if out is not None:
         _leave(out, race, result)
-    if as_json:
-        typer.echo(json.dumps(result))
-    else:
-        typer.echo("\n".join([*_table(race), "", *map(check_line, race.checks)]))
-    return 0 if result["ok"] else CHECK_FAILED
+    return print_result(result, [*_table(race), "", *check_lines(race.checks)], as_json)
 
 
 def watchers(
@@ -189,13 +164,14 @@ def watchers(
         from sightline.benchmarks.loop.viewers import measure_watchers
 
     setting = LoopSetting(Path(), transport=transport, seconds=seconds)
-    return print_checks(measure_watchers(setting, viewers, lambda line: typer.echo(line, err=True)), as_json)
+    return _print_checks(measure_watchers(setting, viewers, lambda line: typer.echo(line, err=True)), as_json)
 
 
 def _race_result(race: "Race") -> dict[str, Any]:
+    from sightline.evaluation.checks import to_dict
+
     return {
-        "ok": all(check.ok for check in race.checks),
-        "checks": [asdict(check) for check in race.checks],
+        **to_dict(race.checks),
         "setting": {**asdict(race.setting), "pictures": None, "jpeg_bytes": race.jpeg_bytes},
         "contestants": [asdict(figures) for figures in race.figures.values()],
     }
@@ -233,11 +209,6 @@ def _row(name: str, race: "Race") -> str:
 # `sightline bench network`: two machines and a bad network between them, on this one. Shell. Needs root.
 
 
-def register_network_bench(group: typer.Typer) -> None:
-    """Add the command to the `bench` group."""
-    group.command(epilog="Example: sightline bench network --only radio --seeds 1,2,3,4,5 --seconds 60")(network)
-
-
 def network(
     *,
     only: Annotated[list[str] | None, typer.Option("--only", metavar="ROW", help="A row; repeatable.")] = None,
@@ -256,23 +227,21 @@ def network(
     setting = NetworkSetting(transport, seconds, tuple(numbers("--seeds", seeds, int)))
     telling = Progress(lambda line: typer.echo(line, err=True), lambda run: _print_run(run, as_json=as_json))
     runs = run_network(chosen(only or (), transport), setting, BenchWire, telling, {"medium": medium})
-    result = _network_result(runs, transport)
-    if as_json:
-        typer.echo(json.dumps(result))
-    elif len(setting.seeds) > 1:
-        _print_worst(runs)
-    return 0 if result["ok"] else CHECK_FAILED
+    worst = list(_worst(runs))
+    lines = ["worst of all seeds", *_indented(worst)] if len(setting.seeds) > 1 else []
+    return print_result(_network_result(runs, worst, transport), lines, as_json)
 
 
-def _network_result(runs: "Sequence[NetworkRun]", transport: str) -> dict[str, Any]:
-    checks = [asdict(check) for check in _worst(runs)]
+def _network_result(runs: "Sequence[NetworkRun]", worst: "Sequence[Check]", transport: str) -> dict[str, Any]:
+    from sightline.evaluation.checks import to_dict
+
     rows = [
         {"row": run.row.name, "seed": run.seed, "injected": run.injected, "facts": run.facts,
          "checks": [asdict(check) for check in run.checks], "phases": [asdict(of) for of in run.figures]}
         for run in runs
     ]
-    return {"ok": bool(checks) and all(one["ok"] for one in checks), "checks": checks, "transport": transport,
-            "rows": rows}
+    checked = to_dict(worst)
+    return {**checked, "ok": bool(worst) and checked["ok"], "transport": transport, "rows": rows}
 
 
 def _worst(runs: "Sequence[NetworkRun]") -> "Iterator[Check]":
@@ -296,19 +265,14 @@ def _print_run(run: "NetworkRun", *, as_json: bool) -> None:
         )
     if run.facts:
         typer.echo("  " + ", ".join(f"{name} {number(fact)}" for name, fact in run.facts.items()), err=as_json)
-    _print_network_checks(run.checks, as_json=as_json)
+    for line in _indented(run.checks):
+        typer.echo(line, err=as_json)
 
 
-def _print_worst(runs: "Sequence[NetworkRun]") -> None:
-    typer.echo("worst of all seeds")
-    _print_network_checks(list(_worst(runs)), as_json=False)
+def _indented(checks: "Sequence[Check]") -> list[str]:
+    from sightline.evaluation.checks import check_lines
 
-
-def _print_network_checks(checks: "Sequence[Check]", *, as_json: bool) -> None:
-    from sightline.evaluation.checks import check_line
-
-    for check in checks:
-        typer.echo("  " + check_line(check), err=as_json)
+    return [f"  {line}" for line in check_lines(checks)]
 
 
 # `sightline bench detector` and `bench streams`: what eyes elsewhere cost, and one service for many. Shell.
@@ -317,12 +281,6 @@ def _print_network_checks(checks: "Sequence[Check]", *, as_json: bool) -> None:
 _READY_S = 30.0
 _BOUND_US = {"zenoh": 1_000.0, "oip+http": 2_000.0}
 """The median that asking elsewhere on the same machine may add, hot; the rest is only told."""
-
-
-def register_detector_benches(group: typer.Typer) -> None:
-    """Add the commands to the `bench` group."""
-    group.command(epilog="Example: sightline bench detector oip+http://127.0.0.1:8000/ball_jpeg")(detector)
-    group.command(epilog="Example: sightline bench streams --streams 40 --seconds 60")(streams)
 
 
 def detector(
@@ -339,7 +297,7 @@ def detector(
 
     with needs("vision"):
         from sightline.benchmarks.detector import HOT_S, PACED_S, measure_cost
-        from sightline.evaluation.checks import Check
+        from sightline.evaluation.checks import at_most
         from sightline.vision_side.config import VisionConfig
         from sightline.vision_side.detect.plugin_calls import attach_detector, close_detector
         from sightline.vision_side.detect.registry import build_detector
@@ -357,10 +315,9 @@ def detector(
     bound, checks, most = _BOUND_US.get(name.partition(":")[0], float("inf")), [], 0.01 * frames
     for way, cost in costs.items():
         what = f"{name}: added, {way} (here {cost.here_us:.0f}, there {cost.there_us:.0f}, medians)"
-        judged = bound if way == "hot" else float("inf")
-        checks.append(Check(what, cost.added_us, "us", judged, cost.added_us <= judged))
-        checks.append(Check(f"{name}: not answered of {frames}", cost.unanswered, "", most, cost.unanswered <= most))
-    return print_checks(checks, as_json)
+        checks.append(at_most(what, cost.added_us, "us", bound if way == "hot" else float("inf")))
+        checks.append(at_most(f"{name}: not answered of {frames}", cost.unanswered, "", most))
+    return _print_checks(checks, as_json)
 
 
 def streams(
@@ -372,20 +329,19 @@ def streams(
     """Many robots at one detector service that can look at half of their frames: age, fairness, memory."""
     with needs("vision"):
         from sightline.benchmarks import detector as bench
-        from sightline.evaluation.checks import Check
+        from sightline.evaluation.checks import Check, at_most
 
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
         load = bench.measure_streams(_free_endpoint(), Path(folder), streams, seconds)
     missing = streams - len(load.answered)
     checks = [
         Check("offered per answered frame", load.overload, "", bench.OVERLOAD, load.overload >= 0.9 * bench.OVERLOAD),
-        Check("age of boxes, p95", load.p95_ms, "ms", bench.DEADLINE_MS, load.p95_ms <= bench.DEADLINE_MS),
-        Check("furthest from an equal share", load.unfair_percent, "%", bench.FAIRNESS_PERCENT,
-              load.unfair_percent <= bench.FAIRNESS_PERCENT),
-        Check("robots never answered", missing, "", 0, missing == 0),
-        Check("memory of the service grew", load.growth_mb, "MB", bench.MEMORY_MB, load.growth_mb <= bench.MEMORY_MB),
+        at_most("age of boxes, p95", load.p95_ms, "ms", bench.DEADLINE_MS),
+        at_most("furthest from an equal share", load.unfair_percent, "%", bench.FAIRNESS_PERCENT),
+        at_most("robots never answered", missing, "", 0),
+        at_most("memory of the service grew", load.growth_mb, "MB", bench.MEMORY_MB),
     ]
-    return print_checks(checks, as_json)
+    return _print_checks(checks, as_json)
 
 
 @contextmanager

@@ -21,8 +21,8 @@ from rich.table import Table
 from sightline.conformance.benches import LiveBench
 from sightline.conformance.case import Access, Case, Level
 from sightline.conformance.report import summary, to_dict, to_junit
-from sightline.conformance.runner import Outcome, Result, chosen, passed, run_cases
-from sightline.operator_side.cli.options import CHECK_FAILED
+from sightline.conformance.runner import Outcome, Result, chosen, run_cases
+from sightline.operator_side.cli.options import print_result
 from sightline.operator_side.preflight import check_out_file
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.security import own_token
@@ -222,11 +222,9 @@ class RunOptions:
             self.junit.write_text(to_junit(results, side, self.name or peer), "utf-8")
         if self.save is not None:
             self.save.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
-        if self.as_json:
-            typer.echo(json.dumps(found))
-        else:
+        if not self.as_json:
             print_results(results)
-        return 0 if passed(results) else CHECK_FAILED
+        return print_result(found, (), self.as_json)
 
 
 def with_run_options(command: Callable[..., int]) -> Callable[..., int]:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sightline.operator_side.cli.options import (
-    CHECK_FAILED,
     ConfigFile,
     Device,
     Json,
@@ -18,6 +17,7 @@ from sightline.operator_side.cli.options import (
     MaybeSecure,
     ServiceConnect,
     Sets,
+    print_result,
 )
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import needs
@@ -164,8 +164,7 @@ def check(
     times = time_detector(make, seed=seed) if ok else []
     notices = list(dict.fromkeys(line for one in made for line in notices_of(one)))
     report = _as_json(name, ok, results, times) | {"said": notices}
-    typer.echo(json.dumps(report) if as_json else _as_text(name, results, times, notices))
-    return 0 if ok else CHECK_FAILED
+    return print_result(report, [_as_text(name, results, times, notices)], as_json)
 
 
 def own_options(texts: Sequence[str]) -> dict[str, Any]:

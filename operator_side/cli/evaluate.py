@@ -1,20 +1,18 @@
 """Commands that evaluate: demo, score, score detectors, faults, train. Shell."""
 
 import hashlib
-import json
 import os
 import tempfile
 import webbrowser
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from sightline.operator_side.cli.options import CHECK_FAILED, ConfigFile, Device, Json, Sets, numbers
+from sightline.operator_side.cli.options import ConfigFile, Device, Json, Sets, numbers, print_result
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.terminal import progress_bar
@@ -70,13 +68,10 @@ def demo(
     run = run_demo(DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission, detector), say)
     say("all three have ended; the run is being scored, replayed and filmed")
     judged = report(run)
-    if as_json:
-        typer.echo(json.dumps(judged.to_dict()))
-    else:
-        typer.echo("\n".join(summary(judged)))
+    code = print_result(judged.to_dict(), summary(judged), as_json)
     if open_it:
         webbrowser.open((judged.run.folder / "run.mp4").as_uri())
-    return 0 if judged.ok else CHECK_FAILED
+    return code
 
 
 def _seconds(scenario: str, asked: float | None) -> float:
@@ -129,8 +124,7 @@ def score(
     )
     with progress_bar(len(wanted)) as advance:
         report = run_cases(wanted, jobs or os.cpu_count() or 1, lambda _case: advance())
-    typer.echo(json.dumps(report.to_dict()) if as_json else score_text(report))
-    return 0 if report.ok else CHECK_FAILED
+    return print_result(report.to_dict(), [score_text(report)], as_json)
 
 
 # Command `score detectors`: any set of detectors on the same labelled scenes. Shell.
@@ -223,18 +217,13 @@ def _check_device(names: Sequence[str], settings: Any) -> None:
 
 
 def _print_report(report: "Report", checks: "list[Check] | None", as_json: bool) -> int:
-    from sightline.evaluation.score.detector_report import check_lines, silence_lines, text
-    from sightline.operator_side.cli.options import CHECK_FAILED
+    from sightline.evaluation.checks import check_lines, to_dict
+    from sightline.evaluation.score.detector_report import silence_lines, text
 
-    ok = all(check.ok for check in checks or ())
-    judged = {} if checks is None else {"ok": ok, "checks": [asdict(check) for check in checks]}
     for line in silence_lines(report):
         typer.echo(line, err=True)
-    if as_json:
-        typer.echo(json.dumps({**judged, **report.to_dict()}))
-    else:
-        typer.echo("\n".join([text(report), *check_lines(checks or ())]))
-    return 0 if ok else CHECK_FAILED
+    result = {**({} if checks is None else to_dict(checks)), **report.to_dict()}
+    return print_result(result, [text(report), *check_lines(checks or ())], as_json)
 
 
 def _columns(asked: str) -> list[str]:
@@ -272,7 +261,6 @@ def faults(
     with needs("all"):
         from sightline.evaluation.faults.cases import chosen
         from sightline.evaluation.faults.report import (
-            passed,
             progress_line,
             to_dict,
         )
@@ -286,8 +274,7 @@ def faults(
         rows, repeat, folder, jobs, lambda one, progress: typer.echo(progress_line(one, *progress), err=as_json)
     )
     _remove_if_empty(folder)
-    typer.echo(json.dumps(to_dict(results)) if as_json else _summary(results, folder))
-    return 0 if passed(results) else CHECK_FAILED
+    return print_result(to_dict(results), [_summary(results, folder)], as_json)
 
 
 def _remove_if_empty(folder: Path) -> None:

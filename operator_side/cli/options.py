@@ -1,7 +1,8 @@
 """Options and exit codes that several command groups share. Shell (typer)."""
 
-from collections.abc import Callable
-from typing import Annotated, TypeVar
+import json
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, TypeVar
 
 import typer
 
@@ -62,6 +63,16 @@ Port = Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page
 Device = Annotated[str | None, typer.Option("--device", help="auto, cpu, cuda or tensorrt [default: auto].")]
 
 Number = TypeVar("Number", int, float)
+
+
+def print_result(result: dict[str, Any], lines: Iterable[str], as_json: bool) -> int:
+    """Print the result of a command with checks: as JSON, or as `lines`. Returns its exit code.
+
+    A result without `ok` has nothing that can fail.
+    """
+    for line in (json.dumps(result),) if as_json else lines:
+        typer.echo(line)
+    return 0 if result.get("ok", True) else CHECK_FAILED
 
 
 def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:

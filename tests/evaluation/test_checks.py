@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.evaluation.checks import Check, check_line, number
+from sightline.evaluation.checks import Check, check_lines, number
 
 
 @pytest.mark.parametrize(("value", "text"), [
@@ -21,5 +21,10 @@ def test_what_is_shown_is_what_it_is_within_half_a_percent(value):
 
 
 def test_a_check_says_what_how_much_and_whether_it_is_enough():
-    words = check_line(Check("step", 1048.7, "us", 800.0, ok=False)).split()
-    assert words == ["step", "1049", "us", "bound", "800", "FAIL"]
+    (line,) = check_lines([Check("step", 1048.7, "us", 800.0, ok=False)])
+    assert line.split() == ["step", "1049", "us", "bound", "800", "FAIL"]
+
+
+def test_a_failed_value_that_three_digits_round_to_its_bound_has_more_digits():
+    near, equal = Check("share", 94.96, "%", 95.0, ok=False), Check("share", 95.0, "%", 95.0, ok=True)
+    assert [line.split()[1] for line in check_lines([near, equal])] == ["94.96", "95"]

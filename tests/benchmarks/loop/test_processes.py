@@ -20,7 +20,7 @@ from sightline.benchmarks.loop.race import run_race
 from sightline.benchmarks.loop.viewers import measure_watchers
 from sightline.benchmarks.loop.vision import PipelineVision
 from sightline.benchmarks.peers.classic_detector import ClassicVision
-from sightline.operator_side.cli.bench import register_loop_benches
+from sightline.operator_side.cli.bench import register
 from sightline.protocol.errors import HardwareError
 from sightline.robot_side.hardware.cameras.files import FolderCamera, FolderCameraConfig
 from tests.fixtures.links import until
@@ -112,10 +112,10 @@ def test_viewers_come_and_stall_and_the_loop_goes_on():
 @pytest.mark.slow
 def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkeypatch):
     app = typer.Typer()
-    register_loop_benches(app)
+    register(app)
     monkeypatch.setattr("sightline.benchmarks.loop.race.TAKEN_BOUND_PERCENT", 100.0)
     asked = ["--size", "160x120", "--seconds", "2", "--peers", "none", "--out", str(tmp_path / "new"), "--json"]
-    code = app(["loop", *asked], standalone_mode=False)
+    code = app(["bench", "loop", *asked], standalone_mode=False)
     printed = json.loads(capsys.readouterr().out)
     assert code == (0 if printed["ok"] else 5)
     assert [one["name"] for one in printed["contestants"]] == [FLOOR, OURS]

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from docs.make.faults import describe_machine, report_page
-from sightline.evaluation.checks import Check, at_most
+from sightline.evaluation.checks import Check, at_most, worst_checks
 from sightline.evaluation.faults import camera
 from sightline.evaluation.faults.cases import CASES, chosen
 from sightline.evaluation.faults.evidence import (
@@ -31,7 +31,7 @@ from sightline.evaluation.faults.evidence import (
     stop_checks,
 )
 from sightline.evaluation.faults.peer import ATTACKS, MALFORMED, OVERSIZED
-from sightline.evaluation.faults.report import passed, run_line, to_dict, worst_checks
+from sightline.evaluation.faults.report import passed, run_line, to_dict
 from sightline.evaluation.faults.runner import Outcome, run_case, watched_us
 from sightline.evaluation.faults.sampler import read_holes, stalled_us
 from sightline.operator_side.cli import evaluate as cli_faults
@@ -256,14 +256,14 @@ def test_rows_that_cannot_run_are_told_and_are_not_a_pass():
 
 @given(st.lists(st.one_of(st.none(), st.floats(0, 10)), min_size=1, max_size=6))
 def test_the_worst_run_is_reported(values):
-    (worst,) = worst_checks(outcome(value=value) for value in values)
+    (worst,) = worst_checks(outcome(value=value).checks for value in values)
     expected = None if None in values else max(values)
     assert worst.value == expected
 
 
 def test_a_failure_outweighs_a_larger_figure_and_less_injected_is_worse():
     few, many = (Outcome(CASES[0], (Check("injected", value, "times", 1, value >= 1),)) for value in (1.0, 50.0))
-    assert worst_checks([many, few])[0].value == 1.0
+    assert worst_checks([many.checks, few.checks])[0].value == 1.0
 
 
 def test_the_report_is_one_object_and_one_table():

@@ -10,13 +10,13 @@ import pytest
 
 pytest.importorskip("pybullet")
 
+from sightline.evaluation.checks import check_lines
 from sightline.evaluation.score import detector_report as score_scenes_file
 from sightline.evaluation.score.detector_report import (
     LABELLED,
     LEAST_HITS,
     Report,
     all_detector_checks,
-    check_lines,
     close_subjects,
     detector_checks,
     score_scenes,
@@ -78,8 +78,8 @@ def test_each_label_is_demanded_of_enough_objects_and_of_who_never_found_one():
 
 def test_a_line_for_each_check_names_whose_it_is():
     lines = check_lines(all_detector_checks(report(nominal=replace(GOOD, centre_p50_px=None, hits=0.84))))
-    assert " ".join(lines[0].split()) == "onnx: least hits, nominal 84 % bound 85 % FAIL"
-    assert " ".join(lines[3].split()) == "onnx: centre p50, nominal never bound 1 px FAIL"
+    assert " ".join(lines[0].split()) == "onnx: least hits, nominal 84 % bound 85 FAIL"
+    assert " ".join(lines[3].split()) == "onnx: centre p50, nominal never px bound 1 FAIL"
     assert sum(line.endswith("  ok") for line in lines) == len(lines) - 2
 
 
