@@ -134,7 +134,7 @@ class CodecProgram:
         self._stderr_tail = b""
         self._answered = False
         assert self._process.stderr is not None
-        threading.Thread(target=self._listen, args=(self._process.stderr,), daemon=True).start()
+        threading.Thread(target=self._listen, args=(self._process.stderr,), name="codec-stderr", daemon=True).start()
 
     def request(self, questions: Iterator[Question]) -> Iterator[tuple[Question, dict[str, Any]]]:
         """Send all of them, and yield each with its answer as it comes. Raises ProgramError."""
@@ -144,7 +144,7 @@ class CodecProgram:
             self._number += 1
             waiting[self._number] = question
             lines.append(question.line(self._number))
-        threading.Thread(target=self._write, args=(b"".join(lines),), daemon=True).start()
+        threading.Thread(target=self._write, args=(b"".join(lines),), name="codec-stdin", daemon=True).start()
         while waiting:
             number, answer = read_answer(self._line())
             if number not in waiting:

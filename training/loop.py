@@ -352,7 +352,7 @@ def _focal(heat: Any, wanted: Any, counts: Any) -> Any:
 def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[list[Sample]]:
     """Prepared by a second thread, so that two cores have something to do; a few wait, no more."""
     rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
-    with ThreadPoolExecutor(1) as pool:
+    with ThreadPoolExecutor(1, "batches") as pool:
         waiting: deque[Future[list[Sample]]] = deque()
         for step in range(first, training.steps):
             for coming in range(step + len(waiting), min(step + _PREPARED, training.steps)):

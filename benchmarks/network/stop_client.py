@@ -43,7 +43,7 @@ def run(endpoint: str, robot: str, ledger: EventLog, seconds: float, seed: int) 
             ledger.note(STOPPED, operator.report.stamp.t_us)
             _until(operator, lambda status: not any(status.applied))
             ledger.note(RESET)
-            _agreed(lambda: operator.ask(Verb.RESET))
+            _agreed(lambda: operator.request(Verb.RESET))
             _agreed(lambda: operator.arm(_PATIENCE_S))
     print("person done", flush=True)
 

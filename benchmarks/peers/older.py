@@ -27,7 +27,7 @@ class Wheels:
     def __init__(self, tally: Tally) -> None:
         self.command = ""
         self._tally = tally
-        threading.Thread(target=self._run, daemon=True).start()
+        threading.Thread(target=self._run, name="peer", daemon=True).start()
 
     def _run(self) -> None:
         done = ""
@@ -73,7 +73,7 @@ class Newest:
         self.text = ""
         self.processed = True
         self._connection = connection
-        threading.Thread(target=self._run, daemon=True).start()
+        threading.Thread(target=self._run, name="peer", daemon=True).start()
 
     def _run(self) -> None:
         for message in self._connection:

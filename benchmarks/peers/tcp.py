@@ -23,7 +23,7 @@ def robot(film: Film, tally: Tally, port: int) -> None:
     with socket.create_server(("127.0.0.1", port)) as server:
         connection, _ = server.accept()
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    threading.Thread(target=_listen, args=(connection.makefile("rb"), tally), daemon=True).start()
+    threading.Thread(target=_listen, args=(connection.makefile("rb"), tally), name="twists", daemon=True).start()
     while True:
         time.sleep(film.next_in_s())
         t_us, jpeg = film.shoot()

@@ -312,7 +312,7 @@ def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventL
         ledger.note(INJECTED)
         print(f"state {operator.stop(lambda: None).state}", flush=True)
         if options.fault == "reset":
-            reply = operator.ask(Verb.RESET)
+            reply = operator.request(Verb.RESET)
             print(f"reset {reply.ok}: {reply.detail}", flush=True)
     return 0
 

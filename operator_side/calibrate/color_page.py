@@ -49,7 +49,7 @@ class Gallery(Protocol):
         """The last pictures, to try a range on."""
         ...
 
-    def route(self, ask: PageRequest, body: bytes) -> Answer:
+    def route(self, request: PageRequest, body: bytes) -> Answer:
         """`GET /picture`."""
         ...
 
@@ -72,9 +72,9 @@ class StillGallery:
         """All of them."""
         return self._pictures
 
-    def route(self, ask: PageRequest, _body: bytes) -> Answer:
+    def route(self, request: PageRequest, _body: bytes) -> Answer:
         """`?number=N`, else the last."""
-        number = int(ask.get("number", len(self._pictures)))
+        number = int(request.get("number", len(self._pictures)))
         done, data = cv2.imencode(".jpg", self.pixels(number), [cv2.IMWRITE_JPEG_QUALITY, _PAGE_QUALITY])
         if not done:
             return Answer(status=204)
@@ -87,20 +87,20 @@ class LiveGallery:
 
     live = True
 
-    def __init__(self, reel: FrameBuffer) -> None:
-        self._reel = reel
-        self.route = reel.route
+    def __init__(self, buffer: FrameBuffer) -> None:
+        self._buffer = buffer
+        self.route = buffer.route
 
     def pixels(self, number: int) -> Image:
-        """Of the reel."""
-        shot = self._reel.of(number)
+        """Of the buffer."""
+        shot = self._buffer.of(number)
         if shot is None:
             raise ConfigError("that picture is gone by now; pick in a newer one")
         return _decoded(shot.jpeg)
 
     def recent(self) -> Sequence[Image]:
         """All that are kept."""
-        return [_decoded(one.shot.jpeg) for one in self._reel.shots]
+        return [_decoded(one.shot.jpeg) for one in self._buffer.shots]
 
 
 def of_picture(path: Path) -> list[Image]:
@@ -185,20 +185,20 @@ class PickPage:
     def routes(self) -> Mapping[str, Route]:
         """For `served`."""
         return {
-            "GET /": lambda _ask, _body: page("pick.html", title=self._title, live=str(self._gallery.live).lower()),
-            "GET /pick.mjs": lambda _ask, _body: page("pick.mjs"),
+            "GET /": lambda _request, _body: page("pick.html", title=self._title, live=str(self._gallery.live).lower()),
+            "GET /pick.mjs": lambda _request, _body: page("pick.mjs"),
             "GET /picture": self._gallery.route,
             "POST /pick": self._pick,
             "GET /mask": self._mask,
             "POST /use": self._take,
         }
 
-    def _pick(self, _ask: PageRequest, body: bytes) -> Answer:
-        asked = json.loads(body)
-        picture = self._gallery.pixels(int(asked["number"]))
+    def _pick(self, _request: PageRequest, body: bytes) -> Answer:
+        picked = json.loads(body)
+        picture = self._gallery.pixels(int(picked["number"]))
         with self._lock:
             self._picked = self._good = None
-            ranges = pick(picture, Box(*(int(asked[name]) for name in _FIELDS)))
+            ranges = pick(picture, Box(*(int(picked[name]) for name in _FIELDS)))
             self._picked = ranges, picture
             trial = try_out(ranges, self._gallery.recent())
             said: dict[str, Any] = {"ranges": ranges_text(ranges), "toml": f"ranges = {ranges_toml(ranges)}",
@@ -210,11 +210,11 @@ class PickPage:
             self._good = ranges
             return as_json(said)
 
-    def _mask(self, _ask: PageRequest, _body: bytes) -> Answer:
+    def _mask(self, _request: PageRequest, _body: bytes) -> Answer:
         with self._lock:
             return Answer(mask_png(*self._picked), "image/png") if self._picked else Answer(status=204)
 
-    def _take(self, _ask: PageRequest, _body: bytes) -> Answer:
+    def _take(self, _request: PageRequest, _body: bytes) -> Answer:
         with self._lock:
             if self._good is None:
                 raise ConfigError("pick a colour first")

@@ -417,11 +417,11 @@ class _Source:
             return
         role, ending = viewer_role(self._secure), threading.Event()
         with open_link(self._robot, connect=self._connect, role=role, secure=self._secure) as link:
-            pictures, reel = Pictures(link, role, FRAME, self._secure), FrameBuffer(frames)
-            filling = threading.Thread(target=fill, args=(reel, pictures, ending), name="pictures", daemon=True)
+            pictures, buffer = Pictures(link, role, FRAME, self._secure), FrameBuffer(frames)
+            filling = threading.Thread(target=fill, args=(buffer, pictures, ending), name="pictures", daemon=True)
             filling.start()
             try:
-                yield LiveGallery(reel)
+                yield LiveGallery(buffer)
             finally:
                 ending.set()
                 filling.join(2.0)

@@ -86,11 +86,11 @@ def status(
     """Say what a robot does and why: state, driver, twist, frame age, latency, every refusal; its vision's mission."""
     role = viewer_role(secure) if secure else SOURCE  # a viewer's keys are enough to look
     with open_link(robot, connect=connect, role=role, secure=secure) as link:
-        desk = MissionClient(link)
+        missions = MissionClient(link)
         while True:
-            state = desk.operator.wait_report().status
+            state = missions.operator.wait_report().status
             seen_to = state.holder is not None and state.holder.source == "vision"
-            mission = desk.newest(_REPORT_S if seen_to else 0.0)
+            mission = missions.newest(_REPORT_S if seen_to else 0.0)
             if as_json:
                 about = mission and mission.model_dump(mode="json")
                 typer.echo(json.dumps({"robot": robot, **state.model_dump(mode="json"), "mission": about}))
@@ -117,13 +117,13 @@ def arm(
 def disarm(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> int:
     """Wheels to zero; commands are judged but not obeyed until armed again."""
     with _operator(robot, connect, secure) as operator:
-        return _print_reply(robot, operator.ask(Verb.DISARM), as_json)
+        return _print_reply(robot, operator.request(Verb.DISARM), as_json)
 
 
 def reset(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> int:
     """Leave STOPPED or FAULT. Permits arming, starts nothing."""
     with _operator(robot, connect, secure) as operator:
-        return _print_reply(robot, operator.ask(Verb.RESET), as_json)
+        return _print_reply(robot, operator.request(Verb.RESET), as_json)
 
 
 def stop(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> None:
@@ -183,8 +183,8 @@ def mission(
         raise ConfigError("--set is for a mission to begin: name it, e.g. sightline mission r1 follow --set ...")
     if name is not None:
         request_of(0, name, (), options)  # what is wrong with it is said without a robot
-    with _missions(robot, connect, secure) as desk:
-        report = desk.report() if name is None else desk.ask(name, options=options)
+    with _missions(robot, connect, secure) as missions:
+        report = missions.report() if name is None else missions.request(name, options=options)
         return _print_report(robot, report, as_json, asked=name is not None)
 
 
@@ -206,11 +206,11 @@ def goto(
     """Send a robot to one place or several, round what its range sensors see. Ctrl-C does not stop it: `stop` does."""
     waypoints, options = _given(numbers or [], file), options_of(sets or ())
     request_of(0, "goto", waypoints, options)
-    with _missions(robot, connect, secure) as desk:
-        report = desk.ask("goto", waypoints, options)
+    with _missions(robot, connect, secure) as missions:
+        report = missions.request("goto", waypoints, options)
         if report.refused or not wait:
             return _print_report(robot, report, as_json, asked=True)
-        for report in desk.follow():
+        for report in missions.follow():
             if not as_json and not report.done:
                 typer.echo(f"{robot}: {mission_line(report)}")
         code = _print_report(robot, report, as_json, asked=True)

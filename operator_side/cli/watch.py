@@ -114,15 +114,15 @@ def _why_silent(channel: Channel) -> str:
 
 def _show_text(link: Link, ends_s: float) -> int:
 
-    desk = MissionClient(link)
+    missions = MissionClient(link)
     with LiveBlock() as live:
         while time.monotonic() < ends_s:
             try:
-                status = desk.operator.wait_report().status
+                status = missions.operator.wait_report().status
             except LinkError as error:
                 live.show([str(error)])
                 continue
-            mission = desk.newest(0.0)
+            mission = missions.newest(0.0)
             live.show([*status_lines(link.robot, status), *(mission_lines(mission) if mission else ())])
             time.sleep(_TEXT_PERIOD_S)
     return 0

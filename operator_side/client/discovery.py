@@ -121,7 +121,7 @@ def discover_all(connect: Sequence[str] | None, seconds: float, secure: str) -> 
     if not places:
         raise LinkError(f"nobody listens at {DEFAULT_ENDPOINT}, and nobody answers a multicast within {SCOUT_S:g} s; "
                         "name where one listens: sightline robots --connect tcp/ROBOT:7447")
-    with ThreadPoolExecutor(len(places)) as pool:
+    with ThreadPoolExecutor(len(places), "discovery") as pool:
         return DiscoveryReport(
             dict(zip(places, pool.map(lambda place: _looked(place, seconds, secure), places), strict=True))
         )

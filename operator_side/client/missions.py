@@ -71,7 +71,7 @@ def _counted(found: Waypoints) -> Waypoints:
 # Asks a vision for a mission and hears what it does, over any `Link`. Shell (waits).
 #
 # with open_link("r1", connect=[...], role="operator") as link:
-#     MissionDesk(link).ask("goto", waypoints=((1.5, 1.5),))
+#     MissionClient(link).request("goto", waypoints=((1.5, 1.5),))
 
 
 REPEAT_S: Final = 0.2
@@ -106,7 +106,7 @@ class MissionClient:
         """The next report. Raises LinkError when none comes."""
         return self._next(lambda _report: True, timeout_s)
 
-    def ask(self, name: str, waypoints: Waypoints = (), options: Mapping[str, Any] | None = None) -> MissionReport:
+    def request(self, name: str, waypoints: Waypoints = (), options: Mapping[str, Any] | None = None) -> MissionReport:
         """Ask until vision's report names it; the report's `refused` says whether it was taken up.
 
         Raises ConfigError for what cannot be asked, LinkError when the robot or its vision does not answer.

@@ -74,7 +74,7 @@ class Operator:
             assert self._report is not None
             return self._report
 
-    def ask(self, verb: Verb, timeout_s: float = 2.0) -> Reply:
+    def request(self, verb: Verb, timeout_s: float = 2.0) -> Reply:
         """Ask once, repeating it until the reply comes. Raises LinkError when none comes in time."""
         if verb in _CITES_STATUS:
             self.wait_report(timeout_s)  # one of now: not from before an earlier STOP or disarm
@@ -91,10 +91,10 @@ class Operator:
     def arm(self, patience_s: float = 5.0) -> Reply:
         """Arm; while the robot says that something is missing (live commands, wheels at zero) ask again."""
         deadline_s = time.monotonic() + patience_s
-        reply = self.ask(Verb.ARM)
+        reply = self.request(Verb.ARM)
         while not reply.ok and reply.detail.startswith(RejectReason.NOT_ALLOWED) and time.monotonic() < deadline_s:
             self.wait_report()
-            reply = self.ask(Verb.ARM)
+            reply = self.request(Verb.ARM)
         return reply
 
     def stop(self, on_slow: Callable[[], None], timeout_s: float = 10.0) -> Status:

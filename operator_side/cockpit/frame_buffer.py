@@ -22,7 +22,7 @@ _TAKE_S: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Numbered:
-    """One picture of the reel."""
+    """One picture of the buffer."""
 
     number: int
     shot: Shot
@@ -36,7 +36,7 @@ class FrameBuffer:
         self._age_us = age_us
         self._news = threading.Condition()
         self._wanted = -1
-        self._asked_s = 0.0
+        self._requested_s = 0.0
 
     def add(self, shot: Shot) -> None:
         """One more."""
@@ -62,24 +62,24 @@ class FrameBuffer:
     @property
     def is_idle(self) -> bool:
         """Whether nobody asked for a while."""
-        return time.monotonic() - self._asked_s > IDLE_S
+        return time.monotonic() - self._requested_s > IDLE_S
 
     def next(self, after: int, timeout_s: float = WAIT_S) -> Numbered | None:
         """The newest, if its number is above `after` or comes to be in time."""
         with self._news:
             after = after if after <= self._number else 0  # a page of an earlier run
-            self._wanted, self._asked_s = max(self._wanted, after), time.monotonic()
+            self._wanted, self._requested_s = max(self._wanted, after), time.monotonic()
             self._news.notify_all()
             self._news.wait_for(lambda: self._number > after, timeout_s)
             return self._shots[-1] if self._number > after else None
 
-    def route(self, ask: PageRequest, _body: bytes) -> Answer:
+    def route(self, request: PageRequest, _body: bytes) -> Answer:
         """`GET /picture?after=N`, the next one, or `?number=N`, that one; 204 if there is none."""
-        if "number" in ask:
-            shot = self.of(int(ask["number"]))
-            found = Numbered(int(ask["number"]), shot) if shot else None
+        if "number" in request:
+            shot = self.of(int(request["number"]))
+            found = Numbered(int(request["number"]), shot) if shot else None
         else:
-            found = self.next(int(ask.get("after", "0")))
+            found = self.next(int(request.get("after", "0")))
         if found is None:
             return Answer(status=204)
         age_us = self._age_us(found.shot)
@@ -92,13 +92,13 @@ class FrameBuffer:
         return self._shots[-1].number if self._shots else 0
 
 
-def fill(reel: FrameBuffer, pictures: Pictures, ending: threading.Event) -> None:
+def fill(buffer: FrameBuffer, pictures: Pictures, ending: threading.Event) -> None:
     """Take pictures as they are wanted, until `ending`; while nobody looks, nothing is subscribed to."""
     while not ending.is_set():
-        if not reel.is_wanted(_TAKE_S):
-            if reel.is_idle:
+        if not buffer.is_wanted(_TAKE_S):
+            if buffer.is_idle:
                 pictures.pause()
             continue
         shot = pictures.take(_TAKE_S)
         if shot is not None:
-            reel.add(shot)
+            buffer.add(shot)

@@ -20,19 +20,19 @@ _SHOWN_PICTURES = 2  # the newest, and the one before, which a second page may b
 @contextmanager
 def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) -> Iterator[str]:
     """Serve the page while inside; gives its address. Raises LinkError for a port in use."""
-    pictures, desk, ending = Pictures(link, role, first, secure), MissionClient(link), threading.Event()
-    reel = FrameBuffer(_SHOWN_PICTURES, pictures.age_us)
+    pictures, missions, ending = Pictures(link, role, first, secure), MissionClient(link), threading.Event()
+    buffer = FrameBuffer(_SHOWN_PICTURES, pictures.age_us)
 
-    def state(_ask: PageRequest, _body: bytes) -> Answer:
-        return as_json(state_of(link.robot, desk, pictures.is_heard))
+    def state(_request: PageRequest, _body: bytes) -> Answer:
+        return as_json(state_of(link.robot, missions, pictures.is_heard))
 
     routes = {
-        "GET /": lambda _ask, _body: page("watch.html", robot=link.robot),
-        "GET /watch.mjs": lambda _ask, _body: page("watch.mjs"),
-        "GET /picture": reel.route,
+        "GET /": lambda _request, _body: page("watch.html", robot=link.robot),
+        "GET /watch.mjs": lambda _request, _body: page("watch.mjs"),
+        "GET /picture": buffer.route,
         "GET /state": state,
     }
-    filling = threading.Thread(target=fill, args=(reel, pictures, ending), name="pictures", daemon=True)
+    filling = threading.Thread(target=fill, args=(buffer, pictures, ending), name="pictures", daemon=True)
     with served(routes, port) as address:
         filling.start()
         try:
@@ -42,11 +42,11 @@ def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) ->
             filling.join(2.0)
 
 
-def state_of(robot: str, desk: MissionClient, heard: bool) -> dict[str, Any]:
+def state_of(robot: str, missions: MissionClient, heard: bool) -> dict[str, Any]:
     """What the page says beside the picture; `heard` is false for a robot that is silent."""
-    report = desk.operator.report
+    report = missions.operator.report
     lines = _robot_lines(report.status) if report is not None else []
-    mission = desk.newest(0.0)
+    mission = missions.newest(0.0)
     if mission is not None:
         lines.insert(0, ("mission", mission_line(mission)))
         if mission.detector:

@@ -55,8 +55,8 @@ def findings(keys_folder: str) -> Iterator[Finding]:
 
 def _versions() -> Finding:
     installed = {extra: _version(name) for extra, name in _EXTRAS.items()}
-    said = ", ".join(f"{extra} {version}" for extra, version in installed.items() if version)
-    text = f"sightline {_version('sightline-robot')}, protocol {VERSION}, Python {platform.python_version()}; {said}"
+    extras = ", ".join(f"{extra} {version}" for extra, version in installed.items() if version)
+    text = f"sightline {_version('sightline-robot')}, protocol {VERSION}, Python {platform.python_version()}; {extras}"
     return Finding("versions", None, text)
 
 
@@ -116,10 +116,10 @@ def _temperature() -> Iterator[Finding]:
     if degrees:
         fix = "a heat sink or a fan: a hot processor is slowed down"
         yield Finding("temperature", max(degrees) < _HOT_C, f"{max(degrees):.0f}", fix, "C", f"{_HOT_C:.0f}")
-    said = _asked("vcgencmd", "get_throttled")
-    if said:
+    printed = _output_of("vcgencmd", "get_throttled")
+    if printed:
         fix = "a stronger power supply, or cooling; sudo reboot clears the mark"
-        yield Finding("throttled", said.endswith("0x0"), said, fix)
+        yield Finding("throttled", printed.endswith("0x0"), printed, fix)
 
 
 def _slowed_down() -> Iterator[Finding]:
@@ -144,10 +144,10 @@ def _slowed_down() -> Iterator[Finding]:
 def _power_save() -> Iterator[Finding]:
     for device in sorted(INTERFACES.glob("*/wireless")):
         name = device.parent.name
-        said = _asked("iw", "dev", name, "get", "power_save")
+        printed = _output_of("iw", "dev", name, "get", "power_save")
         fix = f"sudo iw dev {name} set power_save off"
-        yield Finding(f"power save {name}", "on" not in said.lower().split() if said else None,
-                      said or "cannot be read: apt install iw", fix)
+        yield Finding(f"power save {name}", "on" not in printed.lower().split() if printed else None,
+                      printed or "cannot be read: apt install iw", fix)
 
 
 def _multicast() -> Finding:
@@ -168,8 +168,8 @@ def _multicast() -> Finding:
 
 
 def _clock() -> Finding:
-    said = _asked("timedatectl", "show", "--property=NTPSynchronized", "--value")
-    words = {"yes": "synchronised", "no": "not synchronised"}.get(said, "unknown")
+    printed = _output_of("timedatectl", "show", "--property=NTPSynchronized", "--value")
+    words = {"yes": "synchronised", "no": "not synchronised"}.get(printed, "unknown")
     return Finding("clock", None, f"{words}; only certificates and logs need it, no frame or command does")
 
 
@@ -188,7 +188,7 @@ def _certificates(folder: str) -> Iterator[Finding]:
         yield Finding(f"key {one.file.stem}", one.ends - now > _EXPIRES_SOON, f"until {one.ends:%Y-%m-%d}", anew)
 
 
-def _asked(*command: str) -> str:
+def _output_of(*command: str) -> str:
     """What a tool of the system says; "" where it is not there or fails."""
     if shutil.which(command[0]) is None:
         return ""
@@ -238,13 +238,13 @@ def modes() -> Iterator[Finding]:
 
 
 def _finding(device: Path, offered: list[str]) -> Finding:
-    said, option = ", ".join(offered), f"--set camera.kind=v4l2 --set camera.options.device={device}"
+    formats, option = ", ".join(offered), f"--set camera.kind=v4l2 --set camera.options.device={device}"
     if "MJPG" in offered or "JPEG" in offered:
-        return Finding(f"modes {device.name}", True, f"{said}; its own JPEG is passed through (MJPG, the default)")
+        return Finding(f"modes {device.name}", True, f"{formats}; its own JPEG is passed through (MJPG, the default)")
     if "YUYV" in offered:
-        return Finding(f"modes {device.name}", None, f"{said}; no JPEG of its own: each picture is encoded here",
+        return Finding(f"modes {device.name}", None, f"{formats}; no JPEG of its own: each picture is encoded here",
                        f"sightline robot {option} --set camera.options.format=YUYV")
-    return Finding(f"modes {device.name}", False, f"{said}; neither MJPG nor YUYV", "use another camera")
+    return Finding(f"modes {device.name}", False, f"{formats}; neither MJPG nor YUYV", "use another camera")
 
 
 def formats(device: Path) -> list[str]:

@@ -243,8 +243,8 @@ class Teleop:
         self._due_us = 0
         self._sent = STILL
         self._leaving = self.has_left = False
-        self._asking: Verb | None = None
-        self._ask_due_us = self._ask_until_us = self._asked_from_id = 0
+        self._pending_request: Verb | None = None
+        self._request_due_us = self._request_until_us = self._requested_from_id = 0
 
     # --- what comes in -------------------------------------------------------------------------------------------
 
@@ -303,8 +303,8 @@ class Teleop:
             self.note = f"the robot's status is not understood: {error.detail}"
             return
         self.speeds.limit(self.report.status)
-        if self.mode is Mode.HANDING_OVER and self._asking is not Verb.RELEASE and self._other_drives():
-            self.mode, self._asking, self.note = Mode.LOOKING_ON, None, ""
+        if self.mode is Mode.HANDING_OVER and self._pending_request is not Verb.RELEASE and self._other_drives():
+            self.mode, self._pending_request, self.note = Mode.LOOKING_ON, None, ""
 
     def on_reply(self, message: Message) -> None:
         """An answer to what was asked."""
@@ -312,30 +312,30 @@ class Teleop:
             reply = decode(Reply, message.payload, REPLY.max_payload_bytes)
         except WireError:
             return
-        if reply.to != self.session or reply.id < self._asked_from_id:
+        if reply.to != self.session or reply.id < self._requested_from_id:
             return
         if self._leaving:
             self.has_left |= reply.ok
-        elif self._asking is None:
+        elif self._pending_request is None:
             return
         elif reply.ok:
             self._granted()
         elif not reply.detail.startswith(_ASK_ON):
-            self.note = f"{self._asking} refused: {reply.detail}"
-            self._asking = None
+            self.note = f"{self._pending_request} refused: {reply.detail}"
+            self._pending_request = None
 
     # --- what a person wants -------------------------------------------------------------------------------------
 
     def stop(self) -> None:
         """Stand still, whoever drove; the robot stays armed, in this person's hands."""
         self._let_go()
-        self.mode, self._asking, self._due_us = Mode.DRIVING, None, 0
+        self.mode, self._pending_request, self._due_us = Mode.DRIVING, None, 0
 
     def hand_over(self, now_us: int) -> None:
         """Let go of the robot and arm whoever else sends commands: the one way back to autonomy, and a person's own."""
         self._let_go()
         self.mode, self.note = Mode.HANDING_OVER, ""
-        self._ask(Verb.RELEASE, now_us, _HAND_OVER_FOR_US)
+        self._repeat_request(Verb.RELEASE, now_us, _HAND_OVER_FOR_US)
 
     def _let_go(self) -> None:
         self._hold.release()
@@ -351,7 +351,7 @@ class Teleop:
             yield self._command(STILL, self._echo)
         if not self._leaving:
             self._leaving, self.mode = True, Mode.HANDING_OVER  # one zero: another would take the lease again
-            self._asked_from_id = self._id + 1
+            self._requested_from_id = self._id + 1
         yield self._request(Verb.RELEASE)
 
     def _drive(self, fresh: bool, now_us: int) -> None:
@@ -360,7 +360,8 @@ class Teleop:
         self.mode = Mode.DRIVING
         if fresh or took_over:
             self.note = ""
-            self._ask(Verb.ARM, now_us, _ARM_FOR_US)  # also if it seems armed: a status may be from before a release
+            # Also if it seems armed: a status may be from before a release.
+            self._repeat_request(Verb.ARM, now_us, _ARM_FOR_US)
         if took_over:
             self._speed_up, self._sent = SpeedUp(), STILL
         if self._sent == STILL:
@@ -381,7 +382,7 @@ class Teleop:
         elif self._unanswered and self.mode is not Mode.DRIVING:
             self._unanswered = False
             yield self._message(ACK, encode(self._answer(self._echo)), b"")
-        yield from self._asked(now_us)
+        yield from self._requests(now_us)
 
     def _goal(self, now_us: int) -> Twist:
         """What is held, at the speeds of now."""
@@ -393,29 +394,29 @@ class Teleop:
             linear_mps=linear * self.speeds.linear_mps, angular_rad_s=angular * self.speeds.angular_rad_s
         )
 
-    def _asked(self, now_us: int) -> Iterator[Message]:
-        verb = self._asking
-        if now_us > self._ask_until_us and (verb is not None or self.mode is Mode.HANDING_OVER):
+    def _requests(self, now_us: int) -> Iterator[Message]:
+        verb = self._pending_request
+        if now_us > self._request_until_us and (verb is not None or self.mode is Mode.HANDING_OVER):
             self._gave_up()
-        elif verb is not None and self._may_ask(verb, now_us):
-            self._ask_due_us = now_us + _REPEAT_AFTER_US
+        elif verb is not None and self._may_request(verb, now_us):
+            self._request_due_us = now_us + _REPEAT_AFTER_US
             yield self._request(verb)
 
-    def _may_ask(self, verb: Verb, now_us: int) -> bool:
+    def _may_request(self, verb: Verb, now_us: int) -> bool:
         """What lets a robot move cites a status, so one must have come."""
-        return now_us >= self._ask_due_us and (verb is Verb.RELEASE or self.report is not None)
+        return now_us >= self._request_due_us and (verb is Verb.RELEASE or self.report is not None)
 
-    def _ask(self, verb: Verb, now_us: int, for_us: int) -> None:
-        self._asking, self._ask_due_us, self._ask_until_us = verb, now_us, now_us + for_us
-        self._asked_from_id = self._id + 1
+    def _repeat_request(self, verb: Verb, now_us: int, for_us: int) -> None:
+        self._pending_request, self._request_due_us, self._request_until_us = verb, now_us, now_us + for_us
+        self._requested_from_id = self._id + 1
 
     def _granted(self) -> None:
-        handed_over = self._asking is Verb.RELEASE and self.mode is Mode.HANDING_OVER
-        self._asking = Verb.ARM if handed_over else None
-        self._asked_from_id = self._id + 1
+        handed_over = self._pending_request is Verb.RELEASE and self.mode is Mode.HANDING_OVER
+        self._pending_request = Verb.ARM if handed_over else None
+        self._requested_from_id = self._id + 1
 
     def _gave_up(self) -> None:
-        self._asking = None
+        self._pending_request = None
         if self.mode is Mode.HANDING_OVER:
             self.mode, self.note = Mode.LOOKING_ON, "nobody has taken over: is vision running?"
         else:

@@ -109,36 +109,36 @@ def test_the_robots_silence_is_noticed(site, monkeypatch):
 
 def test_a_page_gets_the_next_picture_when_it_asks_and_none_is_fetched_for_nobody(site, monkeypatch):
     monkeypatch.setattr(reel_module, "IDLE_S", 0.4)
-    pictures, reel, ending = Pictures(site.link, "viewer"), FrameBuffer(2), threading.Event()
-    filling = threading.Thread(target=fill, args=(reel, pictures, ending), daemon=True)
+    pictures, buffer, ending = Pictures(site.link, "viewer"), FrameBuffer(2), threading.Event()
+    filling = threading.Thread(target=fill, args=(buffer, pictures, ending), daemon=True)
     filling.start()
     try:
-        assert reel.next(0, 0.05) is None
+        assert buffer.next(0, 0.05) is None
         assert until(lambda: site.vision.has_listener(OVERLAY))
         numbers = []
         while len(numbers) < 5:
             site.overlay()
-            found = reel.next(numbers[-1] if numbers else 0, 0.05)
+            found = buffer.next(numbers[-1] if numbers else 0, 0.05)
             numbers += [found.number] if found else []
         assert numbers == [1, 2, 3, 4, 5]
-        assert [one.number for one in reel.shots] == [4, 5] and reel.of(3) is None and reel.of(5) is not None
+        assert [one.number for one in buffer.shots] == [4, 5] and buffer.of(3) is None and buffer.of(5) is not None
         site.overlay()
         time.sleep(0.1)
-        assert reel.next(0, 0.0).number == 5  # nobody asked for a sixth
+        assert buffer.next(0, 0.0).number == 5  # nobody asked for a sixth
         assert until(lambda: not site.vision.has_listener(OVERLAY), 3.0)
-        assert reel.next(99, 0.0).number == 5  # a page of an earlier run
+        assert buffer.next(99, 0.0).number == 5  # a page of an earlier run
     finally:
         ending.set()
         filling.join(3.0)
 
 
 def test_the_reel_over_http_says_which_picture_it_is(site):
-    pictures, reel = Pictures(site.link, "viewer"), FrameBuffer(2, lambda shot: 7)
-    reel.add(taken(pictures, site.overlay))
-    answer = reel.route({"after": "0"}, b"")
+    pictures, buffer = Pictures(site.link, "viewer"), FrameBuffer(2, lambda shot: 7)
+    buffer.add(taken(pictures, site.overlay))
+    answer = buffer.route({"after": "0"}, b"")
     assert answer.body == jpeg(640, 480)
     assert answer.headers["X-Channel"] == "overlay" and answer.headers["X-Age-Us"] == "7"
-    assert reel.route({"number": "1"}, b"").status == 200 and reel.route({"number": "2"}, b"").status == 204
+    assert buffer.route({"number": "1"}, b"").status == 200 and buffer.route({"number": "2"}, b"").status == 204
 
 
 def test_who_has_the_keys_of_an_operator_watches_as_one(tmp_path):

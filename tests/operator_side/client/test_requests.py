@@ -74,9 +74,10 @@ def test_arm_drive_stop_reset():
         refused = operator.arm(patience_s=2.0)
         assert not refused.ok
         assert "reset" in refused.detail
-        assert operator.ask(Verb.RESET).ok or operator.ask(Verb.RESET).ok  # the first may still find turning wheels
+        # The first may still find turning wheels.
+        assert operator.request(Verb.RESET).ok or operator.request(Verb.RESET).ok
         assert operator.wait_report().status.state == "DISARMED"
-        assert operator.ask(Verb.DISARM).ok
+        assert operator.request(Verb.DISARM).ok
 
 
 def test_arm_waits_for_live_commands_and_says_what_is_missing():
@@ -92,7 +93,7 @@ def test_requests_without_an_answer_end_in_time_and_say_so():
     with PumpedRobot(hears=False) as robot:
         robot.operator.wait_report()
         with pytest.raises(LinkError, match="does not answer arm"):
-            robot.operator.ask(Verb.ARM, timeout_s=0.3)
+            robot.operator.request(Verb.ARM, timeout_s=0.3)
 
 
 def test_stop_is_repeated_at_20_hz_and_tells_when_it_is_slow():
@@ -131,7 +132,7 @@ def test_replies_to_others_are_not_taken():
         replies = [None, None]
 
         def ask(at: int, operator: Operator, verb: Verb) -> None:
-            replies[at] = operator.ask(verb)
+            replies[at] = operator.request(verb)
 
         threads = [
             threading.Thread(target=ask, args=(0, robot.operator, Verb.DISARM), daemon=True),
