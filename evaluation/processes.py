@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -126,6 +127,19 @@ def last_line(log: Path) -> str:
     """The last line of a log, without `error: `."""
     lines = [line for line in log.read_text("utf-8", "replace").splitlines() if line.strip()]
     return lines[-1].removeprefix("error: ") if lines else "nothing"
+
+
+def free_port() -> int:
+    """A port on loopback on which nothing listens, and nothing on the next one."""
+    while True:
+        with socket.socket() as probe, socket.socket() as next_probe:
+            probe.bind(("127.0.0.1", 0))
+            port = int(probe.getsockname()[1])
+            try:
+                next_probe.bind(("127.0.0.1", port + 1))
+            except (OSError, OverflowError):
+                continue
+            return port
 
 
 # Work on several processes that ends when it is told to. Shell (processes).

@@ -9,7 +9,8 @@ from typing import Final
 
 from sightline.benchmarks.loop.counters import children_of
 from sightline.benchmarks.loop.figures import Accepted, Course, LoopSetting, course_of_headers
-from sightline.benchmarks.loop.processes import BenchProcesses, free_port
+from sightline.benchmarks.loop.processes import BenchProcesses
+from sightline.evaluation.processes import free_port
 from sightline.protocol.channels import STATUS
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import ConfigError

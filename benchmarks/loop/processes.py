@@ -1,7 +1,6 @@
 """The processes of one contestant of `bench loop`: started, waited for by what they print, ended. Shell (processes)."""
 
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -84,17 +83,3 @@ class BenchProcesses:
     def _last_words(self, name: str) -> str:
         lines: Sequence[str] = self._log(name).read_text("utf-8", "replace").split("\n")
         return next((line for line in reversed(lines) if line.strip()), "nothing").removeprefix("error: ")
-
-
-
-def free_port() -> int:
-    """A port on loopback that nobody listens on, with the next one free too."""
-    while True:
-        with socket.socket() as probe, socket.socket() as next_probe:
-            probe.bind(("127.0.0.1", 0))
-            port = int(probe.getsockname()[1])
-            try:
-                next_probe.bind(("127.0.0.1", port + 1))
-            except OSError:
-                continue
-            return port

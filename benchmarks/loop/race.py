@@ -37,10 +37,10 @@ from sightline.benchmarks.loop.figures import (
 )
 from sightline.benchmarks.loop.ours import endpoint_of, running_services
 from sightline.benchmarks.loop.pictures import write_pictures
-from sightline.benchmarks.loop.processes import BenchProcesses, free_port
+from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.loop.vision import overloaded
 from sightline.evaluation.checks import Check
-from sightline.evaluation.processes import terminated_like_interrupted
+from sightline.evaluation.processes import free_port, terminated_like_interrupted
 from sightline.protocol.clock import monotonic_us
 
 _SETTLE_S: Final = 1.5

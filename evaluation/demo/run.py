@@ -2,7 +2,6 @@
 
 import math
 import os
-import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sightline.evaluation.demo.shaped_vision import Shape
-from sightline.evaluation.processes import Processes, terminated_like_interrupted
+from sightline.evaluation.processes import Processes, free_port, terminated_like_interrupted
 from sightline.evaluation.scenario_config import robot_of, robot_table, vision_config, vision_table
 from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.operator_side.client.status import millis, twist_text
@@ -137,8 +136,8 @@ def _check_vision(options: DemoOptions, scenario: Scenario) -> None:
 
 
 def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str], None]) -> None:
-    options, endpoint = run.options, TRANSPORTS["zenoh"].format(_free_port())
-    for_vision = endpoint if options.transport == "zenoh" else TRANSPORTS[options.transport].format(_free_port())
+    options, endpoint = run.options, TRANSPORTS["zenoh"].format(free_port())
+    for_vision = endpoint if options.transport == "zenoh" else TRANSPORTS[options.transport].format(free_port())
     listen = [part for end in dict.fromkeys((endpoint, for_vision)) for part in ("--listen", end)]
     _write_configuration(run, sockets)
     say(f"simulation, robot and vision start as three processes; their logs are in {run.folder}")
@@ -255,12 +254,6 @@ def _run_folder(options: DemoOptions, scenario: Scenario) -> Path:
             if options.out is not None or not isinstance(error, FileExistsError):
                 raise ConfigError(f"run folder {folder}: {error.strerror}; choose another with --out") from None
             folder = folder.with_name(folder.name + "-again")  # another run began in the same second
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -20,7 +19,7 @@ from sightline.evaluation.faults import evidence as judge
 from sightline.evaluation.faults.evidence import GOOD, INJECTED, MotorRow, SentCommand, read_events, wheel_mps
 from sightline.evaluation.faults.peer import PeerOptions, Role
 from sightline.evaluation.faults.sampler import Hole, read_holes, stalled_us
-from sightline.evaluation.processes import END_S, Processes
+from sightline.evaluation.processes import END_S, Processes, free_port
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import HardwareError, SightlineError
@@ -265,8 +264,8 @@ class RobotFixture:
         self._ending.enter_context(self.fleet)
         if self.setup.wired:
             self.wire = self._ending.enter_context(BenchWire(self.folder / "wire.log"))
-        self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"tcp/127.0.0.1:{_free_port()}"
-        self.web_endpoint = f"ws://127.0.0.1:{_free_port()}" if self.setup.web else ""
+        self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"tcp/127.0.0.1:{free_port()}"
+        self.web_endpoint = f"ws://127.0.0.1:{free_port()}" if self.setup.web else ""
         self._write_files(self._sockets)
         self.fleet.run("sim", COMMAND_LINE, ["sim", "--config", str(self.folder / "sim.toml")])
         self.fleet.run("sampler", "sightline.evaluation.faults.sampler", [str(self.folder / "holes.csv")])
@@ -425,9 +424,3 @@ class RobotFixture:
     def holes(self) -> list[Hole]:
         """When this machine stood still."""
         return read_holes(self.folder / "holes.csv")
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -330,9 +330,10 @@ def streams(
     with needs("vision"):
         from sightline.benchmarks import detector as bench
         from sightline.evaluation.checks import Check, at_most
+        from sightline.evaluation.processes import free_port
 
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
-        load = bench.measure_streams(_free_endpoint(), Path(folder), streams, seconds)
+        load = bench.measure_streams(f"tcp/127.0.0.1:{free_port()}", Path(folder), streams, seconds)
     missing = streams - len(load.answered)
     checks = [
         Check("offered per answered frame", load.overload, "", bench.OVERLOAD, load.overload >= 0.9 * bench.OVERLOAD),
@@ -347,13 +348,13 @@ def streams(
 @contextmanager
 def _service(name: str, folder: Path) -> "Iterator[Any]":
     """For `zenoh` a service, and a link that is both the robot's and vision's, where they meet; else None."""
-    from sightline.evaluation.processes import Processes
+    from sightline.evaluation.processes import Processes, free_port
     from sightline.protocol.transports.open import open_link
 
     if name != "zenoh":
         yield None
         return
-    endpoint = _free_endpoint()
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ExitStack() as ending:
         robot = ending.enter_context(open_link("r1", listen=[endpoint]))
         processes = ending.enter_context(Processes(folder))
@@ -380,11 +381,3 @@ def _picture(folder: Path) -> bytes:
 
     write_pictures(folder, 320, 240)
     return min(folder.glob("*.jpg")).read_bytes()
-
-
-def _free_endpoint() -> str:
-    import socket
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
