@@ -57,7 +57,7 @@ class SimSocketConfig(Config):
     socket_dir: Annotated[str, Field(min_length=1, max_length=90)] = Field(default_factory=default_socket_dir)
 
 
-class Connection:
+class BusConnection:
     """Comes back by itself: a call after a loss connects anew. Never blocks unless asked to wait."""
 
     def __init__(self, socket_dir: str, name: str) -> None:
@@ -156,7 +156,7 @@ class SimCamera:
     live = True
 
     def __init__(self, config: SimSocketConfig) -> None:
-        self._connection = Connection(config.socket_dir, CAMERA)
+        self._connection = BusConnection(config.socket_dir, CAMERA)
         self._request = PICTURE_REQUEST.pack(100, 100)
         self.model: CameraModel
         self._greet()
@@ -195,7 +195,7 @@ class SimDrive:
         """Where the simulation listens."""
 
     def __init__(self, config: SimSocketConfig) -> None:
-        self._connection = Connection(config.socket_dir, MOTION)
+        self._connection = BusConnection(config.socket_dir, MOTION)
         self._connection.open()
         self._angles: WheelAngles | None = None
 
@@ -231,7 +231,7 @@ class SimRange:
         """Where the simulation listens."""
 
     def __init__(self, config: SimSocketConfig) -> None:
-        self._connection = Connection(config.socket_dir, RANGE)
+        self._connection = BusConnection(config.socket_dir, RANGE)
         self._connection.open()
 
     def read(self) -> Ranges | None:
@@ -261,7 +261,7 @@ class TruthReader:
     """Reads what is really so, for displays and scores."""
 
     def __init__(self, socket_dir: str) -> None:
-        self._connection = Connection(socket_dir, TRUTH)
+        self._connection = BusConnection(socket_dir, TRUTH)
         self.simulated = SimulationInfo.model_validate_json(self._connection.hello())
 
     def read(self, timeout_s: float) -> Truth | None:
@@ -307,7 +307,7 @@ class LabelReader:
     """The labels of the newest pictures, by their capture times."""
 
     def __init__(self, socket_dir: str) -> None:
-        self._connection = Connection(socket_dir, TRUTH)
+        self._connection = BusConnection(socket_dir, TRUTH)
         self._connection.hello()
         self._kept: OrderedDict[int, dict[str, Any]] = OrderedDict()
 

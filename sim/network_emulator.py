@@ -77,7 +77,7 @@ class Medium:
     free_us: float = 0.0
 
 
-class Leg:
+class EmulatedLeg:
     """One direction. The caller puts packets in and takes out what is due; times never go back."""
 
     def __init__(self, seed: str) -> None:
@@ -164,7 +164,7 @@ class EmulatedLink:
     """Two legs and one medium, or two."""
 
     def __init__(self, seed: int = 1) -> None:
-        self.ab, self.ba = Leg(f"{seed} ab"), Leg(f"{seed} ba")
+        self.ab, self.ba = EmulatedLeg(f"{seed} ab"), EmulatedLeg(f"{seed} ba")
 
     def shape(self, shapes: LinkShapes) -> None:
         """From now on packets fare so."""

@@ -15,7 +15,7 @@ from sightline.sim.toml_file import check, find, names_in, read_table
 __all__ = ["Forced", "OnPath", "Pushed", "Scenario", "Start", "Static", "Wall", "load_scenario", "scenario_names"]
 
 
-class Leg(Config):
+class PathLeg(Config):
     """One piece of a path: its length along the path and how far it turns, left positive."""
 
     length_m: Annotated[float, Field(gt=0, le=1000)]
@@ -33,7 +33,7 @@ class Place(NamedTuple):
 class ClosedPath:
     """Legs walked for ever, starting at `start`. Raises ValueError when the end does not meet the start."""
 
-    def __init__(self, start: Place, legs: tuple[Leg, ...]) -> None:
+    def __init__(self, start: Place, legs: tuple[PathLeg, ...]) -> None:
         self._legs = legs
         self._starts = [start]
         for leg in legs:
@@ -56,7 +56,7 @@ class ClosedPath:
         return self._starts[0]
 
 
-def _along(start: Place, leg: Leg, distance_m: float) -> Place:
+def _along(start: Place, leg: PathLeg, distance_m: float) -> Place:
     """The place `distance_m` into `leg`: the chord of an arc, which a straight is the limit of."""
     half_rad = math.radians(leg.turn_deg) * distance_m / leg.length_m / 2
     chord_m = distance_m * (math.sin(half_rad) / half_rad if abs(half_rad) > 1e-9 else 1.0)
@@ -154,7 +154,7 @@ class OnPath(Thing):
     kind: Literal["path"]
     start_m: Point = (0.0, 0.0)
     heading_deg: Degrees = 0.0
-    path: Annotated[tuple[Leg, ...], Field(min_length=1, max_length=64)]
+    path: Annotated[tuple[PathLeg, ...], Field(min_length=1, max_length=64)]
     speed_mps: Annotated[float, Field(ge=0, le=5)]
     phase: Amounts = (0.0, 1.0)
     """Where on the path it begins, as a fraction of a lap."""
@@ -224,7 +224,7 @@ LIT: dict[str, Color] = {"red": (0.95, 0.10, 0.08), "yellow": (0.98, 0.80, 0.06)
 UNLIT = 0.22  # of its lit colour: glass that nothing shines behind
 
 
-class Phase(Config):
+class LightPhase(Config):
     """One colour for a time."""
 
     state: State
@@ -256,8 +256,10 @@ class Light(Config):
     box_m: tuple[Side, Side, Side] = (0.266, 0.317, 0.281)
     line_m: Side = 0.6
     """The stop line is this far before it."""
-    schedule: Annotated[tuple[Phase, ...], Field(min_length=1, max_length=16)] = (
-        Phase(state="red", seconds=5.0), Phase(state="green", seconds=5.0), Phase(state="yellow", seconds=2.0),
+    schedule: Annotated[tuple[LightPhase, ...], Field(min_length=1, max_length=16)] = (
+        LightPhase(state="red", seconds=5.0),
+        LightPhase(state="green", seconds=5.0),
+        LightPhase(state="yellow", seconds=2.0),
     )
     begin: Amounts = (0.0, 1.0)
     """Where in its cycle it begins, as a fraction; the seed draws."""

@@ -24,7 +24,7 @@ from pydantic import ValidationError
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import first_problem
 from sightline.protocol.errors import ConfigError, HardwareError
-from sightline.sim.network_emulator import EmulatedLink, Leg, LinkShapes
+from sightline.sim.network_emulator import EmulatedLeg, EmulatedLink, LinkShapes
 
 ADDRESS_A: Final = "10.213.77.1"
 ADDRESS_B: Final = "10.213.77.2"
@@ -120,13 +120,13 @@ def _wait_s(wire: EmulatedLink) -> float:
     return max(0.0, min(_LONGEST_WAIT_S, (due_us - monotonic_us()) / 1e6))
 
 
-def _read(tun: int, leg: Leg) -> None:
+def _read(tun: int, leg: EmulatedLeg) -> None:
     with suppress(BlockingIOError):
         for _ in range(_READS_PER_TURN):
             leg.put(os.read(tun, 2 * MTU_BYTES), monotonic_us())
 
 
-def _write(leg: Leg, tun: int) -> None:
+def _write(leg: EmulatedLeg, tun: int) -> None:
     for packet in leg.take_due(monotonic_us()):
         with suppress(OSError):  # the far end is going away
             os.write(tun, packet)

@@ -34,14 +34,14 @@ from sightline.training.network import (
     Weights,
     network,
 )
-from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes, Sample, drawn_scenes, sample
+from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes, TrainingSample, drawn_scenes, sample
 from sightline.training.schedule import Training
 from sightline.training.shipping import Card, Progress, card_text, chosen_thresholds, final_report, written
 
 _RARE = -4.6  # bias of the heat maps at the beginning: a hundredth of the cells
 
 
-class Network(nn.Module):  # type: ignore[misc]
+class TorchNetwork(nn.Module):  # type: ignore[misc]
     """Runs the table. Takes RGB or BGR as it was trained, uint8 (N, 3, H, W)."""
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ class Network(nn.Module):  # type: ignore[misc]
         return getattr(self, _key(layer))(takes[0])
 
 
-def begin_from(network: Network, weights: Weights, images: Any) -> None:
+def begin_from(network: TorchNetwork, weights: Weights, images: Any) -> None:
     """Give a new network the weights of `folded`, and each normalization its statistics on these pictures, uint8 (N, 3,
     H, W): the output stays the same. The maps of `TAUGHT` are not among the weights and begin at random; the thresholds
     worked into a file's head are learned away."""
@@ -267,7 +267,7 @@ class _State:
     def __init__(self, scenes: DrawnScenes, training: Training, device: Any) -> None:
         self._training, self._made_by = training, _made_by(scenes, training)
         self._device = device
-        self.network = Network().to(device=device, memory_format=torch.channels_last).train()
+        self.network = TorchNetwork().to(device=device, memory_format=torch.channels_last).train()
         self._optimizer = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay)
         self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimizer, training.rate_at)
         self.average = self._copied()
@@ -275,13 +275,13 @@ class _State:
     def _copied(self) -> dict[str, Any]:
         return {name: value.detach().clone() for name, value in self.network.state_dict().items()}
 
-    def begin(self, weights: Weights, batch: list[Sample]) -> None:
+    def begin(self, weights: Weights, batch: list[TrainingSample]) -> None:
         """Take those weights over, for the last round."""
         begin_from(self.network, weights, self._on_device([one.image for one in batch]))
         self.average = self._copied()
         self._schedule.last_epoch = self._training.last_from
 
-    def learn(self, step: int, batch: list[Sample]) -> float:
+    def learn(self, step: int, batch: list[TrainingSample]) -> float:
         """One step; its loss."""
         loss = _loss(self.network(self._on_device([one.image for one in batch])), batch, self._on_device)
         self._optimizer.zero_grad()
@@ -329,7 +329,7 @@ class _State:
         return int(kept["step"])
 
 
-def _loss(given: Any, batch: list[Sample], on_device: Callable[[list[Any]], Any]) -> Any:
+def _loss(given: Any, batch: list[TrainingSample], on_device: Callable[[list[Any]], Any]) -> Any:
     """Focal loss on the heat maps, distances on the geometry of the middle cells."""
     geometry = given[:, len(LABELS) : OUTPUTS]
     wanted, counts = on_device([one.heat for one in batch]), on_device([one.counts for one in batch])[:, None]
@@ -349,18 +349,18 @@ def _focal(heat: Any, wanted: Any, counts: Any) -> Any:
     return -((found + empty) * counts).sum() / is_middle.sum().clamp(min=1.0)
 
 
-def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[list[Sample]]:
+def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[list[TrainingSample]]:
     """Prepared by a second thread, so that two cores have something to do; a few wait, no more."""
     rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
     with ThreadPoolExecutor(1, "batches") as pool:
-        waiting: deque[Future[list[Sample]]] = deque()
+        waiting: deque[Future[list[TrainingSample]]] = deque()
         for step in range(first, training.steps):
             for coming in range(step + len(waiting), min(step + _PREPARED, training.steps)):
                 waiting.append(pool.submit(_batch, scenes, training, coming, rank))
             yield waiting.popleft().result()
 
 
-def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> list[Sample]:
+def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> list[TrainingSample]:
     """This process's share."""
     size_px, count = (WHOLE_PX, training.batch // 2) if training.whole_at(step) else (CUT_PX, training.batch)
     share, shown = max(1, count // training.jobs), training.shown_at(step, len(scenes.truths))

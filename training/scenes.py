@@ -144,7 +144,7 @@ Array = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class TrainingSample:
     """One picture BGR (3, H, W) and its wanted output."""
 
     image: npt.NDArray[np.uint8]
@@ -158,7 +158,9 @@ class Sample:
     """(H/4, W/4): 0 where the right output is not known."""
 
 
-def sample(scenes: DrawnScenes, shown: SceneRange, numbers: tuple[int, int, int], size_px: tuple[int, int]) -> Sample:
+def sample(
+    scenes: DrawnScenes, shown: SceneRange, numbers: tuple[int, int, int], size_px: tuple[int, int]
+) -> TrainingSample:
     """One of the scenes, a cut, a side, defects; the same for the same seed, step, place in a batch."""
     draw = np.random.default_rng(numbers)
     number, around, column = (_harder if shown.harder else _plain)(draw, scenes, shown)
@@ -205,9 +207,9 @@ def _moved(box: Box, left: int, top: int, size_px: tuple[int, int], mirrored: bo
 
 
 def _wanted(image: npt.NDArray[np.uint8], objects: list[tuple[LabelledBox, Box]], unclear: list[Box],
-            others: list[Box]) -> Sample:
+            others: list[Box]) -> TrainingSample:
     rows, columns = image.shape[1] // STRIDE, image.shape[2] // STRIDE
-    one = Sample(image, np.zeros((len(LABELS) + TAUGHT, rows, columns), np.float32),
+    one = TrainingSample(image, np.zeros((len(LABELS) + TAUGHT, rows, columns), np.float32),
                  np.zeros((GEOMETRY, rows, columns), np.float32), np.zeros((rows, columns), np.float32),
                  np.ones((rows, columns), np.float32))
     for box in unclear:
@@ -223,17 +225,17 @@ def _area(box: Box) -> float:
     return max(0.0, box[2] - box[0]) * max(0.0, box[3] - box[1])
 
 
-def _within(box: Box, one: Sample) -> Box:
+def _within(box: Box, one: TrainingSample) -> Box:
     height, width = one.image.shape[1:]
     return max(0.0, box[0]), max(0.0, box[1]), min(float(width), box[2]), min(float(height), box[3])
 
 
-def _blank(one: Sample, box: Box) -> None:
+def _blank(one: TrainingSample, box: Box) -> None:
     x1, y1, x2, y2 = (int(edge // STRIDE) for edge in _within(box, one))
     one.counts[y1 : y2 + 1, x1 : x2 + 1] = 0
 
 
-def _mark(one: Sample, truth: LabelledBox, whole: Box) -> None:
+def _mark(one: TrainingSample, truth: LabelledBox, whole: Box) -> None:
     """A bump on the label's heat map; in its middle cells, where the edges are."""
     box = _within(whole, one)
     if _area(box) <= 0:
@@ -250,7 +252,7 @@ def _mark(one: Sample, truth: LabelledBox, whole: Box) -> None:
         part[sure] = np.broadcast_to(np.asarray(values), bump.shape)[sure]
 
 
-def _mark_other(one: Sample, whole: Box) -> None:
+def _mark_other(one: TrainingSample, whole: Box) -> None:
     """A bump on the last heat map, where enough is left of it."""
     box = _within(whole, one)
     if _area(box) > 0 and _area(box) >= _LEAST_LEFT * _area(whole):

@@ -14,7 +14,7 @@ from sightline.evaluation.processes import worker_pool
 from sightline.evaluation.score.detector_report import (
     LABELLED,
     LIGHT_SHARE,
-    Report,
+    DetectorReport,
     Subject,
     detections,
     detector_checks,
@@ -98,7 +98,7 @@ class Card:
     size_bytes: int
     sha256: str
     validated: int
-    report: Report
+    report: DetectorReport
 
 
 def card_text(card: Card) -> str:
@@ -165,7 +165,7 @@ def _scored(card: Card) -> list[str]:
     ]
 
 
-def _demanded(report: Report) -> list[str]:
+def _demanded(report: DetectorReport) -> list[str]:
     checks = detector_checks(report, "onnx")
     broken = [one for one in checks if not one.ok]
     kept = f"{len(checks) - len(broken)} of {len(checks)} demands are kept"
@@ -228,7 +228,7 @@ def _seen(path: Path, column: Column, seeds: Sequence[int]) -> tuple[str, list[F
     return column.name, results, found
 
 
-def final_report(path: Path, frames: int, progress: Progress) -> Report:
+def final_report(path: Path, frames: int, progress: Progress) -> DetectorReport:
     """Score the model on the seeds that no training and no choice uses."""
     with progress(int((len(COLUMNS) + LIGHT_SHARE) * frames), "scenes for the score") as advance:
         return score_scenes([_subject(path)], frames, each=lambda _: advance(1))

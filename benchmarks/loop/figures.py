@@ -107,7 +107,7 @@ class Course:
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class LoopSample:
     """What was measured of `name` within `seconds`; processor time and memory are by process.
 
     `taken_percent` is the share of the machine's time that others had; `hot_us` one step without pauses (floor only);
@@ -125,7 +125,7 @@ class Sample:
     tries: int = 1
 
 
-def joined(samples: Sequence[Sample]) -> Sample:
+def joined(samples: Sequence[LoopSample]) -> LoopSample:
     """What was measured of one contestant in several turns, as one sample; memory and disturbance are the worst."""
     first, courses = samples[0], [sample.course for sample in samples]
     captured = sum(course.captured for course in courses)
@@ -205,7 +205,7 @@ _PARTS: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
+class LoopFigures:
     """One contestant. Times are from capture to the verdict; None where nothing was answered.
 
     `first_ms` and `last_ms` are medians of the first and the last ten seconds, or fifths of a shorter time; `cpu_ms` is
@@ -239,13 +239,13 @@ def percentile(values: Sequence[float], percent: float) -> float | None:
     return ordered[max(0, int(rank) - 1)]
 
 
-def figures_of(sample: Sample) -> Figures:
+def figures_of(sample: LoopSample) -> LoopFigures:
     """The figures of a sample."""
     course = sample.course
     ages_ms = [age_us / 1000 for _, age_us in course.ages_us]
     parts = _parts(course.ages_us)
     judged = max(1, len(ages_ms))
-    return Figures(
+    return LoopFigures(
         name=sample.name,
         captured=course.captured,
         fps=course.captured * course.answered_percent / 100 / sample.seconds,
@@ -275,7 +275,7 @@ def _parts(ages_us: Sequence[tuple[int, int]]) -> tuple[float | None, float | No
     return median(first) / 1000, median(last) / 1000
 
 
-def loop_checks(figures: Mapping[str, Figures], setting: LoopSetting) -> list[Check]:
+def loop_checks(figures: Mapping[str, LoopFigures], setting: LoopSetting) -> list[Check]:
     """Hold Sightline against the floor of the same run, or, with a detector slower than the camera, against its delay.
 
     And against every rival there is; transports with our eyes are shown and not judged. `figures` has at least the
@@ -293,7 +293,7 @@ def loop_checks(figures: Mapping[str, Figures], setting: LoopSetting) -> list[Ch
     return [*checks, at_most("samples disturbed by others", len(disturbed), "", 0.0)]
 
 
-def _unloaded(ours: Figures, floor: Figures) -> list[Check]:
+def _unloaded(ours: LoopFigures, floor: LoopFigures) -> list[Check]:
     cpu_ms = ours.cpu_ms["vision"] - floor.cpu_ms["vision"]
     return [
         at_most("p50 over floor", _over(ours.p50_ms, floor.p50_ms), "ms", P50_OVER_FLOOR_MS),
@@ -303,7 +303,7 @@ def _unloaded(ours: Figures, floor: Figures) -> list[Check]:
     ]
 
 
-def _loaded(ours: Figures, delay_ms: float) -> list[Check]:
+def _loaded(ours: LoopFigures, delay_ms: float) -> list[Check]:
     drift = _over(ours.last_ms, ours.first_ms)
     drift_percent = None if drift is None or not ours.first_ms else 100 * abs(drift) / ours.first_ms
     return [

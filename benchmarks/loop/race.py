@@ -27,9 +27,9 @@ from sightline.benchmarks.loop.figures import (
     OWN_DETECTOR,
     TAKEN_BOUND_PERCENT,
     Course,
-    Figures,
+    LoopFigures,
+    LoopSample,
     LoopSetting,
-    Sample,
     course_of_tally,
     figures_of,
     joined,
@@ -67,7 +67,7 @@ class Contestant(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Peer:
+class Contestants:
     """A peer, or the floor, running."""
 
     pids: dict[str, int]
@@ -80,9 +80,9 @@ class Peer:
         return course_of_tally(noted["captured_us"], noted["judged_us"], begin_us, end_us)
 
 
-def take_sample(name: str, setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> Sample:
+def take_sample(name: str, setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> LoopSample:
     """The least disturbed of up to `setting.tries` samples. Raises HardwareError if the contestant does not start."""
-    taken: list[Sample] = []
+    taken: list[LoopSample] = []
     while len(taken) < setting.tries:
         number = len(taken) + 1
         taken.append(_take_one(name, setting, folder / f"{name}-{number}", number))
@@ -93,7 +93,7 @@ def take_sample(name: str, setting: LoopSetting, folder: Path, say: Callable[[st
     return min(taken, key=lambda sample: sample.taken_percent)
 
 
-def _take_one(name: str, setting: LoopSetting, folder: Path, number: int) -> Sample:
+def _take_one(name: str, setting: LoopSetting, folder: Path, number: int) -> LoopSample:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     with BenchProcesses(folder) as crew, _running(name, setting, folder, crew) as contestant:
@@ -109,7 +109,7 @@ def _take_one(name: str, setting: LoopSetting, folder: Path, number: int) -> Sam
         crew.end()
         cpu_s = {process: after.cpu_s[process] - before.cpu_s[process] for process in after.cpu_s}
         seconds = (end_us - begin_us) / 1e6
-        return Sample(
+        return LoopSample(
             name, contestant.course(begin_us, end_us), seconds, cpu_s, memory_mb,
             carried_between(carried_before, carried_after), taken_percent(before, after, seconds),
             _hot_us(contestant), number,
@@ -136,11 +136,11 @@ def _running(name: str, setting: LoopSetting, folder: Path, crew: BenchProcesses
         pids = {"robot": crew.start("robot", _MODULE, peer, "robot", settings)}
         pids["vision"] = crew.start("vision", _MODULE, peer, "vision", settings)
         crew.wait_line("robot", "first answer")
-    yield Peer(pids, (port, port + 1), tally)
+    yield Contestants(pids, (port, port + 1), tally)
 
 
 def _hot_us(contestant: Contestant) -> float | None:
-    return json.loads(contestant.tally.read_text())["hot_us"] if isinstance(contestant, Peer) else None
+    return json.loads(contestant.tally.read_text())["hot_us"] if isinstance(contestant, Contestants) else None
 
 
 # `sightline bench loop`: capture to the driver's verdict, against the floor and what others build. Shell.
@@ -156,8 +156,8 @@ class Race:
 
     setting: LoopSetting
     jpeg_bytes: float
-    samples: dict[str, Sample]
-    figures: dict[str, Figures]
+    samples: dict[str, LoopSample]
+    figures: dict[str, LoopFigures]
     checks: list[Check]
 
 
@@ -179,7 +179,7 @@ def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
     return Race(ready, jpeg_bytes, samples, figures, loop_checks(figures, ready))
 
 
-def _samples(setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> dict[str, Sample]:
+def _samples(setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> dict[str, LoopSample]:
     """One of each contestant.
 
     Floor and Sightline take turns, since what is judged is their difference and a shared machine's clock changes from

@@ -63,7 +63,7 @@ _SETTLE_S: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
+class ViewedStretch:
     """When it was, the network process's high-water mark at its end, and what others took of the machine."""
 
     begin_us: int
@@ -124,17 +124,17 @@ def start_viewers(crew: BenchProcesses, endpoint: str, viewers: int) -> dict[str
     return pids
 
 
-def _stretch(ours: Ours, viewers: Mapping[str, int], seconds: float) -> Stretch:
+def _stretch(ours: Ours, viewers: Mapping[str, int], seconds: float) -> ViewedStretch:
     time.sleep(_SETTLE_S)
     pids = {**ours.pids, **viewers}
     before, begin_ns = read_machine(pids), time.monotonic_ns()
     time.sleep(seconds)
     after, end_ns = read_machine(pids), time.monotonic_ns()
     taken = taken_percent(before, after, (end_ns - begin_ns) / 1e9)
-    return Stretch(begin_ns // 1000, end_ns // 1000, high_water_mb(ours.pids["network"]), taken)
+    return ViewedStretch(begin_ns // 1000, end_ns // 1000, high_water_mb(ours.pids["network"]), taken)
 
 
-def _watch(ours: Ours, stretch: Stretch) -> Watch:
+def _watch(ours: Ours, stretch: ViewedStretch) -> Watch:
     return Watch(ours.course(stretch.begin_us, stretch.end_us), stretch.memory_mb, stretch.taken_percent)
 
 

@@ -18,7 +18,7 @@ WEBSOCKET: Final = "websocket"
 
 
 @dataclass(frozen=True, slots=True)
-class Phase:
+class NetworkPhase:
     """Shapes in force for `seconds`, or for its share of the time asked for where that is None."""
 
     shapes: LinkShapes
@@ -29,7 +29,7 @@ class Phase:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class NetworkCase:
     """One network. Bounds that are None are not demanded; `over_loopback_ms` is over the first phase's p50.
 
     A row with a `scene` is more than one robot and one vision: its scene runs and judges it. With `passes_through` the
@@ -38,7 +38,7 @@ class Case:
 
     name: str
     what: str
-    phases: tuple[Phase, ...]
+    phases: tuple[NetworkPhase, ...]
     least_fps: float | None = None
     p50_ms: float | None = None
     p95_ms: float | None = None
@@ -65,8 +65,8 @@ def both(**changes: float | bool) -> LinkShapes:
     return LinkShapes(ab=shape, ba=shape)
 
 
-def _steady(**changes: float | bool) -> tuple[Phase, ...]:
-    return (Phase(both(**changes)),)
+def _steady(**changes: float | bool) -> tuple[NetworkPhase, ...]:
+    return (NetworkPhase(both(**changes)),)
 
 
 _NEAR: Final = both(delay_ms=1)
@@ -74,9 +74,11 @@ _SITE: Final = (ZENOH,)
 """Rows with a router, or with one vision for many robots, which WebSocket has not."""
 
 CASES: Final = (
-    Case("rtt40", "40 ms round trip", _steady(delay_ms=20), least_fps=28, p50_ms=40 + 15),
-    Case("near", "no loss, 1 ms each way", (Phase(both(), judged=False), Phase(_NEAR)), over_first_ms=2 + 1),
-    Case(
+    NetworkCase("rtt40", "40 ms round trip", _steady(delay_ms=20), least_fps=28, p50_ms=40 + 15),
+    NetworkCase(
+        "near", "no loss, 1 ms each way", (NetworkPhase(both(), judged=False), NetworkPhase(_NEAR)), over_first_ms=2 + 1
+    ),
+    NetworkCase(
         "radio",
         "10 Mbit/s, 40 ms round trip, 2 % loss",
         _steady(delay_ms=20, loss=0.02, rate_bit_s=1e7),
@@ -85,89 +87,97 @@ CASES: Final = (
         most_holds=1,
         longest_hold_s=0.5,
     ),
-    Case(
+    NetworkCase(
         "bursts",
         "10 Mbit/s, 40 ms round trip, losses five in a row, 1 % in all",
         _steady(delay_ms=20, burst_start=0.002, burst_end=0.2, rate_bit_s=1e7),
         least_fps=12,
         p95_ms=160,
     ),
-    Case("thin", "2 Mbit/s, 10 ms round trip", _steady(delay_ms=5, rate_bit_s=2e6), p95_ms=250),
-    Case(
+    NetworkCase("thin", "2 Mbit/s, 10 ms round trip", _steady(delay_ms=5, rate_bit_s=2e6), p95_ms=250),
+    NetworkCase(
         "through",
         "2 Mbit/s, 10 ms round trip, a camera's own JPEGs of 46 kB",
         _steady(delay_ms=5, rate_bit_s=2e6),
         p95_ms=250,
         passes_through=True,
     ),
-    Case(
+    NetworkCase(
         "step",
         "10 Mbit/s, then 1 Mbit/s",
         (
-            Phase(both(delay_ms=5, rate_bit_s=1e7), judged=False),
-            Phase(both(delay_ms=5, rate_bit_s=1e6), settle_s=STEP_SETTLES_S),
+            NetworkPhase(both(delay_ms=5, rate_bit_s=1e7), judged=False),
+            NetworkPhase(both(delay_ms=5, rate_bit_s=1e6), settle_s=STEP_SETTLES_S),
         ),
         p95_ms=250,
     ),
-    Case(
+    NetworkCase(
         "rise",
         "1 Mbit/s, then 10 Mbit/s",
         (
-            Phase(both(delay_ms=5, rate_bit_s=1e6), judged=False),
-            Phase(both(delay_ms=5, rate_bit_s=1e7), settle_s=STEP_SETTLES_S),
+            NetworkPhase(both(delay_ms=5, rate_bit_s=1e6), judged=False),
+            NetworkPhase(both(delay_ms=5, rate_bit_s=1e7), settle_s=STEP_SETTLES_S),
         ),
         least_fps=12,
         p95_ms=160,
     ),
-    Case("rtt200", "200 ms round trip", _steady(delay_ms=100), least_fps=20, p95_ms=200 + 60),
-    Case(
+    NetworkCase("rtt200", "200 ms round trip", _steady(delay_ms=100), least_fps=20, p95_ms=200 + 60),
+    NetworkCase(
         "cut",
         "a partition of 5 s",
         (
-            Phase(_NEAR, judged=False),
-            Phase(both(cut=True), CUT_S, judged=False),
-            Phase(_NEAR, settle_s=HEALS_S),
+            NetworkPhase(_NEAR, judged=False),
+            NetworkPhase(both(cut=True), CUT_S, judged=False),
+            NetworkPhase(_NEAR, settle_s=HEALS_S),
         ),
         flows_again_s=HEALS_S,
     ),
-    Case(
+    NetworkCase(
         "nothing",
         "20 Mbit/s, 10 ms round trip, a second of nothing",
         (
-            Phase(both(delay_ms=5, rate_bit_s=2e7), judged=False),
-            Phase(both(cut=True), NOTHING_S, judged=False),
-            Phase(both(delay_ms=5, rate_bit_s=2e7), settle_s=HEALS_S),
+            NetworkPhase(both(delay_ms=5, rate_bit_s=2e7), judged=False),
+            NetworkPhase(both(cut=True), NOTHING_S, judged=False),
+            NetworkPhase(both(delay_ms=5, rate_bit_s=2e7), settle_s=HEALS_S),
         ),
         flows_again_s=HEALS_S,
     ),
-    Case(
+    NetworkCase(
         "medium",
         "one half-duplex medium of 1 Mbit/s, video offered at 4, an operator says STOP",
-        (Phase(both(rate_bit_s=1e6).model_copy(update={"half_duplex": True})),),
+        (NetworkPhase(both(rate_bit_s=1e6).model_copy(update={"half_duplex": True})),),
         scene="medium",
         transports=_SITE,
     ),
-    Case(
+    NetworkCase(
         "uplink",
         "vision, standby, a second reader and a viewer at a router beyond the radio",
-        (Phase(_NEAR),),
+        (NetworkPhase(_NEAR),),
         scene="uplink",
         transports=_SITE,
     ),
-    Case("standby", "the driving vision killed with -9, a standby beside it", (Phase(_NEAR),), scene="standby"),
-    Case(
+    NetworkCase(
+        "standby", "the driving vision killed with -9, a standby beside it", (NetworkPhase(_NEAR),), scene="standby"
+    ),
+    NetworkCase(
         "router",
         "the router killed with -9 and started again after 1 s",
-        (Phase(_NEAR),),
+        (NetworkPhase(_NEAR),),
         scene="router",
         transports=_SITE,
     ),
-    Case("moved", "the robot gets another address", (Phase(_NEAR),), scene="moved", transports=_SITE),
-    Case("fleet", "20 robots at 320x240, 15 fps, into one vision", (Phase(_NEAR),), scene="fleet", transports=_SITE),
+    NetworkCase("moved", "the robot gets another address", (NetworkPhase(_NEAR),), scene="moved", transports=_SITE),
+    NetworkCase(
+        "fleet",
+        "20 robots at 320x240, 15 fps, into one vision",
+        (NetworkPhase(_NEAR),),
+        scene="fleet",
+        transports=_SITE,
+    ),
 )
 
 
-def chosen(only: Iterable[str], transport: str = ZENOH) -> tuple[Case, ...]:
+def chosen(only: Iterable[str], transport: str = ZENOH) -> tuple[NetworkCase, ...]:
     """The rows named, all where none is, of those that `transport` can do. Raises ConfigError for another name."""
     names = tuple(only)
     possible = tuple(row for row in CASES if transport in row.transports)
@@ -178,7 +188,7 @@ def chosen(only: Iterable[str], transport: str = ZENOH) -> tuple[Case, ...]:
     return tuple(row for row in possible if not names or row.name in names)
 
 
-def spans_s(row: Case, seconds: float) -> list[float]:
+def spans_s(row: NetworkCase, seconds: float) -> list[float]:
     """How long each phase lasts when `seconds` are shared among those that have no length of their own."""
     shared = sum(phase.seconds is None for phase in row.phases)
     return [seconds / shared if phase.seconds is None else phase.seconds for phase in row.phases]

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 from sightline.benchmarks.loop.figures import percentile
-from sightline.benchmarks.network.cases import HOLD_AGE_MS, Case
+from sightline.benchmarks.network.cases import HOLD_AGE_MS, NetworkCase
 from sightline.benchmarks.network.watch import NOTED
 from sightline.evaluation.checks import Check, at_least, at_most, worst_checks
 from sightline.robot_side.safety.limits import TICK_US, SafetyConfig, stop_bound
@@ -190,7 +190,7 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else 0.0
 
 
-def network_checks(row: Case, figures: Sequence[NetworkFigures]) -> Iterator[Check]:
+def network_checks(row: NetworkCase, figures: Sequence[NetworkFigures]) -> Iterator[Check]:
     """Hold the last phase of a row against its bounds; `figures` are those of all its phases."""
     last, first = figures[-1], figures[0]
     if row.p50_ms is not None:

@@ -16,14 +16,14 @@ import numpy as np
 
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.processes import BenchProcesses
-from sightline.benchmarks.network.cases import Case, spans_s
+from sightline.benchmarks.network.cases import NetworkCase, spans_s
 from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks, on_old_sight, read_wheel_commands
 from sightline.benchmarks.network.scenes import fleet, moved, router, standby, uplink
 from sightline.benchmarks.network.stage import (
-    BenchWire,
     NetworkRun,
     NetworkSetting,
     Scene,
+    ShapedWire,
     Stage,
     Wiring,
     start_robot,
@@ -44,7 +44,7 @@ _SETTLE_S: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class NetworkProgress:
     """Who hears how it goes: that a run begins, and what came of it."""
 
     begins: Callable[[str], None]
@@ -52,7 +52,11 @@ class Progress:
 
 
 def run_network(
-    rows: Sequence[Case], setting: NetworkSetting, wiring: Wiring, telling: Progress, scenes: Mapping[str, Scene]
+    rows: Sequence[NetworkCase],
+    setting: NetworkSetting,
+    wiring: Wiring,
+    telling: NetworkProgress,
+    scenes: Mapping[str, Scene],
 ) -> list[NetworkRun]:
     """Every row, with every seed where chance has a part in it; `scenes` are added to `SCENES`.
 
@@ -87,7 +91,7 @@ def write_film(folder: Path) -> Path:
     return path
 
 
-def _run(row: Case, stage: Stage, scenes: Mapping[str, Scene]) -> NetworkRun:
+def _run(row: NetworkCase, stage: Stage, scenes: Mapping[str, Scene]) -> NetworkRun:
     try:
         return scenes[row.scene](row, stage) if row.scene else _course(row, stage)
     except HardwareError as error:
@@ -95,7 +99,7 @@ def _run(row: Case, stage: Stage, scenes: Mapping[str, Scene]) -> NetworkRun:
         return NetworkRun(row, stage.seed, 0, (), (Check(why, None, "", 1.0, ok=False),))
 
 
-def _course(row: Case, stage: Stage) -> NetworkRun:
+def _course(row: NetworkCase, stage: Stage) -> NetworkRun:
     """One robot and one vision, the wire shaped phase by phase."""
     with stage.wire() as wire, stage.crew("crew") as crew:
         # From the first packet on: what TCP learned of a better wire would be what is measured.
@@ -126,7 +130,7 @@ def _wheel_checks(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) ->
         yield at_most("moved on frames over 400 ms", float(lines), "lines", 0)
 
 
-def _start(row: Case, wire: BenchWire, crew: BenchProcesses, stage: Stage) -> None:
+def _start(row: NetworkCase, wire: ShapedWire, crew: BenchProcesses, stage: Stage) -> None:
     """Robot and watcher on one side, vision on the other, seen driving over the wire as it is."""
     start_robot(stage, crew, wire.robot_side, passes_through=row.passes_through)
     crew.start(

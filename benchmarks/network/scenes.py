@@ -14,10 +14,10 @@ from typing import Any, Final
 from sightline.benchmarks.loop.figures import percentile
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.processes import BenchProcesses
-from sightline.benchmarks.network.cases import Case
+from sightline.benchmarks.network.cases import NetworkCase
 from sightline.benchmarks.network.figures import WheelCommand, moves_again_s, read_wheel_commands, sent_between
 from sightline.benchmarks.network.robots import Settings
-from sightline.benchmarks.network.stage import EVERYWHERE, BenchWire, NetworkRun, Stage, start_robot, start_vision
+from sightline.benchmarks.network.stage import EVERYWHERE, NetworkRun, ShapedWire, Stage, start_robot, start_vision
 from sightline.benchmarks.network.stop_client import RESET, STOPPED
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.evidence import REQUESTED, MotorRow, measure_stop, moved_on_old_sight, wheel_mps
@@ -37,7 +37,7 @@ _PATIENCE_S: Final = 10.0
 _OTHER_ADDRESS: Final = "10.213.77.3"
 
 
-def standby(row: Case, stage: Stage) -> NetworkRun:
+def standby(row: NetworkCase, stage: Stage) -> NetworkRun:
     """Two visions; whoever drives is killed and a new one stands by, for as long as there is time."""
     endpoint = stage.form.format(ADDRESS_A)
     with _on_site(row, stage) as (wire, ending):
@@ -59,7 +59,7 @@ def standby(row: Case, stage: Stage) -> NetworkRun:
         return _checks(row, stage, harm, "drives again after", TAKES_OVER_S)
 
 
-def router(row: Case, stage: Stage) -> NetworkRun:
+def router(row: NetworkCase, stage: Stage) -> NetworkRun:
     """Everybody is a client of a router that is killed; counted from when there is one again."""
     with _on_site(row, stage) as (wire, ending):
         crews: list[tuple[BenchProcesses, int]] = []
@@ -80,7 +80,7 @@ def router(row: Case, stage: Stage) -> NetworkRun:
         return _checks(row, stage, harm, "drives again after", BACK_S)
 
 
-def moved(row: Case, stage: Stage) -> NetworkRun:
+def moved(row: NetworkCase, stage: Stage) -> NetworkRun:
     """The robot's end of the wire gets another address, and the one before back the next time."""
     addresses = [ADDRESS_A, _OTHER_ADDRESS]
     with _on_site(row, stage) as (wire, ending):
@@ -97,7 +97,7 @@ def moved(row: Case, stage: Stage) -> NetworkRun:
         return _checks(row, stage, harm, "drives again after", BACK_S)
 
 
-def start_router(crew: BenchProcesses, wire: BenchWire) -> int:
+def start_router(crew: BenchProcesses, wire: ShapedWire) -> int:
     """`sightline router` beyond the radio; returns its process id."""
     pid = crew.start("router", "sightline.operator_side.cli.app", "router", "--listen", f"tcp/{EVERYWHERE}:7447",
                      namespace=wire.far_side)
@@ -106,18 +106,18 @@ def start_router(crew: BenchProcesses, wire: BenchWire) -> int:
 
 
 @contextmanager
-def _on_site(row: Case, stage: Stage) -> Iterator[tuple[BenchWire, ExitStack]]:
+def _on_site(row: NetworkCase, stage: Stage) -> Iterator[tuple[ShapedWire, ExitStack]]:
     with stage.wire() as wire, ExitStack() as ending:
         wire.shape(stage.seeded(row.phases[0].shapes))
         yield wire, ending
 
 
-def _start_clients(stage: Stage, wire: BenchWire, ending: ExitStack) -> None:
+def _start_clients(stage: Stage, wire: ShapedWire, ending: ExitStack) -> None:
     start_robot(stage, ending.enter_context(stage.crew("robot")), wire.robot_side, connect=f"tcp/{ADDRESS_B}:7447")
     start_vision(stage, ending.enter_context(stage.crew("vision")), wire.far_side, "tcp/127.0.0.1:7447")
 
 
-def _checks(row: Case, stage: Stage, harm: Callable[[], int], what: str, bound_s: float) -> NetworkRun:
+def _checks(row: NetworkCase, stage: Stage, harm: Callable[[], int], what: str, bound_s: float) -> NetworkRun:
     """Do `harm` until the time is over; the worst of the times until the wheels turned again."""
     _wait_moving(stage)
     end_s = time.monotonic() + stage.setting.seconds
@@ -173,7 +173,7 @@ _AT_ROUTER: Final = "tcp/127.0.0.1:7447"
 _UPLINK_SETTLE_S: Final = 2.0
 
 
-def uplink(row: Case, stage: Stage) -> NetworkRun:
+def uplink(row: NetworkCase, stage: Stage) -> NetworkRun:
     """Bytes from the robot for each frame it sent, crowded over alone."""
     shapes = stage.seeded(row.phases[0].shapes)
     with stage.wire() as wire, ExitStack() as ending:
@@ -199,13 +199,13 @@ def uplink(row: Case, stage: Stage) -> NetworkRun:
     return _uplink_run(row, stage, injected, [_stream_of(notes, one) for one in (alone, crowded)])
 
 
-def _start_notes(crew: BenchProcesses, wire: BenchWire, stage: Stage) -> None:
+def _start_notes(crew: BenchProcesses, wire: ShapedWire, stage: Stage) -> None:
     crew.start("notes", "sightline.benchmarks.network.watch", _AT_ROUTER, str(stage.folder / "notes.json"), "statuses",
                namespace=wire.far_side)
     crew.wait_line("notes", "watching")
 
 
-def _stretch(wire: BenchWire, shapes: LinkShapes, seconds: float) -> tuple[int, int, int]:
+def _stretch(wire: ShapedWire, shapes: LinkShapes, seconds: float) -> tuple[int, int, int]:
     """(from, until, bytes that came from the robot in between)."""
     time.sleep(_UPLINK_SETTLE_S)
     wire.shape(shapes)
@@ -222,7 +222,7 @@ def _stream_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: tuple[int,
     return carried / max(1.0, sent), sent * 1e6 / (end_us - begin_us)
 
 
-def _uplink_run(row: Case, stage: Stage, injected: int, streams: Sequence[tuple[float, float]]) -> NetworkRun:
+def _uplink_run(row: NetworkCase, stage: Stage, injected: int, streams: Sequence[tuple[float, float]]) -> NetworkRun:
     (alone_bytes, alone_fps), (crowded_bytes, crowded_fps) = streams
     checks = (
         at_least("injected", float(injected), "", 1.0),
@@ -243,7 +243,7 @@ MOST_P95_MS: Final = 80.0
 _FLEET_SETTLE_S: Final = 3.0
 
 
-def fleet(row: Case, stage: Stage) -> NetworkRun:
+def fleet(row: NetworkCase, stage: Stage) -> NetworkRun:
     """All of them for as long as there is time; judged by the robot that fared worst."""
     pictures = stage.folder / "small"
     pictures.mkdir()
@@ -310,7 +310,7 @@ _READY_S: Final = 30.0
 _BESIDE_S: Final = 60.0
 
 
-def medium(row: Case, stage: Stage) -> NetworkRun:
+def medium(row: NetworkCase, stage: Stage) -> NetworkRun:
     """STOP, reset and so on for as long as there is time. Raises HardwareError if anything does not run."""
     try:
         with RobotFixture(stage.folder / "rig", Setup(wired=True, camera="heavy")) as rig:
@@ -319,7 +319,7 @@ def medium(row: Case, stage: Stage) -> NetworkRun:
         raise HardwareError(str(error)) from None
 
 
-def _medium_run(row: Case, stage: Stage, rig: RobotFixture) -> NetworkRun:
+def _medium_run(row: NetworkCase, stage: Stage, rig: RobotFixture) -> NetworkRun:
     assert rig.wire is not None
     before = rig.wire.shape(stage.seeded(row.phases[0].shapes))
     ledger = rig.folder / "person.ledger"

@@ -9,7 +9,7 @@ from typing import Any, Final, Protocol
 
 from sightline.benchmarks.loop.ours import ROBOT
 from sightline.benchmarks.loop.processes import BenchProcesses
-from sightline.benchmarks.network.cases import WEBSOCKET, ZENOH, Case
+from sightline.benchmarks.network.cases import WEBSOCKET, ZENOH, NetworkCase
 from sightline.benchmarks.network.figures import NetworkFigures
 from sightline.evaluation.checks import Check
 from sightline.protocol.errors import ConfigError
@@ -22,7 +22,7 @@ _HFOV_DEG: Final = 80.0
 _TOKENED: Final = (WEBSOCKET,)
 
 
-class BenchWire(Protocol):
+class ShapedWire(Protocol):
     """What shapes the packets between the two namespaces."""
 
     robot_side: str
@@ -34,7 +34,7 @@ class BenchWire(Protocol):
         ...
 
 
-Wiring = Callable[[Path], AbstractContextManager[BenchWire]]
+Wiring = Callable[[Path], AbstractContextManager[ShapedWire]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class NetworkSetting:
 class NetworkRun:
     """One row with one seed; `injected` packets or processes were harmed. `facts` are what was seen besides."""
 
-    row: Case
+    row: NetworkCase
     seed: int
     injected: int
     figures: tuple[NetworkFigures, ...]
@@ -78,7 +78,7 @@ class Stage:
     setting: NetworkSetting
     seed: int
 
-    def wire(self) -> AbstractContextManager[BenchWire]:
+    def wire(self) -> AbstractContextManager[ShapedWire]:
         """The two namespaces and what lies between."""
         return self.wiring(self.folder / "wire.log")
 
@@ -103,7 +103,7 @@ class Stage:
         return self.folder / "wheels.csv"
 
 
-Scene = Callable[[Case, Stage], NetworkRun]
+Scene = Callable[[NetworkCase, Stage], NetworkRun]
 
 
 def start_robot(

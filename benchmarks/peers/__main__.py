@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from sightline.benchmarks.peers.contest import Film, Tally, Vision
+from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 _RETRY_S: Final = 0.1
 
@@ -34,7 +34,7 @@ def _part(peer: ModuleType, role: str, settings: dict[str, Any]) -> Callable[[],
     if role == "vision":
         signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
         return partial(peer.vision, _vision(settings), settings["port"])
-    tally, film = Tally(Path(settings["tally"])), Film(Path(settings["pictures"]), settings["fps"])
+    tally, film = Tally(Path(settings["tally"])), RecordedFrames(Path(settings["pictures"]), settings["fps"])
     signal.signal(signal.SIGTERM, lambda *_: _end(tally))
     if role == "alone":
         slow = settings["delay_ms"] or settings["busy_ms"]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Film, Tally, Vision
+    from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 STAMP: Final = struct.Struct("<Q")
 
@@ -33,7 +33,7 @@ def _session(where: str, port: int) -> zenoh.Session:
     )
 
 
-def robot(film: Film, tally: Tally, port: int) -> None:
+def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
     """Publish pictures and listen for commands."""
 
     def on_command(sample: zenoh.Sample) -> None:

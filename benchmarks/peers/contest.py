@@ -22,7 +22,7 @@ class Vision(Protocol):
 # nobody came for in time are not made up for, as with the folder camera of the robot service.
 
 
-class Film:
+class RecordedFrames:
     """`fps` pictures a second, looped."""
 
     def __init__(self, folder: Path, fps: float) -> None:

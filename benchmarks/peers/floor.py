@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Final
 from sightline.protocol.text import parse_twist
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Film, Tally, Vision
+    from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 _HOT_STEPS: Final = 150
 
 
-def alone(film: Film, eyes: Vision, tally: Tally, *, hot: bool) -> None:
+def alone(film: RecordedFrames, eyes: Vision, tally: Tally, *, hot: bool) -> None:
     """Answer pictures at their pace for ever; before that, `hot` measures steps without any pause."""
     if hot:
         tally.hot_us = statistics.median(_step_us(film, eyes) for _ in range(_HOT_STEPS))
@@ -26,7 +26,7 @@ def alone(film: Film, eyes: Vision, tally: Tally, *, hot: bool) -> None:
         tally.judge(t_us)
 
 
-def _step_us(film: Film, eyes: Vision) -> float:
+def _step_us(film: RecordedFrames, eyes: Vision) -> float:
     t_us, jpeg = film.shoot()
     began_ns = time.perf_counter_ns()
     eyes.answer(t_us, jpeg)

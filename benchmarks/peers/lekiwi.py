@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import zmq
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Film, Tally, Vision
+    from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 Socket = zmq.Socket[bytes]
 
@@ -24,7 +24,7 @@ def _newest(context: zmq.Context[Socket], kind: int) -> Socket:
     return made
 
 
-def robot(film: Film, tally: Tally, port: int) -> None:
+def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
     """Tick at the pictures' pace: command in, picture out."""
     context = zmq.Context()
     commands, observations = _newest(context, zmq.PULL), _newest(context, zmq.PUSH)

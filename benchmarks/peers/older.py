@@ -16,12 +16,12 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.sync.client import ClientConnection, connect
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Film, Tally, Vision
+    from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 COMMAND_PERIOD_S: Final = 0.0551
 
 
-class Wheels:
+class RepeatedCommand:
     """The newest command, given to the motors again and again by a thread."""
 
     def __init__(self, tally: Tally) -> None:
@@ -41,14 +41,14 @@ class Wheels:
                 self._tally.judge(int(t_us))
 
 
-def robot(film: Film, tally: Tally, port: int) -> None:
+def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
     """Serve pictures to whoever connects."""
     asyncio.run(_serve(film, tally, port))
 
 
-async def _serve(film: Film, tally: Tally, port: int) -> None:
+async def _serve(film: RecordedFrames, tally: Tally, port: int) -> None:
     clients: set[ServerConnection] = set()
-    wheels = Wheels(tally)
+    wheels = RepeatedCommand(tally)
 
     async def hear(client: ServerConnection) -> None:
         clients.add(client)

@@ -14,13 +14,13 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.sync.client import connect
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Film, Tally, Vision
+    from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 STAMP: Final = struct.Struct("<Q")
 ANSWER: Final = struct.Struct("<Qdd")
 
 
-def robot(film: Film, tally: Tally, port: int) -> None:
+def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
     """Ask the vision at `port` about one picture after the other."""
     connection = connect(f"ws://127.0.0.1:{port}", compression=None, max_size=None)
     while True:

@@ -12,13 +12,13 @@ import time
 from typing import IO, TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from sightline.benchmarks.peers.contest import Film, Tally, Vision
+    from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 HEAD: Final = struct.Struct("<IQ")
 """Bytes of JPEG, and the capture time in microseconds, by which the answer is told apart in measuring."""
 
 
-def robot(film: Film, tally: Tally, port: int) -> None:
+def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
     """Serve one vision."""
     with socket.create_server(("127.0.0.1", port)) as server:
         connection, _ = server.accept()

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, Final
 
 from sightline.conformance.case import Bench, Level, Suite, itself
-from sightline.conformance.vision.fixture import Answer, RobotPlayed, met
+from sightline.conformance.vision.fixture import RobotPlayed, VisionAnswer, met
 from sightline.conformance.vision.images import png
 from sightline.protocol.channels import MAX_HEADER_BYTES
 from sightline.protocol.errors import RejectReason, WireError
@@ -23,7 +23,7 @@ _ECHO: Final = {"channel", "session", "seq", "t_us"}
 _FOUR_DECIMALS: Final = re.compile(rb"[+-]?[0-9]+\.[0-9]{4}\|[+-]?[0-9]+\.[0-9]{4}")
 
 
-def _sample(bench: Bench, junk: int = 0) -> list[Answer]:
+def _sample(bench: Bench, junk: int = 0) -> list[VisionAnswer]:
     """Answers to six views, of a target beside and ahead and of none, and to so many that are not pictures."""
     robot = RobotPlayed(bench)
     for name in ("left", "left", "centre", "centre", "right", "absent"):
@@ -210,7 +210,7 @@ def no_infinite_numbers(bench: Bench) -> None:
 # --- grammar of twists -----------------------------------------------------------------------------------------------
 
 
-def _twists(bench: Bench) -> list[Answer]:
+def _twists(bench: Bench) -> list[VisionAnswer]:
     twists = [one for one in _sample(bench) if one.is_twist]
     bench.need(twists, "it sends no twists")
     return twists
@@ -240,7 +240,7 @@ def four_decimals(bench: Bench) -> None:
         bench.expect(not _is_number_pair(twist) or _FOUR_DECIMALS.fullmatch(twist.text), f"{twist.text!r}")
 
 
-def _is_number_pair(twist: Answer) -> bool:
+def _is_number_pair(twist: VisionAnswer) -> bool:
     try:
         parse_twist(twist.text)
     except WireError:
@@ -269,7 +269,7 @@ _AHEAD_RAD_S: Final = 0.2
 _STILL_MPS: Final = 0.001
 
 
-def _last_twist(bench: Bench, robot: RobotPlayed, name: str, frames: int = _SECOND) -> Answer:
+def _last_twist(bench: Bench, robot: RobotPlayed, name: str, frames: int = _SECOND) -> VisionAnswer:
     """What it reports after so many pictures of one kind."""
     mark = bench.mark()
     robot.film(name, frames, _EVERY_US)

@@ -5,14 +5,14 @@ from collections.abc import Callable
 from typing import Any
 
 from sightline.conformance.case import Bench, Level, Suite, itself
-from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, Answer, RobotPlayed, Sent, met
+from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, RobotPlayed, Sent, VisionAnswer, met
 from sightline.conformance.vision.images import png
 
 SUITE = Suite("V")
 _BURST = 20
 
 
-def _cited(bench: Bench) -> list[tuple[Sent, Answer]]:
+def _cited(bench: Bench) -> list[tuple[Sent, VisionAnswer]]:
     robot = RobotPlayed(bench)
     sent = robot.film("left", 6, 100_000)
     pairs = [(one, answer) for one in sent for answer in robot.answers_to(one)]
@@ -145,7 +145,7 @@ def an_hour_is_fine(_bench: Bench, robot: RobotPlayed) -> None:
 # --- its own sequence ------------------------------------------------------------------------------------------------
 
 
-def _rises(bench: Bench, answers: list[Answer], what: str) -> None:
+def _rises(bench: Bench, answers: list[VisionAnswer], what: str) -> None:
     numbers = [one.fields.get("seq") for one in answers]
     reported = [number for number in numbers if isinstance(number, int)]
     bench.expect(all(one < other for one, other in itertools.pairwise(reported)), f"{what} came as {reported}")

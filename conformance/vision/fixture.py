@@ -46,7 +46,7 @@ class Sent:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class VisionAnswer:
     """A twist or an ack. `fields` is its header as JSON, empty if it is invalid."""
 
     received: Received
@@ -86,13 +86,13 @@ class Answer:
         return f"a {self.received.message.channel.name} that cites {json.dumps(self.echo)[:160]}"
 
 
-def read_answer(received: Received) -> Answer:
+def read_answer(received: Received) -> VisionAnswer:
     """`heard` with its header read as any JSON object."""
     try:
         fields = json.loads(received.message.header)
     except (ValueError, RecursionError):
         fields = {}
-    return Answer(received, fields if isinstance(fields, dict) else {})
+    return VisionAnswer(received, fields if isinstance(fields, dict) else {})
 
 
 def met(bench: Bench) -> "RobotPlayed":
@@ -119,7 +119,7 @@ class RobotPlayed:
         self._began_us, self._mark, self._dropped = bench.now_us, bench.mark(), bench.dropped_here.total()
         self._first_t_us, self._last_t_us, self._next_seq = first_t_us, first_t_us - 1, first_seq
         self._stamps, self._stopped = itertools.count(1), False
-        self._read: dict[int, Answer] = {}
+        self._read: dict[int, VisionAnswer] = {}
         self._announce_camera()
         self._announce_status()
 
@@ -186,7 +186,7 @@ class RobotPlayed:
 
     # --- what it receives ---------------------------------------------------------------------------------------------
 
-    def answers(self, since: int | None = None) -> list[Answer]:
+    def answers(self, since: int | None = None) -> list[VisionAnswer]:
         """Twists and acks since this robot began, or since a mark, in the order of their arrival."""
         since = self._mark if since is None else since
         received = [*self.bench.received(TWIST, since), *self.bench.received(ACK, since)]
@@ -195,11 +195,11 @@ class RobotPlayed:
                 self._read[one.number] = read_answer(one)
         return [self._read[number] for number in sorted(one.number for one in received)]
 
-    def twists(self, since: int | None = None) -> list[Answer]:
+    def twists(self, since: int | None = None) -> list[VisionAnswer]:
         """Only what drives."""
         return [one for one in self.answers(since) if one.is_twist]
 
-    def answers_to(self, sent: Sent) -> list[Answer]:
+    def answers_to(self, sent: Sent) -> list[VisionAnswer]:
         """Whatever cites `sent`."""
         return [one for one in self.answers() if one.cites(sent)]
 
@@ -207,7 +207,7 @@ class RobotPlayed:
         """Whether an answer to `sent` comes in time."""
         return self.bench.wait(lambda: self.answers_to(sent), within_us)
 
-    def answer_to(self, sent: Sent, within_us: int = ANSWER_US) -> Answer:
+    def answer_to(self, sent: Sent, within_us: int = ANSWER_US) -> VisionAnswer:
         """The answer to `sent`; the case fails if none comes in time."""
         if not self.is_answered(sent, within_us):
             self.need_nothing_dropped()
@@ -224,7 +224,7 @@ class RobotPlayed:
         twist = any(one.is_twist for frame in sent for one in self.answers_to(frame))
         self.bench.expect(twist, "no twist came")
 
-    def twists_to(self, sent: Sent) -> list[Answer]:
+    def twists_to(self, sent: Sent) -> list[VisionAnswer]:
         """Whatever cites `sent` and drives."""
         return [one for one in self.answers_to(sent) if one.is_twist]
 
@@ -250,7 +250,7 @@ class RobotPlayed:
         self.bench.rest(FRAME_US)
         return False
 
-    def expect_driven(self, after: str) -> Answer:
+    def expect_driven(self, after: str) -> VisionAnswer:
         """One of three plain frames is answered by a twist; the case fails otherwise."""
         for _ in range(3):
             sent = self.frame()

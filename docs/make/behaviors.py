@@ -35,7 +35,7 @@ from sightline.evaluation.score.figures import (
     median_and_worst,
     score,
 )
-from sightline.evaluation.score.runs import Case, run_of
+from sightline.evaluation.score.runs import ScoreCase, run_of
 from sightline.operator_side.terminal import progress_bar
 from sightline.sim.scenario import Scenario, Start, load_scenario
 from sightline.sim.truth import Truth
@@ -77,12 +77,12 @@ class Row:
         """What a baseline is compared with."""
         return Row(self.scenario, "", self.robot)
 
-    def cases(self, seeds: Sequence[int], look: str | None = None) -> list[Case]:
+    def cases(self, seeds: Sequence[int], look: str | None = None) -> list[ScoreCase]:
         """Its runs in one light, the scenario's own if None."""
         mission = self.baseline or None
-        return [Case(self.scenario, LATENCY_MS, LOSS, seed, None, mission, self.robot, look) for seed in seeds]
+        return [ScoreCase(self.scenario, LATENCY_MS, LOSS, seed, None, mission, self.robot, look) for seed in seeds]
 
-    def all_cases(self, seeds: Sequence[int]) -> list[Case]:
+    def all_cases(self, seeds: Sequence[int]) -> list[ScoreCase]:
         """Its runs in every light."""
         return [case for look in (None, *self.looks) for case in self.cases(seeds, look)]
 
@@ -226,14 +226,14 @@ def _plot(axes: Axes, runs: Sequence[SpeedRun], label: str, values: Sequence[Seq
 # The text of docs/behaviours.md, from the scores of its runs. Pure.
 
 
-Results = Mapping[Case, Score]
+Results = Mapping[ScoreCase, Score]
 SPEEDS: Final = "thymio-speeds.png"
 _ALSO_OF_BASELINES: Final = ("unseen_percent", "target_contacts")
 _UNITS: Final = {**UNITS, "unseen_percent": "%"}
 _IN_LIGHT: Final = ("wrong_states_percent", "crossed_on_red", "crossed_late", "least_crossings", "start_s")
 
 
-def picture_name(case: Case) -> str:
+def picture_name(case: ScoreCase) -> str:
     """The file of the picture of this run."""
     return "-".join(part for part in (case.scenario, case.robot and f"on-{case.robot}", case.mission) if part) + ".png"
 
@@ -412,12 +412,12 @@ def write_page(page: Path, seeds: Sequence[int], jobs: int, rows: Sequence[Row] 
     return all(kept(row, results, seeds) for row in rows)
 
 
-def _picture(folder: Path, case: Case, seeds: Sequence[int]) -> Path | None:
+def _picture(folder: Path, case: ScoreCase, seeds: Sequence[int]) -> Path | None:
     """Where the picture of this run goes; only the first seed's run in the scenario's own light has one."""
     return folder / picture_name(case) if case.seed == seeds[0] and case.look is None else None
 
 
-def _run(case: Case, picture: Path | None) -> Score:
+def _run(case: ScoreCase, picture: Path | None) -> Score:
     scenario, run = run_of(case)
     if picture is not None:
         whose = f" on {case.robot}" if case.robot else ""

@@ -15,7 +15,7 @@ from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.evidence import INJECTED, REQUESTED, MotorRow, most_gain_mps2, wheel_mps
 from sightline.evaluation.faults.fixture import READY_S, RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
-from sightline.evaluation.faults.runner import Case, Injected
+from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.evaluation.faults.sampler import Hole
 from sightline.operator_side.config.errors import no_such_name
 from sightline.protocol.clock import monotonic_us
@@ -156,20 +156,36 @@ _SCRIPT: Final = Setup()
 _ENDED: Final = "zero is the last speed told, exit code 0, port free <= 2 s"
 
 PROCESS_CASES: Final = (
-    Case("vision.kill", "vision: SIGKILL", _kill_vision, _VISION, short=True),
-    Case("vision.pause", "vision: SIGSTOP 3 s, then SIGCONT", _pause_vision, _VISION, again=True),
-    Case("vision.raises", "vision: the detector raises", _fail_detector, Setup("vision", "raises")),
-    Case("vision.hangs", "vision: the detector hangs", _fail_detector, Setup("vision", "hangs"), short=True),
-    Case("vision.slow", "vision: the detector takes 330 ms", _slow_detector, Setup("vision", "slow"), stops=False),
-    Case("vision.restart", "vision: killed and started again", _restart_vision, _VISION, again=True),
-    Case("network.kill", "network process: SIGKILL", _kill_network, _SCRIPT, blind=True, again=True, short=True),
-    Case("network.pause", "network process: SIGSTOP 3 s", _pause_network, _SCRIPT, blind=True, again=True),
-    Case("network.gil", "network process: C code holds the interpreter 1 s", _hold_gil, _SCRIPT, blind=True, again=True,
-        short=True),
-    Case("driver.starved", "robot: four busy processes beside it; then vision: SIGKILL", _starve, _SCRIPT, alone=True),
+    FaultCase("vision.kill", "vision: SIGKILL", _kill_vision, _VISION, short=True),
+    FaultCase("vision.pause", "vision: SIGSTOP 3 s, then SIGCONT", _pause_vision, _VISION, again=True),
+    FaultCase("vision.raises", "vision: the detector raises", _fail_detector, Setup("vision", "raises")),
+    FaultCase("vision.hangs", "vision: the detector hangs", _fail_detector, Setup("vision", "hangs"), short=True),
+    FaultCase("vision.slow", "vision: the detector takes 330 ms", _slow_detector, Setup("vision", "slow"), stops=False),
+    FaultCase("vision.restart", "vision: killed and started again", _restart_vision, _VISION, again=True),
+    FaultCase("network.kill", "network process: SIGKILL", _kill_network, _SCRIPT, blind=True, again=True, short=True),
+    FaultCase("network.pause", "network process: SIGSTOP 3 s", _pause_network, _SCRIPT, blind=True, again=True),
+    FaultCase(
+        "network.gil",
+        "network process: C code holds the interpreter 1 s",
+        _hold_gil,
+        _SCRIPT,
+        blind=True,
+        again=True,
+        short=True,
+    ),
+    FaultCase(
+        "driver.starved", "robot: four busy processes beside it; then vision: SIGKILL", _starve, _SCRIPT, alone=True
+    ),
     *(
-        Case(f"end.{number.name.lower()}", f"robot: {number.name} while moving", partial(_end_robot, number=number),
-            _SCRIPT, blind=True, also=_ENDED, short=number is signal.SIGTERM)
+        FaultCase(
+            f"end.{number.name.lower()}",
+            f"robot: {number.name} while moving",
+            partial(_end_robot, number=number),
+            _SCRIPT,
+            blind=True,
+            also=_ENDED,
+            short=number is signal.SIGTERM,
+        )
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     ),
 )
@@ -226,7 +242,7 @@ _MIXED: Final = LinkShape(delay_ms=10, jitter_ms=5, reorder=0.1, duplicate=0.1)
 _THIN: Final = LinkShape(rate_bit_s=1e6)
 
 NETWORK_CASES: Final = (
-    Case(
+    FaultCase(
         "wire.cut3",
         "network: partition 3 s",
         partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=3.0),
@@ -235,7 +251,7 @@ NETWORK_CASES: Final = (
         again=True,
         short=True,
     ),
-    Case(
+    FaultCase(
         "wire.cut15",
         "network: partition 15 s",
         partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=15.0),
@@ -243,7 +259,7 @@ NETWORK_CASES: Final = (
         blind=True,
         again=True,
     ),
-    Case(
+    FaultCase(
         "wire.no_frames",
         "network: one direction only, frames lost",
         partial(_cut, shapes=LinkShapes(ab=CUT), seconds=3.0),
@@ -252,7 +268,7 @@ NETWORK_CASES: Final = (
         by_frame=True,
         again=True,
     ),
-    Case(
+    FaultCase(
         "wire.no_commands",
         "network: one direction only, commands lost",
         partial(_cut, shapes=LinkShapes(ba=CUT), seconds=3.0),
@@ -260,7 +276,7 @@ NETWORK_CASES: Final = (
         blind=True,
         again=True,
     ),
-    Case(
+    FaultCase(
         "wire.delay",
         "network: 300 ms each way",
         partial(_worsen, shapes=LinkShapes(ab=_SLOW, ba=_SLOW)),
@@ -268,7 +284,7 @@ NETWORK_CASES: Final = (
         stops=False,
         again=True,
     ),
-    Case(
+    FaultCase(
         "wire.loss",
         "network: 20 % loss each way",
         partial(_worsen, shapes=LinkShapes(ab=LOSSY, ba=LOSSY)),
@@ -276,7 +292,7 @@ NETWORK_CASES: Final = (
         stops=False,
         again=True,
     ),
-    Case(
+    FaultCase(
         "wire.mixed",
         "network: 10 % reordered, 10 % duplicated",
         partial(_worsen, shapes=LinkShapes(ab=_MIXED, ba=_MIXED)),
@@ -284,7 +300,7 @@ NETWORK_CASES: Final = (
         stops=False,
         again=True,
     ),
-    Case(
+    FaultCase(
         "wire.thin",
         "network: 1 Mbit/s under a camera of 4 Mbit/s",
         partial(_worsen, shapes=LinkShapes(ab=_THIN, ba=_THIN)),
@@ -292,7 +308,7 @@ NETWORK_CASES: Final = (
         stops=False,
         again=True,
     ),
-    Case("wire.flaps", "network: gone and back every 0.5 s", _flap, _WIRED, stops=False, again=True),
+    FaultCase("wire.flaps", "network: gone and back every 0.5 s", _flap, _WIRED, stops=False, again=True),
 )
 
 
@@ -387,21 +403,21 @@ def _holder_dies(rig: RobotFixture) -> Injected:
     return Injected(1, at_us, last_us + LEASE_US - 20_000, bool(moving), checks)
 
 
-def _command_case(name: str, what: str, *, short: bool = False) -> Case:
-    return Case(f"command.{name}", f"commands: {what}", _attack, Setup(fault=name), short=short)
+def _command_case(name: str, what: str, *, short: bool = False) -> FaultCase:
+    return FaultCase(f"command.{name}", f"commands: {what}", _attack, Setup(fault=name), short=short)
 
 
 COMMAND_CASES: Final = (
     _command_case("late", "each 500 ms after its frame"),
     _command_case("replay", "this session's, replayed", short=True),
-    Case("command.earlier", "commands: an earlier session's, replayed", _replay_earlier, Setup()),
+    FaultCase("command.earlier", "commands: an earlier session's, replayed", _replay_earlier, Setup()),
     _command_case("never_issued", "citing frames never issued"),
     _command_case("from_future", "citing frames from the future"),
     _command_case("wrapped", "their numbers wrap"),
     _command_case(
         "malformed", "nan, inf, 1e400, underscores, full-width, empty, 3 fields, 257 bytes, 10 MB, binary ..."
     ),
-    Case(
+    FaultCase(
         "command.flood",
         "commands: an old one at 10 kHz",
         partial(_attack, at_least_times=FLOOD_AT_LEAST),
@@ -410,7 +426,7 @@ COMMAND_CASES: Final = (
         short=True,
         alone=True,
     ),
-    Case(
+    FaultCase(
         "command.reversal",
         "commands: full speed ahead and back at 50 Hz",
         _reverse,
@@ -418,8 +434,8 @@ COMMAND_CASES: Final = (
         also=f"speed changes by <= {GAIN_MPS2:g} m/s2",
     ),
     _command_case("heartbeat", "none, but frames are acknowledged and the link is alive", short=True),
-    Case("driver.two", "drivers: two visions, then none", _two_visions, Setup(), also="the second is not obeyed"),
-    Case(
+    FaultCase("driver.two", "drivers: two visions, then none", _two_visions, Setup(), also="the second is not obeyed"),
+    FaultCase(
         "driver.person",
         "drivers: a person takes over at full speed, and is lost",
         _take_over,
@@ -427,7 +443,7 @@ COMMAND_CASES: Final = (
         blind=True,
         also="obeyed <= 1000 ms; vision does not resume by itself",
     ),
-    Case(
+    FaultCase(
         "driver.dies",
         "drivers: the holder dies while another waits",
         _holder_dies,
@@ -518,11 +534,11 @@ _WEB: Final = Setup(web=True)
 _DRIVEN: Final = f"speed stays >= {KEPT_MPS:g} m/s while they are there"
 
 CLIENT_CASES: Final = (
-    Case("crowd.viewers", f"drivers: {VIEWERS} WebSocket viewers, one never reading; then the driver dies",
+    FaultCase("crowd.viewers", f"drivers: {VIEWERS} WebSocket viewers, one never reading; then the driver dies",
         partial(_load, kind="viewers", at_least_times=VIEWERS), _WEB, also=_DRIVEN, alone=True),
-    Case("crowd.handshakes", f"drivers: {HANDSHAKES} half-open handshakes; then the driver dies",
+    FaultCase("crowd.handshakes", f"drivers: {HANDSHAKES} half-open handshakes; then the driver dies",
         partial(_load, kind="handshakes", at_least_times=HANDSHAKES), _WEB, also=_DRIVEN, alone=True),
-    Case("driver.tick", "robot: four busy processes beside it for 24 s; then the driver dies", _keep_time, Setup(),
+    FaultCase("driver.tick", "robot: four busy processes beside it for 24 s; then the driver dies", _keep_time, Setup(),
         also=f"p99.9 of ticks <= {TICK_MS:g} ms, lateness published", alone=True),
 )
 
@@ -635,40 +651,91 @@ def _drive_on(rig: RobotFixture) -> Injected:
 _STAYS: Final = "and stays at zero"
 
 OPERATOR_CASES: Final = (
-    Case("camera.unplugged", "camera: unplugged 3 s", partial(_spoil_camera, mode="unplugged"), _VISION, again=True),
-    Case("camera.frozen", "camera: frozen 3 s, with new stamps", partial(_spoil_camera, mode="frozen"), _SCRIPT,
-        blind=True, again=True, short=True),
-    Case("camera.black", "camera: black 3 s", _blacken, _VISION, stops=False, again=True,
-        also=f"forward speed zero <= {COASTED_MS:g} ms"),
-    Case("camera.slow", "camera: 5 fps for 3 s", partial(_spoil_camera, mode="slow"), _SCRIPT, stops=False, again=True),
-    Case("camera.bomb", "camera: a JPEG that claims 65500 x 65500, 3 s", partial(_spoil_camera, mode="bomb"), _VISION,
-        blind=True, again=True),
-    Case("camera.resized", "camera: the picture changes size, 3 s", partial(_spoil_camera, mode="resized"), _VISION,
-        blind=True, again=True),
-    Case("stop.driving", "STOP: while driving", _stop, _SCRIPT, blind=True, also=_STAYS, short=True),
-    Case("stop.lossy", "STOP: while 20 % of packets are lost", _stop_lossy, Setup(wired=True), blind=True,
-        zero_ms=LOSSY_STOP_ZERO_MS, distance_m=1.0, also=_STAYS),
-    Case("stop.commands", "STOP: then 1000 commands", _stop_then_commands, Setup(fault="thousand"), blind=True,
-        also=_STAYS),
-    Case("stop.restart", "STOP: then the network process is killed", _stop_then_restart, _SCRIPT, blind=True,
-        also=_STAYS),
-    Case("stop.reset", "STOP: then reset while moving", _reset_moving, _SCRIPT, blind=True, also="refused; " + _STAYS),
-    Case("clock.ahead", "clocks: a day ahead, then vision: SIGKILL", _drive_on, Setup(clock=f"{DAY_S}")),
-    Case("clock.behind", "clocks: a day behind, then vision: SIGKILL", _drive_on, Setup(clock=f"-{DAY_S}")),
-    Case("clock.steps", "clocks: an hour forth and back every 0.5 s", _drive_on,
-        Setup(clock="3600 * (int(2 * right()) % 3 - 1)")),
+    FaultCase(
+        "camera.unplugged", "camera: unplugged 3 s", partial(_spoil_camera, mode="unplugged"), _VISION, again=True
+    ),
+    FaultCase(
+        "camera.frozen",
+        "camera: frozen 3 s, with new stamps",
+        partial(_spoil_camera, mode="frozen"),
+        _SCRIPT,
+        blind=True,
+        again=True,
+        short=True,
+    ),
+    FaultCase(
+        "camera.black",
+        "camera: black 3 s",
+        _blacken,
+        _VISION,
+        stops=False,
+        again=True,
+        also=f"forward speed zero <= {COASTED_MS:g} ms",
+    ),
+    FaultCase(
+        "camera.slow", "camera: 5 fps for 3 s", partial(_spoil_camera, mode="slow"), _SCRIPT, stops=False, again=True
+    ),
+    FaultCase(
+        "camera.bomb",
+        "camera: a JPEG that claims 65500 x 65500, 3 s",
+        partial(_spoil_camera, mode="bomb"),
+        _VISION,
+        blind=True,
+        again=True,
+    ),
+    FaultCase(
+        "camera.resized",
+        "camera: the picture changes size, 3 s",
+        partial(_spoil_camera, mode="resized"),
+        _VISION,
+        blind=True,
+        again=True,
+    ),
+    FaultCase("stop.driving", "STOP: while driving", _stop, _SCRIPT, blind=True, also=_STAYS, short=True),
+    FaultCase(
+        "stop.lossy",
+        "STOP: while 20 % of packets are lost",
+        _stop_lossy,
+        Setup(wired=True),
+        blind=True,
+        zero_ms=LOSSY_STOP_ZERO_MS,
+        distance_m=1.0,
+        also=_STAYS,
+    ),
+    FaultCase(
+        "stop.commands",
+        "STOP: then 1000 commands",
+        _stop_then_commands,
+        Setup(fault="thousand"),
+        blind=True,
+        also=_STAYS,
+    ),
+    FaultCase(
+        "stop.restart", "STOP: then the network process is killed", _stop_then_restart, _SCRIPT, blind=True, also=_STAYS
+    ),
+    FaultCase(
+        "stop.reset", "STOP: then reset while moving", _reset_moving, _SCRIPT, blind=True, also="refused; " + _STAYS
+    ),
+    FaultCase("clock.ahead", "clocks: a day ahead, then vision: SIGKILL", _drive_on, Setup(clock=f"{DAY_S}")),
+    FaultCase("clock.behind", "clocks: a day behind, then vision: SIGKILL", _drive_on, Setup(clock=f"-{DAY_S}")),
+    FaultCase(
+        "clock.steps",
+        "clocks: an hour forth and back every 0.5 s",
+        _drive_on,
+        Setup(clock="3600 * (int(2 * right()) % 3 - 1)"),
+    ),
 )
 
 
 # All rows of the fault bench, and the choice among them. Shell (what the rows inject is).
 
 
-CASES: Final[tuple[Case, ...]] = (
+CASES: Final[tuple[FaultCase, ...]] = (
     *PROCESS_CASES, *NETWORK_CASES, *COMMAND_CASES, *CLIENT_CASES, *OPERATOR_CASES,
 )
 
 
-def chosen(only: Sequence[str], *, short: bool) -> list[Case]:
+def chosen(only: Sequence[str], *, short: bool) -> list[FaultCase]:
     """The rows named by id or by what comes before the dot; all without names. Raises ConfigError for no such row."""
     for name in only:
         if not any(_is_named(row, name) for row in CASES):
@@ -679,5 +746,5 @@ def chosen(only: Sequence[str], *, short: bool) -> list[Case]:
     ]
 
 
-def _is_named(row: Case, name: str) -> bool:
+def _is_named(row: FaultCase, name: str) -> bool:
     return name in (row.id, row.id.partition(".")[0])

@@ -39,7 +39,7 @@ _AGAIN_S: Final = 0.25
 _BEGUN: Final = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgr"
 
 
-class Viewer:
+class LoadViewer:
     """One viewer; `reads` is False for the one that takes nothing but the hello out of its connection."""
 
     def __init__(self, ledger: EventLog, role: str, *, reads: bool) -> None:
@@ -68,7 +68,7 @@ class Viewer:
 def view(endpoint: str, ledger: EventLog) -> None:
     """All viewers, for ever."""
     roles = ["operator"] * RESERVED_SLOTS + ["viewer"] * (VIEWERS - RESERVED_SLOTS)
-    viewers = [Viewer(ledger, role, reads=number != RESERVED_SLOTS) for number, role in enumerate(roles)]
+    viewers = [LoadViewer(ledger, role, reads=number != RESERVED_SLOTS) for number, role in enumerate(roles)]
     dialers = [Client(parse_websocket_endpoint(endpoint), viewer.watch, lambda _reason: None) for viewer in viewers]
     waiting = list(zip(viewers, dialers, strict=True))
     while waiting:

@@ -5,9 +5,9 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from sightline.evaluation.checks import Check, number, worst_checks
-from sightline.evaluation.faults.runner import Outcome
+from sightline.evaluation.faults.runner import FaultOutcome
 
-Results = Sequence[Sequence[Outcome]]
+Results = Sequence[Sequence[FaultOutcome]]
 _COUNTED_FROM: Final = 1000
 
 
@@ -17,7 +17,7 @@ def passed(results: Results) -> bool:
     return bool(ran) and all(outcome.ok for outcome in ran)
 
 
-def run_line(outcome: Outcome) -> str:
+def run_line(outcome: FaultOutcome) -> str:
     """One run, for a person who waits."""
     if outcome.skipped:
         return f"{outcome.row.id:<22} skip  {outcome.skipped}"
@@ -26,7 +26,7 @@ def run_line(outcome: Outcome) -> str:
     return f"{outcome.row.id:<22} {'ok  ' if outcome.ok else 'FAIL'}  {text}"
 
 
-def progress_line(outcome: Outcome, done: int, total: int, left_s: float) -> str:
+def progress_line(outcome: FaultOutcome, done: int, total: int, left_s: float) -> str:
     """`run_line` with how far the whole is."""
     left = f"{left_s / 60:.0f} min" if left_s >= 90 else f"{left_s:.0f} s"
     return f"{done:>{len(str(total))}}/{total} ({left} left)  {run_line(outcome)}"

@@ -49,7 +49,7 @@ class Injected:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class FaultCase:
     """One fault. `inject` is given a robot at speed and returns when there is nothing more to see."""
 
     id: str
@@ -85,10 +85,10 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class FaultOutcome:
     """What became of one run of a row. `skipped` says why it could not run."""
 
-    row: Case
+    row: FaultCase
     checks: tuple[Check, ...] = ()
     skipped: str = ""
     trouble: str = ""
@@ -109,28 +109,28 @@ _WATCHED_US: Final = 1_000_000
 """After the injection: the time in which a stop is measured, and a stalled sampler spoils it."""
 
 
-def run_case(row: Case, folder: Path, run: int = 1) -> Outcome:
+def run_case(row: FaultCase, folder: Path, run: int = 1) -> FaultOutcome:
     """Run a row, again while its sampler stalled; its files stay in `folder` unless all was well."""
     if row.setup.wired and (why := why_impossible()):
-        return Outcome(row, skipped=why)
+        return FaultOutcome(row, skipped=why)
     for number in range(1, MOST_TRIES + 1):
         place = folder / f"{row.id}-{run}-{number}"
         shutil.rmtree(place, ignore_errors=True)
         try:
             checks, stalled_us = _run_once(row, place)
         except (SightlineError, OSError) as error:  # OSError: a process that was to be hurt is gone
-            return Outcome(row, trouble=" ".join(str(error).split()))
+            return FaultOutcome(row, trouble=" ".join(str(error).split()))
         if stalled_us <= STALL_US:
             break
     else:
-        return Outcome(row, checks, trouble=f"inconclusive: sampler stalled {stalled_us / 1000:.0f} ms each time")
-    outcome = Outcome(row, checks)
+        return FaultOutcome(row, checks, trouble=f"inconclusive: sampler stalled {stalled_us / 1000:.0f} ms each time")
+    outcome = FaultOutcome(row, checks)
     if outcome.ok:
         shutil.rmtree(place)
     return outcome
 
 
-def _run_once(row: Case, place: Path) -> tuple[tuple[Check, ...], int]:
+def _run_once(row: FaultCase, place: Path) -> tuple[tuple[Check, ...], int]:
     """The checks, and for how long the sampler stalled."""
     with RobotFixture(place, row.setup) as rig:
         injected = row.inject(rig)
@@ -152,7 +152,7 @@ def watched_us(checks: Sequence[Check]) -> int:
     return _WATCHED_US if all(check.ok for check in checks) else _TO_THE_END_US
 
 
-def _motion_checks(row: Case, rig: RobotFixture, injected: Injected) -> Iterable[Check]:
+def _motion_checks(row: FaultCase, rig: RobotFixture, injected: Injected) -> Iterable[Check]:
     rows, sent = rig.motors(), rig.sent()
     blind = Blind(injected.at_us, injected.resumed_us, row.by_frame) if row.blind else None
     if row.stops:
@@ -173,7 +173,7 @@ _END_S: Final = 30.0
 """A row that was interrupted ends its own processes within this."""
 
 
-class Progress(NamedTuple):
+class FaultProgress(NamedTuple):
     """How far the whole is; `left_s` is a guess from what has run."""
 
     done: int
@@ -186,7 +186,7 @@ class _Turn:
     """One run of one row; `index` is the row's place in the report."""
 
     index: int
-    row: Case
+    row: FaultCase
     number: int
 
 
@@ -198,10 +198,10 @@ class _Running:
 
 
 def run_cases(
-    rows: Sequence[Case], repeat: int, folder: Path, jobs: int, say: Callable[[Outcome, Progress], None]
-) -> list[list[Outcome]]:
+    rows: Sequence[FaultCase], repeat: int, folder: Path, jobs: int, say: Callable[[FaultOutcome, FaultProgress], None]
+) -> list[list[FaultOutcome]]:
     """Every row `repeat` times, `jobs` at once, those that want it alone last. What is skipped is not repeated."""
-    results: list[list[Outcome]] = [[] for _ in rows]
+    results: list[list[FaultOutcome]] = [[] for _ in rows]
     turns = [_Turn(index, row, number) for index, row in enumerate(rows) for number in range(1, repeat + 1)]
     turns.sort(key=lambda turn: turn.row.alone)  # stable: otherwise in the report's order
     began_s, done, total = time.monotonic(), 0, len(turns)
@@ -210,13 +210,13 @@ def run_cases(
             results[turn.index].append(outcome)
             done += 1
             left_s = (time.monotonic() - began_s) / done * (total - done)
-            say(outcome, Progress(done, total, left_s))
+            say(outcome, FaultProgress(done, total, left_s))
     return [[one for one in row if not one.skipped] or row[:1] for row in results]
 
 
 def _outcomes(
-    turns: list[_Turn], folder: Path, jobs: int, results: Sequence[Sequence[Outcome]]
-) -> Generator[tuple[_Turn, Outcome], None, None]:
+    turns: list[_Turn], folder: Path, jobs: int, results: Sequence[Sequence[FaultOutcome]]
+) -> Generator[tuple[_Turn, FaultOutcome], None, None]:
     waiting, running = list(turns), list[_Running]()
     try:
         while waiting or running:
@@ -238,7 +238,7 @@ def _outcomes(
             one.process.join(_END_S)
 
 
-def _may_start(row: Case, running: Sequence[_Running], jobs: int) -> bool:
+def _may_start(row: FaultCase, running: Sequence[_Running], jobs: int) -> bool:
     if not running:
         return True
     return len(running) < jobs and not row.alone and not running[0].turn.row.alone
@@ -259,8 +259,8 @@ def _run(turn: _Turn, folder: Path, answer: connection.Connection) -> None:
         answer.send((outcome.checks, outcome.skipped, outcome.trouble))
 
 
-def _collect(ended: _Running) -> Outcome:
-    outcome = Outcome(ended.turn.row)
+def _collect(ended: _Running) -> FaultOutcome:
+    outcome = FaultOutcome(ended.turn.row)
     try:
         checks, skipped, trouble = ended.answer.recv()
         outcome = replace(outcome, checks=checks, skipped=skipped, trouble=trouble)

@@ -12,7 +12,7 @@ from typing import Any, Final
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.score.detectors import (
     BALL_LABELS,
-    Figures,
+    DetectorFigures,
     FrameResult,
     LabelMatches,
     figures,
@@ -70,12 +70,12 @@ class Silence:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class DetectorReport:
     """Figures by column and subject; average precision by subject and label; what each ran on."""
 
     first_seed: int
     frames: int
-    columns: dict[str, dict[str, Figures]]
+    columns: dict[str, dict[str, DetectorFigures]]
     precision: dict[str, dict[str, tuple[int, float | None]]]
     """Objects, AP50."""
     made_by: dict[str, dict[str, str]]
@@ -137,7 +137,7 @@ def _answer(detector: Detector, seed: int, jpeg: bytes, decoder: Decoder, looks:
 def score_scenes(
     asked: Sequence[Subject], frames: int, first_seed: int = JUDGED_FROM, *, looks: int = 1,
     columns: Sequence[str] = tuple(COLUMNS), each: Callable[[ScoredScene], None] = lambda _seen: None,
-) -> Report:
+) -> DetectorReport:
     """All columns, `frames` scenes each, and `LIGHT_SHARE` times as many of lights and legs.
 
     `each` is told of every scene.
@@ -156,7 +156,7 @@ def score_scenes(
             for label, marks in count.found.items():
                 marks.add(label, detections(result), seen.scene)
             count.note(result, why)
-    return Report(
+    return DetectorReport(
         first_seed, frames,
         {name: {one.name: figures(one.verdicts[name]) for one in counts} for name in columns},
         {one.name: precisions(one.found) for one in counts},
@@ -228,19 +228,19 @@ LEAST_OBJECTS: Final = 300
 """Of each label; a figure of fewer says too little."""
 
 
-def all_detector_checks(report: Report) -> list[Check]:
+def all_detector_checks(report: DetectorReport) -> list[Check]:
     """The checks of every detector, by name."""
     names = dict.fromkeys(name for own in report.columns.values() for name in own)
     return [replace(check, name=f"{name}: {check.name}") for name in names for check in detector_checks(report, name)]
 
 
-def detector_checks(report: Report, name: str) -> list[Check]:
+def detector_checks(report: DetectorReport, name: str) -> list[Check]:
     """Hold one detector's figures against all that is demanded, in the columns that were shown."""
     checks = [check for column, own in report.columns.items() for check in _of_column(column, own[name])]
     return checks + [check for label in LABELLED for check in _of_label(label, report.precision[name].get(label))]
 
 
-def _of_column(column: str, one: Figures) -> Iterator[Check]:
+def _of_column(column: str, one: DetectorFigures) -> Iterator[Check]:
     yield _least(f"hits, {column}", one.hits, LEAST_HITS[column])
     for what, share in (("wrong object", one.wrong_object), ("false alarms", one.false_alarms)):
         yield Check(f"{what}, {column}", _percent(share), "%", _percent(MOST_WRONG), share <= MOST_WRONG)
@@ -271,19 +271,19 @@ _HEAD = ("column", "detector", "hits", "missed", "wrong object", "false alarms",
 _MOST_LABELS = 3
 
 
-def rows(report: Report) -> list[tuple[str, ...]]:
+def rows(report: DetectorReport) -> list[tuple[str, ...]]:
     """One for each column and detector."""
     return [(column, name, *_cells(one)) for column, own in report.columns.items() for name, one in own.items()]
 
 
-def _cells(one: Figures) -> tuple[str, ...]:
+def _cells(one: DetectorFigures) -> tuple[str, ...]:
     shares = [f"{100 * share:.1f} %" for share in (one.hits, one.missed, one.wrong_object, one.false_alarms)]
     centre = "-" if one.centre_p50_px is None else f"{one.centre_p50_px:.2f} / {one.centre_p95_px:.2f}"
     time = "-" if one.compute_p50_us is None else f"{one.compute_p50_us / 1000:.2f}"
     return (*shares, centre, time)
 
 
-def precision_lines(report: Report) -> list[str]:
+def precision_lines(report: DetectorReport) -> list[str]:
     """One for each detector that finds more than balls."""
     lines = []
     for name, labels in report.precision.items():
@@ -293,7 +293,7 @@ def precision_lines(report: Report) -> list[str]:
     return lines
 
 
-def text(report: Report) -> str:
+def text(report: DetectorReport) -> str:
     """For a terminal."""
     table = [_HEAD, *rows(report)]
     widths = [max(len(row[place]) for row in table) for place in range(len(_HEAD))]
@@ -301,13 +301,13 @@ def text(report: Report) -> str:
     return "\n".join([*lines, *precision_lines(report), _made(report)])
 
 
-def markdown(report: Report) -> str:
+def markdown(report: DetectorReport) -> str:
     """For a page."""
     lines = [_line(_HEAD), _line(["---"] * len(_HEAD)), *(_line(row) for row in rows(report))]
     return "\n".join([*lines, "", *(f"- {line}" for line in precision_lines(report))])
 
 
-def silence_lines(report: Report) -> list[str]:
+def silence_lines(report: DetectorReport) -> list[str]:
     """One for each detector that did not always answer, and for each that calls things what nobody asks for."""
     silent = [f"{name}: no answer to {one.scenes} of {one.of} scenes, which count as missed: {one.why}"
               for name, one in report.silent.items()]
@@ -327,7 +327,7 @@ def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _made(report: Report) -> str:
+def _made(report: DetectorReport) -> str:
     ran = ", ".join(f"{name} on {by['device'] or 'its own'}" for name, by in report.made_by.items())
     last = report.first_seed + report.frames - 1
     return f"{report.frames} scenes a column, seeds {report.first_seed} to {last}; {ran or 'nobody answered'}"

@@ -83,7 +83,7 @@ def _is_on_another(one: Detection, scene: Scene) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
+class DetectorFigures:
     """Of one detector in one column. Shares are 0..1."""
 
     frames: int
@@ -102,13 +102,13 @@ class Figures:
     compute_p50_us: float | None
 
 
-def figures(frames: Sequence[FrameResult]) -> Figures:
+def figures(frames: Sequence[FrameResult]) -> DetectorFigures:
     """Count them."""
     balls = [one for one in frames if one.has_ball]
     empty = [one for one in frames if not one.has_ball]
     off = [one.off_px for one in balls if one.off_px is not None]
     times = [float(one.compute_us) for one in frames if one.compute_us is not None]
-    return Figures(
+    return DetectorFigures(
         len(frames), len(balls), _share(one.verdict == "hit" for one in balls),
         _share(one.verdict == "none" for one in balls), _share(one.verdict == "wrong object" for one in frames),
         _share(one.verdict != "none" for one in empty), _quantile(off, 0.5), _quantile(off, 0.95),

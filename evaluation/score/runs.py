@@ -24,7 +24,7 @@ _MOST_NOTICES: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class ScoreCase:
     """One run to make. `seconds` None is the scenario's own length."""
 
     scenario: str
@@ -62,7 +62,7 @@ class ScoredFigure:
 class ScoreReport:
     """All runs, and what was demanded of them."""
 
-    runs: list[tuple[Case, Score]]
+    runs: list[tuple[ScoreCase, Score]]
     judged: list[ScoredFigure]
     news: dict[str, list[str]] = field(default_factory=dict)
     """What the detector had to tell a person, by group: why it gave no answer, for one."""
@@ -90,7 +90,7 @@ def cases(
     scenarios: Sequence[str], seeds: Sequence[int], latencies_ms: Sequence[float], losses: Sequence[float],
     seconds: float | None, *, mission: str | None = None, robot: str | None = None, look: str | None = None,
     detector: str | None = None,
-) -> list[Case]:
+) -> list[ScoreCase]:
     """Every combination, those of one group together. Raises ConfigError for a name or number that is none."""
     if mission is not None:
         REGISTRY.load(mission)
@@ -112,18 +112,18 @@ def cases(
     if any(not 0 <= one <= 10_000 for one in latencies_ms) or any(not 0 <= one < 1 for one in losses):
         raise ConfigError("--latency-ms is 0 to 10000 and --loss 0 to below 1, e.g. --latency-ms 0,50 --loss 0.1")
     return [
-        Case(name, latency_ms, loss, seed, seconds, mission, robot, look, detector)
+        ScoreCase(name, latency_ms, loss, seed, seconds, mission, robot, look, detector)
         for name, latency_ms, loss, seed in product(scenarios, latencies_ms, losses, seeds)
     ]
 
 
-def run_case(case: Case) -> tuple[Score, list[str]]:
+def run_case(case: ScoreCase) -> tuple[Score, list[str]]:
     """One run in lockstep, scored, and the detector's news."""
     scenario, run = run_of(case)
     return score(run.samples, scenario.stand_off_m, figures_of(scenario, run.samples, run.said)), run.news
 
 
-def run_of(case: Case) -> tuple[Scenario, Run]:
+def run_of(case: ScoreCase) -> tuple[Scenario, Run]:
     """The run itself, and the scenario as it was run."""
     scenario = load_scenario(case.scenario)
     if case.look is not None:
@@ -135,9 +135,9 @@ def run_of(case: Case) -> tuple[Scenario, Run]:
     return scenario, run_lockstep(scenario, model, case.seed, conditions, case.seconds, vision=vision)
 
 
-def run_cases(wanted: Sequence[Case], jobs: int, on_done: Callable[[Case], None]) -> ScoreReport:
+def run_cases(wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCase], None]) -> ScoreReport:
     """Run `wanted` on `jobs` processes, in any order, and judge them. `on_done` is called as each is done."""
-    results: dict[Case, tuple[Score, list[str]]] = {}
+    results: dict[ScoreCase, tuple[Score, list[str]]] = {}
     with worker_pool(min(jobs, len(wanted))) as pool:
         futures = {pool.submit(run_case, case): case for case in wanted}
         for future in as_completed(futures):
@@ -152,7 +152,7 @@ def run_cases(wanted: Sequence[Case], jobs: int, on_done: Callable[[Case], None]
     return ScoreReport(runs, scored_figures(runs), told)
 
 
-def scored_figures(runs: Sequence[tuple[Case, Score]]) -> list[ScoredFigure]:
+def scored_figures(runs: Sequence[tuple[ScoreCase, Score]]) -> list[ScoredFigure]:
     """Each group's figures: median, worst, and whether every run of it is within the bound."""
     judged = []
     for name, members in groupby(runs, key=lambda run: run[0].group):

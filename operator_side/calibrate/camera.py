@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sightline.operator_side.client.pictures import Viewer
+from sightline.operator_side.client.pictures import FrameViewer
 from sightline.protocol.channels import CAMERA, FRAME
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import ConfigError, LinkError, WireError
@@ -267,7 +267,7 @@ def robot_pictures(link: Link, seconds: float, role: str = ROLE, secure: str = "
 
     Raises LinkError when no frame comes for five seconds.
     """
-    frames, viewer = link.latest(FRAME), Viewer(link, role, secure)
+    frames, viewer = link.latest(FRAME), FrameViewer(link, role, secure)
     heard_s = time.monotonic()
     ends_s = heard_s + seconds
     while time.monotonic() < ends_s:

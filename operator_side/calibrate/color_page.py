@@ -24,7 +24,7 @@ from sightline.operator_side.calibrate.color import (
 from sightline.operator_side.calibrate.color_file import mask_png, ranges_toml
 from sightline.operator_side.client.pictures import Pictures
 from sightline.operator_side.cockpit.frame_buffer import FrameBuffer
-from sightline.operator_side.cockpit.http_server import Answer, PageRequest, Route, as_json, page
+from sightline.operator_side.cockpit.http_server import HttpAnswer, PageRequest, Route, as_json, page
 from sightline.operator_side.recording.film import jpeg_pixels
 from sightline.protocol.errors import ConfigError, LinkError, WireError
 
@@ -49,7 +49,7 @@ class Gallery(Protocol):
         """The last pictures, to try a range on."""
         ...
 
-    def route(self, request: PageRequest, body: bytes) -> Answer:
+    def route(self, request: PageRequest, body: bytes) -> HttpAnswer:
         """`GET /picture`."""
         ...
 
@@ -72,14 +72,14 @@ class StillGallery:
         """All of them."""
         return self._pictures
 
-    def route(self, request: PageRequest, _body: bytes) -> Answer:
+    def route(self, request: PageRequest, _body: bytes) -> HttpAnswer:
         """`?number=N`, else the last."""
         number = int(request.get("number", len(self._pictures)))
         done, data = cv2.imencode(".jpg", self.pixels(number), [cv2.IMWRITE_JPEG_QUALITY, _PAGE_QUALITY])
         if not done:
-            return Answer(status=204)
+            return HttpAnswer(status=204)
         count = {"X-Number": str(number), "X-Count": str(len(self._pictures))}
-        return Answer(data.tobytes(), "image/jpeg", headers=count)
+        return HttpAnswer(data.tobytes(), "image/jpeg", headers=count)
 
 
 class LiveGallery:
@@ -193,7 +193,7 @@ class PickPage:
             "POST /use": self._take,
         }
 
-    def _pick(self, _request: PageRequest, body: bytes) -> Answer:
+    def _pick(self, _request: PageRequest, body: bytes) -> HttpAnswer:
         picked = json.loads(body)
         picture = self._gallery.pixels(int(picked["number"]))
         with self._lock:
@@ -210,11 +210,11 @@ class PickPage:
             self._good = ranges
             return as_json(said)
 
-    def _mask(self, _request: PageRequest, _body: bytes) -> Answer:
+    def _mask(self, _request: PageRequest, _body: bytes) -> HttpAnswer:
         with self._lock:
-            return Answer(mask_png(*self._picked), "image/png") if self._picked else Answer(status=204)
+            return HttpAnswer(mask_png(*self._picked), "image/png") if self._picked else HttpAnswer(status=204)
 
-    def _take(self, _request: PageRequest, _body: bytes) -> Answer:
+    def _take(self, _request: PageRequest, _body: bytes) -> HttpAnswer:
         with self._lock:
             if self._good is None:
                 raise ConfigError("pick a colour first")

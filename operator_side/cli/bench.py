@@ -220,12 +220,12 @@ def network(
     """Robots, visions and people in two network namespaces: what slow, lossy, far, broken and shared wires cost."""
     with needs("all"):
         from sightline.benchmarks.network.cases import chosen
-        from sightline.benchmarks.network.run import Progress, run_network
+        from sightline.benchmarks.network.run import NetworkProgress, run_network
         from sightline.benchmarks.network.scenes import medium
         from sightline.benchmarks.network.stage import NetworkSetting
         from sightline.evaluation.faults.fixture import BenchWire
     setting = NetworkSetting(transport, seconds, tuple(numbers("--seeds", seeds, int)))
-    telling = Progress(lambda line: typer.echo(line, err=True), lambda run: _print_run(run, as_json=as_json))
+    telling = NetworkProgress(lambda line: typer.echo(line, err=True), lambda run: _print_run(run, as_json=as_json))
     runs = run_network(chosen(only or (), transport), setting, BenchWire, telling, {"medium": medium})
     worst = list(_worst(runs))
     lines = ["worst of all seeds", *_indented(worst)] if len(setting.seeds) > 1 else []

@@ -22,7 +22,7 @@ from sightline.training.schedule import Training
 if TYPE_CHECKING:
     from sightline.evaluation.checks import Check
     from sightline.evaluation.faults.report import Results
-    from sightline.evaluation.score.detector_report import Report, Subject
+    from sightline.evaluation.score.detector_report import DetectorReport, Subject
     from sightline.operator_side.config.loading import Loaded
     from sightline.training.network import Weights
 
@@ -216,7 +216,7 @@ def _check_device(names: Sequence[str], settings: Any) -> None:
         raise errors[0]
 
 
-def _print_report(report: "Report", checks: "list[Check] | None", as_json: bool) -> int:
+def _print_report(report: "DetectorReport", checks: "list[Check] | None", as_json: bool) -> int:
     from sightline.evaluation.checks import check_lines, to_dict
     from sightline.evaluation.score.detector_report import silence_lines, text
 

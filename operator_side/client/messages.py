@@ -5,7 +5,7 @@ import queue
 from collections.abc import Mapping
 from typing import Any, Final
 
-from sightline.operator_side.client.pictures import Viewer
+from sightline.operator_side.client.pictures import FrameViewer
 from sightline.protocol.channels import FRAME, JPEG, SCAN, TWIST, Channel
 from sightline.protocol.codec import decode, decode_ranges
 from sightline.protocol.errors import WireError
@@ -24,7 +24,7 @@ class ChannelInbox:
     def __init__(self, link: Link, role: str, channel: Channel, secure: str = "") -> None:
         self._words: queue.Queue[Message] = queue.Queue(MAX_WAITING)
         self._picture: LatestSlot[Message] | None = LatestSlot() if channel.encoding == JPEG else None
-        self._viewer = Viewer(link, role, secure) if channel is FRAME else None
+        self._viewer = FrameViewer(link, role, secure) if channel is FRAME else None
         self.robot, self.channel = link.robot, channel
         self._refused = 0
         link.subscribe(channel, self._put)

@@ -18,7 +18,7 @@ from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.security import certificate_role
 
 
-class Viewer:
+class FrameViewer:
     """One viewer's session; `role` names it on the wire. Keys in `secure` may be of a role that has nothing to say."""
 
     def __init__(self, link: Link, role: str, secure: str = "") -> None:
@@ -82,7 +82,7 @@ class Pictures:
         in `secure` are those of `link`."""
         self.robot = link.robot
         self._link, self._first = link, first
-        self._viewer = Viewer(link, role, secure)
+        self._viewer = FrameViewer(link, role, secure)
         self._news = threading.Condition()
         self._newest: Message | None = None
         self._heard: set[str] = set()

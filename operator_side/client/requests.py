@@ -29,16 +29,16 @@ _CITES_STATUS = (Verb.ARM, Verb.RESET, Verb.ACQUIRE)
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class StatusReport:
     """A robot's status and when it said so."""
 
     stamp: Stamp
     status: Status
 
 
-def read_report(message: Message) -> Report:
+def read_report(message: Message) -> StatusReport:
     """Decode a `status` message. Raises WireError."""
-    return Report(decode(Stamp, message.header), decode(Status, message.payload, STATUS.max_payload_bytes))
+    return StatusReport(decode(Stamp, message.header), decode(Status, message.payload, STATUS.max_payload_bytes))
 
 
 class Operator:
@@ -49,7 +49,7 @@ class Operator:
         self._session = secrets.token_hex(4)
         self._seq = self._id = 0
         self._news = threading.Condition()
-        self._report: Report | None = None
+        self._report: StatusReport | None = None
         self._reports = 0
         self._version_trouble = ""
         self._replies: OrderedDict[int, Reply] = OrderedDict()
@@ -57,11 +57,11 @@ class Operator:
         link.subscribe(REPLY, self._on_reply)
 
     @property
-    def report(self) -> Report | None:
+    def report(self) -> StatusReport | None:
         """The newest status heard."""
         return self._report
 
-    def wait_report(self, timeout_s: float = 2.0) -> Report:
+    def wait_report(self, timeout_s: float = 2.0) -> StatusReport:
         """The next status. Raises LinkError when none comes, saying so of a robot of another protocol version."""
         with self._news:
             seen, self._version_trouble = self._reports, ""
@@ -121,7 +121,7 @@ class Operator:
     def _is_stopped(self) -> bool:
         return self._report is not None and self._report.status.state is State.STOPPED
 
-    def _send(self, verb: Verb, report: Report | None) -> None:
+    def _send(self, verb: Verb, report: StatusReport | None) -> None:
         self._seq += 1
         echo = None if report is None else Echo.of(report.stamp)
         header = RequestHeader(source=SOURCE, session=self._session, seq=self._seq, echo=echo)

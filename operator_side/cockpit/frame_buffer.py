@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from sightline.operator_side.client.pictures import Pictures, Shot
-from sightline.operator_side.cockpit.http_server import Answer, PageRequest
+from sightline.operator_side.cockpit.http_server import HttpAnswer, PageRequest
 
 IDLE_S: Final = 3.0
 """A page that asks for nothing for this long is closed: nobody watches."""
@@ -73,7 +73,7 @@ class FrameBuffer:
             self._news.wait_for(lambda: self._number > after, timeout_s)
             return self._shots[-1] if self._number > after else None
 
-    def route(self, request: PageRequest, _body: bytes) -> Answer:
+    def route(self, request: PageRequest, _body: bytes) -> HttpAnswer:
         """`GET /picture?after=N`, the next one, or `?number=N`, that one; 204 if there is none."""
         if "number" in request:
             shot = self.of(int(request["number"]))
@@ -81,11 +81,11 @@ class FrameBuffer:
         else:
             found = self.next(int(request.get("after", "0")))
         if found is None:
-            return Answer(status=204)
+            return HttpAnswer(status=204)
         age_us = self._age_us(found.shot)
         about = {"X-Number": str(found.number), "X-Channel": found.shot.channel.name, "X-Seq": str(found.shot.seq),
                  "X-Age-Us": "" if age_us is None else str(age_us)}
-        return Answer(found.shot.jpeg, "image/jpeg", headers=about)
+        return HttpAnswer(found.shot.jpeg, "image/jpeg", headers=about)
 
     @property
     def _number(self) -> int:

@@ -35,7 +35,7 @@ _KINDS: Final = {".html": "text/html; charset=utf-8", ".mjs": "text/javascript; 
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class HttpAnswer:
     """What is sent back."""
 
     body: bytes = b""
@@ -45,20 +45,20 @@ class Answer:
 
 
 PageRequest = Mapping[str, str]
-Route = Callable[[PageRequest, bytes], Answer]
+Route = Callable[[PageRequest, bytes], HttpAnswer]
 
 
-def as_json(value: Any, status: int = 200) -> Answer:
+def as_json(value: Any, status: int = 200) -> HttpAnswer:
     """`value` as an answer."""
-    return Answer(json.dumps(value).encode(), status=status)
+    return HttpAnswer(json.dumps(value).encode(), status=status)
 
 
-def page(name: str, **words: str) -> Answer:
+def page(name: str, **words: str) -> HttpAnswer:
     """A file of `operator_side/cockpit/pages`, with `{{word}}` filled in; what the words say is text, never HTML."""
     text = files(__package__).joinpath("pages", name).read_text("utf-8")
     for word, value in words.items():
         text = text.replace("{{" + word + "}}", escape(value))
-    return Answer(text.encode(), _KINDS[Path(name).suffix])
+    return HttpAnswer(text.encode(), _KINDS[Path(name).suffix])
 
 
 @contextmanager
@@ -84,7 +84,7 @@ def served(routes: Mapping[str, Route], port: int, host: str = HOST, *, names: S
         server.server_close()
 
 
-def _answered(route: Route, query: str, body: bytes) -> Answer:
+def _answered(route: Route, query: str, body: bytes) -> HttpAnswer:
     """What the route says; what was asked in a wrong way is said as such."""
     try:
         return route(dict(parse_qsl(query, max_num_fields=_MAX_FIELDS)), body)
@@ -156,7 +156,7 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._send(_answered(route, target.query, body))
 
-    def _refusal(self, method: str) -> Answer | None:
+    def _refusal(self, method: str) -> HttpAnswer | None:
         host = self.headers.get("Host", "")
         if self.names and host.rpartition(":")[0] not in self.names and host not in self.names:
             return as_json({"error": "this page is for this machine alone"}, 403)
@@ -168,7 +168,7 @@ class _Handler(BaseHTTPRequestHandler):
             return as_json({"error": f"at most {MAX_BODY_BYTES} bytes"}, 413)
         return None
 
-    def _send(self, answer: Answer) -> None:
+    def _send(self, answer: HttpAnswer) -> None:
         self.send_response(answer.status)
         fixed = {"Content-Type": answer.kind, "Content-Length": str(len(answer.body)), "Cache-Control": "no-store",
                  "Cross-Origin-Resource-Policy": "same-origin", "X-Content-Type-Options": "nosniff",

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Protocol
 
 from sightline.operator_side.client.requests import read_report
-from sightline.operator_side.cockpit.http_server import Answer, PageRequest, Route, served
+from sightline.operator_side.cockpit.http_server import HttpAnswer, PageRequest, Route, served
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import State, Status, StreamStatus
@@ -66,11 +66,15 @@ def serving(exposed: Exposed, host: str, port: int) -> Iterator[str]:
     registry = CollectorRegistry()
     registry.register(exposed)
 
-    def health(_request: PageRequest, _body: bytes) -> Answer:
-        return Answer(b"heard\n", "text/plain") if exposed.is_heard() else Answer(b"not heard\n", "text/plain", 503)
+    def health(_request: PageRequest, _body: bytes) -> HttpAnswer:
+        return (
+            HttpAnswer(b"heard\n", "text/plain")
+            if exposed.is_heard()
+            else HttpAnswer(b"not heard\n", "text/plain", 503)
+        )
 
     routes: dict[str, Route] = {
-        "GET /metrics": lambda _request, _body: Answer(generate_latest(registry), CONTENT_TYPE_LATEST),
+        "GET /metrics": lambda _request, _body: HttpAnswer(generate_latest(registry), CONTENT_TYPE_LATEST),
         "GET /health": health,
     }
     with served(routes, port, host, names=()) as address:

@@ -9,7 +9,7 @@ from sightline.operator_side.client.missions import MissionClient, detector_line
 from sightline.operator_side.client.pictures import Pictures
 from sightline.operator_side.client.status import drops_text, encoding_text, millis, refusals_text, twist_text
 from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
-from sightline.operator_side.cockpit.http_server import Answer, PageRequest, as_json, page, served
+from sightline.operator_side.cockpit.http_server import HttpAnswer, PageRequest, as_json, page, served
 from sightline.protocol.channels import Channel
 from sightline.protocol.messages import Status
 from sightline.protocol.transports.link import Link
@@ -23,7 +23,7 @@ def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) ->
     pictures, missions, ending = Pictures(link, role, first, secure), MissionClient(link), threading.Event()
     buffer = FrameBuffer(_SHOWN_PICTURES, pictures.age_us)
 
-    def state(_request: PageRequest, _body: bytes) -> Answer:
+    def state(_request: PageRequest, _body: bytes) -> HttpAnswer:
         return as_json(state_of(link.robot, missions, pictures.is_heard))
 
     routes = {

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median, quantiles
 
-from sightline.operator_side.client.pictures import Viewer, viewer_role
+from sightline.operator_side.client.pictures import FrameViewer, viewer_role
 from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.client.status import encoding_text, stream_is_whole
 from sightline.operator_side.doctor.finding import Finding, histogram, trouble
@@ -59,7 +59,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
             if transport in _OVER_UDP:
                 yield from _round_trip(_answer_ms(link), "questions")
             yield from _peers(link, robot)
-            yield from _robot(link, robot, Viewer(link, role, secure))
+            yield from _robot(link, robot, FrameViewer(link, role, secure))
     except SightlineError as error:
         yield _no_link(error, endpoint)
 
@@ -174,7 +174,7 @@ def _round_trip(knocks_ms: list[float], what: str) -> Iterator[Finding]:
     yield Finding("jitter", None, f"{max(knocks_ms) - min(knocks_ms):.2f} ms over {len(knocks_ms)} {what}{lines}")
 
 
-def _robot(link: Link, robot: str, viewer: Viewer) -> Iterator[Finding]:
+def _robot(link: Link, robot: str, viewer: FrameViewer) -> Iterator[Finding]:
     status = Operator(link).wait_report().status
     yield Finding("robot", None, f"{robot} is {status.state}: {status.reason}")
     yield from _refusals(status)
@@ -194,7 +194,7 @@ def _refusals(status: Status) -> Iterator[Finding]:
         yield Finding(f"refused {reason}", None, f"{count} times since its start")
 
 
-def _watch(link: Link, viewer: Viewer) -> tuple[float, float]:
+def _watch(link: Link, viewer: FrameViewer) -> tuple[float, float]:
     """Frames per second and kB a frame over a few seconds; each is acknowledged, as any viewer does."""
     slot, begun_s = link.latest(FRAME), time.monotonic()
     sizes: list[int] = []

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from sightline.operator_side.client.requests import Report, read_report
+from sightline.operator_side.client.requests import StatusReport, read_report
 from sightline.protocol.channels import ACK, REPLY, REQUEST, TWIST, Channel
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
@@ -226,7 +226,7 @@ class Teleop:
         self.session = session
         self.speeds = speeds
         self.mode = Mode.LOOKING_ON
-        self.report: Report | None = None
+        self.report: StatusReport | None = None
         self.heard_us = 0
         """When a status came, understood or not."""
         self.note = ""

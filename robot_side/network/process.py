@@ -66,7 +66,7 @@ _LEAVES_WITHIN_S = 3.0
 _KEYS = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP)  # Ctrl-C, Ctrl-\ and Ctrl-Z
 
 
-class Network:
+class NetworkProcess:
     """The camera loop (main thread), the driver's packets (a thread), the link's callbacks (its thread)."""
 
     def __init__(self, setup: NetworkSetup, driver: NetworkEnd, link: Link, camera: Camera) -> None:
@@ -215,7 +215,7 @@ def _run(driver: NetworkEnd) -> None:
         _log.info("robot %s: on %s, camera %s", config.robot, where, config.camera.kind)
         if reached := reachable_endpoints(config.listen):
             _log.info("robot %s: others reach it at %s", config.robot, ", ".join(reached))
-        Network(setup, driver, link, camera).run()
+        NetworkProcess(setup, driver, link, camera).run()
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.protocol.transports.open import LinkGroup
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.hardware.cameras.timing import LatestPicture
-from sightline.robot_side.network.process import Network
+from sightline.robot_side.network.process import NetworkProcess
 from sightline.robot_side.pipe import NetworkEnd, NetworkSetup
 from sightline.robot_side.ports import Picture
 from tests.fixtures.cameras import jpeg
@@ -46,7 +46,7 @@ def running(link, camera):
     pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2)]
     setup = NetworkSetup(config=RobotConfig(), session="0000aaaa", first_seq=0)
     OPEN.extend(pairs)
-    network = Network(setup, NetworkEnd(*(theirs for _, theirs in pairs)), link, camera)
+    network = NetworkProcess(setup, NetworkEnd(*(theirs for _, theirs in pairs)), link, camera)
     threading.Thread(target=network.run, daemon=True).start()
     return network, pairs
 

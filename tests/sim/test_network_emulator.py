@@ -14,8 +14,8 @@ from sightline.protocol.errors import ConfigError
 from sightline.sim.network_emulator import (
     IP_HEADER_BYTES,
     MAX_WAITING,
+    EmulatedLeg,
     EmulatedLink,
-    Leg,
     LinkShape,
     LinkShapes,
     Medium,
@@ -41,7 +41,7 @@ shapes = st.builds(
 
 
 def leg(seed="1", **shape):
-    made = Leg(seed)
+    made = EmulatedLeg(seed)
     made.shape = LinkShape(**shape)
     return made
 
@@ -60,7 +60,7 @@ def carry(wire, packets, every_us=1000, until_us=LONG_US):
 
 @given(shapes, st.integers(0, 60), st.text(max_size=4))
 def test_every_packet_is_accounted_for(shape, count, seed):
-    wire = Leg(seed)
+    wire = EmulatedLeg(seed)
     wire.shape = shape
     out = carry(wire, [PACKET] * count)
     counts = wire.counts
@@ -71,7 +71,7 @@ def test_every_packet_is_accounted_for(shape, count, seed):
 
 @given(shapes, st.text(max_size=4))
 def test_the_same_seed_does_the_same(shape, seed):
-    first, second = Leg(seed), Leg(seed)
+    first, second = EmulatedLeg(seed), EmulatedLeg(seed)
     first.shape = second.shape = shape
     assert carry(first, numbered(30)) == carry(second, numbered(30))
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sightline.protocol.errors import ConfigError
 from sightline.sim.process import PeriodicTimer
 from sightline.sim.robot import load_robot, robot_names
-from sightline.sim.scenario import ClosedPath, Leg, OnPath, Place, load_scenario, look_named, scenario_names
+from sightline.sim.scenario import ClosedPath, OnPath, PathLeg, Place, load_scenario, look_named, scenario_names
 from sightline.sim.world.world import Motor
 
 STEP_S = 0.004
@@ -87,7 +87,7 @@ def test_a_target_on_a_path_never_jumps(distance_m, ahead_m):
 
 @given(st.floats(0.1, 5), st.floats(-3, 3))
 def test_a_circle_ends_where_it_began(radius_m, heading_rad):
-    path = ClosedPath(Place(1.0, 2.0, heading_rad), (Leg(length_m=math.tau * radius_m, turn_deg=360),))
+    path = ClosedPath(Place(1.0, 2.0, heading_rad), (PathLeg(length_m=math.tau * radius_m, turn_deg=360),))
     half = path.at(path.length_m / 2)
     assert math.hypot(half.x_m - 1.0, half.y_m - 2.0) == pytest.approx(2 * radius_m)
     assert path.at(path.length_m * 3)[:2] == pytest.approx((1.0, 2.0), abs=1e-6)

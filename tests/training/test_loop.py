@@ -19,7 +19,7 @@ from sightline.sim.scenes.model import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED
 from sightline.training import export as train_export
 from sightline.training import loop as train_run
 from sightline.training.export import onnx_bytes, weights_in
-from sightline.training.loop import Network, begin_from, folded, train
+from sightline.training.loop import TorchNetwork, begin_from, folded, train
 from sightline.training.network import AGAINST, OUTPUTS, Layer, network
 from sightline.training.scenes import CUT_PX, DrawnScenes
 from sightline.training.schedule import Training
@@ -98,7 +98,7 @@ def test_a_process_that_dies_is_one_line(tmp_path):
 
 def test_the_graph_gives_what_the_module_gives(tmp_path):
     torch.manual_seed(3)
-    network = Network()
+    network = TorchNetwork()
     with torch.no_grad():
         network.layer_head.weight.normal_(0, 0.3)
         network.layer_head.bias.zero_()
@@ -119,7 +119,7 @@ def test_the_graph_gives_what_the_module_gives(tmp_path):
 
 
 def test_a_network_that_begins_from_a_file_gives_what_the_file_gives():
-    network, given = Network(), weights()
+    network, given = TorchNetwork(), weights()
     images = torch.randint(0, 256, (4, 3, HEIGHT_PX, WIDTH_PX), dtype=torch.uint8)
     begin_from(network, weights_in(onnx_bytes(given, {})), images)
     assert network.training and np.allclose(network.layer_head.bias[:OUTPUTS].detach(), given["head.bias"])

@@ -17,8 +17,8 @@ from sightline.benchmarks.loop.figures import (
     TCP,
     WITH_OUR_DETECTOR,
     Course,
+    LoopSample,
     LoopSetting,
-    Sample,
     course_of_headers,
     course_of_tally,
     figures_of,
@@ -40,7 +40,7 @@ MS = 1000
 def sample(name, ages_ms, cpu_s=0.1, answered_percent=100.0, taken=0.0):
     ages_us = tuple((at * 33 * MS, round(age_ms * MS)) for at, age_ms in enumerate(ages_ms))
     course = Course(len(ages_us), answered_percent, ages_us)
-    return Sample(name, course, 10.0, {"vision": cpu_s}, {"vision": 60.0}, 1000, taken)
+    return LoopSample(name, course, 10.0, {"vision": cpu_s}, {"vision": 60.0}, 1000, taken)
 
 
 def judged(setting=SMALL, **samples):

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from sightline.benchmarks.network.cases import CASES, Case, chosen, spans_s
+from sightline.benchmarks.network.cases import CASES, NetworkCase, chosen, spans_s
 from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks, sent_between, worst_of_seeds
 from sightline.benchmarks.network.run import SCENES, write_film
 from sightline.benchmarks.network.stage import NetworkSetting
@@ -127,7 +127,7 @@ def test_flowing_again_is_the_first_acceptance_of_a_frame_of_the_stretch():
 
 
 def test_a_bound_that_is_broken_is_not_ok_and_none_is_never_ok():
-    row = Case("x", "x", CASES[0].phases, least_fps=28, p50_ms=55, p95_ms=60, flows_again_s=1, most_holds=0)
+    row = NetworkCase("x", "x", CASES[0].phases, least_fps=28, p50_ms=55, p95_ms=60, flows_again_s=1, most_holds=0)
     good = network_checks(row, [seen(frames(*range(40, 50), begin_s=0.1), [status(0), status(9.9, accepted=300)])])
     assert all(check.ok for check in good)
     bad = {check.name: check.ok for check in network_checks(row, [seen((), [status(0), status(1, "HOLD"), status(2)])])}

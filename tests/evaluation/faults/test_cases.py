@@ -32,7 +32,7 @@ from sightline.evaluation.faults.evidence import (
 )
 from sightline.evaluation.faults.peer import ATTACKS, MALFORMED, OVERSIZED
 from sightline.evaluation.faults.report import passed, run_line, to_dict
-from sightline.evaluation.faults.runner import Outcome, run_case, watched_us
+from sightline.evaluation.faults.runner import FaultOutcome, run_case, watched_us
 from sightline.evaluation.faults.sampler import read_holes, stalled_us
 from sightline.operator_side.cli import evaluate as cli_faults
 from sightline.protocol.channels import TWIST
@@ -217,7 +217,7 @@ def test_the_cameras_spare_pictures_are_what_they_are_called(tmp_path):
 
 def outcome(row=CASES[0], value=1.0, bound=2.0, **changes):
     check = Check("zero", value, "ms", bound, value is not None and value <= bound)
-    return Outcome(row, **{"checks": (check,), **changes})
+    return FaultOutcome(row, **{"checks": (check,), **changes})
 
 
 def test_rows_are_told_apart_and_say_what_they_demand():
@@ -262,7 +262,7 @@ def test_the_worst_run_is_reported(values):
 
 
 def test_a_failure_outweighs_a_larger_figure_and_less_injected_is_worse():
-    few, many = (Outcome(CASES[0], (Check("injected", value, "times", 1, value >= 1),)) for value in (1.0, 50.0))
+    few, many = (FaultOutcome(CASES[0], (Check("injected", value, "times", 1, value >= 1),)) for value in (1.0, 50.0))
     assert worst_checks([many.checks, few.checks])[0].value == 1.0
 
 

@@ -12,13 +12,13 @@ from sightline.evaluation.checks import Check
 from sightline.evaluation.faults import runner as parallel
 from sightline.evaluation.faults.fixture import Setup
 from sightline.evaluation.faults.report import progress_line
-from sightline.evaluation.faults.runner import Case, Outcome, run_cases
+from sightline.evaluation.faults.runner import FaultCase, FaultOutcome, run_cases
 
 GOOD = (Check("zero", 1.0, "ms", 2.0, True),)
 
 
 def row(name, **changes):
-    return Case(f"made.{name}", f"made up: {name}", lambda rig: None, Setup(), **changes)
+    return FaultCase(f"made.{name}", f"made up: {name}", lambda rig: None, Setup(), **changes)
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def bench(monkeypatch, tmp_path):
         time.sleep(0.15)
         skipped = "needs root" if made.id.endswith("skips") else ""
         (folder / f"{made.id}-{number}").write_text(f"{began_s} {time.monotonic()}")
-        return Outcome(made, () if skipped else GOOD, skipped=skipped)
+        return FaultOutcome(made, () if skipped else GOOD, skipped=skipped)
 
     monkeypatch.setattr(parallel, "run_case", run)
     return tmp_path
@@ -96,5 +96,5 @@ def test_whoever_interrupts_the_bench_interrupts_its_rows(bench):
     ("left_s", "says"), [(0.0, "0 s left"), (89.0, "89 s left"), (90.0, "2 min left"), (3000.0, "50 min left")]
 )
 def test_a_run_is_told_with_how_long_the_rest_takes(left_s, says):
-    line = progress_line(Outcome(row("a"), GOOD), 3, 520, left_s)
+    line = progress_line(FaultOutcome(row("a"), GOOD), 3, 520, left_s)
     assert line.startswith("  3/520 (") and says in line and "made.a" in line

@@ -15,14 +15,14 @@ from sightline.evaluation.score import detector_report as score_scenes_file
 from sightline.evaluation.score.detector_report import (
     LABELLED,
     LEAST_HITS,
-    Report,
+    DetectorReport,
     all_detector_checks,
     close_subjects,
     detector_checks,
     score_scenes,
     subjects,
 )
-from sightline.evaluation.score.detectors import Figures
+from sightline.evaluation.score.detectors import DetectorFigures
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import evaluate as cli_score_detectors
 from sightline.protocol.config import Config as Settings
@@ -31,14 +31,14 @@ from sightline.sim.scenes.model import COLUMNS
 from sightline.vision_side.detect.port import Detection, Maker, result_of
 from tests.fixtures.vision.remote import frame
 
-GOOD = Figures(500, 400, 0.85, 0.1, 0.05, 0.05, 1.0, 3.0, 900.0)
+GOOD = DetectorFigures(500, 400, 0.85, 0.1, 0.05, 0.05, 1.0, 3.0, 900.0)
 EVERY = dict.fromkeys(LABELLED, (300, 0.8))
 
 
 def report(precision=None, **columns):
     of = {name: {"onnx": GOOD} for name in COLUMNS}
     of |= {name.replace("_", " "): {"onnx": one} for name, one in columns.items()}
-    return Report(900_000, 500, of, {"onnx": EVERY if precision is None else precision}, {}, {}, {})
+    return DetectorReport(900_000, 500, of, {"onnx": EVERY if precision is None else precision}, {}, {}, {})
 
 
 def failed(one):

@@ -6,7 +6,15 @@ from dataclasses import replace
 import pytest
 
 from sightline.evaluation.score.figures import Score
-from sightline.evaluation.score.runs import Case, ScoreReport, cases, run_case, run_cases, score_text, scored_figures
+from sightline.evaluation.score.runs import (
+    ScoreCase,
+    ScoreReport,
+    cases,
+    run_case,
+    run_cases,
+    score_text,
+    scored_figures,
+)
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import ConfigError
 
@@ -42,7 +50,7 @@ def test_what_cannot_be_run_is_refused_before_anything_runs(arguments):
 @pytest.mark.parametrize("at", range(3))
 @pytest.mark.parametrize("bad", [{"bearing_rms_deg": 0.9}, {"acquired_s": None}, {"wall_contacts": 1}])
 def test_one_bad_run_of_three_fails_its_figure_and_no_other(at, bad):
-    runs = [(Case("static", 50, 0.1, seed, 5.0), GOOD) for seed in range(3)]
+    runs = [(ScoreCase("static", 50, 0.1, seed, 5.0), GOOD) for seed in range(3)]
     assert all(one.ok for one in scored_figures(runs))
     runs[at] = (runs[at][0], replace(GOOD, **bad))
     judged = scored_figures(runs)

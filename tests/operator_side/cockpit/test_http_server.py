@@ -7,7 +7,14 @@ from contextlib import contextmanager
 
 import pytest
 
-from sightline.operator_side.cockpit.http_server import MAX_BODY_BYTES, MAX_CONNECTIONS, Answer, as_json, page, served
+from sightline.operator_side.cockpit.http_server import (
+    MAX_BODY_BYTES,
+    MAX_CONNECTIONS,
+    HttpAnswer,
+    as_json,
+    page,
+    served,
+)
 from sightline.protocol.errors import ConfigError, LinkError
 from tests.fixtures.links import until
 
@@ -19,7 +26,7 @@ def _refuse(ask, body):
 ROUTES = {
     "GET /": lambda ask, body: page("watch.html", robot="<b>r1</b>"),
     "GET /echo": lambda ask, body: as_json(dict(ask)),
-    "POST /echo": lambda ask, body: Answer(body),
+    "POST /echo": lambda ask, body: HttpAnswer(body),
     "POST /refuse": _refuse,
     "POST /number": lambda ask, body: as_json(int(json.loads(body)["number"])),
 }

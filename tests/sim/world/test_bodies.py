@@ -14,7 +14,7 @@ import simplejpeg
 
 from sightline.protocol.errors import ConfigError
 from sightline.sim.robot import load_robot
-from sightline.sim.scenario import LIT, LegShape, Light, Phase, color_of, load_scenario
+from sightline.sim.scenario import LIT, LegShape, Light, LightPhase, color_of, load_scenario
 from sightline.sim.toml_file import laid_over
 from sightline.sim.world.bodies import PathMover
 from sightline.sim.world.start import goals_seen
@@ -84,7 +84,7 @@ def test_the_light_keeps_its_schedule(begin, now_us):
 
 
 def test_a_light_of_one_colour_never_changes():
-    light = Light(at_m=(0.0, 0.0), schedule=(Phase(state="red", seconds=1),))
+    light = Light(at_m=(0.0, 0.0), schedule=(LightPhase(state="red", seconds=1),))
     assert {light.state_at(0.3, now_us) for now_us in range(0, 5_000_000, 100_000)} == {"red"}
 
 

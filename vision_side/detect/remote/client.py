@@ -223,7 +223,7 @@ class ServerAnswer:
     maker: Maker
 
 
-class Server(Protocol):
+class DetectorServer(Protocol):
     """The client of one kind of server."""
 
     def request(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
@@ -271,7 +271,7 @@ class FrameByFrame(ABC):
 class ServerDetector(FrameByFrame):
     """A detector over one server. It may block for longer than the deadline; `DeadlineDetector` around it does not."""
 
-    def __init__(self, name: str, server: Server) -> None:
+    def __init__(self, name: str, server: DetectorServer) -> None:
         super().__init__(name)
         self._server = server
 

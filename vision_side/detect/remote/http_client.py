@@ -45,7 +45,7 @@ RETRY_US: Final = 200_000
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class HttpReply:
     """A status of 200 with these headers (names in lower case) and this body."""
 
     headers: Mapping[str, str]
@@ -64,11 +64,11 @@ class HttpExchange:
         self.lost = 0
         """Open connections that turned out to be over: the server behind the next may be another."""
 
-    def get(self, path: str, until_us: int) -> Reply:
+    def get(self, path: str, until_us: int) -> HttpReply:
         """Raises NoAnswerError as `post` does."""
         return self._exchange("GET", self._head("GET", path, {}, 0), b"", until_us)
 
-    def post(self, path: str, headers: Mapping[str, str], body: bytes, until_us: int) -> Reply:
+    def post(self, path: str, headers: Mapping[str, str], body: bytes, until_us: int) -> HttpReply:
         """Raises NoAnswerError: LATE, UNREACHABLE, REJECTED (any status but 200), TOO_LARGE, ENCODED, MALFORMED."""
         return self._exchange("POST", self._head("POST", path, headers, len(body)), body, until_us)
 
@@ -85,7 +85,7 @@ class HttpExchange:
                  f"Content-Length: {length}", *(f"{name}: {value}" for name, value in headers.items())]
         return ("\r\n".join(lines) + "\r\n\r\n").encode("ascii")
 
-    def _exchange(self, method: str, head: bytes, body: bytes, until_us: int) -> Reply:
+    def _exchange(self, method: str, head: bytes, body: bytes, until_us: int) -> HttpReply:
         """Use the open connection; once more a new one if the server had closed that meanwhile."""
         kept = self._is_kept()
         try:
@@ -101,7 +101,7 @@ class HttpExchange:
             self.close()
             raise
 
-    def _once(self, method: str, head: bytes, body: bytes, until_us: int) -> Reply:
+    def _once(self, method: str, head: bytes, body: bytes, until_us: int) -> HttpReply:
         try:
             connection = self._socket or self._connect(until_us)
             connection.settimeout(_left_s(until_us))
@@ -162,7 +162,7 @@ class HttpExchange:
             NoAnswerReason.UNREACHABLE, f"{self._host}:{self._port}: {why}; does the server run there?"
         )
 
-    def _read(self, connection: socket.socket, method: str, until_us: int) -> Reply:
+    def _read(self, connection: socket.socket, method: str, until_us: int) -> HttpReply:
         source: Any = _Timed(connection, until_us)
         with http.client.HTTPResponse(source, method=method) as response:
             response.begin()
@@ -184,7 +184,7 @@ class HttpExchange:
                 )
             if response.will_close or not response.isclosed():
                 self.close()
-            return Reply({name.lower(): value for name, value in response.headers.items()}, body)
+            return HttpReply({name.lower(): value for name, value in response.headers.items()}, body)
 
 
 def _connected(found: Any, timeout_s: float) -> socket.socket:

@@ -46,7 +46,7 @@ class OipSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Slot:
+class TensorSlot:
     """One input or output in a model's metadata: -1 is any size."""
 
     name: str
@@ -60,7 +60,7 @@ class OipModel:
 
     name: str
     version: str
-    input: Slot
+    input: TensorSlot
     outputs: tuple[str, ...]
 
     def title(self, scheme: str, answered: str) -> str:
@@ -78,7 +78,7 @@ class OipModel:
 
 
 @dataclass(frozen=True, slots=True)
-class Tensor:
+class OipTensor:
     """One tensor to send: little-endian bytes of the binary extension."""
 
     name: str
@@ -96,7 +96,7 @@ class Inferred:
     """Version of the model that answered; empty where the server does not give one."""
 
 
-def model_of(name: str, version: str, inputs: Sequence[Slot], outputs: Sequence[Slot]) -> OipModel:
+def model_of(name: str, version: str, inputs: Sequence[TensorSlot], outputs: Sequence[TensorSlot]) -> OipModel:
     """The model, if it can be used here. Raises NoAnswerError UNFIT with what it lacks."""
     if len(inputs) != 1:
         raise _unfit(name, f"it takes {len(inputs)} inputs, one picture is given")
@@ -126,7 +126,7 @@ def _layout(shape: tuple[int, ...]) -> tuple[int, int, bool] | None:
     return (last[1], last[2], True) if last[0] == _CHANNELS else None
 
 
-def tensor_of(model: OipModel, frame: DetectFrame, rgb: bool) -> tuple[Tensor, tuple[float, float]]:
+def tensor_of(model: OipModel, frame: DetectFrame, rgb: bool) -> tuple[OipTensor, tuple[float, float]]:
     """Return the input for `frame`, and what turns the answer's pixels into those of the encoded picture.
 
     Raises WireError where the model takes pixels and the JPEG has none.
@@ -134,13 +134,13 @@ def tensor_of(model: OipModel, frame: DetectFrame, rgb: bool) -> tuple[Tensor, t
     one = model.input
     if model.takes_jpeg:
         data = len(frame.jpeg).to_bytes(4, "little") + frame.jpeg
-        return Tensor(one.name, one.datatype, (1,) * len(one.shape), data), (1.0, 1.0)
+        return OipTensor(one.name, one.datatype, (1,) * len(one.shape), data), (1.0, 1.0)
     pixels = _fitted(frame.picture().bgr, one.shape, rgb)
     rows, columns = pixels.shape[:2]
     stretch = frame.width_px / columns, frame.height_px / rows
     laid = pixels.transpose(2, 0, 1) if (_layout(one.shape) or (0, 0, False))[2] else pixels
     shape = (1,) * (len(one.shape) - 3) + laid.shape
-    return Tensor(one.name, one.datatype, shape, laid.tobytes()), stretch
+    return OipTensor(one.name, one.datatype, shape, laid.tobytes()), stretch
 
 
 def _fitted(bgr: NDArray[np.uint8], shape: tuple[int, ...], rgb: bool) -> NDArray[Any]:

@@ -27,8 +27,8 @@ from sightline.vision_side.detect.remote.oip import (
     Inferred,
     OipModel,
     OipSettings,
-    Slot,
-    Tensor,
+    OipTensor,
+    TensorSlot,
     detections_of,
     elements_of,
     model_of,
@@ -83,11 +83,13 @@ class _Answer(_FromServer):
 def read_metadata(body: bytes) -> OipModel:
     """The model that `GET v2/models/NAME` describes. Raises NoAnswerError."""
     metadata = _validated(_Metadata, body)
-    slots = [[Slot(one.name, one.datatype, one.shape) for one in of] for of in (metadata.inputs, metadata.outputs)]
+    slots = [
+        [TensorSlot(one.name, one.datatype, one.shape) for one in of] for of in (metadata.inputs, metadata.outputs)
+    ]
     return model_of(metadata.name, metadata.versions[-1] if metadata.versions else "", *slots)
 
 
-def infer_body(model: OipModel, tensor: Tensor, number: str) -> tuple[int, bytes]:
+def infer_body(model: OipModel, tensor: OipTensor, number: str) -> tuple[int, bytes]:
     """The body of `POST v2/models/NAME/infer`, and how much of it is JSON; `number` comes back as the answer's id."""
     head = json.dumps({
         "id": number,

@@ -13,7 +13,7 @@ from sightline.vision_side.detect.remote.oip import (
     Inferred,
     OipModel,
     OipSettings,
-    Slot,
+    TensorSlot,
     detections_of,
     model_of,
     tensor_of,
@@ -21,7 +21,7 @@ from sightline.vision_side.detect.remote.oip import (
 from sightline.vision_side.detect.remote.oip_http import read_infer, read_metadata
 from tests.fixtures.vision.remote import ASKED, BALL_JPEG, JPEG_INPUT, OUTPUTS, frame
 
-PIXELS = Slot("image", "UINT8", (-1, 240, 320, 3))
+PIXELS = TensorSlot("image", "UINT8", (-1, 240, 320, 3))
 SIZE = (320, 240)
 
 
@@ -55,10 +55,11 @@ def test_metadata_tells_what_to_send():
 
 @pytest.mark.parametrize(("inputs", "outputs", "why"), [
     ([], OUTPUTS, "takes 0 inputs"), ([JPEG_INPUT, PIXELS], OUTPUTS, "takes 2 inputs"),
-    ([Slot("image", "FP32", (1, 3, 240, 320))], OUTPUTS, "FP32; BYTES"), ([PIXELS], OUTPUTS[:1], "scores missing"),
-    ([PIXELS], [], "boxes and scores missing"), ([Slot("image", "UINT8", (240, 320))], OUTPUTS, "not a picture"),
-    ([Slot("image", "UINT8", (1, 240, 320, 4))], OUTPUTS, "not a picture"),
-    ([Slot("image", "BYTES", (1, 1, 1))], OUTPUTS, "not one JPEG"),
+    ([TensorSlot("image", "FP32", (1, 3, 240, 320))], OUTPUTS, "FP32; BYTES"),
+    ([PIXELS], OUTPUTS[:1], "scores missing"),
+    ([PIXELS], [], "boxes and scores missing"), ([TensorSlot("image", "UINT8", (240, 320))], OUTPUTS, "not a picture"),
+    ([TensorSlot("image", "UINT8", (1, 240, 320, 4))], OUTPUTS, "not a picture"),
+    ([TensorSlot("image", "BYTES", (1, 1, 1))], OUTPUTS, "not one JPEG"),
 ])  # fmt: skip
 def test_a_model_that_does_not_fit_is_said_in_words(inputs, outputs, why):
     with pytest.raises(NoAnswerError, match=why) as error:
@@ -79,7 +80,7 @@ def test_a_jpeg_is_sent_as_one_bytes_element():
 ])
 def test_pixels_are_sent_at_the_size_that_the_model_takes(shape, sent, stretch):
     one = frame()
-    tensor, factors = tensor_of(model_of("m", "", [Slot("image", "UINT8", shape)], OUTPUTS), one, False)
+    tensor, factors = tensor_of(model_of("m", "", [TensorSlot("image", "UINT8", shape)], OUTPUTS), one, False)
     assert tensor.shape == sent and factors == pytest.approx(stretch) and len(tensor.data) == np.prod(sent)
     if sent[1:] == (240, 320, 3):
         assert tensor.data == one.picture().bgr.tobytes()
