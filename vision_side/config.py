@@ -48,7 +48,7 @@ Device = Literal["auto", "cpu", "cuda", "tensorrt"]
 
 
 class DetectorConfig(Config):
-    """Whose eyes: a detector of `sightline detector list`, or `boxes`, which somebody publishes as `detections`."""
+    """The detector: one of `sightline detector list`, or `boxes`, which another service publishes as `detections`."""
 
     renamed_keys: ClassVar[Mapping[str, str]] = {"only_colour": "only_color"}
     kind: Annotated[str, Field(min_length=1, max_length=256)] = "hsv"
@@ -155,7 +155,7 @@ class LatencyConfig(Config):
     """From an accepted command to wheels that follow it; the robot cannot measure this part."""
     linear_acceleration_mps2: Annotated[float, Field(gt=0, le=50)] = 2.0
     angular_acceleration_rad_s2: Annotated[float, Field(gt=0, le=200)] = 10.0
-    """The robot's own limits, for foretelling where the commands under way will take it."""
+    """The robot's own limits, for the prediction of where the commands in flight will take it."""
 
 
 class SearchConfig(Config):
@@ -204,7 +204,7 @@ class VisionConfig(Config):
     boxes: BoxesConfig = BoxesConfig()
     mission: MissionConfig = MissionConfig()
     missions: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """Options by the name of the mission, for those that may be asked for while vision runs, e.g. missions.goto."""
+    """Options by the name of the mission, for those that may be requested while vision runs, e.g. missions.goto."""
     target: TargetConfig = TargetConfig()
     track: TrackConfig = TrackConfig()
     steer: SteerConfig = SteerConfig()

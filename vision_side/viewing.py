@@ -53,7 +53,7 @@ class RateLimiter:
 IDLE_S: Final = 2.0
 """Without anything to show for this long the thread ends; the next frame that is watched starts another."""
 KEPT: Final = 4
-"""Frames whose answer comes later, from somebody else's eyes: a detector that is further behind is not shown."""
+"""Frames whose answer comes later, from another service's detector: one that is further behind is not shown."""
 NO_PICTURE: Final = "no picture"
 """The phase of what vision refused to decode; it is not decoded here either."""
 _NICE: Final = 10  # of this thread: answering the next frame comes first
@@ -74,9 +74,9 @@ class _Job:
 class ViewPublisher:
     """What one vision shows of one robot."""
 
-    def __init__(self, config: VisionConfig, link: Link, tell: Callable[[str, str], None]) -> None:
-        """`tell` prints a line (about what, the line) if it changed."""
-        self._config, self._link, self._tell = config, link, tell
+    def __init__(self, config: VisionConfig, link: Link, log_change: Callable[[str, str], None]) -> None:
+        """`log_change` prints a line (about what, the line) if it changed."""
+        self._config, self._link, self._log_change = config, link, log_change
         self._paces = {OVERLAY: RateLimiter(config.viewing.overlay_hz), PREVIEW: RateLimiter(config.viewing.preview_hz)}
         self._kept: deque[tuple[FrameHeader, bytes]] = deque(maxlen=KEPT)
         self._jobs: LatestSlot[_Job] = LatestSlot()
@@ -130,9 +130,9 @@ class ViewPublisher:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         while (job := self._next()) is not None:
             try:
-                self._say(job)
+                self._publish(job)
             except Exception as error:  # whatever a plug-in's detections hold: people see less, the robot drives on
-                self._tell("viewing", f"a picture cannot be shown: {type(error).__name__}: {error}")
+                self._log_change("viewing", f"a picture cannot be shown: {type(error).__name__}: {error}")
 
     def _next(self) -> _Job | None:
         job = self._jobs.take(IDLE_S)
@@ -144,7 +144,7 @@ class ViewPublisher:
                 self._thread = None
             return job
 
-    def _say(self, job: _Job) -> None:
+    def _publish(self, job: _Job) -> None:
         picture = self._decoded(job)
         for channel, drawn, quality in self._views(picture, job):
             jpeg = _encoded(drawn, quality, channel.max_payload_bytes)

@@ -112,7 +112,7 @@ class DetectFrame:
 
     @property
     def decoded(self) -> DecodedImage | None:
-        """The pixels, if somebody asked for them already."""
+        """The pixels, if they were decoded already."""
         return self._picture
 
 

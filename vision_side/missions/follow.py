@@ -1,6 +1,6 @@
 """The default mission: turn towards one target and keep a distance to it; when it is lost, look around. Pure.
 
-Track, foretell, steer, search: each is a file of its own. What a detector found is located as a sphere of known size;
+Track, predict, steer, search: each is a file of its own. What a detector found is located as a sphere of known size;
 boxes that somebody else found are located by their height or width.
 """
 
@@ -46,7 +46,7 @@ class Follow:
         self._track = Track(config.track)
         self._steer = Steer(config.steer, config.target.stand_off_m)
         self._search = Search(config.search)
-        self._foretelling = MotionPredictor(config.latency)
+        self._motion_predictor = MotionPredictor(config.latency)
 
     def step(self, view: View) -> Plan:
         """The plan for one frame."""
@@ -54,16 +54,16 @@ class Follow:
         self._hear(view)
         seen = self._track.step(view.dt_s, view.header.pose, self._sightings(places))
         plan = self._act(view, seen)
-        self._foretelling.sent(view.header.t_us, plan.twist)
+        self._motion_predictor.sent(view.header.t_us, plan.twist)
         return plan
 
     def _hear(self, view: View) -> None:
         """Let the delay estimate and the integrals know what the robot did."""
         header, dt_s = view.header, view.dt_s
-        self._foretelling.measure(header.latency_us, dt_s)
-        asked = self._foretelling.expected(header.t_us)
-        if asked is not None and header.applied == (0.0, 0.0):
-            self._steer.unmet(dt_s, -asked[0], -asked[1])
+        self._motion_predictor.measure(header.latency_us, dt_s)
+        expected = self._motion_predictor.expected(header.t_us)
+        if expected is not None and header.applied == (0.0, 0.0):
+            self._steer.unmet(dt_s, -expected[0], -expected[1])
 
     def _places(self, view: View) -> list[Sighting | None]:
         """Where each detection is: a sphere, or a box that somebody else found or whose size is given."""
@@ -112,8 +112,8 @@ class Follow:
         return Plan(twist, phase, target=box, bearing_rad=bearing_rad, distance_m=math.hypot(x, y))
 
     def _steer_to(self, target: Target, header: FrameHeader, dt_s: float) -> Twist:
-        latency_s = self._foretelling.latency_s
-        then = self._foretelling.motion(header.t_us, header.pose, header.moving, header.applied)
+        latency_s = self._motion_predictor.latency_s
+        then = self._motion_predictor.motion(header.t_us, header.pose, header.moving, header.applied)
         aim = aim_at(target, then, self._camera, latency_s)
         return self._steer.step(dt_s, aim, latency_s, self._may_drive(target))
 

@@ -178,7 +178,7 @@ class Goto:
         self._keep_m = config.body.radius_m + config.clearance_m
         self._ground = Costmap()
         self._poses = PoseMemory()
-        self._foretelling = MotionPredictor(config.latency)
+        self._motion_predictor = MotionPredictor(config.latency)
         self._patience = ProgressChecker(config.patience)
         self._reached = 0
         self._route: Planner | None = None
@@ -190,12 +190,12 @@ class Goto:
     def step(self, view: View) -> Plan:
         """The twist towards the next waypoint."""
         self._poses.add(view.header)
-        self._foretelling.measure(view.header.latency_us, view.dt_s)
+        self._motion_predictor.measure(view.header.latency_us, view.dt_s)
         self._look(view)
         plan = self._ended or self._next(view)
         if plan.done:
             self._ended = plan
-        self._foretelling.sent(view.header.t_us, plan.twist)
+        self._motion_predictor.sent(view.header.t_us, plan.twist)
         return plan
 
     def _look(self, view: View) -> None:
@@ -270,7 +270,7 @@ class Goto:
     def _then(self, view: View) -> PredictedMotion:
         """The robot when the command acts."""
         header = view.header
-        return self._foretelling.motion(header.t_us, header.pose, header.moving, header.applied)
+        return self._motion_predictor.motion(header.t_us, header.pose, header.moving, header.applied)
 
     def _chosen(self, route: Planner, robot: Point, carrot: Point, left_m: float) -> Point:
         """`carrot`, or the one before it where the way over that, on the other side, is hardly longer."""
@@ -298,7 +298,7 @@ class Goto:
             return self._leave(view, room)
         goal_m = math.dist(header.pose[:2], route.goal)
         linear = self._speed(math.dist(then.pose[:2], route.goal), bearing_rad, self._sight_mps(then))
-        kp = min(config.bearing_kp, 0.9 / max(self._foretelling.latency_s, 1e-3))
+        kp = min(config.bearing_kp, 0.9 / max(self._motion_predictor.latency_s, 1e-3))
         angular = max(-config.max_angular_rad_s, min(config.max_angular_rad_s, kp * bearing_rad))
         phase = "to goal" if carrot == route.goal else "along wall"
         note = f"{self._score()}, {goal_m:.2f} m to waypoint {self._reached + 1}"

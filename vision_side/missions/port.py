@@ -45,7 +45,7 @@ class View:
     detections: tuple[Detection, ...]
     """Empty means "saw nothing"."""
     picture: DecodedImage | None = None
-    """Decoded pixels, valid during the step only; None where somebody else looked at the frame."""
+    """Decoded pixels, valid during the step only; None where another service detects."""
     scan: RangeScan | None = None
     """The newest that came before the frame was answered; its age is `header.t_us - scan.t_us`."""
 

@@ -73,7 +73,7 @@ def check_missions(config: VisionConfig) -> None:
 
 
 def requested_mission(request: MissionRequest, config: VisionConfig) -> MissionSpec:
-    """The mission that somebody asked for: its options over those that `config` has for the same one.
+    """The mission of a request: its options over those that `config` has for the same one.
 
     Raises ConfigError for an unknown one or a wrong option.
     """

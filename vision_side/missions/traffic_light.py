@@ -125,16 +125,16 @@ class TrafficLight:
         self._config, self._camera = config, camera
         self._reader = self.reader(config.lamp)
         self._lane = Lane(config.lane)
-        self._foretelling = MotionPredictor(config.latency)
+        self._motion_predictor = MotionPredictor(config.latency)
         self._light: Place | None = None
         self._sure = 0.0
         self._stop = StopLine(config.stop)
 
     def step(self, view: View) -> Plan:
         """The twist along the lane."""
-        self._foretelling.measure(view.header.latency_us, view.dt_s)
+        self._motion_predictor.measure(view.header.latency_us, view.dt_s)
         plan = self._plan(view)
-        self._foretelling.sent(view.header.t_us, plan.twist)
+        self._motion_predictor.sent(view.header.t_us, plan.twist)
         return plan
 
     def _plan(self, view: View) -> Plan:
@@ -245,7 +245,7 @@ class TrafficLight:
         lane_m = self._lane.left_m(header.pose)
         if lane_m <= 0:
             return Plan(STILL, "lane end", f"{self._shown()}; the lane has no more blocks", done=True)
-        then = self._foretelling.motion(header.t_us, header.pose, header.moving, header.applied)
+        then = self._motion_predictor.motion(header.t_us, header.pose, header.moving, header.applied)
         cruise = min(self._config.cruise_mps, math.sqrt(2 * self._config.stop.brake_mps2 * lane_m))
         left_m = self._left_m(line, self._light, then.pose) if self._light else None
         linear = cruise if left_m is None else self._stop.speed(left_m, then.linear_mps, cruise)

@@ -19,7 +19,7 @@ from sightline.vision_side.pipeline import SOURCE, Frame, Observation, Pipeline,
 from sightline.vision_side.serving.mission_channel import MissionChannel
 from sightline.vision_side.serving.service import Service
 
-_TELL_EVERY_S = 0.5
+_PRINT_EVERY_S = 0.5
 _WAIT_S = 0.2
 _RETRY_S = 0.5
 _DEGREES = 57.29577951308232
@@ -46,7 +46,7 @@ class LocalCamera(Protocol):
         ...
 
 
-def watch_robot(config: VisionConfig, say: LogLine, seconds: float | None = None) -> int:
+def watch_robot(config: VisionConfig, report: LogLine, seconds: float | None = None) -> int:
     """Tell what is seen in the robot's pictures, until Ctrl-C or for `seconds`; returns the exit code 0.
 
     Raises ConfigError for an endpoint that is none, LinkError if the link cannot be opened.
@@ -56,17 +56,17 @@ def watch_robot(config: VisionConfig, say: LogLine, seconds: float | None = None
     opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                        max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     with opened as link:
-        say(f"vision: dry run with robot {config.robot}; nothing is driven")
-        service = AckingService(config, link, say)
+        report(f"vision: dry run with robot {config.robot}; nothing is driven")
+        service = AckingService(config, link, report)
         return _repeat(lambda: service.turn(_WAIT_S), seconds)
 
 
-def watch_camera(config: VisionConfig, camera: LocalCamera, say: LogLine, seconds: float | None = None) -> int:
+def watch_camera(config: VisionConfig, camera: LocalCamera, report: LogLine, seconds: float | None = None) -> int:
     """Tell what is seen by a camera of this machine, until Ctrl-C or for `seconds`; returns the exit code 0."""
     model = camera.model
     lens = "calibrated" if model.calibrated else "not calibrated, so distances are a guess"
-    watching = LocalRun(config, camera, say)
-    say(f"vision: dry run, camera {model.width_px}x{model.height_px}, {lens}; nothing is driven")
+    watching = LocalRun(config, camera, report)
+    report(f"vision: dry run, camera {model.width_px}x{model.height_px}, {lens}; nothing is driven")
     return _repeat(watching.turn, seconds)
 
 
@@ -83,15 +83,15 @@ def _repeat(turn: Callable[[], None], seconds: float | None) -> int:
 class AckingService(Service):
     """The vision service as it is, but every answer goes out as an acknowledgement."""
 
-    def __init__(self, config: VisionConfig, link: Link, say: LogLine) -> None:
-        super().__init__(config, link, say)
-        self._mission_channel = ScansOnly(config, link, self._detector, self._tell, self._refuse)
+    def __init__(self, config: VisionConfig, link: Link, report: LogLine) -> None:
+        super().__init__(config, link, report)
+        self._mission_channel = ScansOnly(config, link, self._detector, self._log_change, self._reject)
         self._mission_channel.log_notices()
-        self._telling = ProgressPrinter(say)
+        self._progress_printer = ProgressPrinter(report)
 
     def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
         super()._publish(header, PipelineAnswer(None, answer.seen), compute_us)
-        self._telling.step(answer, time.monotonic())
+        self._progress_printer.step(answer, time.monotonic())
 
 
 class ScansOnly(MissionChannel):
@@ -109,12 +109,12 @@ class ScansOnly(MissionChannel):
 class LocalRun:
     """A local camera straight into the pipeline, as if its robot stood still."""
 
-    def __init__(self, config: VisionConfig, camera: LocalCamera, say: LogLine) -> None:
-        self._camera, self._say = camera, say
+    def __init__(self, config: VisionConfig, camera: LocalCamera, report: LogLine) -> None:
+        self._camera, self._report = camera, report
         self._patience_us = round(config.detector.deadline_s * 1e6)
         self._detector = configured_detector(config)
         self._pipeline = Pipeline(config, camera.model, self._detector)
-        self._telling = ProgressPrinter(say)
+        self._progress_printer = ProgressPrinter(report)
         self._log_notices()
         self._session = secrets.token_hex(4)
         self._seq = 0
@@ -133,38 +133,38 @@ class LocalRun:
             self._seq += 1
             header = FrameHeader(session=self._session, seq=self._seq, t_us=picture.t_us)
             frame = Frame(header, picture.jpeg, monotonic_us() + self._patience_us)
-            self._telling.step(self._pipeline.step(frame), time.monotonic())
+            self._progress_printer.step(self._pipeline.step(frame), time.monotonic())
             self._log_notices()
 
     def _log_notices(self) -> None:
         for line in notices_of(self._detector):
-            self._say(f"vision: {line}")
+            self._report(f"vision: {line}")
 
     def _complain(self, fault: str) -> None:
         if fault != self._fault:
-            self._say(f"camera: {fault or 'back'}")
+            self._report(f"camera: {fault or 'back'}")
         self._fault = fault
 
 
 class ProgressPrinter:
     """One line at most every half second, with the pictures per second since the last."""
 
-    def __init__(self, say: LogLine) -> None:
-        self._say = say
-        self._told_s: float | None = None
+    def __init__(self, report: LogLine) -> None:
+        self._report = report
+        self._printed_s: float | None = None
         self._pictures = 0
 
     def step(self, answer: PipelineAnswer, now_s: float) -> None:
-        """Count a picture; tell of it if it is time."""
+        """Count an image; print a line if it is time."""
         self._pictures += 1
-        if self._told_s is None:
-            self._tell(answer, "", now_s)
-        elif now_s - self._told_s >= _TELL_EVERY_S:
-            self._tell(answer, f" ({self._pictures / (now_s - self._told_s):.0f} pictures/s)", now_s)
+        if self._printed_s is None:
+            self._print(answer, "", now_s)
+        elif now_s - self._printed_s >= _PRINT_EVERY_S:
+            self._print(answer, f" ({self._pictures / (now_s - self._printed_s):.0f} pictures/s)", now_s)
 
-    def _tell(self, answer: PipelineAnswer, rate: str, now_s: float) -> None:
-        self._say(f"{seen_text(answer.seen)}{_would_text(answer)}{rate}")
-        self._told_s, self._pictures = now_s, 0
+    def _print(self, answer: PipelineAnswer, rate: str, now_s: float) -> None:
+        self._report(f"{seen_text(answer.seen)}{_would_text(answer)}{rate}")
+        self._printed_s, self._pictures = now_s, 0
 
 
 def seen_text(seen: Observation) -> str:

@@ -1,6 +1,6 @@
 """Mission requests, scans and reports of one robot. Shell (slots).
 
-Times are the robot's: what was asked must cite a status not much older than the frame at hand, so that a message that
+Times are the robot's: a request must cite a status not much older than the frame at hand, so that a message that
 a network kept back does not start anything.
 """
 
@@ -97,8 +97,8 @@ class Reporter:
     def __init__(self, detector: DetectorConfig) -> None:
         self._detector = detector.kind.partition(":")[0]  # until there is a result to say more
         self._device = "cpu" if detector.kind == "hsv" else ""
-        self._said: tuple[object, ...] | None = None
-        self._said_s = 0.0
+        self._reported: tuple[object, ...] | None = None
+        self._reported_s = 0.0
 
     def due(
         self, now_s: float, mission: str, seen: Observation, newest: RequestId | None, rejection: str, *,
@@ -106,10 +106,10 @@ class Reporter:
     ) -> MissionReport | None:
         """The report, if it is time for one. `result` is the detector's newest, `beside` tells of the shadow."""
         state = (mission, seen.phase, seen.done, newest, rejection)
-        gap_s = LEAST_GAP_S if state != self._said else PERIOD_S
-        if self._said is not None and now_s - self._said_s < gap_s:
+        gap_s = LEAST_GAP_S if state != self._reported else PERIOD_S
+        if self._reported is not None and now_s - self._reported_s < gap_s:
             return None
-        self._said, self._said_s = state, now_s
+        self._reported, self._reported_s = state, now_s
         return MissionReport(
             mission=mission[:_NAME_LENGTH], phase=_line(seen.phase, _PHASE_LENGTH),
             note=_line(seen.note, _TEXT_LENGTH), done=seen.done,
@@ -143,14 +143,14 @@ class MissionChannel:
     """One robot's missions. Scans are subscribed to only once a mission goes by them."""
 
     def __init__(
-        self, config: VisionConfig, link: Link, detector: Detector, tell: Callable[[str, str], None],
-        refuse: Callable[[WireError], None],
+        self, config: VisionConfig, link: Link, detector: Detector, log_change: Callable[[str, str], None],
+        reject: Callable[[WireError], None],
     ) -> None:
-        """`tell` prints a line (about what, the line) if it changed; `refuse` counts.
+        """`log_change` prints a line (about what, the line) if it changed; `reject` counts.
 
         Raises ConfigError for a configured mission that there is not.
         """
-        self._link, self._detector, self._tell, self._refuse = link, detector, tell, refuse
+        self._link, self._detector, self._log_change, self._reject = link, detector, log_change, reject
         self._mission = configured_mission(config).name
         self._result: DetectionResult | None = None
         self._missions: LatestSlot[Message] = link.latest(MISSION)
@@ -187,19 +187,19 @@ class MissionChannel:
     def log_notices(self) -> None:
         """Log what the detector reports."""
         for line in notices_of(self._detector):
-            self._tell("detector", line)
+            self._log_change("detector", line)
 
     def _apply(self, message: Message, pipeline: Pipeline, frame: FrameHeader) -> None:
         try:
             chosen = self._requests.take(message, frame)
         except WireError as error:
-            self._refuse(error)
+            self._reject(error)
             return
         if chosen is not None and self._requests.newest is not None:
             pipeline.switch(chosen, self._requests.newest, frame.session)
-            self._tell("mission", f"mission {chosen.name}, requested by {message.source}")
+            self._log_change("mission", f"mission {chosen.name}, requested by {message.source}")
         elif self._requests.rejection:
-            self._tell("mission", f"rejected a mission of {message.source}: {self._requests.rejection}")
+            self._log_change("mission", f"rejected a mission of {message.source}: {self._requests.rejection}")
 
     def _give_scan(self, pipeline: Pipeline) -> None:
         if not pipeline.mission.wants_scan:
@@ -212,5 +212,5 @@ class MissionChannel:
         try:
             pipeline.put_scan(*decode_scan(message.header, message.payload))
         except WireError as error:
-            self._refuse(error)
-            self._tell("scan", f"rejected scans: {error.detail}")
+            self._reject(error)
+            self._log_change("scan", f"rejected scans: {error.detail}")

@@ -82,13 +82,13 @@ def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe |
 
 
 def serve(
-    config: VisionConfig, link: Link, ending: threading.Event, say: LogLine, observe: Observe | None = None, *,
+    config: VisionConfig, link: Link, ending: threading.Event, report: LogLine, observe: Observe | None = None, *,
     detector: Detector | None = None,
 ) -> None:
     """Answer frames that come over `link` until `ending` is set."""
-    service = open_service(config, link, say, detector)
+    service = open_service(config, link, report, detector)
     if observe is not None:
         observe(lambda: [service.counts()])
     while not ending.is_set():
         service.turn(_WAIT_S)
-    say(f"vision: ended after {service.answered} frames; skipped: {dict(service.skipped) or 'none'}")
+    report(f"vision: ended after {service.answered} frames; skipped: {dict(service.skipped) or 'none'}")

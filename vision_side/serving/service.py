@@ -127,24 +127,24 @@ class SessionSelector:
 _SILENCE_S = 3.0
 _NO_FRAMES_S = 1.0  # twice what the slowest stream takes between two frames
 _CAMERA_PATIENCE_S = 1.5
-_TOLD_COUNTS = tuple(10**power for power in range(10))  # a camera gone bad is told at 1, 10, 100 ... pictures
-_TOLD_PHASES = {"searching": "target not in sight, searching", "lost": "target lost"}
+_REPORTED_COUNTS = tuple(10**power for power in range(10))  # a camera gone bad is told at 1, 10, 100 ... pictures
+_REPORTED_PHASES = {"searching": "target not in sight, searching", "lost": "target lost"}
 LogLine = Callable[[str], None]
 Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
 
 
-def open_service(config: VisionConfig, link: Link, say: LogLine, detector: Detector | None = None) -> "Service":
+def open_service(config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None) -> "Service":
     """The service for one robot that fits its detector; `detector` is that of `config` if None."""
     if config.detector.kind == "boxes":
-        return BoxesService(config, link, say, detector)
-    return Service(config, link, say, detector)
+        return BoxesService(config, link, report, detector)
+    return Service(config, link, report, detector)
 
 
 class Service:
     """What is known of the robot on the other end, and the pipeline that fits it."""
 
-    def __init__(self, config: VisionConfig, link: Link, say: LogLine, detector: Detector | None = None) -> None:
-        self._config, self._link, self._say = config, link, say
+    def __init__(self, config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None) -> None:
+        self._config, self._link, self._report = config, link, report
         self._detector = detector or configured_detector(config)
         attach_detector(self._detector, link)
         self._cameras: LatestSlot[Message] = link.latest(CAMERA)
@@ -154,7 +154,7 @@ class Service:
         self._session = secrets.token_hex(4)
         self._robot_session = ""
         self._sessions = SessionSelector()
-        self._said: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
         if config.camera is not None:
             self._use(config.camera)
         self._heard_s = time.monotonic()
@@ -162,8 +162,8 @@ class Service:
         self._newest: tuple[int, int | None] = (0, None)
         self.answered = self.steered = 0
         self.skipped: Counter[str] = Counter()
-        self._mission_channel = MissionChannel(config, link, self._detector, self._tell, self._refuse)
-        self._viewing = ViewPublisher(config, link, self._tell)
+        self._mission_channel = MissionChannel(config, link, self._detector, self._log_change, self._reject)
+        self._viewing = ViewPublisher(config, link, self._log_change)
 
     def _arrivals(self, link: Link) -> LatestSlot[Message]:
         """Where what is to be answered arrives."""
@@ -188,7 +188,7 @@ class Service:
             self._mission_channel.report(now_s, self._acknowledge(NO_FRAMES), None)
         if now_s - self._heard_s > _SILENCE_S:
             self._robot_session = ""
-            self._tell("link", f"no frames from robot {self._config.robot} at {endpoints_text(self._config)}; is "
+            self._log_change("link", f"no frames from robot {self._config.robot} at {endpoints_text(self._config)}; is "
                                "`sightline robot` running there, with this robot id?")
 
     def counts(self) -> ServiceCounts:
@@ -213,7 +213,7 @@ class Service:
         else:
             self._pipeline.set_camera(camera)
         lens = "calibrated" if camera.calibrated else "not calibrated"
-        self._tell("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")
+        self._log_change("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")
 
     def _frame(self, message: Message, started_ns: int) -> None:
         header = self._decoded(FrameHeader, message.header, MAX_HEADER_BYTES)
@@ -221,14 +221,14 @@ class Service:
             return
         if not self._sessions.admits(header.session, header.t_us, monotonic_us()):
             self.skipped["OTHER_SESSION"] += 1
-            self._tell("other", f"frames of session {header.session} are refused: robot {self._config.robot} is "
+            self._log_change("other", f"frames of session {header.session} are refused: robot {self._config.robot} is "
                                 f"steered in session {self._sessions.current}; two robots with this id? give each its "
                                 "own with --robot")
             return
         self._heard_s = time.monotonic()
         if header.session != self._robot_session:
             self._robot_session = header.session
-            self._tell("link", f"frames from robot {self._config.robot}, session {header.session}")
+            self._log_change("link", f"frames from robot {self._config.robot}, session {header.session}")
         if self._pipeline is None:
             self._wait_for_camera()
             self._publish(header, PipelineAnswer(None, Observation("no picture", note="no camera model yet")), 0)
@@ -239,7 +239,7 @@ class Service:
         if answer.skipped:
             self.skipped[answer.skipped] += 1
         self._publish(header, answer, (time.perf_counter_ns() - started_ns) // 1000)
-        self._tell_phase(answer)
+        self._report_phase(answer)
         self._mission_channel.report(time.monotonic(), answer, header)
         self._viewing.show(header, answer, self._camera, started_ns=started_ns, jpeg=message.payload)
 
@@ -250,7 +250,7 @@ class Service:
         """The model comes twice a second; only a longer wait is worth a word."""
         self._blind_since_s = self._blind_since_s or time.monotonic()
         if time.monotonic() - self._blind_since_s > _CAMERA_PATIENCE_S:
-            self._tell("camera", "frames come, but no camera model; is the robot of another version?")
+            self._log_change("camera", "frames come, but no camera model; is the robot of another version?")
 
     def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
         self.answered += 1
@@ -266,39 +266,39 @@ class Service:
         try:
             return decode(model, data, max_bytes)
         except WireError as error:
-            self._refuse(error)
+            self._reject(error)
             return None
 
-    def _refuse(self, error: WireError) -> None:
+    def _reject(self, error: WireError) -> None:
         self.skipped[error.reason] += 1
         if error.reason is RejectReason.UNSUPPORTED_VERSION:
-            self._tell("version", error.detail)
+            self._log_change("version", error.detail)
 
-    def _tell_phase(self, answer: PipelineAnswer) -> None:
+    def _report_phase(self, answer: PipelineAnswer) -> None:
         seen = answer.seen
         if answer.twist is None:
             count = self.skipped.total()
-            if count in _TOLD_COUNTS:
-                self._say(f"vision: pictures skipped so far: {count}; this one: {seen.note}")
-        elif seen.phase in _TOLD_PHASES:
-            self._tell("phase", _TOLD_PHASES[seen.phase])
+            if count in _REPORTED_COUNTS:
+                self._report(f"vision: pictures skipped so far: {count}; this one: {seen.note}")
+        elif seen.phase in _REPORTED_PHASES:
+            self._log_change("phase", _REPORTED_PHASES[seen.phase])
         elif seen.phase == "tracking" and seen.distance_m is not None:
-            self._tell("phase", f"target seen at {seen.distance_m:.2f} m", "seen")
+            self._log_change("phase", f"target seen at {seen.distance_m:.2f} m", "seen")
         elif seen.phase != "coasting":
-            self._tell("phase", ": ".join(filter(None, (seen.phase, seen.note))), seen.phase)
+            self._log_change("phase", ": ".join(filter(None, (seen.phase, seen.note))), seen.phase)
 
-    def _tell(self, about: str, line: str, state: str = "") -> None:
+    def _log_change(self, about: str, line: str, state: str = "") -> None:
         """Print `line` if what it is about changed since it was last told."""
-        if self._said.get(about) != (state or line):
-            self._said[about] = state or line
-            self._say(f"vision: {line}")
+        if self._reported.get(about) != (state or line):
+            self._reported[about] = state or line
+            self._report(f"vision: {line}")
 
 
 def endpoints_text(config: VisionConfig) -> str:
     return ", ".join([*config.connect, *(f"{one} (listening)" for one in config.listen)]) or "nowhere"
 
 
-# The vision service without eyes of its own: it steers by boxes that somebody publishes. Shell.
+# The vision service without a detector of its own: it steers by boxes that another service publishes. Shell.
 #
 # Every frame is acknowledged at once, since nothing here looks at it; boxes are answered with a twist that cites the
 # frame in which they were found, however old that is by now: the robot judges. No boxes, no twist: the robot holds.
@@ -339,11 +339,11 @@ class BoxesInbox(LatestSlot[Message]):
 class BoxesService(Service):
     """A `Service` whose detector is elsewhere."""
 
-    def __init__(self, config: VisionConfig, link: Link, say: LogLine, detector: Detector | None = None) -> None:
+    def __init__(self, config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None) -> None:
         self._inbox = BoxesInbox(config.boxes.source)
         self._reader = BoxReader(config.boxes)
         self._boxes_heard_s = time.monotonic()
-        super().__init__(config, link, say, detector)
+        super().__init__(config, link, report, detector)
 
     def _arrivals(self, link: Link) -> LatestSlot[Message]:
         for channel in (FRAME, DETECTIONS):
@@ -359,14 +359,15 @@ class BoxesService(Service):
         if header is None:
             return
         self._heard_s = time.monotonic()
-        self._tell("link", f"frames from robot {self._config.robot}, session {header.session}")
+        self._log_change("link", f"frames from robot {self._config.robot}, session {header.session}")
         self._publish(header, PipelineAnswer(None, Observation("no picture", note="somebody else looks")), 0)
         self._viewing.keep(header, message.payload)
         if self._pipeline is None:
             self._wait_for_camera()
         elif time.monotonic() - self._boxes_heard_s > _BOXES_SILENCE_S:
             self._mission_channel.report(time.monotonic(), self._acknowledge(_NO_BOXES), header)
-            self._tell("boxes", f"frames come, but no boxes from {self._config.boxes.source}; does its detector run?")
+            source = self._config.boxes.source
+            self._log_change("boxes", f"frames come, but no boxes from {source}; does its detector run?")
 
     def _boxes(self, message: Message, started_ns: int) -> None:
         self._remember_frames()
@@ -377,16 +378,16 @@ class BoxesService(Service):
             frame, found = self._reader.read(message.header, message.payload, self._camera)
         except WireError as error:
             self.skipped[error.reason] += 1
-            self._tell("boxes", f"boxes are refused: {error.detail}", f"refused {error.reason}")
+            self._log_change("boxes", f"boxes are refused: {error.detail}", f"refused {error.reason}")
             return
-        self._tell("boxes", f"boxes from {self._config.boxes.source}")
+        self._log_change("boxes", f"boxes from {self._config.boxes.source}")
         self._mission_channel.prepare(self._pipeline, frame)
         answer = self._pipeline.follow(frame, found)
         if answer.skipped:
             self.skipped[answer.skipped] += 1
             return
         self._publish(frame, answer, (time.perf_counter_ns() - started_ns) // 1000)
-        self._tell_phase(answer)
+        self._report_phase(answer)
         self._mission_channel.report(time.monotonic(), answer, frame)
         self._viewing.show(frame, answer, self._camera, started_ns=started_ns)
 

@@ -1,4 +1,4 @@
-"""Other eyes in the pipeline and the service: "saw nothing" searches, "no answer" holds, nonsense is refused."""
+"""Detectors in the pipeline and the service: "saw nothing" searches, "no answer" holds, nonsense is rejected."""
 
 import math
 from dataclasses import replace

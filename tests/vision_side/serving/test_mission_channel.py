@@ -73,7 +73,7 @@ class Bench:
 
     def report(self) -> MissionReport:
         """The newest, once it had its time."""
-        self.service._mission_channel._reporter._said_s = -1e9
+        self.service._mission_channel._reporter._reported_s = -1e9
         self.frames()
         return decode(MissionReport, self.reports[-1].payload, REPORT.max_payload_bytes)
 
@@ -134,7 +134,7 @@ def test_a_broken_mission_is_counted_and_ends_nothing(payload):
 def test_a_new_session_of_the_robot_ends_what_was_asked_for_and_says_so():
     bench = Bench().frames(5).ask("band", 3).frames(6)
     bench.frames(2, session="0000beef")
-    bench.service._mission_channel._reporter._said_s = -1e9
+    bench.service._mission_channel._reporter._reported_s = -1e9
     bench.frames(1, session="0000beef")
     report = decode(MissionReport, bench.reports[-1].payload)
     assert (report.mission, report.asked.id) == ("follow", 3) and "started anew" in report.refused

@@ -190,7 +190,7 @@ class AdaptiveTracker:
         self._everywhere = HsvDetector(config.hsv, config.label)
         self._track: PixelTrack | None = None
         self._candidate: tuple[PixelTrack, int] | None = None
-        self._chroma: ColorModel | None = None
+        self._color_model: ColorModel | None = None
         self._seen_us = 0
         self._last_us: int | None = None
 
@@ -221,7 +221,7 @@ class AdaptiveTracker:
 
     def _region(self, picture: DecodedImage, track: PixelTrack) -> Region | None:
         """Around where it should be, with what has its colour marked."""
-        if self._chroma is None:
+        if self._color_model is None:
             return None
         half = track.gate_px + 1.4 * track.radius_px + 4
         columns = _cut(track.cx_px - half, track.cx_px + half, picture.scale, picture.bgr.shape[1])
@@ -229,11 +229,11 @@ class AdaptiveTracker:
         part = picture.bgr[rows, columns]
         if not part.size:
             return None
-        return Region(part, self._chroma.mask(part, self._config.color_sigmas), (columns.start, rows.start))
+        return Region(part, self._color_model.mask(part, self._config.color_sigmas), (columns.start, rows.start))
 
     def _acquire(self, picture: DecodedImage, t_us: int, dt_s: float) -> Detection | None:
         """The largest of the configured colour, once it was at one place for some pictures in a row."""
-        known = self._chroma if t_us - self._seen_us <= self._config.remembered_s * 1e6 else None
+        known = self._color_model if t_us - self._seen_us <= self._config.remembered_s * 1e6 else None
         found = next((one for one in self._everywhere.detect(picture) if self._is_it(picture, one, known)), None)
         if found is None:
             self._candidate = None
@@ -247,7 +247,7 @@ class AdaptiveTracker:
         self._candidate = (track, times + 1)
         if times + 1 < self._config.confirm:
             return None
-        self._track, self._candidate, self._chroma = track, None, known
+        self._track, self._candidate, self._color_model = track, None, known
         return found
 
     def _is_it(self, picture: DecodedImage, found: Detection, known: ColorModel | None) -> bool:
@@ -258,10 +258,10 @@ class AdaptiveTracker:
         pixels = _pixels(picture, _circle(found))
         if not len(pixels):
             return
-        if self._chroma is None:
-            self._chroma = ColorModel(pixels)
+        if self._color_model is None:
+            self._color_model = ColorModel(pixels)
         elif found.score >= _CLEAR:
-            self._chroma.learn(pixels, 1 - math.exp(-dt_s / self._config.adapt_s))
+            self._color_model.learn(pixels, 1 - math.exp(-dt_s / self._config.adapt_s))
 
 
 def _circle(one: Detection) -> Circle:

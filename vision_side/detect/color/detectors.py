@@ -45,14 +45,14 @@ class Adaptive:
     maker = Maker("adaptive", device=_CPU)
 
     def __init__(self, config: AdaptiveConfig) -> None:
-        self._eyes = PerSession(lambda: AdaptiveTracker(config))
+        self._trackers = PerSession(lambda: AdaptiveTracker(config))
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
         """A result for each; one takes two or three times as long as by plain colour, whatever the deadline."""
         return [self._look(frame) for frame in frames]
 
     def _look(self, frame: DetectFrame) -> DetectionResult | None:
-        eye, t_us = self._eyes.of(frame.robot, frame.header.session), frame.header.t_us
-        return timed(frame, self.maker, lambda picture: eye.detect(picture, t_us))
+        tracker, t_us = self._trackers.of(frame.robot, frame.header.session), frame.header.t_us
+        return timed(frame, self.maker, lambda picture: tracker.detect(picture, t_us))
 
 
