@@ -51,7 +51,7 @@ class LoadViewer:
     def watch(self, wire: "Connection") -> None:
         """Say hello and take pictures, until the robot has had enough."""
         wire.protocol.max_message_size = MAX_BLOCK_BYTES + FRAME.max_payload_bytes
-        wire.say(self._hello)
+        wire.send_text(self._hello)
         wire.receive_one(time.monotonic() + OPEN_S)  # the robot's, which says that there is a place
         self.admitted = True
         self._ledger.note(ADMITTED)

@@ -108,7 +108,7 @@ class Pictures:
     def pause(self) -> None:
         """Nobody looks: hear no pictures until the next `take`."""
         for name in tuple(self._heard):
-            self._link.ignore(FRAME if name == FRAME.name else self._first)
+            self._link.unsubscribe(FRAME if name == FRAME.name else self._first)
         self._heard.clear()
         with self._news:
             self._newest = None
@@ -133,7 +133,7 @@ class Pictures:
             self._hear(FRAME)
         elif FRAME.name in self._heard:  # which it is only once what is wanted did not come
             self._heard.discard(FRAME.name)
-            self._link.ignore(FRAME)
+            self._link.unsubscribe(FRAME)
 
     def _hear(self, channel: Channel) -> None:
         if channel.name not in self._heard:

@@ -196,7 +196,7 @@ class Link(Closing):
         """Call `callback` for every message of `channel` with the exact key and within its bounds."""
 
     @abstractmethod
-    def ignore(self, channel: Channel) -> None:
+    def unsubscribe(self, channel: Channel) -> None:
         """End every subscription of this link to `channel`; the other ends see that it has none."""
 
     @abstractmethod
@@ -251,9 +251,9 @@ class LinkWrapper(Link):
         """As `Link`."""
         self._link.subscribe(channel, callback)
 
-    def ignore(self, channel: Channel) -> None:
+    def unsubscribe(self, channel: Channel) -> None:
         """As `Link`."""
-        self._link.ignore(channel)
+        self._link.unsubscribe(channel)
 
     def has_listener(self, channel: Channel) -> bool:
         """As `Link`."""

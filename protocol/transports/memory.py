@@ -163,7 +163,7 @@ class MemoryNetwork:
         A key with a wildcard reaches every link that has subscribed, as it would on Zenoh; its receivers turn it away.
         """
         parsed = parse_key(key)
-        takers = [link for link in self._links if link is not sender and link.hears(key)]
+        takers = [link for link in self._links if link is not sender and link.subscribes_to(key)]
         direction = parsed[1].direction if parsed else Direction.TO_ROBOT
         packet = _Packet(sender.number if sender else 0, direction, key, header, payload)
         results = [self._send(packet, to) for to in takers]
@@ -220,16 +220,16 @@ class MemoryLink(BaseLink):
         """Call `callback`, inside `MemoryNetwork.advance`, for every message with the exact key and within bounds."""
         self._callbacks.append((channel, callback))
 
-    def ignore(self, channel: Channel) -> None:
+    def unsubscribe(self, channel: Channel) -> None:
         """End every subscription to `channel`."""
         self._callbacks = [one for one in self._callbacks if one[0] is not channel]
 
     def has_listener(self, channel: Channel) -> bool:
         """Whether another link subscribes to what this end publishes on `channel`."""
         key = self._rules.key(channel)
-        return not self._closed and any(peer.hears(key) for peer in self._network.peers_of(self))
+        return not self._closed and any(peer.subscribes_to(key) for peer in self._network.peers_of(self))
 
-    def hears(self, key: str) -> bool:
+    def subscribes_to(self, key: str) -> bool:
         """Whether a subscription here matches `key`, as Zenoh matches: a wildcard in the key matches all."""
         return any("*" in key or _matches(self.robot, channel, key) for channel, _ in self._callbacks)
 

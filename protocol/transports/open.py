@@ -84,10 +84,10 @@ class LinkGroup(Link):
         for link in self.links:
             link.subscribe(channel, callback)
 
-    def ignore(self, channel: Channel) -> None:
+    def unsubscribe(self, channel: Channel) -> None:
         """As `Link` says, on all of them."""
         for link in self.links:
-            link.ignore(channel)
+            link.unsubscribe(channel)
 
     def has_listener(self, channel: Channel) -> bool:
         """Whether somebody listens on any of them."""
@@ -138,7 +138,7 @@ class Relay:
                     self._begin(channel, near)
                 elif not wanted and (channel.name, number) in self._open:
                     self._open.remove((channel.name, number))
-                    near.ignore(channel)
+                    near.unsubscribe(channel)
 
     def _begin(self, channel: Channel, near: Link) -> None:
         near.subscribe(channel, partial(_republish, self._others(near)))

@@ -95,7 +95,7 @@ def test_an_overlay_reaches_who_watches_once_and_only_then(ends, near, far):
             assert until(lambda number=number: len(heard) == number, 5.0), heard
         assert [message.header for message in heard] == [b'{"seq":%d}' % number for number in range(1, 4)]
         assert heard[0].payload == JPEG and heard[0].source == "vision"
-        viewer.ignore(OVERLAY)
+        viewer.unsubscribe(OVERLAY)
         assert until(lambda: not vision.has_listener(OVERLAY), 5.0)
 
 

@@ -90,7 +90,7 @@ def test_it_ends_when_nobody_watches_any_more(site, monkeypatch):
     assert until(lambda: site.link.has_listener(OVERLAY) and site.link.has_listener(PREVIEW))
     site.frame()
     assert overlays.take(5.0) and pixels(previews.take(5.0)).shape == (240, 320, 3)
-    site.viewer.ignore(OVERLAY)
+    site.viewer.unsubscribe(OVERLAY)
     assert until(lambda: not site.link.has_listener(OVERLAY)) and site.link.has_listener(PREVIEW)
     site.viewer.close()
     assert until(lambda: not site.link.has_listener(PREVIEW))

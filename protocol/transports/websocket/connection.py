@@ -345,7 +345,7 @@ class Connection:
             self._ring()
         return False
 
-    def say(self, text: str) -> None:
+    def send_text(self, text: str) -> None:
         """Send a text, or as much of it as there is room for now and the rest later."""
         with self.lock:
             self._frame((text.encode("utf-8"),), True)
@@ -373,7 +373,7 @@ class Connection:
         with self.lock:
             self._flush()
 
-    def way_out(self) -> SendPath:
+    def send_path(self) -> SendPath:
         """What is known of the way to the other end."""
         holds = bool(self._unsent) or self._wants_room
         return send_path(self._near, holds or self._unheard_bytes >= _MUCH_BYTES)

@@ -148,7 +148,7 @@ class PeerCodec(Protocol):
         """Channels that the peer said it wants; of a dialect without words for it none."""
         ...
 
-    def hears(self, channel: Channel) -> bool:
+    def subscribes_to(self, channel: Channel) -> bool:
         """Whether the peer wants `channel`."""
         ...
 
@@ -193,7 +193,7 @@ class SightlineV1:
     def form(self) -> Hashable:
         return SightlineV1
 
-    def hears(self, channel: Channel) -> bool:
+    def subscribes_to(self, channel: Channel) -> bool:
         return channel.name in self.wants
 
     def write(self, message: Message) -> tuple[bytes, ...]:

@@ -26,18 +26,18 @@ from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.websocket.framing import BAD_FRAMING, IncomingMessage, PeerError
 
 DRIVER_SLOT_US: Final = 1_000_000
-"""A driver that has said nothing valid for so long has left its seat; as long as the robot's own lease."""
+"""A driver that has said nothing valid for so long has left its slot; as long as the robot's own lease."""
 
 
 class DriverSlot:
-    """The one seat of a link."""
+    """The one slot of a link."""
 
     def __init__(self) -> None:
         self._driver = ""
         self._until_us = 0
 
     def claim(self, who: str, now_us: int) -> str:
-        """Who drives after `who` said something valid: `who` itself if the seat was its own, or free."""
+        """Who drives after `who` said something valid: `who` itself if the slot was its own, or free."""
         if who == self._driver or now_us >= self._until_us:
             self._driver, self._until_us = who, now_us + DRIVER_SLOT_US
         return self._driver
@@ -59,10 +59,10 @@ MAX_COMMAND_TEXT_BYTES: Final = 256
 
 
 class LegacyClient(NamedTuple):
-    """Who speaks the older dialect with a robot, the seat it shares with others, and where lines for the log go."""
+    """Who speaks the older dialect with a robot, the slot it shares with others, and where lines for the log go."""
 
     who: str
-    seat: DriverSlot
+    driver_slot: DriverSlot
     tell: Callable[[str], None]
 
 
@@ -79,7 +79,7 @@ class LegacyToVision:
     def __init__(self, robot: str, options: LegacyOptions, now_us: Callable[[], int], client: LegacyClient) -> None:
         """`now_us` reads a monotonic clock."""
         self._robot, self._options, self._now_us = robot, options, now_us
-        self._who, self._seat, self._tell = client
+        self._who, self._driver_slot, self._tell = client
         self._told = ""
         self._sent: tuple[bytes, int] | None = None
         self._looked_at: tuple[bytes, bytes] | None = None
@@ -89,7 +89,7 @@ class LegacyToVision:
     def form(self) -> Hashable:
         return self._options
 
-    def hears(self, channel: Channel) -> bool:
+    def subscribes_to(self, channel: Channel) -> bool:
         return channel is FRAME
 
     def write(self, message: Message) -> tuple[bytes, ...]:
@@ -113,7 +113,7 @@ class LegacyToVision:
 
     def note_gone(self) -> None:
         """The client is gone: another may drive."""
-        self._seat.leave(self._who)
+        self._driver_slot.leave(self._who)
 
     def _twist(self, text: bytes) -> IncomingMessage:
         """What is no twist stays as it is: the robot refuses it, and says why in `status`."""
@@ -121,13 +121,13 @@ class LegacyToVision:
             twist = parse_dashed(text, self._options.swapped) if self._options.dashed else parse_twist(text)
         except WireError:
             return IncomingMessage(key_for(self._robot, TWIST, GUEST), b"", text)
-        self._take_seat()
+        self._claim_driver_slot()
         barred = format_twist(twist) if self._options.dashed else text
         return IncomingMessage(key_for(self._robot, TWIST, GUEST), b"", barred)
 
-    def _take_seat(self) -> None:
+    def _claim_driver_slot(self) -> None:
         """Raise WireError, told once for each driver, if another client drives."""
-        driver = self._seat.claim(self._who, self._now_us())
+        driver = self._driver_slot.claim(self._who, self._now_us())
         if driver != self._told:
             self._told = driver
             self._tell(f"{self._who} drives" if driver == self._who else f"{self._who} only watches: {driver} drives")
@@ -188,7 +188,7 @@ class LegacyToRobot:
     def form(self) -> Hashable:
         return self._options
 
-    def hears(self, channel: Channel) -> bool:
+    def subscribes_to(self, channel: Channel) -> bool:
         return channel is TWIST
 
     def write(self, message: Message) -> tuple[bytes, ...]:

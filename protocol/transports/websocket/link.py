@@ -37,7 +37,7 @@ _WATCHED = tuple(one for one in CHANNELS.values() if one.while_watched)
 class Subscriber(Protocol):
     """Another end."""
 
-    def hears(self, channel: Channel) -> bool:
+    def subscribes_to(self, channel: Channel) -> bool:
         """Whether it wants `channel`."""
         ...
 
@@ -51,12 +51,12 @@ class Subscriber(Protocol):
 
 
 class Subscriptions:
-    """The wants of one link. `told` is what its peers know of them."""
+    """The wants of one link. `announced` is what its peers know of them."""
 
     def __init__(self, rules: LinkRules, session: str) -> None:
         self._rules, self._session = rules, session
         self._callbacks: dict[str, list[Callback]] = {}
-        self.told: tuple[str, ...] = ()
+        self.announced: tuple[str, ...] = ()
 
     def add(self, channel: Channel, callback: Callback) -> None:
         """One more that is called for `channel`."""
@@ -71,25 +71,25 @@ class Subscriptions:
         return tuple(self._callbacks.get(channel.name, ()))
 
     def hello(self) -> str:
-        """The hello that says what was told last."""
-        about = Hello(robot=self._rules.robot, role=self._rules.role, session=self._session, wants=self.told)
+        """The hello that says what was announced last."""
+        about = Hello(robot=self._rules.robot, role=self._rules.role, session=self._session, wants=self.announced)
         return encode(about).decode("utf-8")
 
     def bound(self) -> int:
-        """The largest payload of what was told last, in bytes."""
-        return max((self._rules.payload_bound(CHANNELS[name]) for name in self.told), default=0)
+        """The largest payload of what was announced last, in bytes."""
+        return max((self._rules.payload_bound(CHANNELS[name]) for name in self.announced), default=0)
 
     def tell(self, peer: Subscriber) -> None:
-        """Tell one peer what the others were told."""
+        """Announce to one peer what the others know."""
         peer.limit(self.bound())
         peer.tell(self.hello())
 
-    def retell(self, peers: Sequence[Subscriber], passing_on: bool) -> None:
+    def announce(self, peers: Sequence[Subscriber], passing_on: bool) -> None:
         """Tell all `peers` what is wanted now, if it changed. `passing_on`: what one says is for the others too."""
-        watched = (one.name for one in _WATCHED if passing_on and any(peer.hears(one) for peer in peers))
+        watched = (one.name for one in _WATCHED if passing_on and any(peer.subscribes_to(one) for peer in peers))
         names = tuple(dict.fromkeys((*self._callbacks, *watched)))
-        if names != self.told:
-            self.told = names
+        if names != self.announced:
+            self.announced = names
             for peer in peers:
                 self.tell(peer)
 
@@ -124,8 +124,8 @@ def open_websocket(
     not speak.
     """
     rules = LinkRules(robot, role, max_frame_bytes)
-    doors, far = [[parse_websocket_endpoint(text) for text in _listed(ends)] for ends in (listen, connect)]
-    if not doors and not far:
+    near, far = [[parse_websocket_endpoint(text) for text in _listed(ends)] for ends in (listen, connect)]
+    if not near and not far:
         raise ConfigError("no endpoint: give one to listen on (--listen) or to connect to (--connect)")
     try:
         import websockets  # noqa: F401
@@ -133,8 +133,8 @@ def open_websocket(
         raise ConfigError("websockets is not installed: pip install 'sightline-robot[websocket]'") from None
     link = WebSocketLink(rules)
     try:
-        link.open(doors, far, secure)
-        if not doors:
+        link.open(near, far, secure)
+        if not near:
             link.wait_connected(timeout_s)
     except (LinkError, ConfigError):
         link.close()
@@ -152,7 +152,7 @@ class WebSocketLink(BaseLink):
     def __init__(self, rules: LinkRules) -> None:
         """Made by `open_websocket`."""
         super().__init__(rules)
-        self._wants = Subscriptions(rules, secrets.token_hex(4))
+        self._subscriptions = Subscriptions(rules, secrets.token_hex(4))
         # Who drives comes first. Replaced, never changed, so that publishing needs no lock.
         self._peers: tuple[Peer, ...] = ()
         self._joining = threading.Lock()
@@ -161,7 +161,7 @@ class WebSocketLink(BaseLink):
         self._dialers: list[Dialer] = []
         self._in_callback = threading.local()
         self._dropped: Counter[str] = Counter()
-        self._seat = DriverSlot()
+        self._driver_slot = DriverSlot()
         self._repeat_limiter = RepeatLimiter()
 
     @property
@@ -188,18 +188,18 @@ class WebSocketLink(BaseLink):
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
         """Call `callback`, on a peer's thread, for every message with the exact key and within bounds."""
         with self._joining:
-            self._wants.add(channel, callback)
-            self._retell()
+            self._subscriptions.add(channel, callback)
+            self._announce()
 
-    def ignore(self, channel: Channel) -> None:
+    def unsubscribe(self, channel: Channel) -> None:
         """End every subscription to `channel`."""
         with self._joining:
-            self._wants.drop(channel)
-            self._retell()
+            self._subscriptions.drop(channel)
+            self._announce()
 
     def has_listener(self, channel: Channel) -> bool:
         """Whether a peer said that it wants `channel`; never blocks on the network."""
-        return self.connected and any(peer.hears(channel) for peer in self._peers)
+        return self.connected and any(peer.subscribes_to(channel) for peer in self._peers)
 
     def close(self) -> None:
         """Tell the peers and end it; idempotent, over within two seconds, safe even inside a callback."""
@@ -220,10 +220,10 @@ class WebSocketLink(BaseLink):
 
     # --- opening -------------------------------------------------------------------------------------------------
 
-    def open(self, doors: Sequence[WebSocketEndpoint], far: Sequence[WebSocketEndpoint], secure: str) -> None:
-        """Listen on `doors` and begin to connect to `far`. Raises what `open_websocket` does."""
+    def open(self, near: Sequence[WebSocketEndpoint], far: Sequence[WebSocketEndpoint], secure: str) -> None:
+        """Listen on `near` and begin to connect to `far`. Raises what `open_websocket` does."""
         refuse, keys = self._rules.reject, KeyFolder(secure, self._rules.role)
-        for end in doors:
+        for end in near:
             self._listeners.append(Server(end, partial(self._serve, end), refuse, self._tell, keys))
         for end in far:
             self._dialers.append(Dialer(end, partial(self._serve, end), refuse, keys))
@@ -249,28 +249,29 @@ class WebSocketLink(BaseLink):
         """
         dialect = self._dialect(end, settle is not None, "{}:{}".format(*wire.address))
         with self._joining:
-            told, hello, wanted_bytes = self._wants.told, self._wants.hello(), self._wants.bound()
-        peer = Peer(wire, dialect, self._heed)
+            announced, hello = self._subscriptions.announced, self._subscriptions.hello()
+            wanted_bytes = self._subscriptions.bound()
+        peer = Peer(wire, dialect, self._on_change)
         peer.limit(wanted_bytes)
         if isinstance(dialect, SightlineV1):
             exchange_hellos(wire, dialect, hello, settle)
         elif settle is not None:
             settle("")
-        if self._join(peer, told):
+        if self._join(peer, announced):
             try:
                 peer.run(self._deliver, self._rules.reject)
             finally:
                 self._leave(peer)
                 dialect.note_gone()
 
-    def _join(self, peer: Peer, told: tuple[str, ...]) -> bool:
+    def _join(self, peer: Peer, announced: tuple[str, ...]) -> bool:
         with self._joining:
             if self._closed:
                 return False
             self._peers = (*self._peers, peer)
-            if told != self._wants.told:
-                self._wants.tell(peer)
-            self._retell()
+            if announced != self._subscriptions.announced:
+                self._subscriptions.tell(peer)
+            self._announce()
         self._joined.set()
         return True
 
@@ -278,16 +279,16 @@ class WebSocketLink(BaseLink):
         with self._joining:
             self._peers = tuple(other for other in self._peers if other is not peer)
             self._dropped += peer.queue.dropped
-            self._retell()
+            self._announce()
 
-    def _heed(self) -> None:
+    def _on_change(self) -> None:
         """A peer wants something else now, which may be what another says only while it is watched."""
         with self._joining:
-            self._retell()
+            self._announce()
 
-    def _retell(self) -> None:
+    def _announce(self) -> None:
         """With the lock held."""
-        self._wants.retell(self._peers, bool(self._listeners))
+        self._subscriptions.announce(self._peers, bool(self._listeners))
 
     def _put_first(self, peer: Peer) -> None:
         """Who drives is sent everything before those who watch."""
@@ -305,7 +306,8 @@ class WebSocketLink(BaseLink):
         if end.legacy is None:
             return SightlineV1(self.robot, self._rules.role)
         if listening:
-            return LegacyToVision(self.robot, end.legacy, monotonic_us, LegacyClient(who, self._seat, self._tell))
+            client = LegacyClient(who, self._driver_slot, self._tell)
+            return LegacyToVision(self.robot, end.legacy, monotonic_us, client)
         bound = self._rules.payload_bound(FRAME)
         return LegacyToRobot(self.robot, end.legacy, monotonic_us, secrets.token_hex(4), bound)
 
@@ -324,7 +326,7 @@ class WebSocketLink(BaseLink):
             return
         if parsed[1] is TWIST and self._peers[0] is not peer:
             self._put_first(peer)
-        callbacks = self._wants.of(parsed[1])
+        callbacks = self._subscriptions.of(parsed[1])
         if parsed[1].passed_on and self._listeners:
             callbacks = (partial(self._pass_on, peer), *callbacks)
         self._in_callback.now = True

@@ -81,18 +81,18 @@ _COUNTED_FOR_CODE: Final = {1002: BAD_FRAMING, 1007: BAD_FRAMING, 1009: OVERSIZE
 class Peer:
     """An open connection whose other end is known, and the dialect that it speaks."""
 
-    def __init__(self, wire: Connection, dialect: PeerCodec, heed: Callable[[], None] = lambda: None) -> None:
-        """`heed` is called on the reading thread when the peer says that it wants something else."""
+    def __init__(self, wire: Connection, dialect: PeerCodec, on_change: Callable[[], None] = lambda: None) -> None:
+        """`on_change` is called on the reading thread when the peer says that it wants something else."""
         self.queue: OutgoingQueue[Publication | str] = OutgoingQueue()
-        self._heed = heed
+        self._on_change = on_change
         self._wire, self._dialect = wire, dialect
         self._reader = threading.current_thread()
         self._gone = threading.Event()
         self._look_us = 0
 
-    def hears(self, channel: Channel) -> bool:
+    def subscribes_to(self, channel: Channel) -> bool:
         """Whether the peer wants `channel`."""
-        return self._dialect.hears(channel)
+        return self._dialect.subscribes_to(channel)
 
     def admits(self, key: str, refuse: Callable[[str], None], tell: Callable[[str], None]) -> bool:
         """Whether its token lets it publish on `key`; if not, that is counted and logged."""
@@ -107,7 +107,7 @@ class Peer:
 
     def offer(self, post: Publication) -> None:
         """Send it if the peer wants it, now or when there is room and nothing newer; never blocks."""
-        if self._dialect.hears(post.message.channel):
+        if self._dialect.subscribes_to(post.message.channel):
             self.queue.put(post.message, post)
             self._send()
 
@@ -127,9 +127,9 @@ class Peer:
         """Read until the connection ends; a peer that breaks the rules is dropped and told why."""
         from websockets.exceptions import ConnectionClosed
 
-        life = Keepalive(monotonic_us())
+        keepalive = Keepalive(monotonic_us())
         try:
-            while self._turn(life, deliver, refuse):
+            while self._turn(keepalive, deliver, refuse):
                 self._wire.wait(_TICK_US / 1e6)
             refuse(SILENT)
             self._wire.close(1011, "silent for too long")
@@ -144,7 +144,7 @@ class Peer:
             self._gone.set()
 
     def _turn(
-        self, life: Keepalive, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]
+        self, keepalive: Keepalive, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]
     ) -> bool:
         """Read what there is, and send; False if the other end is to be given up."""
         now_us = monotonic_us()  # before reading: however long this end stood still, what came meanwhile counts
@@ -154,11 +154,11 @@ class Peer:
             self._send()
             return True
         self._look_us = now_us + _TICK_US
-        life.hear(self._wire.heard_us)
-        if life.is_ping_due(now_us):
+        keepalive.hear(self._wire.heard_us)
+        if keepalive.is_ping_due(now_us):
             self._wire.ping()
         self._send()
-        return not life.is_over(now_us, self._wire.way_out)
+        return not keepalive.is_over(now_us, self._wire.send_path)
 
     def _read(
         self, message: Any, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]
@@ -170,7 +170,7 @@ class Peer:
             refuse(error.reason)
             return
         if self._dialect.wants != before:
-            self._heed()
+            self._on_change()
         for packet in packets:
             deliver(self, packet)
 
@@ -208,7 +208,7 @@ class Peer:
 def exchange_hellos(wire: Connection, dialect: SightlineV1, hello: str, settle: Promote | None) -> None:
     """Exchange hellos; who connects, and so gives no place, speaks first."""
     if settle is None:
-        wire.say(hello)
+        wire.send_text(hello)
     try:
         answer = wire.receive_one(time.monotonic() + OPEN_S)
     except TimeoutError:
@@ -218,7 +218,7 @@ def exchange_hellos(wire: Connection, dialect: SightlineV1, hello: str, settle: 
     dialect.accept(answer)
     if settle is not None:
         settle(dialect.peer_role)
-        wire.say(hello)
+        wire.send_text(hello)
 
 
 def count_close(closed: ConnectionClosed, refuse: Callable[[str], None]) -> None:

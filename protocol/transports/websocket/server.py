@@ -76,33 +76,33 @@ class ConnectionLimits:
         self._lock = threading.Lock()
         self._taken: set[Slot] = set()
 
-    def knock(self, address: str) -> Slot | None:
+    def admit(self, address: str) -> Slot | None:
         """A stranger's place for who comes from `address`; None if there is none."""
         with self._lock:
             strangers = [one.address for one in self._taken if one.acts is None]
             if len(strangers) >= MAX_HANDSHAKES or strangers.count(address) >= MAX_HANDSHAKES_PER_ADDRESS:
                 return None
-            place = Slot(address)
-            self._taken.add(place)
-            return place
+            slot = Slot(address)
+            self._taken.add(slot)
+            return slot
 
     def problem(self, acts: bool) -> str:
         """Why one more client that `acts`, or only watches, has no place; "" if it has."""
         with self._lock:
             return self._problem(acts)
 
-    def settle(self, place: Slot, acts: bool) -> str:
-        """Give a client's place to the stranger at `place`; returns why not, or ""."""
+    def promote(self, slot: Slot, acts: bool) -> str:
+        """Give a client's place to the stranger at `slot`; returns why not, or ""."""
         with self._lock:
             problem = self._problem(acts)
             if not problem:
-                place.acts = acts
+                slot.acts = acts
             return problem
 
-    def leave(self, place: Slot) -> None:
+    def leave(self, slot: Slot) -> None:
         """Its connection has ended."""
         with self._lock:
-            self._taken.discard(place)
+            self._taken.discard(slot)
 
     def _problem(self, acts: bool) -> str:
         clients = [one.acts for one in self._taken if one.acts is not None]
@@ -170,24 +170,24 @@ class Server:
         self,
         endpoint: WebSocketEndpoint,
         serve: Callable[[Connection, Promote], None],
-        refuse: Callable[[str], None],
-        tell: Callable[[str], None],
+        count_rejection: Callable[[str], None],
+        log: Callable[[str], None],
         keys: KeyFolder,
     ) -> None:
         """`serve` is called for each client and returns when it is gone; it may raise PeerError to drop it.
 
         It calls what it is given with the role in the client's hello, which raises PeerError if there is no place.
-        `tell` writes one line to the log. Raises LinkError if the endpoint cannot be listened on, ConfigError if it
+        `log` writes one line to the log. Raises LinkError if the endpoint cannot be listened on, ConfigError if it
         would be open to anybody, or if `keys` lack what it needs.
         """
-        self._endpoint, self._serve, self._refuse, self._tell = endpoint, serve, refuse, tell
+        self._endpoint, self._serve, self._count_rejection, self._log = endpoint, serve, count_rejection, log
         self._tokens = {} if endpoint.legacy else read_tokens(keys.folder)
         check_listening(endpoint, self._tokens)
         self._context = server_tls_context(keys.folder, keys.source) if endpoint.secure else None
-        self._door = listening_socket(endpoint)
+        self._listener = listening_socket(endpoint)
         self._alarm, self._bell = socket.socketpair()
         self._counting = threading.Lock()
-        self._places = ConnectionLimits()
+        self._connection_limits = ConnectionLimits()
         self._wires: set[Connection] = set()
         # Daemons: no client keeps a finished process alive.
         self._acceptor = threading.Thread(target=self._accept_all, name="websocket-listen", daemon=True)
@@ -205,45 +205,45 @@ class Server:
 
     def _accept_all(self) -> None:
         waiting = select.poll()
-        waiting.register(self._door, select.POLLIN)
+        waiting.register(self._listener, select.POLLIN)
         waiting.register(self._alarm, select.POLLIN)
         while not any(descriptor == self._alarm.fileno() for descriptor, _ in waiting.poll()):
             try:
-                near, address = self._door.accept()
+                near, address = self._listener.accept()
                 self._welcome(near, address[0])
             except OSError:  # gone again, or no descriptor left
                 time.sleep(_PAUSE_S)
-        for end in (self._door, self._alarm, self._bell):
+        for end in (self._listener, self._alarm, self._bell):
             end.close()
 
     def _welcome(self, near: socket.socket, address: str) -> None:
-        place = self._places.knock(address)
-        if place is not None and self._is_begun(near, place):
+        slot = self._connection_limits.admit(address)
+        if slot is not None and self._is_begun(near, slot):
             return
-        self._turn_away(TOO_MANY_CLIENTS, address, "too many connections at once")
+        self._reject(TOO_MANY_CLIENTS, address, "too many connections at once")
         near.close()
 
-    def _is_begun(self, near: socket.socket, place: Slot) -> bool:
+    def _is_begun(self, near: socket.socket, slot: Slot) -> bool:
         """Whether a thread of its own has taken over; a machine may have none left."""
-        thread = threading.Thread(target=self._handle, args=(near, place), name="websocket-peer", daemon=True)
+        thread = threading.Thread(target=self._handle, args=(near, slot), name="websocket-peer", daemon=True)
         try:
             thread.start()
         except RuntimeError:
-            self._places.leave(place)
+            self._connection_limits.leave(slot)
             return False
         return True
 
-    def _turn_away(self, counted: str, address: str, why: str) -> None:
-        self._refuse(counted)
-        self._tell(f"{self._endpoint.text}: turned {address or 'a client'} away: {why}")
+    def _reject(self, counted: str, address: str, why: str) -> None:
+        self._count_rejection(counted)
+        self._log(f"{self._endpoint.text}: turned {address or 'a client'} away: {why}")
 
-    def _handle(self, near: socket.socket, place: Slot) -> None:
+    def _handle(self, near: socket.socket, slot: Slot) -> None:
         try:
             secured = self._secured(near)
             if secured is not None:
-                self._welcome_on(secured, place)
+                self._welcome_on(secured, slot)
         finally:
-            self._places.leave(place)
+            self._connection_limits.leave(slot)
 
     def _secured(self, near: socket.socket) -> socket.socket | None:
         """`near`, with TLS where that is asked for; None for a client that does not agree."""
@@ -254,11 +254,11 @@ class Server:
             address = near.getpeername()[0]
             return tls_handshake(near, self._context, "", time.monotonic() + OPEN_S)
         except OSError as error:  # SSLError and TimeoutError among them
-            self._turn_away(NO_TLS, address, f"no TLS: {getattr(error, 'reason', '') or type(error).__name__}")
+            self._reject(NO_TLS, address, f"no TLS: {getattr(error, 'reason', '') or type(error).__name__}")
             near.close()
             return None
 
-    def _welcome_on(self, near: socket.socket, place: Slot) -> None:
+    def _welcome_on(self, near: socket.socket, slot: Slot) -> None:
         from websockets.server import ServerProtocol
 
         protocol = ServerProtocol(max_size=MAX_HELLO_BYTES, **PROTOCOL_OPTIONS)
@@ -268,32 +268,33 @@ class Server:
         with self._counting:
             self._wires.add(wire)
         try:
-            self._speak(wire, protocol, place)
+            self._speak(wire, protocol, slot)
         finally:
             wire.shut()
             with self._counting:
                 self._wires.discard(wire)
 
-    def _speak(self, wire: Connection, protocol: ServerProtocol, place: Slot) -> None:
+    def _speak(self, wire: Connection, protocol: ServerProtocol, slot: Slot) -> None:
         from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
         try:
             if self._shake_hands(wire, protocol):
-                self._serve(wire, partial(self._settle, wire, place))
+                self._serve(wire, partial(self._promote, wire, slot))
         except PeerError as error:
-            self._turn_away(error.counted, wire.address[0], str(error))
+            self._reject(error.counted, wire.address[0], str(error))
             wire.close(error.code, str(error))
             wire.linger()
         except ConnectionClosed as closed:  # before it said who it is
-            count_close(closed, self._refuse)
+            count_close(closed, self._count_rejection)
         except (InvalidHandshake, TimeoutError):
             pass
 
-    def _settle(self, wire: Connection, place: Slot, role: str) -> None:
+    def _promote(self, wire: Connection, slot: Slot, role: str) -> None:
         """Give it a client's place. Where no token says what it may do, its hello does. Raises PeerError for none."""
         granted = grants_of_role(certificate_role(role)) if wire.granted is None else wire.granted
         claims = wire.granted is None and role == _GUEST
-        problem = self._places.settle(place, self._endpoint.legacy is not None or claims or may_control(granted))
+        acts = self._endpoint.legacy is not None or claims or may_control(granted)
+        problem = self._connection_limits.promote(slot, acts)
         if problem:
             raise PeerError(TOO_MANY_CLIENTS, 1013, problem)
 
@@ -301,7 +302,7 @@ class Server:
         """Whether the client came in; else it has been told why not."""
         request: Request = cast(Any, wire.receive_one(time.monotonic() + OPEN_S))
         if protocol.close_expected():  # what came with it is so broken that the protocol has hung up
-            self._turn_away(BAD_FRAMING, wire.address[0], "nonsense behind its request")
+            self._reject(BAD_FRAMING, wire.address[0], "nonsense behind its request")
             return False
         response = self._answer(wire, protocol, request)
         with wire.lock:
@@ -313,13 +314,13 @@ class Server:
 
     def _answer(self, wire: Connection, protocol: ServerProtocol, request: Request) -> Response:
         address = wire.address[0]
-        refusal = self._refusal(wire, address, request) or self._crowding(wire)
-        if refusal is None:
+        rejection = self._rejection(wire, address, request) or self._crowding(wire)
+        if rejection is None:
             return protocol.accept(request)
-        self._turn_away(refusal[0], address, refusal[2])
-        return protocol.reject(refusal[1], refusal[2] + "\n")
+        self._reject(rejection[0], address, rejection[2])
+        return protocol.reject(rejection[1], rejection[2] + "\n")
 
-    def _refusal(self, wire: Connection, address: str, request: Request) -> tuple[str, int, str] | None:
+    def _rejection(self, wire: Connection, address: str, request: Request) -> tuple[str, int, str] | None:
         """What it counts as, HTTP status, and why; None for a client that may come in."""
         headers = request.headers
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
@@ -339,7 +340,7 @@ class Server:
 
     def _crowding(self, wire: Connection) -> tuple[str, int, str] | None:
         """The same, for want of a place: told by HTTP where that is known before the hello."""
-        problem = self._places.problem(wire.granted is None or may_control(wire.granted))
+        problem = self._connection_limits.problem(wire.granted is None or may_control(wire.granted))
         return (TOO_MANY_CLIENTS, 503, problem) if problem else None
 
     def _select(self, offered: Sequence[Subprotocol]) -> Subprotocol:
@@ -348,5 +349,5 @@ class Server:
         for subprotocol in offered:
             if subprotocol == SUBPROTOCOL:
                 return subprotocol
-        self._turn_away(WRONG_SUBPROTOCOL, "", f"it does not offer {SUBPROTOCOL}")
+        self._reject(WRONG_SUBPROTOCOL, "", f"it does not offer {SUBPROTOCOL}")
         raise NegotiationError(f"offer the sub-protocol {SUBPROTOCOL}; the older text dialect has a port of its own")

@@ -128,7 +128,7 @@ class ZenohLink(BaseLink):
                 subscriber = self._session.declare_subscriber(pattern_for(self.robot, channel), handler)
                 self._subscribers[channel.name].append(subscriber)
 
-    def ignore(self, channel: Channel) -> None:
+    def unsubscribe(self, channel: Channel) -> None:
         """End every subscription to `channel`."""
         with self._declaring:
             ended = self._subscribers.pop(channel.name, [])

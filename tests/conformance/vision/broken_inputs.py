@@ -240,7 +240,8 @@ class Eavesdropping(BrokenVision):
             receive(key, header, payload)
 
         self.link.receive = hears_all
-        self.link.hears = lambda key, hears=self.link.hears: self.overhears(key) or hears(key)
+        matched = self.link.subscribes_to
+        self.link.subscribes_to = lambda key: self.overhears(key) or matched(key)
 
 
 for _id, _key in (("V-HOST-61", "sightline/*/frame"), ("V-HOST-62", "sightline/xr1/frame"), ("V-HOST-63", "**")):

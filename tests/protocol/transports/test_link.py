@@ -164,8 +164,8 @@ def test_has_listener_follows_who_subscribes(rig):
 def test_what_is_ignored_is_heard_no_more_and_may_be_heard_again(rig):
     robot, peer, frames, _ = _pair(rig)
     second = peer.latest(FRAME)
-    peer.ignore(FRAME)
-    peer.ignore(STATUS)  # what was never subscribed to
+    peer.unsubscribe(FRAME)
+    peer.unsubscribe(STATUS)  # what was never subscribed to
     assert rig.until(lambda: not robot.has_listener(FRAME))
     robot.publish(FRAME, b"", b"1")
     rig.wait(0.1)

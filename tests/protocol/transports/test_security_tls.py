@@ -77,7 +77,7 @@ def test_who_reads_nothing_over_tls_stays_and_delays_nobody(secured):
     ):
         frames = vision.latest(FRAME)
         stalled.send('{"robot":"r1","session":"0000beef","wants":["frame"]}')
-        assert until(lambda: [peer.hears(FRAME) for peer in robot._peers] == [True, True])
+        assert until(lambda: [peer.subscribes_to(FRAME) for peer in robot._peers] == [True, True])
         for number in range(100):
             begin_s = time.monotonic()
             robot.publish(FRAME, b"{}", number.to_bytes(4) + bytes(200_000))

@@ -189,7 +189,7 @@ def watchers_drive(robot):
 def hears_raw(robot, is_taken, change=lambda header, payload: (header, payload)):
     """Raw messages for which `is_taken(key, header, payload)` are twists of vision."""
     link, twist = robot.link, CHANNELS["twist"]
-    wrap(link, "hears", lambda inner, key: inner(key) or is_taken(key, b"", b""))
+    wrap(link, "subscribes_to", lambda inner, key: inner(key) or is_taken(key, b"", b""))
 
     def receive(inner, key, header, payload):
         if is_taken(key, header, payload):

@@ -123,7 +123,8 @@ def test_a_connection_that_breaks_off_is_forgotten(robot):
 def test_a_frame_over_a_smaller_bound_is_counted_and_the_peer_stays(robot):
     with open_websocket("r1", connect=robot.endpoint, max_frame_bytes=999) as peer:
         frames = peer.latest(FRAME)
-        assert until(lambda: len(robot.link._peers) == 2 and all(each.hears(FRAME) for each in robot.link._peers))
+        peers = lambda: robot.link._peers  # noqa: E731
+        assert until(lambda: len(peers()) == 2 and all(each.subscribes_to(FRAME) for each in peers()))
         robot.link.publish(FRAME, b"", bytes(1000))
         assert until(lambda: peer.rejected == {OVERSIZE: 1})
         robot.link.publish(FRAME, b"", bytes(999))

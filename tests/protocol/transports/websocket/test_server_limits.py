@@ -48,8 +48,8 @@ def keys(tmp_path):
 
 def settled(places: ConnectionLimits, acts: bool) -> str:
     """What becomes of one more client."""
-    place = places.knock("10.0.0.1")
-    problem = places.settle(place, acts)
+    place = places.admit("10.0.0.1")
+    problem = places.promote(place, acts)
     if problem:
         places.leave(place)
     return problem
@@ -80,12 +80,12 @@ def test_who_may_act_takes_any_place():
 def test_an_address_has_few_strangers_and_all_together_not_many():
     places, given = ConnectionLimits(), []
     for number in range(MAX_HANDSHAKES // MAX_HANDSHAKES_PER_ADDRESS):
-        given += [places.knock(f"10.0.0.{number}") for _ in range(MAX_HANDSHAKES_PER_ADDRESS)]
-        assert places.knock(f"10.0.0.{number}") is None
+        given += [places.admit(f"10.0.0.{number}") for _ in range(MAX_HANDSHAKES_PER_ADDRESS)]
+        assert places.admit(f"10.0.0.{number}") is None
     assert None not in given
-    assert places.knock("10.0.0.99") is None
+    assert places.admit("10.0.0.99") is None
     places.leave(given[0])
-    assert places.knock("10.0.0.99") is not None
+    assert places.admit("10.0.0.99") is not None
 
 
 def test_a_client_is_no_stranger_any_more():
@@ -93,7 +93,7 @@ def test_a_client_is_no_stranger_any_more():
     assert [settled(places, True) for _ in range(2 * MAX_HANDSHAKES_PER_ADDRESS)] == [
         ""
     ] * 2 * MAX_HANDSHAKES_PER_ADDRESS
-    assert places.knock("10.0.0.1") is not None
+    assert places.admit("10.0.0.1") is not None
 
 
 # --- over sockets ----------------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ def test_vision_learns_of_viewers_and_of_their_end(site):
     vision, one, two = opened("vision"), opened("viewer"), opened("viewer")
     heard, seen = one.latest(OVERLAY), two.latest(OVERLAY)
     assert until(lambda: vision.has_listener(OVERLAY))
-    one.ignore(OVERLAY)
+    one.unsubscribe(OVERLAY)
     assert until(lambda: vision.publish(OVERLAY, b"{}", b"jpeg") and seen.take())
     heard.take()
     vision.publish(OVERLAY, b"{}", b"jpeg")
@@ -64,7 +64,7 @@ def test_large_messages_are_taken_only_while_somebody_wants_them(site):
     stranger = hail(end, role="vision", wants=["status"])
     assert until(lambda: stranger.send(large) or seen.take(0.2))
     viewer.close()
-    assert until(lambda: not robot._wants.told[1:])
+    assert until(lambda: not robot._subscriptions.announced[1:])
     with pytest.raises(ConnectionClosed):
         stranger.send(large)
         for _ in range(20):

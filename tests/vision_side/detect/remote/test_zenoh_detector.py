@@ -234,7 +234,7 @@ def pair():
     endpoint = free_endpoint()
     with ExitStack() as ending:
         robot = Robot("r1", endpoint, listens=True)
-        robot.link.ignore(DETECTIONS)  # or the service would take the robot for who waits
+        robot.link.unsubscribe(DETECTIONS)  # or the service would take the robot for who waits
         service = open_zenoh("r1", connect=[endpoint], role=ROLE)
         link = open_zenoh("r1", connect=[endpoint])
         for one in (robot.link, service, link):
