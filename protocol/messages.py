@@ -249,6 +249,9 @@ class Status(WireModel):
     auto_arm: bool = Field(default=False, description="whether the robot arms without an operator")
     tick_late_max_us: Microseconds = Field(default=0, description="the latest tick of the driver's loop")
     network_restarts: Counter = Field(default=0, description="how often the network process was started again")
+    battery_v: Number | None = Field(
+        default=None, description="voltage of the battery; null without a battery or a reading of the last 5 s"
+    )
     max_linear_mps: Number = Field(default=0.0, description="limit of speed")
     max_angular_rad_s: Number = Field(default=0.0, description="limit of turning")
 

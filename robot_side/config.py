@@ -53,6 +53,8 @@ class RobotConfig(Config):
     drive: PluginChoice = PluginChoice(kind="sim")
     range_sensor: PluginChoice | None = None
     """None: the simulation's when the drive is the simulation's, else none; kind "none" switches it off."""
+    battery: PluginChoice | None = None
+    """None: the robot does not measure its battery, and nothing depends on it."""
     legacy: LegacyConfig = LegacyConfig()
     safety: SafetyConfig = SafetyConfig()
     guard: GuardConfig = GuardConfig()
@@ -70,7 +72,8 @@ class RobotConfig(Config):
     @property
     def devices(self) -> dict[str, PluginChoice | None]:
         """The device in use of each kind, by its key; None where there is none."""
-        return {"camera": self.camera, "drive": self.motors, "range_sensor": self.ranging}
+        return {"camera": self.camera, "drive": self.motors, "range_sensor": self.ranging,
+                "battery": self.battery}
 
     @property
     def motors(self) -> PluginChoice:

@@ -5,7 +5,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from sightline.protocol.config import PluginRegistry
 from sightline.robot_side.config import PluginChoice
-from sightline.robot_side.ports import Camera, Drive, RangeSensor
+from sightline.robot_side.ports import Battery, Camera, Drive, RangeSensor
 
 Port = TypeVar("Port")
 
@@ -39,5 +39,6 @@ class DeviceGroup(Generic[Port]):
 CAMERAS: Final = DeviceGroup[Camera]("camera", Camera, "sightline.cameras")
 DRIVES: Final = DeviceGroup[Drive]("drive", Drive, "sightline.drives")
 RANGE_SENSORS: Final = DeviceGroup[RangeSensor]("range_sensor", RangeSensor, "sightline.range_sensors")
+BATTERIES: Final = DeviceGroup[Battery]("battery", Battery, "sightline.batteries")
 
-DEVICE_GROUPS: Final[tuple[DeviceGroup[Any], ...]] = (CAMERAS, DRIVES, RANGE_SENSORS)
+DEVICE_GROUPS: Final[tuple[DeviceGroup[Any], ...]] = (CAMERAS, DRIVES, RANGE_SENSORS, BATTERIES)

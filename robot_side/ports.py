@@ -1,4 +1,4 @@
-"""What a robot is made of, as ports: `Camera`, `Drive`, `RangeSensor`. Pure.
+"""What a robot is made of, as ports: `Camera`, `Drive`, `RangeSensor`, `Battery`. Pure.
 
 A plug-in is a class with a pydantic `Config` attribute, built as `Plugin(config)`. All times are microseconds of the
 robot's monotonic clock. Every method raises HardwareError, with the fix in its text, when the device is gone.
@@ -105,6 +105,16 @@ class RangeSensor(Protocol):
 
     def read(self) -> Ranges | None:
         """The newest scan that was not yet read; never blocks."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class Battery(Protocol):
+    """Measures the voltage of the battery. It is called on a thread of its own and may take a second."""
+
+    def read(self) -> float:
+        """Volts now. The battery counts as low after 5 s without a reading."""
         ...
 
     def close(self) -> None: ...

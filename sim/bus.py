@@ -44,6 +44,7 @@ PICTURE_HEAD = struct.Struct("<qB")
 PICTURE_REQUEST = struct.Struct("<BB")
 MAX_MESSAGE_BYTES = 1 << 20
 HELLO_TIMEOUT_S = 2.0
+_BATTERY_WAIT_S = 0.1
 
 
 def default_socket_dir() -> str:
@@ -242,6 +243,42 @@ class SimRange:
         t_us, first_rad, each_rad, least_m, most_m = RANGE_HEAD.unpack_from(message)
         ranges_m = array.array("f", message[RANGE_HEAD.size :])
         return Ranges(t_us, first_rad, each_rad, least_m, most_m, ranges_m)
+
+    def close(self) -> None:
+        """Idempotent."""
+        self._connection.close()
+
+
+class SimBattery:
+    """A battery that the simulated wheels drain: from full to empty over the distance that they turn."""
+
+    class Config(SimSocketConfig):
+        """Where the simulation listens, and what the battery holds."""
+
+        full_v: Annotated[float, Field(gt=0, le=100)] = 8.4
+        empty_v: Annotated[float, Field(gt=0, le=100)] = 6.0
+        range_m: Annotated[float, Field(gt=0, le=1e6)] = 1_000.0
+        """Way of each wheel until it is empty."""
+        wheel_radius_m: Annotated[float, Field(gt=0.005, lt=1.0)] = 0.035
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._connection = BusConnection(config.socket_dir, MOTION)
+        self._connection.open()
+        self._angles_rad = (0.0, 0.0)  # of a simulation that has just begun: its battery outlives this process
+        self._turned_rad = 0.0
+
+    def read(self) -> float:
+        """Volts now. Raises HardwareError when the simulation is gone."""
+        self._connection.newest()  # what has waited since the last call is old
+        message = self._connection.wait(_BATTERY_WAIT_S)
+        if message is not None:
+            left_rad, right_rad, _ = MOTION_ANGLES.unpack(message)
+            before_rad, self._angles_rad = self._angles_rad, (left_rad, right_rad)
+            self._turned_rad += (abs(left_rad - before_rad[0]) + abs(right_rad - before_rad[1])) / 2
+        config = self._config
+        share = min(1.0, self._turned_rad * config.wheel_radius_m / config.range_m)
+        return config.full_v - share * (config.full_v - config.empty_v)
 
     def close(self) -> None:
         """Idempotent."""

@@ -147,6 +147,7 @@ export const Status = {
   auto_arm: [boolean, false],
   tick_late_max_us: [counter, 0],
   network_restarts: [counter, 0],
+  battery_v: [orNull(real), null],
   max_linear_mps: [real, 0],
   max_angular_rad_s: [real, 0],
 };

@@ -20,6 +20,8 @@ def status_lines(robot: str, status: Status) -> Iterator[str]:
     yield f"driver    {holder}" + ("; arms by itself" if status.auto_arm else "")
     yield f"wheels    {twist_text(status.applied)}"
     yield f"limits    {status.max_linear_mps:.2f} m/s, {status.max_angular_rad_s:.2f} rad/s"
+    if status.battery_v is not None:
+        yield f"battery   {status.battery_v:.2f} V"
     yield f"sight     frame age {millis(status.frame_age_us)}, capture to command {millis(status.latency_us)}"
     camera = "calibrated" if stream.calibrated else "not calibrated"
     counts = f"{stream.sent} sent, {stream.credit_timeouts} unanswered"

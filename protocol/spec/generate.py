@@ -34,6 +34,7 @@ _UNITS: Final = {
     "_rad_s3": "rad/s³",
     "_s": "s",
     "_ms": "ms",
+    "_v": "V",
     "_rad": "rad",
     "_us": "µs",
     "_px": "px",

@@ -28,6 +28,7 @@ from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.kinematics import Odometer, wheel_speeds
 from sightline.robot_side.pipe import CommandAck, RobotMotion
 from sightline.robot_side.ports import Ranges, WheelAngles
+from sightline.robot_side.safety.battery import BatteryMonitor
 from sightline.robot_side.safety.gate import SafetyGate
 from sightline.robot_side.safety.guard import RangeGuard
 
@@ -57,7 +58,8 @@ class DriverCore:
         self.config = config
         self.session = session
         self._guard = RangeGuard(config.guard) if config.ranging else None
-        self.gate = SafetyGate(config.safety, session, stopped=stopped, guard=self._guard)
+        self.battery = BatteryMonitor(config.safety) if config.battery else None
+        self.gate = SafetyGate(config.safety, session, stopped=stopped, guard=self._guard, battery=self.battery)
         self.odometer = Odometer(config.wheels)
         self.stream = StreamStatus()
         self.tick_late_max_us = 0
@@ -89,6 +91,11 @@ class DriverCore:
             return None
         sender = Holder(source=header.source, session=header.session)
         return CommandAck(sender, header.echo.seq, header.compute_us, self.gate.holder(now_us))
+
+    def on_battery(self, volts: float, t_us: int) -> None:
+        """The newest voltage, and when it was read."""
+        if self.battery is not None:
+            self.battery.see(volts, t_us)
 
     def on_request(self, message: Message, now_us: int) -> None:
         """Carry out a request; the reply waits in `messages`."""
@@ -156,6 +163,7 @@ class DriverCore:
             auto_arm=gate.arms_itself,
             tick_late_max_us=self.tick_late_max_us,
             network_restarts=self.network_restarts,
+            battery_v=self._battery_v(now_us),
             max_linear_mps=limits.max_linear_mps,
             max_angular_rad_s=limits.max_angular_rad_s,
         )
@@ -183,6 +191,10 @@ class DriverCore:
         payload = encode_ranges(scan.ranges_m)
         if len(payload) <= SCAN.max_payload_bytes:
             self._outbox.append(Message(SCAN, "", encode(header), payload))
+
+    def _battery_v(self, now_us: int) -> float | None:
+        volts = self.battery.volts(now_us) if self.battery else None
+        return None if volts is None else _within(volts)
 
     def _is_due(self, channel: Channel, now_us: int) -> bool:
         due_us = self._due_us.get(channel.name, now_us)

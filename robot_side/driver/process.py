@@ -1,6 +1,7 @@
 """The control loop of the driver process. Shell."""
 
 import logging
+import math
 import secrets
 import select
 import signal
@@ -14,6 +15,7 @@ from typing import Final
 from sightline.protocol.channels import REQUEST, TWIST, check_robot_id
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
+from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import WireError
 from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.messages import LastRejection, State, StreamStatus
@@ -23,8 +25,9 @@ from sightline.robot_side.driver.core import DriverCore
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS, SystemdNotifier, request_real_time
 from sightline.robot_side.pipe import DriverEnd
-from sightline.robot_side.plugins import DRIVES, RANGE_SENSORS
-from sightline.robot_side.ports import Drive, Ranges, RangeSensor, WheelAngles
+from sightline.robot_side.plugins import BATTERIES, DRIVES, RANGE_SENSORS
+from sightline.robot_side.ports import Battery, Drive, Ranges, RangeSensor, WheelAngles
+from sightline.robot_side.safety.battery import BatteryLevel
 from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
 from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
 
@@ -39,6 +42,7 @@ _log: Final = logging.getLogger(__name__)
 _SHUTDOWN_US = 2_000_000
 _WATCHDOG_PERIOD_US = 100_000
 _STACK_BYTES = 256 * 1024  # the process locks its memory, a stack of the usual 8 MB with it
+_BATTERY_PERIOD_S = 1.0
 _WARNING = (
     "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
     "(docs/safety.md)"
@@ -58,7 +62,10 @@ def run(config: RobotConfig) -> int:
         ranges = RANGE_SENSORS.build(config.ranging) if config.ranging else None
         if ranges is not None:
             ending.callback(ranges.close)
-        driver = Driver(config, drive, ranges)
+        reader = BatteryReader(BATTERIES.build(config.battery)) if config.battery else None
+        if reader is not None:
+            ending.callback(reader.close)
+        driver = Driver(config, drive, ranges, reader)
         ending.callback(driver.latch_writer.close)
         ending.callback(driver.driver_end.close)
         ending.callback(_zero, drive)  # last in, first to run: however the loop ends, the motors are set to zero
@@ -80,14 +87,51 @@ def zero_motors(config: RobotConfig) -> int:
     return 0
 
 
+class BatteryReader:
+    """Reads the battery once a second on a thread of its own: a slow device must not hold up the loop."""
+
+    def __init__(self, battery: Battery) -> None:
+        self._battery = battery
+        self._closing = threading.Event()
+        self._failed = False
+        self.newest: tuple[float, int] | None = None
+        """Volts, and when they were read."""
+        threading.Thread(target=self._read_all, name="battery", daemon=True).start()
+
+    def close(self) -> None:
+        """End after the reading under way; never waits for it."""
+        self._closing.set()
+        self._battery.close()
+
+    def _read_all(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self.newest = self._read(), monotonic_us()
+            except PLUGIN_ERRORS:
+                if not self._failed and not self._closing.is_set():
+                    _log.exception("the battery cannot be read")
+                self._failed = True
+            self._closing.wait(_BATTERY_PERIOD_S)
+
+    def _read(self) -> float:
+        volts = float(self._battery.read())
+        if not math.isfinite(volts):
+            raise ValueError(f"invalid voltage {volts}: not finite")
+        return volts
+
+
 class Driver:
     """The loop and what it holds."""
 
-    def __init__(self, config: RobotConfig, drive: Drive, ranges: RangeSensor | None) -> None:
+    def __init__(
+        self, config: RobotConfig, drive: Drive, ranges: RangeSensor | None, battery_reader: BatteryReader | None = None
+    ) -> None:
         latch = StopLatch(config.state_dir, config.robot)
         self.latch_writer = LatchWriter(latch)
         self._drive = drive
         self._ranges = ranges
+        self._battery_reader = battery_reader
+        self._logged_level = BatteryLevel.SILENT
         self._driver_core = DriverCore(config, secrets.token_hex(4), stopped=latch.is_set())
         self._logged_state = self._driver_core.gate.state
         self._ending_since_us: int | None = None
@@ -157,6 +201,7 @@ class Driver:
             self._driver_core.network_restarts = max(0, self.driver_end.restarts)
             self.latch_writer.want(self._driver_core.gate.state is State.STOPPED)
             self._log_state(self._driver_core.gate.state, self._driver_core.gate.reason)
+            self._log_battery(now_us)
             self._feed_watchdog(now_us)
 
     def _answer(self) -> None:
@@ -182,6 +227,8 @@ class Driver:
         try:
             wheels = self._drive.wheels()
             scan = self._scanned()
+            if self._battery_reader is not None and self._battery_reader.newest is not None:
+                self._driver_core.on_battery(*self._battery_reader.newest)
             speeds = self._driver_core.tick(monotonic_us(), wheels, scan)
         except BlindZoneError:  # with the first scan, and without one nothing moves
             raise
@@ -218,6 +265,17 @@ class Driver:
         logged, self._logged_state = self._logged_state, state
         if state is not logged and {state, logged} != {State.ACTIVE, State.DEGRADED}:
             self._log(f"{state} ({reason})")  # on a lossy link those two alternate many times a second
+
+    def _log_battery(self, now_us: int) -> None:
+        """One line per change of level."""
+        battery = self._driver_core.battery
+        if battery is None:
+            return
+        level, logged = battery.level(now_us), self._logged_level
+        self._logged_level = level
+        if level is not logged:
+            volts = battery.volts(now_us)
+            self._log(f"battery {level.value}" + (f" ({volts:.2f} V)" if volts is not None else ""))
 
     def _log(self, line: str) -> None:
         _log.info("robot %s: %s", self._driver_core.config.robot, line)

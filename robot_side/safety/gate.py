@@ -20,6 +20,7 @@ from sightline.protocol.messages import (
     Twist,
     Verb,
 )
+from sightline.robot_side.safety.battery import BatteryMonitor
 from sightline.robot_side.safety.guard import RangeGuard
 from sightline.robot_side.safety.lease import HUMANS, RANKS, Lease
 from sightline.robot_side.safety.limits import Ramp, SafetyConfig, age_factor, clamp_twist
@@ -42,7 +43,13 @@ class SafetyGate:
     """See the module. Times are the robot's monotonic clock and never go back; the caller steps it at 50 Hz."""
 
     def __init__(
-        self, config: SafetyConfig, session: str, *, stopped: bool = False, guard: RangeGuard | None = None
+        self,
+        config: SafetyConfig,
+        session: str,
+        *,
+        stopped: bool = False,
+        guard: RangeGuard | None = None,
+        battery: BatteryMonitor | None = None,
     ) -> None:
         self.config = config
         self.issued = IssuedRecord(session)
@@ -58,6 +65,7 @@ class SafetyGate:
         self._lease = Lease(config.lease_ms * 1000)
         self._ramp = Ramp(config)
         self._guard = guard
+        self._battery = battery
         self._command: AcceptedCommand | None = None
         self._live_commands = 0
         self.arms_itself = config.auto_arm and not stopped
@@ -168,6 +176,8 @@ class SafetyGate:
     def _causes(self, command: AcceptedCommand | None, now_us: int) -> Iterator[Cause]:
         """Everything that may slow or hold the robot. The smallest factor wins, the first of equal ones."""
         config = self.config
+        if self._battery is not None:
+            yield from self._battery.causes(now_us)
         if self.pictures.unchanged_us() > config.max_age_us:
             yield Cause(0.0, "the camera's picture does not change")
         if command is None:

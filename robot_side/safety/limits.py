@@ -6,8 +6,8 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from sightline.protocol.config import Config
 from sightline.protocol.messages import STILL, Twist
+from sightline.robot_side.safety.battery import BatteryLimits
 
 TICK_US = 20_000
 """The driver's period: 50 Hz."""
@@ -24,7 +24,7 @@ _LONGEST_STEP_US = 1_000_000
 Millis = Annotated[int, Field(ge=20, le=5_000)]
 
 
-class SafetyConfig(Config):
+class SafetyConfig(BatteryLimits):
     """Limits and times of the gate. Rejected where the stop they imply breaks 700 ms or 0.25 m."""
 
     max_linear_mps: float = Field(default=0.5, gt=0, le=3.0, description="forward speed, at most")

@@ -203,3 +203,48 @@ def test_a_guard_that_cuts_nothing_says_nothing():
     rig = guarded()
     rig.offer(0.5)
     assert rig.step() == Decision(twist(0.5), A, "driving")
+
+
+# --- the battery -------------------------------------------------------------------------------------------------
+
+
+def battery_rig(volts, seconds_old=0.0):
+    """An armed rig with a battery that gave `volts` so long ago."""
+    rig = Rig(battery=True).armed()
+    rig.battery.see(volts, rig.now_us - round(seconds_old * 1e6))
+    return rig
+
+
+@pytest.mark.parametrize(
+    ("volts", "seconds_old", "factor", "state", "reason"),
+    [
+        (8.0, 0.0, 1.0, A, "driving"),
+        (6.9, 0.0, 0.5, G, "the battery is low; half speed"),
+        (8.0, 6.0, 0.5, G, "the battery is silent; half speed"),
+        (6.3, 0.0, 0.0, H, "the battery is empty"),
+    ],
+)
+@pytest.mark.parametrize(("linear", "angular"), [(0.5, 0.0), (0.0, 2.5), (0.5, 2.5), (-0.5, 1.0)])
+def test_battery_scales_both_axes_so_that_the_curve_stays(volts, seconds_old, factor, state, reason, linear, angular):
+    rig = battery_rig(volts, seconds_old)
+    rig.drive(3000, linear, angular)
+    decision = rig.gate.step(rig.now_us)
+    assert (decision.state, decision.reason) == (state, reason)
+    assert rig.gate.applied.linear_mps == pytest.approx(factor * linear)
+    assert rig.gate.applied.angular_rad_s == pytest.approx(factor * angular)
+
+
+@pytest.mark.parametrize(("age_ms", "factor"), [(0, 0.5), (275, 0.5), (350, 0.2)])
+def test_the_smaller_limit_wins_beside_a_low_battery(age_ms, factor):
+    rig = battery_rig(6.9)
+    for _ in range(150):
+        rig.offer(0.5, 0.0, age_ms=age_ms - 20 if age_ms else 0)
+        rig.step()
+    assert rig.gate.applied.linear_mps == pytest.approx(factor * 0.5)
+    assert rig.gate.reason == ("the battery is low; half speed" if factor == 0.5 else "the frames are ageing; slower")
+
+
+def test_an_empty_battery_is_the_reason_also_without_a_command():
+    rig = battery_rig(6.3)
+    rig.silence(400)
+    assert (rig.gate.state, rig.gate.reason) == (H, "the battery is empty")

@@ -1,0 +1,93 @@
+"""What the voltage of the battery permits: full speed, half of it, or none. Pure."""
+
+import math
+from enum import Enum
+from typing import Final, Self
+
+from pydantic import Field, model_validator
+
+from sightline.protocol.config import Config
+from sightline.robot_side.safety.states import Cause
+
+SILENT_US: Final = 5_000_000
+"""Without a valid reading for longer than this the battery counts as low."""
+
+
+class BatteryLimits(Config):
+    """Voltages of the battery, part of the limits of the gate. The defaults are those of two lithium cells."""
+
+    low_battery_v: float = Field(default=7.0, le=100, description="the speed limit is halved below this voltage")
+    empty_battery_v: float = Field(default=6.4, gt=0, description="HOLD below this voltage")
+    battery_hysteresis_v: float = Field(
+        default=0.3,
+        ge=0,
+        le=10,
+        description="low and empty end only this far above their voltage, which recovers when the motors stop",
+    )
+
+    @model_validator(mode="after")
+    def _empty_is_below_low(self) -> Self:
+        if self.empty_battery_v >= self.low_battery_v:
+            raise ValueError("empty_battery_v must be below low_battery_v")
+        return self
+
+
+class BatteryLevel(Enum):
+    """How full the battery is."""
+
+    OK = "ok"
+    LOW = "low"
+    SILENT = "silent"
+    EMPTY = "empty"
+
+
+_CAUSES: Final = {
+    BatteryLevel.LOW: Cause(0.5, "the battery is low; half speed"),
+    BatteryLevel.SILENT: Cause(0.5, "the battery is silent; half speed"),
+    BatteryLevel.EMPTY: Cause(0.0, "the battery is empty"),
+}
+
+
+class BatteryMonitor:
+    """The level after the newest reading.
+
+    Voltage recovers when the motors stop. A level therefore ends only `battery_hysteresis_v` above where it began.
+    """
+
+    def __init__(self, config: BatteryLimits) -> None:
+        self._config = config
+        self._level = BatteryLevel.OK
+        self._newest: tuple[float, int] | None = None
+
+    def see(self, volts: float, t_us: int) -> None:
+        """Take a reading made at `t_us`; nan and inf are not readings."""
+        if math.isfinite(volts):
+            self._level = self._after(volts)
+            self._newest = volts, t_us
+
+    def _after(self, volts: float) -> BatteryLevel:
+        config = self._config
+        empty_v, low_v = config.empty_battery_v, config.low_battery_v
+        if self._level is BatteryLevel.EMPTY:
+            empty_v += config.battery_hysteresis_v
+        if self._level is not BatteryLevel.OK:
+            low_v += config.battery_hysteresis_v
+        if volts < empty_v:
+            return BatteryLevel.EMPTY
+        return BatteryLevel.LOW if volts < low_v else BatteryLevel.OK
+
+    def volts(self, now_us: int) -> float | None:
+        """The newest reading; None while the battery is silent."""
+        if self._newest is None or now_us - self._newest[1] > SILENT_US:
+            return None
+        return self._newest[0]
+
+    def level(self, now_us: int) -> BatteryLevel:
+        """The level now. An empty battery that falls silent stays empty."""
+        silent = self.volts(now_us) is None and self._level is not BatteryLevel.EMPTY
+        return BatteryLevel.SILENT if silent else self._level
+
+    def causes(self, now_us: int) -> tuple[Cause, ...]:
+        """What limits the speed now, if anything."""
+        cause = _CAUSES.get(self.level(now_us))
+        return () if cause is None else (cause,)
