@@ -1,0 +1,28 @@
+"""docs/how-to: at most ten steps a list, and every file and folder that a page names exists."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent.parent
+PAGES = sorted((ROOT / "docs" / "how-to").glob("add-*.md"))
+NAMED = re.compile(r"`([a-z_]+/[\w/.-]*|pyproject\.toml)`")
+LINKED = re.compile(r"\]\(([^)]+)\)")
+
+
+def test_there_are_the_agreed_pages():
+    assert {page.stem for page in PAGES} == {
+        "add-a-device", "add-a-status-field", "add-a-mission", "add-a-detector", "add-a-command",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_page_has_at_most_ten_steps_and_names_what_exists(page):
+    text = page.read_text()
+    steps = [int(number) for number in re.findall(r"^(\d+)\. ", text, re.MULTILINE)]
+    assert steps and max(steps) <= 10
+    for path in NAMED.findall(text):
+        assert (ROOT / path).exists(), path
+    for link in LINKED.findall(text):
+        assert (page.parent / link).exists(), link
