@@ -84,7 +84,7 @@ class DriverCore:
             header = decode(AnswerHeader, message.header) if message.header else None
             twist = parse_twist(message.payload)
         except WireError as error:
-            self.gate.refuse(message.source, error)
+            self.gate.reject(message.source, error)
             return None
         result = self.gate.offer(message.source, header, twist, now_us)
         if header is None or result.reason in _CITES_NOTHING_OF_OURS:
@@ -104,14 +104,14 @@ class DriverCore:
             header = decode(RequestHeader, message.header)
             request = decode(Request, message.payload)
         except WireError as error:
-            self.gate.refuse(message.source, error)
+            self.gate.reject(message.source, error)
             return
         try:
             if header.source != message.source:
                 raise WireError(RejectReason.UNKNOWN_SOURCE, "key and header disagree on the source")
             detail, granted = self.gate.request(header, request, now_us), True
         except WireError as error:
-            self.gate.refuse(message.source, error)
+            self.gate.reject(message.source, error)
             detail, granted = f"{error.reason}: {error.detail}"[:200], False
         reply = Reply(to=header.session, id=request.id, ok=granted, state=self.gate.state, detail=detail)
         self._post(REPLY, reply, now_us)
@@ -158,7 +158,7 @@ class DriverCore:
             latency_us=gate.latency_us,
             accepted=gate.accepted,
             refused=dict(gate.counters + self.rejected_by_transport),
-            last_refusal=gate.last_refusal,
+            last_refusal=gate.last_rejection,
             stream=self.stream,
             auto_arm=gate.arms_itself,
             tick_late_max_us=self.tick_late_max_us,

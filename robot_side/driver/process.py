@@ -250,7 +250,7 @@ class Driver:
             return 0.0, 0.0
 
     def _scanned(self) -> Ranges | None:
-        """The newest scan. Raises DeadZoneError for a sensor that the guard must not rely on."""
+        """The newest scan. Raises BlindZoneError for a sensor that the guard must not rely on."""
         scan = self._ranges.read() if self._ranges else None
         if scan is None:
             return None
@@ -314,14 +314,14 @@ class Driver:
             self._log_rejection(rejection, count)
 
     def _on_raw(self, packet: bytes) -> bool:
-        message, rejection_before = ipc.unpack_message(packet), self._driver_core.gate.last_refusal
+        message, rejection_before = ipc.unpack_message(packet), self._driver_core.gate.last_rejection
         if message.channel is TWIST:
             ack = self._driver_core.on_twist(message, monotonic_us())
             if ack is not None:
                 self._command_acks.append(ack)
         elif message.channel is REQUEST:
             self._driver_core.on_request(message, monotonic_us())
-        rejection = self._driver_core.gate.last_refusal
+        rejection = self._driver_core.gate.last_rejection
         if rejection is not None and rejection is not rejection_before:
             self._log_rejection(rejection)
         return True

@@ -1,7 +1,7 @@
 """`SafetyGate`: accepts or rejects commands, and decides at every tick what the wheels do. Pure.
 
-`offer` judges a command once, on arrival; `step` decides, each tick and with the age judged again, what the wheels do.
-Liveness is the accepted command: refused commands, acks and open connections refresh nothing.
+`offer` validates a command once, on arrival; `step` checks its age again each tick and decides what the wheels do.
+Liveness is the accepted command: rejected commands, acks and open connections refresh nothing.
 """
 
 import math
@@ -56,7 +56,7 @@ class SafetyGate:
         self.pictures = FreshnessRecord()
         self.counters: Counter[str] = Counter()
         self.accepted = 0
-        self.last_refusal: LastRejection | None = None
+        self.last_rejection: LastRejection | None = None
         self.latency_us: int | None = None
         self.state = State.STOPPED if stopped else State.DISARMED
         self.reason = "STOP was set before the restart" if stopped else "not armed"
@@ -75,21 +75,21 @@ class SafetyGate:
     # --- commands ------------------------------------------------------------------------------------------------
 
     def offer(self, source: str, header: AnswerHeader | None, twist: Twist, now_us: int) -> CommandResult:
-        """Judge one command on arrival. Never raises; every refusal is typed, counted and kept in words."""
+        """Validate one command on arrival. Never raises; every rejection is typed and counted, the newest is kept."""
         try:
-            age_us = self._judge(source, header, twist, now_us)
+            age_us = self._validate(source, header, twist, now_us)
         except WireError as error:
-            return self.refuse(source, error)
+            return self.reject(source, error)
         self.accepted += 1
         return CommandResult(None, age_us=age_us)
 
-    def refuse(self, source: str, error: WireError) -> CommandResult:
-        """Count a refusal; also for what the decoder refused before it could be offered."""
+    def reject(self, source: str, error: WireError) -> CommandResult:
+        """Count a rejection; also of what the decoder rejected before it could be offered."""
         self.counters[error.reason] += 1
-        self.last_refusal = LastRejection(source=source[:32], reason=error.reason, detail=error.detail[:200])
+        self.last_rejection = LastRejection(source=source[:32], reason=error.reason, detail=error.detail[:200])
         return CommandResult(error.reason, error.detail)
 
-    def _judge(self, source: str, header: AnswerHeader | None, twist: Twist, now_us: int) -> int:
+    def _validate(self, source: str, header: AnswerHeader | None, twist: Twist, now_us: int) -> int:
         if not (math.isfinite(twist.linear_mps) and math.isfinite(twist.angular_rad_s)):
             raise WireError(RejectReason.NOT_FINITE, "twist is not finite")
         who, age_us = self._identify(source, header, now_us)
@@ -103,7 +103,7 @@ class SafetyGate:
         self._lease.take(who, now_us)
         if not is_armed(self.state):
             raise WireError(RejectReason.DISARMED, self.reason)
-        self._keep(source, twist, now_us, age_us)
+        self._accept(source, twist, now_us, age_us)
         return age_us
 
     def _identify(self, source: str, header: AnswerHeader | None, now_us: int) -> tuple[Holder, int]:
@@ -125,7 +125,7 @@ class SafetyGate:
         self._sequence.check(header)
         return Holder(source=header.source, session=header.session), age_us
 
-    def _keep(self, source: str, twist: Twist, now_us: int, age_us: int) -> None:
+    def _accept(self, source: str, twist: Twist, now_us: int, age_us: int) -> None:
         config, guest = self.config, source == "guest"
         limited = clamp_twist(
             twist,
@@ -198,7 +198,7 @@ class SafetyGate:
         if now_us - self._hold_since_us > self.config.disarm_after_hold_s * 1e6:
             self._leave(Event.EXPIRED, f"disarmed after {self.config.disarm_after_hold_s:g} s without commands")
 
-    # --- what people ask -----------------------------------------------------------------------------------------
+    # --- requests ------------------------------------------------------------------------------------------------
 
     def request(self, header: RequestHeader, request: Request, now_us: int) -> str:
         """Carry out a request and return what happened, in words. Raises WireError with the reason if it may not be."""
@@ -210,8 +210,8 @@ class SafetyGate:
             return self.stop(f"STOP by {who.source}")
         if request.verb is Verb.DISARM:
             return self.disarm(f"disarmed by {who.source}")
-        ask = {Verb.ARM: self.arm, Verb.RESET: self.reset, Verb.ACQUIRE: self.acquire, Verb.RELEASE: self.release}
-        return ask[request.verb](who, now_us)
+        handlers = {Verb.ARM: self.arm, Verb.RESET: self.reset, Verb.ACQUIRE: self.acquire, Verb.RELEASE: self.release}
+        return handlers[request.verb](who, now_us)
 
     def stop(self, reason: str = "STOP") -> str:
         """Latch STOPPED: wheels to zero and held until `reset`. Always granted."""
@@ -224,19 +224,19 @@ class SafetyGate:
             self._end(Event.FAULT, reason)
 
     def halt(self, reason: str) -> None:
-        """As `fault`, and without a ramp: the caller, who could not step this, has told the wheels zero."""
+        """As `fault`, and without a ramp: the caller, who could not step this, has set the wheels to zero."""
         self.fault(reason)
         self._ramp.force(STILL)
         self.applied = STILL
 
     def disarm(self, reason: str = "disarmed") -> str:
-        """Wheels to zero; commands are judged but not obeyed. Always granted."""
+        """Wheels to zero; commands are validated but not applied. Always granted."""
         self._end(Event.DISARM, reason)
         return "disarmed"
 
     def reset(self, who: Holder, now_us: int) -> str:
         """Leave STOPPED or FAULT for DISARMED: permits motion, never starts it."""
-        self._refuse_beside_human(who, now_us)
+        self._reject_beside_human(who, now_us)
         if self.state not in (State.STOPPED, State.FAULT):
             return f"nothing to reset: {self.state}"
         if self.applied != STILL:
@@ -246,7 +246,7 @@ class SafetyGate:
 
     def arm(self, who: Holder, now_us: int) -> str:
         """Let the lease holder drive, once its commands are live and the wheels at zero."""
-        self._refuse_beside_human(who, now_us)
+        self._reject_beside_human(who, now_us)
         if is_armed(self.state):
             return "already armed"
         if self.state is not State.DISARMED:
@@ -287,7 +287,7 @@ class SafetyGate:
         """Age of the frame behind the command in force; None without one."""
         return None if self._command is None else max(0, now_us - self._command.echo_us)
 
-    def _refuse_beside_human(self, who: Holder, now_us: int) -> None:
+    def _reject_beside_human(self, who: Holder, now_us: int) -> None:
         holder = self._lease.live_holder(now_us)
         if holder is not None and holder.source in HUMANS and holder != who:
             raise WireError(RejectReason.NOT_ALLOWED, f"{holder.source} {holder.session} drives")

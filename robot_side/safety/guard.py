@@ -124,7 +124,7 @@ class RangeGuard:
         return self._scan_us is not None and 0 <= now_us - self._scan_us <= self._config.max_scan_age_ms * 1000
 
 
-# What stands inside a range sensor's dead zone is not seen: all of it must lie within the guard's stop zone. Pure.
+# What stands inside the blind zone of a range sensor is not seen: all of it must lie within the guard's stop zone. Pure.
 #
 # Otherwise a robot that creeps up to something loses sight of it before the guard has stopped it, and drives on.
 
@@ -134,7 +134,7 @@ class BlindZoneError(ConfigError):
 
 
 def check_blind_zone(guard: GuardConfig, scan: Ranges) -> None:
-    """Raise DeadZoneError unless whatever this sensor cannot see is nearer to the robot than `guard.stop_m`.
+    """Raise BlindZoneError unless whatever this sensor cannot see is nearer to the robot than `guard.stop_m`.
 
     Of `scan`, what counts is where the sensor looks and its minimum, not what it saw. Raises ValueError where one of
     these is no number: a bad reading, which a later one may mend.

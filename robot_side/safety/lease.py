@@ -11,7 +11,7 @@ HUMANS = frozenset({"teleop"})
 
 @dataclass(slots=True)
 class Lease:
-    """Held until `expires_us`; renewed only by commands that the gate judged good."""
+    """Held until `expires_us`; renewed only by accepted commands."""
 
     life_us: int
     holder: Holder | None = None
@@ -22,7 +22,7 @@ class Lease:
         return self.holder if now_us < self.expires_us else None
 
     def may_take(self, who: Holder, now_us: int) -> bool:
-        """Whether `who` holds it, or outranks the holder, or nobody holds it."""
+        """Whether `who` holds it, or outranks the holder, or there is no holder."""
         holder = self.live_holder(now_us)
         return holder is None or holder == who or RANKS[who.source] > RANKS[holder.source]
 
@@ -31,7 +31,7 @@ class Lease:
         self.holder, self.expires_us = who, now_us + self.life_us
 
     def drop(self) -> None:
-        """Nobody drives."""
+        """End it."""
         self.holder, self.expires_us = None, 0
 
     def lost_human(self, now_us: int) -> bool:

@@ -146,7 +146,7 @@ class Ramp:
 
 @dataclass(frozen=True, slots=True)
 class StopBound:
-    """After the last valid command, from top speed: when the speed told starts to fall (`falls_us`), when it is zero
+    """After the last valid command, from top speed: when the set speed starts to fall (`falls_us`), when it is zero
     (`ramped_us`), when the wheels stand (`zero_us`), and the way until then."""
 
     falls_us: int

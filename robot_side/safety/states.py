@@ -1,10 +1,10 @@
 """States of the gate and the table of their transitions. Pure.
 
     state      wheels                         left by
-    DISARMED   zero; commands are judged      arm
+    DISARMED   zero; commands are validated   arm
     HOLD       ramp to zero, then held        a fresh command; ten seconds; disarm
-    ACTIVE     obey the command               silence, age; disarm
-    DEGRADED   obey, speed limit lowered      silence, age; disarm
+    ACTIVE     apply the command              silence, age; disarm
+    DEGRADED   apply, speed limit lowered     silence, age; disarm
     STOPPED    zero, latched                  reset (never starts motion: it leads to DISARMED)
     FAULT      zero, the drive failed         reset
 """

@@ -1,6 +1,6 @@
 """Validates what a command cites against the robot's own record of issued frames. Pure.
 
-Nothing here trusts a sender: a frame is known because this robot issued it, and as old as the robot's clock says.
+Nothing here trusts a sender: a frame is known because this robot issued it, and its age is by the robot's clock.
 """
 
 from collections import OrderedDict
@@ -15,7 +15,7 @@ _KEPT_SENDERS = 64
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
-    """What became of a command. `reason` is None when it was accepted."""
+    """The result of a command. `reason` is None when it was accepted."""
 
     reason: RejectReason | None
     detail: str = ""
@@ -55,7 +55,7 @@ class IssuedRecord:
         self._denied_seq = -1
 
     def add(self, channel: str, seq: int, t_us: int) -> None:
-        """Remember it; the caller tells this before it publishes."""
+        """Remember it; the caller calls this before it publishes."""
         times = self._times.setdefault(channel, OrderedDict())
         times[seq] = t_us
         if len(times) > _KEPT_PER_CHANNEL:
@@ -66,7 +66,7 @@ class IssuedRecord:
         return next(reversed(self._times.get(channel, OrderedDict({-1: 0}))))
 
     def deny_earlier(self) -> None:
-        """From now on no request may cite a status issued before: somebody has just ended what it was asked for."""
+        """From now on no request may cite a status issued before: what it was for has just ended."""
         self._denied_seq = self.last_seq("status")
 
     def check_request(self, echo: Echo | None, now_us: int, max_age_us: int) -> None:
@@ -105,7 +105,7 @@ class FreshnessRecord:
         self._newest_us = self._changed_us = 0
 
     def add(self, t_us: int, fingerprint: int) -> None:
-        """A frame captured at `t_us` was issued; `fingerprint` 0 is never judged (a source that is not live)."""
+        """A frame captured at `t_us` was issued; `fingerprint` 0 is never compared (a source that is not live)."""
         if fingerprint == 0 or fingerprint != self._fingerprint:
             self._changed_us = t_us
         self._fingerprint, self._newest_us = fingerprint, t_us

@@ -457,7 +457,7 @@ class OlderClient(Client):
         if message.count(b"|") != 1:
             return True
         if other and not self.has("any client drives"):
-            server.robot.driving.gate.refuse("guest", WireError(RejectReason.NOT_HOLDER, "another client drives"))
+            server.robot.driving.gate.reject("guest", WireError(RejectReason.NOT_HOLDER, "another client drives"))
             return False
         server.driver, server.driven_s = self, now_s
         return True

@@ -64,7 +64,7 @@ def test_the_wheels_may_turn_in_three_states():
 def test_a_new_gate_is_off(stopped, state, reason):
     gate = SafetyGate(SafetyConfig(), ROBOT, stopped=stopped)
     assert (gate.state, gate.reason, gate.applied) == (state, reason, STILL)
-    assert (gate.accepted, gate.last_refusal, gate.latency_us, dict(gate.counters)) == (0, None, None, {})
+    assert (gate.accepted, gate.last_rejection, gate.latency_us, dict(gate.counters)) == (0, None, None, {})
     assert gate.holder(0) is None and gate.frame_age_us(0) is None
     assert gate.step(5) == Decision(STILL, state, reason)
     assert SafetyGate(SafetyConfig(), ROBOT).state is D
@@ -97,7 +97,7 @@ def test_a_refusal_is_counted_and_kept_in_words_and_an_acceptance_has_its_age():
     stale = rig.offer(age_ms=401)
     assert stale.detail == "frame 9 is 401 ms old, at most 400"
     assert rig.gate.counters["STALE"] == 1 and rig.gate.accepted == accepted + 1
-    assert rig.gate.last_refusal == LastRejection(source="vision", reason="STALE", detail=stale.detail)
+    assert rig.gate.last_rejection == LastRejection(source="vision", reason="STALE", detail=stale.detail)
     rig.offer(age_ms=402)
     assert rig.gate.counters["STALE"] == 2 and rig.gate.latency_us == 12_000
 
@@ -105,8 +105,8 @@ def test_a_refusal_is_counted_and_kept_in_words_and_an_acceptance_has_its_age():
 @pytest.mark.parametrize("size", [31, 32, 33, 199, 200, 201])
 def test_the_last_refusal_is_cut_to_what_a_status_holds(size):
     rig = Rig()
-    verdict = rig.gate.refuse("s" * size, WireError(RejectReason.MALFORMED, "d" * size))
-    assert rig.gate.last_refusal == LastRejection(
+    verdict = rig.gate.reject("s" * size, WireError(RejectReason.MALFORMED, "d" * size))
+    assert rig.gate.last_rejection == LastRejection(
         source="s" * min(size, 32), reason="MALFORMED", detail="d" * min(size, 200)
     )
     assert verdict.detail == "d" * size and verdict.reason is RejectReason.MALFORMED

@@ -77,7 +77,7 @@ def accepts_unarmed(robot):
         gate.accepted += 1
         return CommandResult(None, age_us=0)
 
-    wrap(gate, "refuse", around)
+    wrap(gate, "reject", around)
 
 
 @breaks("R-ARM-05")
@@ -194,7 +194,7 @@ def judges_on_in_stopped(robot):
         reason = RejectReason.DISARMED if error.reason == "STOPPED" and source in RANKS else error.reason
         return inner(source, WireError(reason, error.detail))
 
-    wrap(gate, "refuse", around)
+    wrap(gate, "reject", around)
 
 
 @breaks("R-STOP-05")

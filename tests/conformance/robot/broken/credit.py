@@ -132,7 +132,7 @@ def on_bare(robot, change):
 @breaks("R-DIAL-01")
 def a_guest_needs_a_header(robot):
     gate = robot.driving.gate
-    on_bare(robot, lambda _inner, message: gate.refuse("guest", WireError(RejectReason.MALFORMED, "no header")))
+    on_bare(robot, lambda _inner, message: gate.reject("guest", WireError(RejectReason.MALFORMED, "no header")))
 
 
 @breaks("R-DIAL-02")

@@ -191,7 +191,7 @@ def counts_refused_as_accepted(robot):
         robot.driving.gate.accepted += error.reason == "MALFORMED" and robot.driving.gate.accepted > 0
         return inner(source, error)
 
-    wrap(robot.driving.gate, "refuse", around)
+    wrap(robot.driving.gate, "reject", around)
 
 
 @breaks("R-STAT-04")

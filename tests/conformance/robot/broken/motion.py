@@ -109,7 +109,7 @@ def revived_by(robot, reason):
             revive(robot)
         return inner(source, error)
 
-    wrap(robot.driving.gate, "refuse", around)
+    wrap(robot.driving.gate, "reject", around)
 
 
 @breaks("R-SIL-02")
@@ -164,7 +164,7 @@ def hold_is_the_end(robot):
 
     def around(inner, source, header, twist, now_us):
         if gate.state is State.HOLD and now_us - gate._hold_since_us > 300_000 and source == "vision":
-            return gate.refuse(source, WireError(RejectReason.NOT_ALLOWED, "arm again"))
+            return gate.reject(source, WireError(RejectReason.NOT_ALLOWED, "arm again"))
         return inner(source, header, twist, now_us)
 
     wrap(gate, "offer", around)

@@ -160,7 +160,7 @@ def remembers_32_senders(robot):
 @breaks("R-ARM-13")
 def a_refusal_breaks_the_row(robot):
     gate = robot.driving.gate
-    wrap(gate, "refuse", lambda inner, source, error: _begin_row(gate, error) or inner(source, error))
+    wrap(gate, "reject", lambda inner, source, error: _begin_row(gate, error) or inner(source, error))
 
 
 def _begin_row(gate, error):

@@ -80,7 +80,7 @@ def nameless_requests(robot):
 def requests_of_known_fields_only(robot):
     def around(inner, message):
         if b'"colour"' in message.payload or b'"mood"' in message.header:
-            robot.driving.gate.refuse(message.source, WireError(RejectReason.MALFORMED, "unknown field"))
+            robot.driving.gate.reject(message.source, WireError(RejectReason.MALFORMED, "unknown field"))
         else:
             inner(message)
 

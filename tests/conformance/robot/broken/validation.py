@@ -13,7 +13,7 @@ HEX = re.compile(r"[0-9a-f]{8}")
 
 def refuse(robot, message, reason="MALFORMED"):
     """Count a refusal that the reference would not make."""
-    robot.driving.gate.refuse(message.source, WireError(RejectReason(reason), "broken on purpose"))
+    robot.driving.gate.reject(message.source, WireError(RejectReason(reason), "broken on purpose"))
 
 
 def refuses(robot, wrong, reason="MALFORMED"):
