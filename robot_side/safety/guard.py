@@ -124,7 +124,7 @@ class RangeGuard:
         return self._scan_us is not None and 0 <= now_us - self._scan_us <= self._config.max_scan_age_ms * 1000
 
 
-# What stands inside the blind zone of a range sensor is not seen: all of it must lie within the guard's stop zone. Pure.
+# A range sensor does not see into its blind zone: all of it must lie within the guard's stop zone. Pure.
 #
 # Otherwise a robot that creeps up to something loses sight of it before the guard has stopped it, and drives on.
 

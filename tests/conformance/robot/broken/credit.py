@@ -169,7 +169,7 @@ def guests_live_long(robot):
         if source == "guest":
             gate._command = AcceptedCommand(gate._command.twist, now_us + 60_000_000, now_us, 60_000_000)
 
-    wrap(gate, "_keep", around)
+    wrap(gate, "_accept", around)
 
 
 # --- roles and keys --------------------------------------------------------------------------------------------------

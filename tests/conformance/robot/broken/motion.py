@@ -17,13 +17,13 @@ def keeps(robot, change):
         inner(source, twist, now_us, age_us)
         gate._command = change(gate._command, twist)
 
-    wrap(gate, "_keep", around)
+    wrap(gate, "_accept", around)
 
 
 def goal(robot, change):
     """`change(twist, asked)` gives the goal of the wheels; `asked` is what the driver asked for last."""
     gate, asked = robot.driving.gate, [STILL]
-    wrap(gate, "_keep", lambda inner, *a: asked.__setitem__(0, a[1]) or inner(*a))
+    wrap(gate, "_accept", lambda inner, *a: asked.__setitem__(0, a[1]) or inner(*a))
 
     def around(inner, now_us):
         twist = inner(now_us)
