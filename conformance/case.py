@@ -149,9 +149,10 @@ def itself(bench: "Bench") -> "Bench":
 Begin = Callable[["Bench"], Any]
 
 
-# What a case sees of the world: messages, time, and words for what it expects. Pure; two files bring it to life.
-# `virtual.py` runs a peer in virtual time without sleeping, `live.py` a real one over the network. A case is written
-# in blocking style; only `wait` and `rest` let time pass, and callbacks (`on`, `after`) run inside them, never beside.
+# What a case sees of the world: messages, time, and words for what it expects. Pure; `benches.py` brings it to life:
+# `VirtualBench` runs a peer in virtual time without sleeping, `LiveBench` a real one over the network. A case is
+# written in blocking style; only `wait` and `rest` let time pass, and callbacks (`on`, `after`) run inside them, never
+# beside.
 
 
 KEPT_MESSAGES: Final = 600

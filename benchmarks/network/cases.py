@@ -30,7 +30,7 @@ class NetworkPhase:
 
 @dataclass(frozen=True, slots=True)
 class NetworkCase:
-    """One network. Bounds that are None are not demanded; `over_loopback_ms` is over the first phase's p50.
+    """One network. Bounds that are None are not demanded; `over_first_ms` is over the first phase's p50.
 
     A row with a `scene` is more than one robot and one vision: its scene runs and judges it. With `passes_through` the
     camera hands over its own JPEGs, which nobody can make smaller.

@@ -39,7 +39,7 @@ class Score:
     target_contacts: int = 0
     """Physics steps in which the robot drove into the target, over the whole run."""
     figures: Mapping[str, float | None] = field(default_factory=dict)
-    """What else this scenario is judged by; see `score_course.py`."""
+    """The other figures of this scenario; see `figures_of`."""
 
     def figure(self, name: str) -> float | None:
         """One figure by its name, whichever kind it is."""

@@ -1,13 +1,13 @@
 """Builds the golden vectors and checks that the decoders agree with each of them. Pure.
 
-`golden_cases.py` and `golden_wires.py` state each case and its outcome by hand; a file is made only if the decoders
+`message_cases.py` and `framing_cases.py` state each case and its outcome by hand; a file is made only if the decoders
 agree. A message lies in `vectors/<channel>/<case>.json`:
 
     {"purpose", "key", "header_hex", "payload_hex", "accept": {"source", "header", "payload"} or "refuse": reason}
 
 `header` and `payload` are as read, with defaults filled in; `null` is a header that may be missing. A picture's payload
 is its size, a scan's the ranges with "inf" for no return. What carries messages lies beside them, in folders that
-`golden_wires.py` lists: fields to read instead of key, header and payload, and what they give.
+`framing_cases.py` lists: fields to read instead of key, header and payload, and what they give.
 """
 
 import json

@@ -118,7 +118,7 @@ def open_websocket(
 
     Endpoints are `ws://host:port`, `wss://` and `ws-legacy://` (`sightline.protocol.transports.endpoints`). Who listens
     reaches `connect` in the background; a lost connection is made again by itself. `role` is the default source of what
-    is published towards the robot. `secure` is a folder of tokens and certificates (`websocket_keys`, `websocket_tls`).
+    is published towards the robot. `secure` is a folder of tokens and certificates (`security.py`, `tls.py`).
     Raises ConfigError for a robot id, endpoint, limit or folder that is none, for an endpoint open to anybody, and for
     a missing `websockets`; LinkError for a port in use, if nobody answers within `timeout_s`, or if who answers will
     not speak.

@@ -66,7 +66,7 @@ class Slot:
 
     address: str
     acts: bool | None = None
-    """Whether it may act, see `may_act`; None for a stranger."""
+    """Whether it may act, see `may_control`; None for a stranger."""
 
 
 class ConnectionLimits:
@@ -148,7 +148,7 @@ CROSS_SITE: Final = "CROSS_SITE"
 WRONG_SUBPROTOCOL: Final = "WRONG_SUBPROTOCOL"
 """Counted for a client that does not offer `sightline.v1`."""
 TOO_MANY_CLIENTS: Final = "TOO_MANY_CLIENTS"
-"""Counted for a client over a limit of `websocket_places`."""
+"""Counted for a client over a limit of `ConnectionLimits`."""
 NO_TLS: Final = "NO_TLS"
 """Counted for a client of wss:// that does not agree on TLS."""
 

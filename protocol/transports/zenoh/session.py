@@ -45,7 +45,7 @@ def multicast_address() -> str:
 
 
 # Opening a Zenoh session the way Sightline uses it, with its errors in words. Shell.  Shared memory is off because it
-# hides the network, gossip because it finds strangers (who listens may be found by people, see `zenoh_discovery`); a
+# hides the network, gossip because it finds strangers (who listens may be found by people, see `discovery.py`); a
 # lease of 2 s tells of a silent link before a person wonders; a message over 1 MiB is refused before it is buffered.
 
 

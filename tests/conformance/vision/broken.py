@@ -1,6 +1,6 @@
 """Broken visions, one per case: the reference with one step changed. Pure.
 
-`BROKEN` maps a case's id to (what is wrong, the class). `test_conformance_vision.py` demands that it fails that case
+`BROKEN` maps a case's id to (what is wrong, the class). `test_cases.py` demands that it fails that case
 and no other. The steps that a broken one may change, in the order of a frame's way, are the methods of `BrokenVision`.
 """
 

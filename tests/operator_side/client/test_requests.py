@@ -1,4 +1,4 @@
-"""The operator against a real gate: `Driving` on a network in memory, pumped by a thread in real time."""
+"""The operator against a real gate: `DriverCore` on a network in memory, pumped by a thread in real time."""
 
 import threading
 import time

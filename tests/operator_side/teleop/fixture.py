@@ -1,4 +1,4 @@
-"""A `Teleop` at a real gate, in virtual time: the robot's own `Driving`, frames at 30 fps, a vision if wanted."""
+"""A `Teleop` at a real gate, in virtual time: the robot's own `DriverCore`, frames at 30 fps, a vision if wanted."""
 
 import random
 

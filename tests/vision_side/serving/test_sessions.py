@@ -11,7 +11,7 @@ FRAME_US = 33_333
 
 
 class Watch:
-    """Plays frames of several robots, each with its own clock, at one `Sessions`."""
+    """Plays frames of several robots, each with its own clock, at one `SessionSelector`."""
 
     def __init__(self):
         self.sessions = SessionSelector()

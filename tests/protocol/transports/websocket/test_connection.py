@@ -1,4 +1,4 @@
-"""Who is given up, by time and by what is known of the way out: tables over `websocket_life`, to the microsecond."""
+"""Who is given up, by time and by what is known of the way out: tables over `connection.py`, to the microsecond."""
 
 import random
 
