@@ -201,7 +201,10 @@ class NetworkEnd:
         return _send_if_room(self._aside, packet)
 
     def forward(self, message: Message) -> None:
-        """A command goes on at once, undecoded. Without room a request waits; a twist is dropped and counted."""
+        """Hand over a command at once, undecoded. Without room a request waits; a twist is dropped and counted.
+
+        Next: `robot_side/driver/process.py`: `Driver.loop`.
+        """
         with self._order:
             if self._pending_requests.flush(self._pass) and self._pass(message):
                 return

@@ -165,13 +165,8 @@ PROCESS_CASES: Final = (
     FaultCase("network.kill", "network process: SIGKILL", _kill_network, _SCRIPT, blind=True, again=True, short=True),
     FaultCase("network.pause", "network process: SIGSTOP 3 s", _pause_network, _SCRIPT, blind=True, again=True),
     FaultCase(
-        "network.gil",
-        "network process: C code holds the interpreter 1 s",
-        _hold_gil,
-        _SCRIPT,
-        blind=True,
-        again=True,
-        short=True,
+        "network.gil", "network process: C code holds the interpreter 1 s", _hold_gil, _SCRIPT, blind=True, again=True,
+        short=True
     ),
     FaultCase(
         "driver.starved", "robot: four busy processes beside it; then vision: SIGKILL", _starve, _SCRIPT, alone=True
@@ -243,70 +238,36 @@ _THIN: Final = LinkShape(rate_bit_s=1e6)
 
 NETWORK_CASES: Final = (
     FaultCase(
-        "wire.cut3",
-        "network: partition 3 s",
-        partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=3.0),
-        _WIRED,
-        blind=True,
-        again=True,
-        short=True,
+        "wire.cut3", "network: partition 3 s", partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=3.0), _WIRED,
+        blind=True, again=True, short=True
     ),
     FaultCase(
-        "wire.cut15",
-        "network: partition 15 s",
-        partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=15.0),
-        _WIRED,
-        blind=True,
-        again=True,
+        "wire.cut15", "network: partition 15 s", partial(_cut, shapes=LinkShapes(ab=CUT, ba=CUT), seconds=15.0), _WIRED,
+        blind=True, again=True
     ),
     FaultCase(
-        "wire.no_frames",
-        "network: one direction only, frames lost",
-        partial(_cut, shapes=LinkShapes(ab=CUT), seconds=3.0),
-        _WIRED,
-        blind=True,
-        by_frame=True,
-        again=True,
+        "wire.no_frames", "network: one direction only, frames lost", partial(_cut, shapes=LinkShapes(ab=CUT),
+        seconds=3.0), _WIRED, blind=True, by_frame=True, again=True
     ),
     FaultCase(
-        "wire.no_commands",
-        "network: one direction only, commands lost",
-        partial(_cut, shapes=LinkShapes(ba=CUT), seconds=3.0),
-        _WIRED,
-        blind=True,
-        again=True,
+        "wire.no_commands", "network: one direction only, commands lost", partial(_cut, shapes=LinkShapes(ba=CUT),
+        seconds=3.0), _WIRED, blind=True, again=True
     ),
     FaultCase(
-        "wire.delay",
-        "network: 300 ms each way",
-        partial(_worsen, shapes=LinkShapes(ab=_SLOW, ba=_SLOW)),
-        _WIRED,
-        stops=False,
-        again=True,
+        "wire.delay", "network: 300 ms each way", partial(_worsen, shapes=LinkShapes(ab=_SLOW, ba=_SLOW)), _WIRED,
+        stops=False, again=True
     ),
     FaultCase(
-        "wire.loss",
-        "network: 20 % loss each way",
-        partial(_worsen, shapes=LinkShapes(ab=LOSSY, ba=LOSSY)),
-        _WIRED,
-        stops=False,
-        again=True,
+        "wire.loss", "network: 20 % loss each way", partial(_worsen, shapes=LinkShapes(ab=LOSSY, ba=LOSSY)), _WIRED,
+        stops=False, again=True
     ),
     FaultCase(
-        "wire.mixed",
-        "network: 10 % reordered, 10 % duplicated",
-        partial(_worsen, shapes=LinkShapes(ab=_MIXED, ba=_MIXED)),
-        _WIRED,
-        stops=False,
-        again=True,
+        "wire.mixed", "network: 10 % reordered, 10 % duplicated", partial(_worsen, shapes=LinkShapes(ab=_MIXED,
+        ba=_MIXED)), _WIRED, stops=False, again=True
     ),
     FaultCase(
-        "wire.thin",
-        "network: 1 Mbit/s under a camera of 4 Mbit/s",
-        partial(_worsen, shapes=LinkShapes(ab=_THIN, ba=_THIN)),
-        _HEAVY,
-        stops=False,
-        again=True,
+        "wire.thin", "network: 1 Mbit/s under a camera of 4 Mbit/s", partial(_worsen, shapes=LinkShapes(ab=_THIN,
+        ba=_THIN)), _HEAVY, stops=False, again=True
     ),
     FaultCase("wire.flaps", "network: gone and back every 0.5 s", _flap, _WIRED, stops=False, again=True),
 )
@@ -418,39 +379,22 @@ COMMAND_CASES: Final = (
         "malformed", "nan, inf, 1e400, underscores, full-width, empty, 3 fields, 257 bytes, 10 MB, binary ..."
     ),
     FaultCase(
-        "command.flood",
-        "commands: an old one at 10 kHz",
-        partial(_attack, at_least_times=FLOOD_AT_LEAST),
-        Setup(fault="flood"),
-        also=f">= {FLOOD_AT_LEAST} sent",
-        short=True,
-        alone=True,
+        "command.flood", "commands: an old one at 10 kHz", partial(_attack, at_least_times=FLOOD_AT_LEAST),
+        Setup(fault="flood"), also=f">= {FLOOD_AT_LEAST} sent", short=True, alone=True
     ),
     FaultCase(
-        "command.reversal",
-        "commands: full speed ahead and back at 50 Hz",
-        _reverse,
-        Setup(fault="reversal"),
-        also=f"speed changes by <= {GAIN_MPS2:g} m/s2",
+        "command.reversal", "commands: full speed ahead and back at 50 Hz", _reverse, Setup(fault="reversal"),
+        also=f"speed changes by <= {GAIN_MPS2:g} m/s2"
     ),
     _command_case("heartbeat", "none, but frames are acknowledged and the link is alive", short=True),
     FaultCase("driver.two", "drivers: two visions, then none", _two_visions, Setup(), also="the second is not obeyed"),
     FaultCase(
-        "driver.person",
-        "drivers: a person takes over at full speed, and is lost",
-        _take_over,
-        Setup(),
-        blind=True,
-        also="obeyed <= 1000 ms; vision does not resume by itself",
+        "driver.person", "drivers: a person takes over at full speed, and is lost", _take_over, Setup(), blind=True,
+        also="obeyed <= 1000 ms; vision does not resume by itself"
     ),
     FaultCase(
-        "driver.dies",
-        "drivers: the holder dies while another waits",
-        _holder_dies,
-        Setup(),
-        blind=True,
-        again=True,
-        also="the other drives only after the lease",
+        "driver.dies", "drivers: the holder dies while another waits", _holder_dies, Setup(), blind=True, again=True,
+        also="the other drives only after the lease"
     ),
 )
 
@@ -655,13 +599,8 @@ OPERATOR_CASES: Final = (
         "camera.unplugged", "camera: unplugged 3 s", partial(_spoil_camera, mode="unplugged"), _VISION, again=True
     ),
     FaultCase(
-        "camera.frozen",
-        "camera: frozen 3 s, with new stamps",
-        partial(_spoil_camera, mode="frozen"),
-        _SCRIPT,
-        blind=True,
-        again=True,
-        short=True,
+        "camera.frozen", "camera: frozen 3 s, with new stamps", partial(_spoil_camera, mode="frozen"), _SCRIPT,
+        blind=True, again=True, short=True
     ),
     FaultCase(
         "camera.black",
@@ -676,39 +615,21 @@ OPERATOR_CASES: Final = (
         "camera.slow", "camera: 5 fps for 3 s", partial(_spoil_camera, mode="slow"), _SCRIPT, stops=False, again=True
     ),
     FaultCase(
-        "camera.bomb",
-        "camera: a JPEG that claims 65500 x 65500, 3 s",
-        partial(_spoil_camera, mode="bomb"),
-        _VISION,
-        blind=True,
-        again=True,
+        "camera.bomb", "camera: a JPEG that claims 65500 x 65500, 3 s", partial(_spoil_camera, mode="bomb"), _VISION,
+        blind=True, again=True
     ),
     FaultCase(
-        "camera.resized",
-        "camera: the picture changes size, 3 s",
-        partial(_spoil_camera, mode="resized"),
-        _VISION,
-        blind=True,
-        again=True,
+        "camera.resized", "camera: the picture changes size, 3 s", partial(_spoil_camera, mode="resized"), _VISION,
+        blind=True, again=True
     ),
     FaultCase("stop.driving", "STOP: while driving", _stop, _SCRIPT, blind=True, also=_STAYS, short=True),
     FaultCase(
-        "stop.lossy",
-        "STOP: while 20 % of packets are lost",
-        _stop_lossy,
-        Setup(wired=True),
-        blind=True,
-        zero_ms=LOSSY_STOP_ZERO_MS,
-        distance_m=1.0,
-        also=_STAYS,
+        "stop.lossy", "STOP: while 20 % of packets are lost", _stop_lossy, Setup(wired=True), blind=True,
+        zero_ms=LOSSY_STOP_ZERO_MS, distance_m=1.0, also=_STAYS
     ),
     FaultCase(
-        "stop.commands",
-        "STOP: then 1000 commands",
-        _stop_then_commands,
-        Setup(fault="thousand"),
-        blind=True,
-        also=_STAYS,
+        "stop.commands", "STOP: then 1000 commands", _stop_then_commands, Setup(fault="thousand"), blind=True,
+        also=_STAYS
     ),
     FaultCase(
         "stop.restart", "STOP: then the network process is killed", _stop_then_restart, _SCRIPT, blind=True, also=_STAYS

@@ -122,6 +122,7 @@ class Operator:
         return self._report is not None and self._report.status.state is State.STOPPED
 
     def _send(self, verb: Verb, report: StatusReport | None) -> None:
+        """Publish a request. Next: `robot_side/pipe.py`: `NetworkEnd.forward`."""
         self._seq += 1
         echo = None if report is None else Echo.of(report.stamp)
         header = RequestHeader(source=SOURCE, session=self._session, seq=self._seq, echo=echo)

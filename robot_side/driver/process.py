@@ -205,7 +205,10 @@ class Driver:
             self._feed_watchdog(now_us)
 
     def _answer(self) -> None:
-        """Send command acks once the wheels are set; motion first, for the frame that an ack permits carries it."""
+        """Send command acks once the wheels are set; motion first, for the frame that an ack permits carries it.
+
+        Next: `robot_side/network/process.py`: `NetworkProcess._on_packet`.
+        """
         self.driver_end.send_aside(ipc.pack_motion(self._driver_core.motion()))
         command_acks, self._command_acks = self._command_acks, []
         for ack in command_acks:
@@ -220,6 +223,7 @@ class Driver:
         """Sensors, gate, motors. Whatever a device raises stops the robot, never the loop that stops it.
 
         The gate's time is taken after the sensors': a scan that is stamped when it is read is not from the future.
+        Next: `robot_side/hardware/gpio.py`: `GpioDrive.set`.
         """
         wheels: WheelAngles | None = None
         scan: Ranges | None = None

@@ -96,7 +96,10 @@ class NetworkProcess:
     # --- frames --------------------------------------------------------------------------------------------------
 
     def _stream_one(self) -> None:
-        """Wait for credit, or take an image and publish its frame. The model of the camera is announced before it."""
+        """Wait for credit, or take an image and publish its frame. The model of the camera is announced before it.
+
+        Next: `vision_side/serving/service.py`: `Service.turn`.
+        """
         picture = self._read_camera() if self._may_capture() else None
         self._network_core.motion = self._network_end.motion(self._network_core.motion)
         with self._lock:

@@ -105,9 +105,9 @@ def test_the_twist_is_out_before_its_picture_and_pictures_keep_their_pace(site):
     site.viewer.subscribe(OVERLAY, lambda message: arrivals.append("overlay"))
     assert until(lambda: site.link.has_listener(OVERLAY))
     started_s = time.monotonic()
-    while time.monotonic() - started_s < 1.0:
-        site.frame()
-    assert until(lambda: arrivals.count("overlay") >= 10)
+    while (lasted_s := time.monotonic() - started_s) < 1.0 or (arrivals.count("overlay") < 10 and lasted_s < 10.0):
+        site.frame()  # on a busy machine the thread that draws gets fewer turns
+    assert arrivals.count("overlay") >= 10
     lasted_s = time.monotonic() - started_s
     assert arrivals[0] == "twist" and arrivals.count("twist") >= 30
     assert arrivals.count("overlay") <= 15.0 * lasted_s + 2

@@ -253,6 +253,10 @@ class Service:
             self._log_change("camera", "frames come, but no camera model; is the robot of another version?")
 
     def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
+        """Publish the twist that cites the frame, or an acknowledgement.
+
+        Next: `robot_side/pipe.py`: `NetworkEnd.forward`.
+        """
         self.answered += 1
         self.steered += answer.twist is not None
         self._newest = (compute_us, header.latency_us)
