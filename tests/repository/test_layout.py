@@ -281,7 +281,7 @@ def test_every_thread_has_a_name():
 PAGES = sorted(chain((ROOT / "docs").rglob("*.md"), ROOT.glob("*.md"), (ROOT / "examples").rglob("*.md"),
                      (ROOT / "protocol").rglob("*.md")))
 _CODE = re.compile(r"`([^`\n]+)`")
-_PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join(PACKAGES)}|tests|docs|examples)(?:/[\w.-]+)+(?![\w<{*])")
+_PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join(PACKAGES)}|tests|docs|examples)(?:/[\w.-]+)+(?![\w<*])")
 _DOTTED = re.compile(rf"sightline\.(?:{'|'.join(PACKAGES)})(?:\.\w+)*")
 _CAMEL_CASE = re.compile(r"\b[A-Z][a-z0-9]+(?:[A-Z][a-z0-9]*)+\b(?!\.\w+\()")
 FOREIGN_CLASSES = {"MyClass", "NaN", "VideoCapture"}
