@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Final, Self
 
-from sightline.protocol.errors import HardwareError, SightlineError
+from sightline.protocol.errors import HardwareError
 from sightline.protocol.log import LOG_FORMAT_VARIABLE, LOG_FORMATS
 
 
@@ -33,39 +33,72 @@ def terminated_like_interrupted() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-# Sightline processes started together and ended together, each with its log. Shell.
+# Processes started together and ended together, each with its log. Shell.
 #
 # Waits are for facts (a printed line), never for time alone; whatever happens, nothing is left behind.
 
 
-END_S: Final = 4.0
+COMMAND_LINE: Final = "sightline.operator_side.cli.app"
+READY_S: Final = 30.0
+"""For one process to print that it is ready; a first start reads hundreds of megabytes from disk."""
+_END_S: Final = 4.0
 """A process that has not ended this long after SIGTERM is killed; the robot takes up to 2 s to bring wheels to zero."""
-_POLL_S = 0.02
+_POLL_S: Final = 0.02
+_BOOTSTRAP: Final = """
+import os, runpy, signal, sys, threading
+
+pipe = os.dup(0)
+os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+
+def end_with_parent():
+    signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # a signal is to wake the main thread
+    while os.read(pipe, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+threading.Thread(target=end_with_parent, name="parent pipe", daemon=True).start()
+del sys.argv[0]
+runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+"""
+"""Runs a module as `python -m` does, its standard input empty, until the pipe that it is given as one closes."""
 
 
-class ProcessError(SightlineError):
-    """A process ended by itself; the text is its last word and the exit code its own."""
+class ProcessError(HardwareError):
+    """A process ended by itself, with an exit code that is passed on, or is not ready in time."""
 
-    def __init__(self, name: str, code: int, log: Path) -> None:
-        super().__init__(f"{name} ended by itself (exit code {code}): {last_line(log)}; its log is {log}")
+    def __init__(self, text: str, code: int = 1) -> None:
+        super().__init__(text)
         self.exit_code = code if code > 0 else 1
 
 
 class Processes:
-    """Use it in a `with`. Each process leads a session of its own, so that Ctrl-C reaches only who starts them."""
+    """Use it in a `with`. Each process leads a session of its own, so that Ctrl-C reaches only who starts them.
 
-    def __init__(self, folder: Path) -> None:
+    A process ends when its parent does, however that ends.
+    """
+
+    def __init__(self, folder: Path, *, oldest_first: bool = False) -> None:
+        """`oldest_first` is the order of ending."""
         self._folder = folder
+        self._oldest_first = oldest_first
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
-    def start(self, name: str, arguments: Sequence[str]) -> None:
-        """Run `sightline ARGUMENTS`, its output going to `<name>.log`, as text: who starts them reads it."""
-        command = [sys.executable, "-u", "-P", "-m", "sightline.operator_side.cli.app", *arguments]
+    def start(
+        self, name: str, arguments: Sequence[str], *, module: str = COMMAND_LINE, namespace: str = "",
+        environment: Mapping[str, str] | None = None,
+    ) -> int:
+        """Run `sightline ARGUMENTS`, or another module, inside a network namespace if one is named.
+
+        Its output goes to `<name>.log`, as text: who starts them reads it. Returns its process id.
+        """
+        entering = ["ip", "netns", "exec", namespace] if namespace else []
         with self.log(name).open("wb") as log:
             self._running[name] = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
-                env={**os.environ, LOG_FORMAT_VARIABLE: LOG_FORMATS[0]},
+                [*entering, sys.executable, "-u", "-P", "-c", _BOOTSTRAP, module, *arguments],
+                stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
+                env={**os.environ, LOG_FORMAT_VARIABLE: LOG_FORMATS[0], **(environment or {})},
             )
+        return self.pid(name)
 
     def log(self, name: str) -> Path:
         """Where `name` writes."""
@@ -75,44 +108,74 @@ class Processes:
         """The process id of `name`."""
         return self._running[name].pid
 
-    def wait_line(self, name: str, text: str, timeout_s: float) -> None:
-        """Wait until a line of `name` contains `text`. Raises SightlineError if one ends or it takes longer."""
+    def child(self, name: str) -> int:
+        """The process id of the newest child of `name`; 0 without one."""
+        return next(reversed(children_of(self.pid(name))), 0)
+
+    @property
+    def names(self) -> list[str]:
+        """Those that were started and not ended here, the oldest first."""
+        return list(self._running)
+
+    def wait_line(self, name: str, text: str, timeout_s: float = READY_S) -> None:
+        """Wait until a line of `name` contains `text`. Raises ProcessError if one ends or it takes longer."""
         deadline_s = time.monotonic() + timeout_s
         while text not in self.log(name).read_text("utf-8", "replace"):
             self.check()
             if time.monotonic() > deadline_s:
                 last = last_line(self.log(name))
-                raise SightlineError(f"{name} is not ready within {timeout_s:g} s; it last said: {last}")
+                raise ProcessError(f"{name} is not ready within {timeout_s:g} s; it last said: {last}")
             time.sleep(_POLL_S)
 
     def check(self, wait_s: float = 0.0) -> None:
-        """Raise ProcessError if one has ended, or does so within `wait_s`."""
+        """Raise ProcessError with its last words if one has ended, or does so within `wait_s`."""
         deadline_s = time.monotonic() + wait_s
         while True:
             for name, process in self._running.items():
                 code = process.poll()
                 if code is not None:
-                    raise ProcessError(name, code, self.log(name))
+                    last = f"{last_line(self.log(name))}; its log is {self.log(name)}"
+                    raise ProcessError(f"{name} ended by itself (exit code {code}): {last}", code)
             if time.monotonic() >= deadline_s:
                 return
             time.sleep(_POLL_S)
 
-    def end(self) -> list[str]:
-        """End one after the other, the newest first, so that nobody sees another vanish; idempotent.
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Send a signal."""
+        self._running[name].send_signal(number)
 
-        Returns the names of those that had to be killed.
+    def exit_code(self, name: str, timeout_s: float) -> int | None:
+        """Its exit code once it has ended, None if it does not in time; an ended one is forgotten."""
+        try:
+            code = self._running[name].wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return None
+        with self._running.pop(name):  # closes the pipe
+            return code
+
+    def kill(self, name: str) -> None:
+        """SIGKILL, and forget it."""
+        with self._running.pop(name) as process:  # waits for it, and closes the pipe
+            process.kill()
+
+    def end_one(self, name: str) -> bool:
+        """SIGTERM, and forget it; whether it had to be killed."""
+        self.signal(name, signal.SIGTERM)
+        if self.exit_code(name, _END_S) is not None:
+            return False
+        self.kill(name)
+        return True
+
+    def end(self) -> list[str]:
+        """Wake those that are stopped and end one after the other; idempotent.
+
+        The newest first, so that nobody sees another vanish, or the oldest, so that a robot keeps its notes before its
+        peer vanishes. Returns the names of those that had to be killed.
         """
-        killed = []
-        for name, process in reversed(self._running.items()):
-            process.terminate()
-            try:
-                process.wait(END_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-                killed.append(name)
-        self._running.clear()
-        return killed
+        for name in self._running:
+            self.signal(name, signal.SIGCONT)
+        names = self.names if self._oldest_first else reversed(self.names)
+        return [name for name in names if self.end_one(name)]
 
     def __enter__(self) -> Self:
         return self
@@ -121,6 +184,11 @@ class Processes:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.end()
+
+
+def children_of(pid: int) -> list[int]:
+    """Process ids of the children that its main thread started, the oldest first."""
+    return [int(text) for text in Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii").split()]
 
 
 def last_line(log: Path) -> str:

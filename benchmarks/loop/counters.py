@@ -50,12 +50,6 @@ def resident_mb(pid: int) -> float:
     return _status_mb(pid, "VmRSS")
 
 
-def children_of(pid: int) -> list[int]:
-    """Process ids of the children that its threads started."""
-    tasks = Path(f"/proc/{pid}/task").iterdir()
-    return [int(text) for task in tasks for text in (task / "children").read_text().split()]
-
-
 def _status_mb(pid: int, name: str) -> float:
     return _field_kib(Path(f"/proc/{pid}/status").read_text().splitlines(), name) / 1024
 

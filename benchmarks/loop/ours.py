@@ -7,10 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from sightline.benchmarks.loop.counters import children_of
 from sightline.benchmarks.loop.figures import Accepted, Course, LoopSetting, course_of_headers
-from sightline.benchmarks.loop.processes import BenchProcesses
-from sightline.evaluation.processes import free_port
+from sightline.evaluation.processes import Processes, free_port
 from sightline.protocol.channels import STATUS
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import ConfigError
@@ -51,24 +49,22 @@ def endpoint_of(transport: str, port: int) -> str:
 
 
 @contextmanager
-def running_services(setting: LoopSetting, folder: Path, crew: BenchProcesses) -> Iterator[Ours]:
+def running_services(setting: LoopSetting, folder: Path, processes: Processes) -> Iterator[Ours]:
     """Robot and vision, seen working. Raises HardwareError with a service's own words if one does not start."""
     port = free_port()
     endpoint = endpoint_of(setting.transport, port)
-    driver = crew.start(
-        "robot", "sightline.operator_side.cli.app", "robot", "--config", str(_robot_toml(setting, folder, endpoint))
-    )
-    crew.wait_line("robot", f"robot {ROBOT}: on")
+    driver = processes.start("robot", ["robot", "--config", str(_robot_toml(setting, folder, endpoint))])
+    processes.wait_line("robot", f"robot {ROBOT}: on")
     with open_link(ROBOT, connect=[endpoint], role="operator") as link:
         tally = folder / "headers.json"
         config = {"robot": ROBOT, "connect": [endpoint]}
         slow = {"delay_ms": setting.detector_delay_ms, "busy_ms": setting.busy_ms}
         settings = {"config": config, "tally": str(tally), **slow}
-        vision = crew.start("vision", "sightline.benchmarks.loop.vision", json.dumps(settings))
-        pids = {"driver": driver, "network": children_of(driver)[0], "vision": vision}
+        vision = processes.start("vision", [json.dumps(settings)], module="sightline.benchmarks.loop.vision")
+        pids = {"driver": driver, "network": processes.child("robot"), "vision": vision}
         ours = Ours(pids, (port,), endpoint, tally)
         link.subscribe(STATUS, ours.note)
-        crew.wait_line("vision", "target seen")
+        processes.wait_line("vision", "target seen")
         yield ours
 
 

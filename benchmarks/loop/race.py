@@ -37,10 +37,9 @@ from sightline.benchmarks.loop.figures import (
 )
 from sightline.benchmarks.loop.ours import endpoint_of, running_services
 from sightline.benchmarks.loop.pictures import write_pictures
-from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.loop.vision import overloaded
 from sightline.evaluation.checks import Check
-from sightline.evaluation.processes import free_port, terminated_like_interrupted
+from sightline.evaluation.processes import Processes, free_port, terminated_like_interrupted
 from sightline.protocol.clock import monotonic_us
 
 _SETTLE_S: Final = 1.5
@@ -96,17 +95,17 @@ def take_sample(name: str, setting: LoopSetting, folder: Path, say: Callable[[st
 def _take_one(name: str, setting: LoopSetting, folder: Path, number: int) -> LoopSample:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    with BenchProcesses(folder) as crew, _running(name, setting, folder, crew) as contestant:
+    with Processes(folder, oldest_first=True) as processes, _running(name, setting, folder, processes) as contestant:
         time.sleep(_SETTLE_S)
         carried_before = carried_bytes(contestant.ports)
         before, begin_us = read_machine(contestant.pids), monotonic_us()
         time.sleep(setting.seconds)
-        crew.check()
+        processes.check()
         after, end_us = read_machine(contestant.pids), monotonic_us()
         carried_after = carried_bytes(contestant.ports)
         memory_mb = {process: high_water_mb(pid) for process, pid in contestant.pids.items()}
         time.sleep(_DRAIN_S + (setting.detector_delay_ms + setting.busy_ms) / 1000)
-        crew.end()
+        processes.end()
         cpu_s = {process: after.cpu_s[process] - before.cpu_s[process] for process in after.cpu_s}
         seconds = (end_us - begin_us) / 1e6
         return LoopSample(
@@ -117,9 +116,9 @@ def _take_one(name: str, setting: LoopSetting, folder: Path, number: int) -> Loo
 
 
 @contextmanager
-def _running(name: str, setting: LoopSetting, folder: Path, crew: BenchProcesses) -> Iterator[Contestant]:
+def _running(name: str, setting: LoopSetting, folder: Path, processes: Processes) -> Iterator[Contestant]:
     if name == OURS:
-        with running_services(setting, folder, crew) as ours:
+        with running_services(setting, folder, processes) as ours:
             yield ours
         return
     tally, port = folder / "tally.json", free_port()
@@ -130,12 +129,12 @@ def _running(name: str, setting: LoopSetting, folder: Path, crew: BenchProcesses
     })
     peer = name.removesuffix(OUR_DETECTOR)
     if name == FLOOR:
-        pids = {"vision": crew.start(FLOOR, _MODULE, peer, "alone", settings)}
-        crew.wait_line(FLOOR, "first answer")
+        pids = {"vision": processes.start(FLOOR, [peer, "alone", settings], module=_MODULE)}
+        processes.wait_line(FLOOR, "first answer")
     else:
-        pids = {"robot": crew.start("robot", _MODULE, peer, "robot", settings)}
-        pids["vision"] = crew.start("vision", _MODULE, peer, "vision", settings)
-        crew.wait_line("robot", "first answer")
+        pids = {"robot": processes.start("robot", [peer, "robot", settings], module=_MODULE)}
+        pids["vision"] = processes.start("vision", [peer, "vision", settings], module=_MODULE)
+        processes.wait_line("robot", "first answer")
     yield Contestants(pids, (port, port + 1), tally)
 
 

@@ -26,9 +26,8 @@ from sightline.benchmarks.loop.figures import (
 )
 from sightline.benchmarks.loop.ours import ROBOT, Ours, running_services
 from sightline.benchmarks.loop.pictures import write_pictures
-from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.evaluation.checks import Check, at_most
-from sightline.evaluation.processes import terminated_like_interrupted
+from sightline.evaluation.processes import Processes, terminated_like_interrupted
 from sightline.protocol.channels import FRAME
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.open import open_link
@@ -102,24 +101,25 @@ def measure_watchers(setting: LoopSetting, viewers: int, say: Callable[[str], No
 
 
 def _measure(setting: LoopSetting, viewers: int, folder: Path, say: Callable[[str], None]) -> tuple[Watch, Watch]:
-    with BenchProcesses(folder) as crew, running_services(setting, folder, crew) as ours:
+    with Processes(folder, oldest_first=True) as processes, running_services(setting, folder, processes) as ours:
         alone = _stretch(ours, {}, setting.seconds)
         say(f"without viewers: others had {alone.taken_percent:.1f} % of the machine's time")
-        crowded = _stretch(ours, start_viewers(crew, ours.endpoint, viewers), setting.seconds)
+        crowded = _stretch(ours, start_viewers(processes, ours.endpoint, viewers), setting.seconds)
         say(f"with {viewers} viewers: others had {crowded.taken_percent:.1f} %")
-        crew.check()
-        crew.end()
+        processes.check()
+        processes.end()
         return _watch(ours, alone), _watch(ours, crowded)
 
 
-def start_viewers(crew: BenchProcesses, endpoint: str, viewers: int) -> dict[str, int]:
+def start_viewers(processes: Processes, endpoint: str, viewers: int) -> dict[str, int]:
     """Start them, each seen watching: one stopped by the kernel, one slow, the rest quick. Returns process ids."""
     parts = {"stalled": (1, 0.0), "slow": (1, _SLOW_NAP_S), "quick": (viewers - 2, 0.0)}
     pids = {}
     for name, (count, nap_s) in parts.items():
         if count:
-            pids[name] = crew.start(name, "sightline.benchmarks.loop.viewers", endpoint, str(count), str(nap_s))
-            crew.wait_line(name, "watching")
+            arguments = [endpoint, str(count), str(nap_s)]
+            pids[name] = processes.start(name, arguments, module="sightline.benchmarks.loop.viewers")
+            processes.wait_line(name, "watching")
     os.kill(pids["stalled"], signal.SIGSTOP)
     return pids
 

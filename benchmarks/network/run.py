@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 
 from sightline.benchmarks.loop.pictures import write_pictures
-from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.network.cases import NetworkCase, spans_s
 from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks, on_old_sight, read_wheel_commands
 from sightline.benchmarks.network.scenes import fleet, moved, router, standby, uplink
@@ -30,7 +29,7 @@ from sightline.benchmarks.network.stage import (
     start_vision,
 )
 from sightline.evaluation.checks import Check, at_least, at_most
-from sightline.evaluation.processes import terminated_like_interrupted
+from sightline.evaluation.processes import Processes, terminated_like_interrupted
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.sim.network_emulator import LinkShapes
@@ -101,10 +100,10 @@ def _run(row: NetworkCase, stage: Stage, scenes: Mapping[str, Scene]) -> Network
 
 def _course(row: NetworkCase, stage: Stage) -> NetworkRun:
     """One robot and one vision, the wire shaped phase by phase."""
-    with stage.wire() as wire, stage.crew("crew") as crew:
+    with stage.wire() as wire, stage.processes("processes") as processes:
         # From the first packet on: what TCP learned of a better wire would be what is measured.
         before = wire.shape(stage.seeded(row.phases[0].shapes))
-        _start(row, wire, crew, stage)
+        _start(row, wire, processes, stage)
         stretches = []
         for phase, seconds in zip(row.phases, spans_s(row, stage.setting.seconds), strict=True):
             wire.shape(stage.seeded(phase.shapes))
@@ -112,9 +111,9 @@ def _course(row: NetworkCase, stage: Stage) -> NetworkRun:
             settle_s = phase.settle_s or (0.0 if phase.seconds else _SETTLE_S)
             time.sleep(seconds if phase.seconds else seconds + settle_s)
             stretches.append(Stretch(begin_us, begin_us + round(settle_s * 1e6), monotonic_us()))
-            crew.check()
+            processes.check()
         injected = wire.shape(LinkShapes()) - before
-        crew.end()
+        processes.end()
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
     figures = tuple(figures_of(notes, stretch) for stretch in stretches)
     harmed = at_least("injected", float(injected), "", 1.0)
@@ -130,15 +129,10 @@ def _wheel_checks(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) ->
         yield at_most("moved on frames over 400 ms", float(lines), "lines", 0)
 
 
-def _start(row: NetworkCase, wire: ShapedWire, crew: BenchProcesses, stage: Stage) -> None:
+def _start(row: NetworkCase, wire: ShapedWire, processes: Processes, stage: Stage) -> None:
     """Robot and watcher on one side, vision on the other, seen driving over the wire as it is."""
-    start_robot(stage, crew, wire.robot_side, passes_through=row.passes_through)
-    crew.start(
-        "watch",
-        "sightline.benchmarks.network.watch",
-        stage.form.format("127.0.0.1"),
-        str(stage.folder / "notes.json"),
-        namespace=wire.robot_side,
-    )
-    crew.wait_line("watch", "watching")
-    start_vision(stage, crew, wire.far_side, stage.form.format(ADDRESS_A))
+    start_robot(stage, processes, wire.robot_side, passes_through=row.passes_through)
+    arguments = [stage.form.format("127.0.0.1"), str(stage.folder / "notes.json")]
+    processes.start("watch", arguments, module="sightline.benchmarks.network.watch", namespace=wire.robot_side)
+    processes.wait_line("watch", "watching")
+    start_vision(stage, processes, wire.far_side, stage.form.format(ADDRESS_A))

@@ -13,7 +13,6 @@ from typing import Any, Final
 
 from sightline.benchmarks.loop.figures import percentile
 from sightline.benchmarks.loop.pictures import write_pictures
-from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.network.cases import NetworkCase
 from sightline.benchmarks.network.figures import WheelCommand, moves_again_s, read_wheel_commands, sent_between
 from sightline.benchmarks.network.robots import Settings
@@ -22,6 +21,7 @@ from sightline.benchmarks.network.stop_client import RESET, STOPPED
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.evidence import REQUESTED, MotorRow, measure_stop, moved_on_old_sight, wheel_mps
 from sightline.evaluation.faults.fixture import ROBOT, RobotFixture, Setup
+from sightline.evaluation.processes import Processes
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import HardwareError, SightlineError
 from sightline.sim.network_emulator import LinkShapes
@@ -41,12 +41,12 @@ def standby(row: NetworkCase, stage: Stage) -> NetworkRun:
     """Two visions; whoever drives is killed and a new one stands by, for as long as there is time."""
     endpoint = stage.form.format(ADDRESS_A)
     with _on_site(row, stage) as (wire, ending):
-        start_robot(stage, ending.enter_context(stage.crew("robot")), wire.robot_side)
-        visions: list[tuple[BenchProcesses, int]] = []
+        start_robot(stage, ending.enter_context(stage.processes("robot")), wire.robot_side)
+        visions: list[tuple[Processes, int]] = []
 
         def start() -> None:
-            crew = ending.enter_context(stage.crew(f"vision{len(visions)}"))
-            visions.append((crew, start_vision(stage, crew, wire.far_side, endpoint)))
+            processes = ending.enter_context(stage.processes(f"vision{len(visions)}"))
+            visions.append((processes, start_vision(stage, processes, wire.far_side, endpoint)))
 
         def harm() -> int:
             start()
@@ -62,15 +62,15 @@ def standby(row: NetworkCase, stage: Stage) -> NetworkRun:
 def router(row: NetworkCase, stage: Stage) -> NetworkRun:
     """Everybody is a client of a router that is killed; counted from when there is one again."""
     with _on_site(row, stage) as (wire, ending):
-        crews: list[tuple[BenchProcesses, int]] = []
+        groups: list[tuple[Processes, int]] = []
 
         def start() -> None:
-            crew = ending.enter_context(stage.crew(f"router{len(crews)}"))
-            crews.append((crew, start_router(crew, wire)))
+            processes = ending.enter_context(stage.processes(f"router{len(groups)}"))
+            groups.append((processes, start_router(processes, wire)))
 
         def harm() -> int:
             time.sleep(_STEADY_S)
-            os.kill(crews[-1][1], signal.SIGKILL)
+            os.kill(groups[-1][1], signal.SIGKILL)
             time.sleep(DOWN_S)
             start()
             return monotonic_us()
@@ -92,16 +92,15 @@ def moved(row: NetworkCase, stage: Stage) -> NetworkRun:
             addresses.reverse()
             return moved_us
 
-        start_router(ending.enter_context(stage.crew("router")), wire)
+        start_router(ending.enter_context(stage.processes("router")), wire)
         _start_clients(stage, wire, ending)
         return _checks(row, stage, harm, "drives again after", BACK_S)
 
 
-def start_router(crew: BenchProcesses, wire: ShapedWire) -> int:
+def start_router(processes: Processes, wire: ShapedWire) -> int:
     """`sightline router` beyond the radio; returns its process id."""
-    pid = crew.start("router", "sightline.operator_side.cli.app", "router", "--listen", f"tcp/{EVERYWHERE}:7447",
-                     namespace=wire.far_side)
-    crew.wait_line("router", "router: on")
+    pid = processes.start("router", ["router", "--listen", f"tcp/{EVERYWHERE}:7447"], namespace=wire.far_side)
+    processes.wait_line("router", "router: on")
     return pid
 
 
@@ -113,8 +112,8 @@ def _on_site(row: NetworkCase, stage: Stage) -> Iterator[tuple[ShapedWire, ExitS
 
 
 def _start_clients(stage: Stage, wire: ShapedWire, ending: ExitStack) -> None:
-    start_robot(stage, ending.enter_context(stage.crew("robot")), wire.robot_side, connect=f"tcp/{ADDRESS_B}:7447")
-    start_vision(stage, ending.enter_context(stage.crew("vision")), wire.far_side, "tcp/127.0.0.1:7447")
+    start_robot(stage, ending.enter_context(stage.processes("robot")), wire.robot_side, connect=f"tcp/{ADDRESS_B}:7447")
+    start_vision(stage, ending.enter_context(stage.processes("vision")), wire.far_side, "tcp/127.0.0.1:7447")
 
 
 def _checks(row: NetworkCase, stage: Stage, harm: Callable[[], int], what: str, bound_s: float) -> NetworkRun:
@@ -178,31 +177,30 @@ def uplink(row: NetworkCase, stage: Stage) -> NetworkRun:
     shapes = stage.seeded(row.phases[0].shapes)
     with stage.wire() as wire, ExitStack() as ending:
         before = wire.shape(shapes)
-        crews = {name: ending.enter_context(stage.crew(name)) for name in ("site", "standby")}
-        start_router(crews["site"], wire)
+        groups = {name: ending.enter_context(stage.processes(name)) for name in ("site", "standby")}
+        start_router(groups["site"], wire)
         # The camera's own JPEGs: none is smaller than another because the machine had more to do.
-        start_robot(stage, crews["site"], wire.robot_side, connect=f"tcp/{ADDRESS_B}:7447", passes_through=True)
-        start_vision(stage, crews["site"], wire.far_side, _AT_ROUTER)
-        _start_notes(crews["site"], wire, stage)
+        start_robot(stage, groups["site"], wire.robot_side, connect=f"tcp/{ADDRESS_B}:7447", passes_through=True)
+        start_vision(stage, groups["site"], wire.far_side, _AT_ROUTER)
+        _start_notes(groups["site"], wire, stage)
         alone = _stretch(wire, shapes, stage.setting.seconds / 2)
-        start_vision(stage, crews["standby"], wire.far_side, _AT_ROUTER)
-        crews["site"].start(
-            "watcher", "sightline.benchmarks.loop.viewers", _AT_ROUTER, str(READERS), "0", namespace=wire.far_side
-        )
-        crews["site"].wait_line("watcher", "watching")
+        start_vision(stage, groups["standby"], wire.far_side, _AT_ROUTER)
+        groups["site"].start("watcher", [_AT_ROUTER, str(READERS), "0"], module="sightline.benchmarks.loop.viewers",
+                             namespace=wire.far_side)
+        groups["site"].wait_line("watcher", "watching")
         crowded = _stretch(wire, shapes, stage.setting.seconds / 2)
-        for crew in crews.values():
-            crew.check()
+        for processes in groups.values():
+            processes.check()
         injected = wire.shape(LinkShapes()) - before
-        crews["site"].end()
+        groups["site"].end()
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
     return _uplink_run(row, stage, injected, [_stream_of(notes, one) for one in (alone, crowded)])
 
 
-def _start_notes(crew: BenchProcesses, wire: ShapedWire, stage: Stage) -> None:
-    crew.start("notes", "sightline.benchmarks.network.watch", _AT_ROUTER, str(stage.folder / "notes.json"), "statuses",
-               namespace=wire.far_side)
-    crew.wait_line("notes", "watching")
+def _start_notes(processes: Processes, wire: ShapedWire, stage: Stage) -> None:
+    arguments = [_AT_ROUTER, str(stage.folder / "notes.json"), "statuses"]
+    processes.start("notes", arguments, module="sightline.benchmarks.network.watch", namespace=wire.far_side)
+    processes.wait_line("notes", "watching")
 
 
 def _stretch(wire: ShapedWire, shapes: LinkShapes, seconds: float) -> tuple[int, int, int]:
@@ -250,30 +248,21 @@ def fleet(row: NetworkCase, stage: Stage) -> NetworkRun:
     write_pictures(pictures, WIDTH_PX, HEIGHT_PX)
     settings = Settings(endpoint=f"tcp/{ADDRESS_B}:7447", robots=ROBOTS, fps=FPS, pictures=pictures,
                         notes=stage.folder / "notes.json", seed=stage.seed)
-    with stage.wire() as wire, stage.crew("crew") as crew:
+    with stage.wire() as wire, stage.processes("processes") as processes:
         before = wire.shape(stage.seeded(row.phases[0].shapes))
-        crew.start(
-            "vision",
-            "sightline.operator_side.cli.app",
-            "vision",
-            "--robot",
-            "r*",
-            "--listen",
-            f"tcp/{EVERYWHERE}:7447",
-            namespace=wire.far_side,
-        )
-        crew.wait_line("vision", "looking for robots")
-        crew.start(
-            "robots", "sightline.benchmarks.network.robots", settings.model_dump_json(), namespace=wire.robot_side
-        )
-        crew.wait_line("robots", f"playing {ROBOTS} robots")
+        arguments = ["vision", "--robot", "r*", "--listen", f"tcp/{EVERYWHERE}:7447"]
+        processes.start("vision", arguments, namespace=wire.far_side)
+        processes.wait_line("vision", "looking for robots")
+        processes.start("robots", [settings.model_dump_json()], module="sightline.benchmarks.network.robots",
+                        namespace=wire.robot_side)
+        processes.wait_line("robots", f"playing {ROBOTS} robots")
         time.sleep(_FLEET_SETTLE_S)
         begin_us = monotonic_us()
         time.sleep(stage.setting.seconds)
         end_us = monotonic_us()
-        crew.check()
+        processes.check()
         injected = wire.shape(LinkShapes()) - before
-        crew.end()
+        processes.end()
     answers = json.loads(settings.notes.read_text("utf-8"))
     harmed = at_least("injected", float(injected), "", 1.0)
     return NetworkRun(row, stage.seed, injected, (), (harmed, *fleet_checks(answers, begin_us, end_us)))
@@ -306,7 +295,6 @@ REPORTED_MS: Final = REACHES_MS + 100.0
 """By the robot's own status, ten times a second: as frames age, wheels slow down by themselves, before any STOP."""
 ZERO_MS: Final = 700.0
 """Reached, and then the ramp from 0.5 m/s: as the fault bench demands of every STOP."""
-_READY_S: Final = 30.0
 _BESIDE_S: Final = 60.0
 
 
@@ -324,10 +312,11 @@ def _medium_run(row: NetworkCase, stage: Stage, rig: RobotFixture) -> NetworkRun
     before = rig.wire.shape(stage.seeded(row.phases[0].shapes))
     ledger = rig.folder / "person.ledger"
     arguments = [rig.endpoint, ROBOT, str(ledger), str(stage.setting.seconds), str(stage.seed)]
-    rig.fleet.run("person", "sightline.benchmarks.network.stop_client", arguments, namespace=rig.wire.far_side)
-    rig.fleet.wait_line("person", "person ready", _READY_S)
-    if rig.fleet.exit_code("person", stage.setting.seconds + _BESIDE_S) != 0:
-        raise HardwareError(f"the person gave up: {rig.fleet.log('person').read_text('utf-8').strip()[-200:]}")
+    rig.processes.start("person", arguments, module="sightline.benchmarks.network.stop_client",
+                        namespace=rig.wire.far_side)
+    rig.processes.wait_line("person", "person ready")
+    if rig.processes.exit_code("person", stage.setting.seconds + _BESIDE_S) != 0:
+        raise HardwareError(f"the person gave up: {rig.processes.log('person').read_text('utf-8').strip()[-200:]}")
     injected = rig.wire.shape(LinkShapes()) - before
     told_us = [one.t_us for one in rig.noted("person", REQUESTED)]
     rows = rig.motors()

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from sightline.benchmarks.loop.ours import ROBOT
-from sightline.benchmarks.loop.processes import BenchProcesses
 from sightline.benchmarks.network.cases import WEBSOCKET, ZENOH, NetworkCase
 from sightline.benchmarks.network.figures import NetworkFigures
 from sightline.evaluation.checks import Check
+from sightline.evaluation.processes import Processes
 from sightline.protocol.errors import ConfigError
 from sightline.sim.network_emulator import LinkShapes
 
@@ -86,11 +86,11 @@ class Stage:
         """`shapes`, their chance drawn from this run's seed."""
         return shapes.model_copy(update={"seed": self.seed})
 
-    def crew(self, name: str) -> BenchProcesses:
+    def processes(self, name: str) -> Processes:
         """Processes with a folder of their own: some may be killed while the others are looked after."""
         folder = self.folder / name
         folder.mkdir()
-        return BenchProcesses(folder)
+        return Processes(folder, oldest_first=True)
 
     @property
     def form(self) -> str:
@@ -107,30 +107,21 @@ Scene = Callable[[NetworkCase, Stage], NetworkRun]
 
 
 def start_robot(
-    stage: Stage, crew: BenchProcesses, namespace: str, *, connect: str = "", passes_through: bool = False
+    stage: Stage, processes: Processes, namespace: str, *, connect: str = "", passes_through: bool = False
 ) -> int:
     """A robot that listens, or connects where a router is; returns its process id once it is on."""
     config = _robot_toml(stage, connect, passes_through)
-    pid = crew.start("robot", "sightline.operator_side.cli.app", "robot", "--config", str(config), namespace=namespace)
-    crew.wait_line("robot", f"robot {ROBOT}: on")
+    pid = processes.start("robot", ["robot", "--config", str(config)], namespace=namespace)
+    processes.wait_line("robot", f"robot {ROBOT}: on")
     return pid
 
 
-def start_vision(stage: Stage, crew: BenchProcesses, namespace: str, endpoint: str) -> int:
+def start_vision(stage: Stage, processes: Processes, namespace: str, endpoint: str) -> int:
     """A vision, seen working; returns its process id."""
     secure = ("--secure", str(stage.folder)) if stage.setting.transport in _TOKENED else ()
-    pid = crew.start(
-        "vision",
-        "sightline.operator_side.cli.app",
-        "vision",
-        "--robot",
-        ROBOT,
-        "--connect",
-        endpoint,
-        *secure,
-        namespace=namespace,
-    )
-    crew.wait_line("vision", "target seen")
+    arguments = ["vision", "--robot", ROBOT, "--connect", endpoint, *secure]
+    pid = processes.start("vision", arguments, namespace=namespace)
+    processes.wait_line("vision", "target seen")
     return pid
 
 

@@ -51,8 +51,6 @@ def _lines(status: Status | None, truth: Truth, stand_off_m: float) -> list[str]
 
 
 ROBOT: Final = "r1"
-READY_S: Final = 30.0
-"""For one process to say that it is ready; a first start reads hundreds of megabytes from disk."""
 ARM_S: Final = 15.0
 _DYING_S: Final = 1.0
 _SILENT_S: Final = 2.0
@@ -145,9 +143,9 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str]
     processes.start("sim", ["sim", "--config", str(run.folder / "sim.toml"), "--scenario", options.scenario,
                             "--seed", str(options.seed), "--motor-log", str(run.folder / MOTOR_LOG),
                             "--socket-dir", sockets])
-    processes.wait_line("sim", "simulation ready", READY_S)
+    processes.wait_line("sim", "simulation ready")
     processes.start("robot", ["robot", "--robot", ROBOT, "--config", str(run.folder / "robot.toml"), *listen])
-    processes.wait_line("robot", f"robot {ROBOT}: on", READY_S)
+    processes.wait_line("robot", f"robot {ROBOT}: on")
     with (
         open_link(ROBOT, connect=[endpoint], role=SOURCE) as link,
         Recorder(link, run.folder / RECORDING, _about(run)) as recorder,

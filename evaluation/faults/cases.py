@@ -13,7 +13,7 @@ from typing import Final
 
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.evidence import INJECTED, REQUESTED, MotorRow, most_gain_mps2, wheel_mps
-from sightline.evaluation.faults.fixture import READY_S, RobotFixture, Setup
+from sightline.evaluation.faults.fixture import RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.evaluation.faults.sampler import Hole
@@ -46,17 +46,17 @@ def drives_again(rig: RobotFixture) -> bool:
 
 def _kill_vision(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
-    rig.fleet.kill("peer")
+    rig.processes.kill("peer")
     rig.watch(SETTLED_S)
     return Injected(1, at_us)
 
 
 def _pause_vision(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
-    rig.fleet.signal("peer", signal.SIGSTOP)
+    rig.processes.signal("peer", signal.SIGSTOP)
     rig.watch(STOPPED_S)
     resumed_us = monotonic_us()
-    rig.fleet.signal("peer", signal.SIGCONT)
+    rig.processes.signal("peer", signal.SIGCONT)
     return Injected(1, at_us, resumed_us, drives_again(rig))
 
 
@@ -74,7 +74,7 @@ def _slow_detector(rig: RobotFixture) -> Injected:
 
 def _restart_vision(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
-    rig.fleet.kill("peer")
+    rig.processes.kill("peer")
     rig.watch(SETTLED_S)
     resumed_us = monotonic_us()
     rig.start_peer("second", "vision")
@@ -82,9 +82,9 @@ def _restart_vision(rig: RobotFixture) -> Injected:
 
 
 def _kill_network(rig: RobotFixture) -> Injected:
-    before = rig.fleet.child("robot")
+    before = rig.processes.child("robot")
     at_us = rig.signal_network(signal.SIGKILL)
-    rig.until(lambda: rig.fleet.child("robot") not in (0, before), AGAIN_S, "a new network process")
+    rig.until(lambda: rig.processes.child("robot") not in (0, before), AGAIN_S, "a new network process")
     rig.watch(SETTLED_S)
     again = drives_again(rig)
     first_us = min((one.t_us for one in rig.sent() if one.t_us > at_us + LEFT_OVER_US), default=None)
@@ -129,8 +129,8 @@ def _starve(rig: RobotFixture) -> Injected:
 
 def _end_robot(rig: RobotFixture, number: signal.Signals) -> Injected:
     started_s, at_us = time.monotonic(), monotonic_us()
-    rig.fleet.signal("robot", number)
-    code = rig.fleet.exit_code("robot", FREE_MS / 1000)
+    rig.processes.signal("robot", number)
+    code = rig.processes.exit_code("robot", FREE_MS / 1000)
     free_ms = (time.monotonic() - started_s) * 1000 if code is not None and _is_free(rig.endpoint) else None
     last_mps = rig.probe_motors()
     checks = (
@@ -304,9 +304,9 @@ def _replay_earlier(rig: RobotFixture) -> Injected:
     recording = rig.folder / "earlier.txt"
     rig.start_peer("recorder", "driver", source="teleop", recording=recording, seconds=3.0)
     rig.until(lambda: recording.exists() and len(recording.read_text("ascii").splitlines()) > 30, 15.0, "a recording")
-    rig.fleet.exit_code("recorder", 15.0)
-    rig.fleet.kill("peer")
-    rig.fleet.end_one("robot")
+    rig.processes.exit_code("recorder", 15.0)
+    rig.processes.kill("peer")
+    rig.processes.end_one("robot")
     rig.start_robot()
     rig.start_peer("replayer", "driver", fault="replay", recording=recording)
     rig.wait_speed(rig.setup.at_speed_mps)
@@ -323,8 +323,8 @@ def _two_visions(rig: RobotFixture) -> Injected:
     backwards = sum(row.left_rad_s + row.right_rad_s < 0 for row in last)
     slowest_mps = min(map(wheel_mps, last))
     at_us = monotonic_us()
-    rig.fleet.kill("second")
-    rig.fleet.kill("peer")
+    rig.processes.kill("second")
+    rig.processes.kill("peer")
     rig.watch(SETTLED_S)
     checks = (
         at_most("obeyed the second", backwards, "lines", 0),
@@ -340,7 +340,7 @@ def _take_over(rig: RobotFixture) -> Injected:
     took_ms = (monotonic_us() - rig.sent("person")[0].t_us) / 1000
     rig.watch(0.5)
     at_us = monotonic_us()
-    rig.fleet.kill("person")
+    rig.processes.kill("person")
     rig.watch(SETTLED_S + 1.0)
     return Injected(1, at_us, checks=(at_most("person obeyed after", took_ms, "ms", 1000.0),))
 
@@ -355,7 +355,7 @@ def _holder_dies(rig: RobotFixture) -> Injected:
     rig.start_peer("second", "driver", linear_mps=0.3)
     rig.until(lambda: len(rig.sent("second")) > 10, 15.0, "a second driver")
     at_us = monotonic_us()
-    rig.fleet.kill("peer")
+    rig.processes.kill("peer")
     rig.watch(ATTACKED_S)
     last_us = rig.sent("peer")[-1].t_us
     moving = [row.t_us for row in rig.motors() if row.t_us > last_us + LEASE_US // 2 and wheel_mps(row) > 0]
@@ -416,12 +416,12 @@ def _load(rig: RobotFixture, kind: str, at_least_times: int) -> Injected:
     """They come while the robot is driven and stay; then whoever drives dies."""
     came_us = monotonic_us()
     rig.start_crowd(kind)
-    rig.fleet.wait_line("crowd", READY, READY_S)
+    rig.processes.wait_line("crowd", READY)
     rig.watch(LOADED_S)
     slowest_mps = min(wheel_mps(row) for row in rig.motors() if row.t_us > came_us)
     times = len(rig.noted("crowd", INJECTED))
     at_us = monotonic_us()
-    rig.fleet.kill("peer")
+    rig.processes.kill("peer")
     rig.watch(SETTLED_S)
     checks = [at_least("came", times, "times", at_least_times), at_least("speed kept", slowest_mps, "m/s", KEPT_MPS)]
     if kind == "viewers":
@@ -436,17 +436,17 @@ def _load(rig: RobotFixture, kind: str, at_least_times: int) -> Injected:
 def _keep_time(rig: RobotFixture) -> Injected:
     """Drive beside busy processes for long enough to tell a 99.9th percentile; then the driving peer dies."""
     rig.start_peer("person", "operator", fault="lateness")
-    rig.fleet.wait_line("person", "person ready", AGAIN_S)
+    rig.processes.wait_line("person", "person ready", AGAIN_S)
     with busy_processes():
         since_us = monotonic_us()
         rig.watch(STARVED_S)
         rows = [row for row in rig.motors() if row.t_us > since_us]
         rig.trigger("person")
-        rig.fleet.wait_line("person", "late by", AGAIN_S)
+        rig.processes.wait_line("person", "late by", AGAIN_S)
         at_us = monotonic_us()
-        rig.fleet.kill("peer")
+        rig.processes.kill("peer")
         rig.watch(SETTLED_S)
-    said = rig.fleet.log("person").read_text("utf-8").rpartition("late by ")[2]
+    said = rig.processes.log("person").read_text("utf-8").rpartition("late by ")[2]
     return Injected(BUSY, at_us, checks=tuple(_tick_checks(rows, rig.holes(), int(said.split()[0]))))
 
 
@@ -529,7 +529,7 @@ def _forward_mps(row: MotorRow) -> float:
 def _send_stop(rig: RobotFixture, fault: str = "") -> int:
     """A person says STOP; returns when it was first sent."""
     rig.start_peer("person", "operator", fault=fault)
-    rig.fleet.wait_line("person", "person ready", AGAIN_S)
+    rig.processes.wait_line("person", "person ready", AGAIN_S)
     rig.trigger("person")
     rig.until(lambda: rig.injected("person") > 0, 5.0, "a STOP")
     return rig.noted("person", REQUESTED)[0].t_us
@@ -544,7 +544,7 @@ def _stop(rig: RobotFixture, fault: str = "") -> Injected:
 def _stop_lossy(rig: RobotFixture) -> Injected:
     before = shape(rig, LinkShapes())
     rig.start_peer("person", "operator")
-    rig.fleet.wait_line("person", "person ready", AGAIN_S)
+    rig.processes.wait_line("person", "person ready", AGAIN_S)
     shape(rig, LinkShapes(ab=LOSSY, ba=LOSSY))
     rig.trigger("person")
     rig.until(lambda: rig.injected("person") > 0, 5.0, "a STOP")
@@ -564,9 +564,9 @@ def _stop_then_commands(rig: RobotFixture) -> Injected:
 def _stop_then_restart(rig: RobotFixture) -> Injected:
     at_us = _send_stop(rig)
     rig.watch(SETTLED_S)
-    before = rig.fleet.child("robot")
+    before = rig.processes.child("robot")
     rig.signal_network(signal.SIGKILL)
-    rig.until(lambda: rig.fleet.child("robot") not in (0, before), AGAIN_S, "a new network process")
+    rig.until(lambda: rig.processes.child("robot") not in (0, before), AGAIN_S, "a new network process")
     since_us = monotonic_us()
     rig.until(lambda: rig.sent("peer")[-1].t_us > since_us, AGAIN_S, "commands after the restart")
     rig.watch(BAD_S)
@@ -576,7 +576,7 @@ def _stop_then_restart(rig: RobotFixture) -> Injected:
 def _reset_moving(rig: RobotFixture) -> Injected:
     """Reset while the wheels still turn; the wheels must come to zero and vision must not take it up again."""
     injected = _stop(rig, "reset")
-    refused = "reset False" in rig.fleet.log("person").read_text("utf-8")
+    refused = "reset False" in rig.processes.log("person").read_text("utf-8")
     return Injected(injected.count, injected.at_us, checks=(at_least("reset refused", refused, "", 1),))
 
 
@@ -588,7 +588,7 @@ def _drive_on(rig: RobotFixture) -> Injected:
     rig.watch(BAD_S)
     slowest_mps = min((wheel_mps(row) for row in rig.motors() if row.t_us > monotonic_us() - BAD_S * 1e6), default=0.0)
     at_us = monotonic_us()
-    rig.fleet.kill("peer")
+    rig.processes.kill("peer")
     rig.watch(SETTLED_S)
     checks = (at_least("speed kept", slowest_mps, "m/s", 0.4),)
     return Injected(len(rig.noted("clock", "injected")), at_us, checks=checks)

@@ -7,8 +7,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +19,7 @@ from sightline.evaluation.faults import evidence as judge
 from sightline.evaluation.faults.evidence import GOOD, INJECTED, MotorRow, SentCommand, read_events, wheel_mps
 from sightline.evaluation.faults.peer import PeerOptions, Role
 from sightline.evaluation.faults.sampler import Hole, read_holes, stalled_us
-from sightline.evaluation.processes import END_S, Processes, free_port
+from sightline.evaluation.processes import Processes, free_port
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import HardwareError, SightlineError
@@ -28,70 +28,14 @@ from sightline.sim.bus import SimDrive, SimSocketConfig
 from sightline.sim.network_emulator import LinkShapes
 from sightline.sim.tun_emulator import ADDRESS_A, namespaces
 
-COMMAND_LINE: Final = "sightline.operator_side.cli.app"
 _RESIDENT: Final = "RssAnon:"
 
 
-class Fleet(Processes):
-    """Processes that may be hurt; all are brought down at the end, hurt or not."""
-
-    def run(
-        self, name: str, module: str, arguments: Sequence[str], *, namespace: str = "",
-        environment: Mapping[str, str] | None = None,
-    ) -> None:
-        """Start `python -m MODULE ARGUMENTS` as `name`, inside a network namespace if one is named."""
-        entering = ["ip", "netns", "exec", namespace] if namespace else []
-        with self.log(name).open("ab") as log:
-            self._running[name] = subprocess.Popen(
-                [*entering, sys.executable, "-P", "-u", "-m", module, *arguments],
-                stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
-                env={**os.environ, **(environment or {})},
-            )
-
-    def signal(self, name: str, number: signal.Signals) -> None:
-        """Send a signal."""
-        self._running[name].send_signal(number)
-
-    def kill(self, name: str) -> None:
-        """SIGKILL, and forget it."""
-        process = self._running.pop(name)
-        process.kill()
-        process.wait()
-
-    def end_one(self, name: str) -> None:
-        """SIGTERM, and forget it."""
-        self._running[name].terminate()
-        if self.exit_code(name, END_S) is None:
-            self.kill(name)
-
-    def exit_code(self, name: str, timeout_s: float) -> int | None:
-        """Its exit code once it has ended, None if it does not in time; an ended one is forgotten."""
-        try:
-            code = self._running[name].wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            return None
-        del self._running[name]
-        return code
-
-    def child(self, name: str) -> int:
-        """The newest child's process id; 0 without one."""
-        pid = self.pid(name)
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii").split()
-        return int(children[-1]) if children else 0
-
-    def memory_kib(self, names: Iterable[str]) -> dict[tuple[str, bool], int]:
-        """Memory that each of these that runs holds for itself, and (True) its child: one started anew counts as it."""
-        running = self._running.keys() & names
-        pids = {(name, is_child): self.child(name) if is_child else self.pid(name)
-                for name in running for is_child in (False, True)}
-        return {who: held for who, pid in pids.items() if pid and (held := _resident_kib(pid)) is not None}
-
-    def end(self) -> list[str]:
-        """As `Processes.end`, after waking whoever is stopped."""
-        for process in self._running.values():
-            with suppress(ProcessLookupError):
-                process.send_signal(signal.SIGCONT)
-        return super().end()
+def memory_kib(processes: Processes, names: Iterable[str]) -> dict[tuple[str, bool], int]:
+    """Memory that each of these that runs holds for itself, and (True) its child: one started anew counts as it."""
+    pids = {(name, is_child): processes.child(name) if is_child else processes.pid(name)
+            for name in names if name in processes.names for is_child in (False, True)}
+    return {who: held for who, pid in pids.items() if pid and (held := _resident_kib(pid)) is not None}
 
 
 def _resident_kib(pid: int) -> int | None:
@@ -195,7 +139,6 @@ with open({str(folder / "clock.ledger")!r}, "a") as ledger:
 
 
 ROBOT: Final = "r1"
-READY_S: Final = 30.0
 AT_SPEED_S: Final = 25.0
 STEADY_US: Final = 500_000
 PORT: Final = 7447
@@ -240,7 +183,7 @@ class RobotFixture:
     def __init__(self, folder: Path, setup: Setup) -> None:
         self.folder, self.setup = folder, setup
         self._ending = ExitStack()
-        self.fleet = Fleet(folder)
+        self.processes = Processes(folder)
         self.wire: BenchWire | None = None
         self.endpoint = self.web_endpoint = ""
         self._peers: list[str] = []
@@ -261,22 +204,22 @@ class RobotFixture:
     def _start(self) -> None:
         self.folder.mkdir(parents=True)
         self._sockets = self._ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
-        self._ending.enter_context(self.fleet)
+        self._ending.enter_context(self.processes)
         if self.setup.wired:
             self.wire = self._ending.enter_context(BenchWire(self.folder / "wire.log"))
         self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"tcp/127.0.0.1:{free_port()}"
         self.web_endpoint = f"ws://127.0.0.1:{free_port()}" if self.setup.web else ""
         self._write_files(self._sockets)
-        self.fleet.run("sim", COMMAND_LINE, ["sim", "--config", str(self.folder / "sim.toml")])
-        self.fleet.run("sampler", "sightline.evaluation.faults.sampler", [str(self.folder / "holes.csv")])
-        self.fleet.wait_line("sim", "simulation ready", READY_S)
-        self.fleet.wait_line("sampler", "sampling", READY_S)
+        self.processes.start("sim", ["sim", "--config", str(self.folder / "sim.toml")])
+        self.processes.start("sampler", [str(self.folder / "holes.csv")], module="sightline.evaluation.faults.sampler")
+        self.processes.wait_line("sim", "simulation ready")
+        self.processes.wait_line("sampler", "sampling")
         for name in ("sim", "sampler"):
-            raise_priority(self.fleet.pid(name))
+            raise_priority(self.processes.pid(name))
         self.start_robot()
         self.start_peer("peer", self.setup.driver, fault=self.setup.fault)
         self.wait_speed(self.setup.at_speed_mps)
-        self._before_kib = self.fleet.memory_kib(self._judged)
+        self._before_kib = memory_kib(self.processes, self._judged)
 
     def _write_files(self, sockets: str) -> None:
         device = {"kind": "sim", "options": {"socket_dir": sockets}}
@@ -303,10 +246,9 @@ class RobotFixture:
         """Start the robot and wait until it listens."""
         arguments = ["robot", "--config", str(self.folder / "robot.toml"), "--listen", self.endpoint]
         arguments += ["--listen", self.web_endpoint] if self.web_endpoint else []
-        self.fleet.log("robot").unlink(missing_ok=True)
-        self.fleet.run("robot", COMMAND_LINE, arguments, namespace=self.wire.robot_side if self.wire else "",
-                       environment=self._environment())
-        self.fleet.wait_line("robot", f"robot {ROBOT}: on", READY_S)
+        self.processes.start("robot", arguments, namespace=self.wire.robot_side if self.wire else "",
+                             environment=self._environment())
+        self.processes.wait_line("robot", f"robot {ROBOT}: on")
 
     def start_peer(self, name: str, role: Role, **changes: Any) -> None:
         """Start a vision, a scripted driver or a person."""
@@ -315,13 +257,13 @@ class RobotFixture:
             config=self.folder / "vision.toml" if role == "vision" else None, **changes,
         )
         self._peers.append(name)
-        self.fleet.run(name, "sightline.evaluation.faults.peer", [options.model_dump_json()],
-                       namespace=self.wire.far_side if self.wire else "", environment=self._environment())
+        self.processes.start(name, [options.model_dump_json()], module="sightline.evaluation.faults.peer",
+                             namespace=self.wire.far_side if self.wire else "", environment=self._environment())
 
     def start_crowd(self, kind: str) -> None:
         """Let many WebSocket clients come; what they do is noted as by a peer called `crowd`."""
         arguments = [kind, self.web_endpoint, str(self.folder / "crowd.ledger")]
-        self.fleet.run("crowd", "sightline.evaluation.faults.load_clients", arguments)
+        self.processes.start("crowd", arguments, module="sightline.evaluation.faults.load_clients")
 
     def _environment(self) -> dict[str, str]:
         return {"PYTHONPATH": str(self.folder)} if self.setup.clock else {}
@@ -329,7 +271,7 @@ class RobotFixture:
     def trigger(self, name: str = "peer") -> int:
         """Let a peer's fault begin; returns when that was."""
         at_us = monotonic_us()
-        self.fleet.signal(name, signal.SIGUSR1)
+        self.processes.signal(name, signal.SIGUSR1)
         return at_us
 
     def camera_mode(self, mode: str) -> int:
@@ -342,7 +284,7 @@ class RobotFixture:
     def signal_network(self, number: signal.Signals) -> int:
         """Send the robot's network process a signal; returns when that was."""
         at_us = monotonic_us()
-        os.kill(self.fleet.child("robot"), number)
+        os.kill(self.processes.child("robot"), number)
         return at_us
 
     # --- waiting -------------------------------------------------------------------------------------------------
@@ -413,7 +355,7 @@ class RobotFixture:
 
     def grown_mb(self) -> float:
         """The most that any judged process has grown since the wheels were at speed."""
-        after_kib = self.fleet.memory_kib(self._judged)
+        after_kib = memory_kib(self.processes, self._judged)
         grown_kib = (after_kib[who] - before for who, before in self._before_kib.items() if who in after_kib)
         return max(grown_kib, default=0) / 1024
 

@@ -278,7 +278,6 @@ def _indented(checks: "Sequence[Check]") -> list[str]:
 # `sightline bench detector` and `bench streams`: what eyes elsewhere cost, and one service for many. Shell.
 
 
-_READY_S = 30.0
 _BOUND_US = {"zenoh": 1_000.0, "oip+http": 2_000.0}
 """The median that asking elsewhere on the same machine may add, hot; the rest is only told."""
 
@@ -359,7 +358,7 @@ def _service(name: str, folder: Path) -> "Iterator[Any]":
         robot = ending.enter_context(open_link("r1", listen=[endpoint]))
         processes = ending.enter_context(Processes(folder))
         processes.start("detector", ["detector", "--serve", "hsv", "--connect", endpoint])
-        processes.wait_line("detector", "for robots", _READY_S)
+        processes.wait_line("detector", "for robots")
         _publish_status(robot, processes)
         yield robot
 

@@ -1,13 +1,17 @@
-"""Work on several processes that is interrupted."""
+"""Processes that end together, and work on several processes that is interrupted."""
 
 import signal
+import subprocess
+import sys
 import time
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 
 import pytest
 
-from sightline.evaluation.processes import worker_pool
+from sightline.evaluation.processes import Processes, worker_pool
 from sightline.protocol.errors import HardwareError
+from tests.fixtures.links import until
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
@@ -36,3 +40,55 @@ def test_all_is_done_when_nothing_happens():
     with worker_pool(2) as pool:
         waiting = [pool.submit(pow, 2, number) for number in range(20)]
     assert [one.result() for one in waiting] == [2**number for number in range(20)]
+
+
+_PARENT = """
+import sys, time
+from pathlib import Path
+from sightline.evaluation.processes import Processes
+processes = Processes(Path(sys.argv[1]))
+processes.start("sleeper", [], module="sleeper", environment={"PYTHONPATH": sys.argv[1]})
+processes.wait_line("sleeper", "sleeps", 20)
+print(processes.pid("sleeper"), flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_parent_that_is_killed_leaves_no_child(tmp_path):
+    (tmp_path / "sleeper.py").write_text("import time\nprint('sleeps')\ntime.sleep(30)\n")
+    with subprocess.Popen([sys.executable, "-c", _PARENT, str(tmp_path)], stdout=subprocess.PIPE) as parent:
+        try:
+            assert parent.stdout is not None
+            child = Path(f"/proc/{int(parent.stdout.readline())}/cmdline")
+            assert child.read_bytes()
+        finally:
+            parent.kill()
+    assert until(lambda: not child.exists() or not child.read_bytes(), 5)
+
+
+def test_a_child_sees_the_arguments_and_the_input_that_python_m_gives_it(tmp_path):
+    (tmp_path / "shows.py").write_text(
+        "import sys, time\nprint(sys.argv, __name__, __spec__.name, repr(sys.stdin.read()))\ntime.sleep(30)\n"
+    )
+    with Processes(tmp_path) as processes:
+        processes.start("shows", ["a", "-b"], module="shows", environment={"PYTHONPATH": str(tmp_path)})
+        processes.wait_line("shows", "\n")
+        shown = processes.log("shows").read_text()
+        assert shown == f"{[str(tmp_path / 'shows.py'), 'a', '-b']} __main__ shows ''\n"
+
+
+@pytest.mark.parametrize(("oldest_first", "order"), [(False, "21"), (True, "12")])
+def test_all_are_ended_one_after_the_other_even_those_that_are_stopped(tmp_path, oldest_first, order):
+    (tmp_path / "notes.py").write_text(
+        "import signal, sys, time\nsignal.signal(signal.SIGTERM, lambda *_: sys.exit())\nprint('ready')\n"
+        "try:\n    time.sleep(30)\nfinally:\n    open(sys.argv[1], 'a').write(sys.argv[2])\n"
+    )
+    with Processes(tmp_path, oldest_first=oldest_first) as processes:
+        for name in "12":
+            environment = {"PYTHONPATH": str(tmp_path)}
+            processes.start(name, [str(tmp_path / "order"), name], module="notes", environment=environment)
+            processes.wait_line(name, "ready")
+        processes.signal("1", signal.SIGSTOP)
+        assert processes.end() == []
+        assert processes.names == []
+    assert (tmp_path / "order").read_text() == order

@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 import typer
 
-from sightline.benchmarks.loop.counters import carried_between, carried_bytes, children_of
+from sightline.benchmarks.loop.counters import carried_between, carried_bytes
 from sightline.benchmarks.loop.figures import FLOOR, OUR_DETECTOR, OURS, PEERS, TCP, WITH_OUR_DETECTOR, LoopSetting
 from sightline.benchmarks.loop.pictures import COUNT, camera_of, write_pictures
 from sightline.benchmarks.loop.race import run_race
 from sightline.benchmarks.loop.viewers import measure_watchers
 from sightline.benchmarks.loop.vision import PipelineVision
 from sightline.benchmarks.peers.classic_detector import ClassicVision
-from sightline.evaluation.processes import free_port
+from sightline.evaluation.processes import children_of, free_port
 from sightline.operator_side.cli.bench import register
 from sightline.protocol.errors import HardwareError
 from sightline.robot_side.hardware.cameras.files import FolderCamera, FolderCameraConfig
