@@ -175,7 +175,7 @@ def _why(error: BaseException, kind: str) -> str:
     if isinstance(error, ModuleNotFoundError) and error.name and _OLD_MODULE.fullmatch(error.name):
         named = next(filter(None, map(_OLD_MODULE.search, (*_lines(error.__traceback__), kind))), None)
         if named is not None:
-            return f"{named[1]} is now sightline.{named[1]}; change the import"
+            return f"{named[1]} is now sightline.{named[1]}; use that name"
     return (str(error) or type(error).__name__)[:_LONGEST_DETAIL]
 
 

@@ -51,7 +51,7 @@ def test_a_plug_in_that_imports_an_old_module_gets_its_new_path(folder, line, ne
     (folder / f"{name}.py").write_text(f"{line}\n\n\nclass Camera:\n    pass\n")
     with pytest.raises(ConfigError) as error:
         CAMERAS.load(f"{name}:Camera")
-    assert str(error.value) == f"camera '{name}:Camera' cannot be loaded: {new}; change the import"
+    assert str(error.value) == f"camera '{name}:Camera' cannot be loaded: {new}; use that name"
 
 
 def test_a_configuration_that_names_an_old_module_gets_its_new_path(folder):
