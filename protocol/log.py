@@ -60,16 +60,33 @@ class QueueHandler(logging.Handler):
     def __init__(self) -> None:
         super().__init__()
         self._lines: queue.Queue[tuple[str, TextIO | None]] = queue.Queue(_MAX_WAITING_LINES)
-        self._thread: threading.Thread | None = None
+        self._is_started = False
+        self._starting = threading.Lock()
+
+    def start(self) -> None:
+        """Start the thread that writes, if it is not started. Raises RuntimeError where the system permits no more."""
+        with self._starting:
+            if not self._is_started:
+                threading.Thread(target=self._write_all, name="log", daemon=True).start()
+                self._is_started = True
+
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Emit without the lock of `logging`, so that no caller waits while a line of another thread is formatted."""
+        passed = bool(self.filter(record))
+        if passed:
+            self.emit(record)
+        return passed
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Queue the line of `record`, or drop it where no more lines may wait. `logging` holds the handler's lock."""
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
-            self._thread.start()
-        with suppress(queue.Full):
-            stream = sys.stderr if record.levelno >= logging.WARNING else sys.stdout
-            self._lines.put_nowait((self.format(record), stream))
+        """Queue the line of `record`, or drop it where no more lines may wait. Never raises into its caller."""
+        try:
+            line = self.format(record)
+        except Exception:  # arguments that do not fit the message
+            line = f"{record.name}: invalid log call {record.msg!r}"
+        with suppress(queue.Full, RuntimeError):
+            if not self._is_started:
+                self.start()
+            self._lines.put_nowait((line, sys.stderr if record.levelno >= logging.WARNING else sys.stdout))
 
     def flush(self) -> None:
         """Wait until all lines are written, for a second at most. `logging` calls it when the process ends."""
@@ -98,6 +115,12 @@ def _write(line: str, stream: TextIO | None) -> None:
 
 _HANDLER: Final = QueueHandler()
 _HANDLER.setFormatter(TextFormatter())
+
+
+def start_log_thread() -> None:
+    """Start the thread that writes the log now: a control loop must not wait for it at its first line."""
+    with suppress(RuntimeError):
+        _HANDLER.start()
 
 
 def start_log(form: str | None, service: str) -> None:

@@ -1,5 +1,23 @@
-"""A shell that starts the tests in its background has Ctrl-C ignored, and every child would inherit that."""
+"""What every test begins with: Ctrl-C as Python has it, and no log of a command that an earlier test ran."""
 
+import logging
 import signal
+import threading
 
+import pytest
+
+from sightline.protocol import log
+
+# A shell that starts the tests in its background has Ctrl-C ignored, and every child would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def no_log_of_an_earlier_command():
+    """A command that runs in this process sets up the log of the process."""
+    hook = threading.excepthook
+    yield
+    logging.getLogger().removeHandler(log._HANDLER)
+    logging.getLogger("sightline").setLevel(logging.NOTSET)
+    logging.captureWarnings(False)
+    threading.excepthook = hook

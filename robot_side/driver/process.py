@@ -17,7 +17,7 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import WireError
-from sightline.protocol.log import RepeatLimiter
+from sightline.protocol.log import RepeatLimiter, start_log_thread
 from sightline.protocol.messages import LastRejection, State, StreamStatus
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
@@ -41,7 +41,8 @@ _log: Final = logging.getLogger(__name__)
 
 _SHUTDOWN_US = 2_000_000
 _WATCHDOG_PERIOD_US = 100_000
-_STACK_BYTES = 256 * 1024  # the process locks its memory, a stack of the usual 8 MB with it
+# The process locks its memory, a stack of the usual 8 MB with it. A plug-in's code needs more than ours.
+_STACK_BYTES, _PLUGIN_STACK_BYTES = 256 * 1024, 1024 * 1024
 _BATTERY_PERIOD_S = 1.0
 _WARNING = (
     "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
@@ -55,17 +56,20 @@ def run(config: RobotConfig) -> int:
     Raises ConfigError, HardwareError or LinkError before anything could move.
     """
     check_robot_id(config.robot)
-    threading.stack_size(_STACK_BYTES)
     with ExitStack() as ending:
         drive = DRIVES.build(config.motors)
         ending.callback(drive.close)
         ranges = RANGE_SENSORS.build(config.ranging) if config.ranging else None
         if ranges is not None:
             ending.callback(ranges.close)
+        threading.stack_size(_PLUGIN_STACK_BYTES)
         reader = BatteryReader(BATTERIES.build(config.battery)) if config.battery else None
         if reader is not None:
             ending.callback(reader.close)
+        threading.stack_size(_STACK_BYTES)
+        start_log_thread()
         driver = Driver(config, drive, ranges, reader)
+        threading.stack_size(_PLUGIN_STACK_BYTES)
         ending.callback(driver.latch_writer.close)
         ending.callback(driver.driver_end.close)
         ending.callback(_zero, drive)  # last in, first to run: however the loop ends, the motors are set to zero
@@ -96,17 +100,26 @@ class BatteryReader:
         self._failed = False
         self.newest: tuple[float, int] | None = None
         """Volts, and when they were read."""
-        threading.Thread(target=self._read_all, name="battery", daemon=True).start()
+        self._thread = threading.Thread(target=self._read_all, name="battery", daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
-        """End after the reading under way; never waits for it."""
+        """End after the reading in progress. A reading that hangs is left behind after a second, its device open."""
         self._closing.set()
-        self._battery.close()
+        self._thread.join(_BATTERY_PERIOD_S)
 
     def _read_all(self) -> None:
+        try:
+            self._read_until_closing()
+        finally:
+            with suppress(*PLUGIN_ERRORS):
+                self._battery.close()
+
+    def _read_until_closing(self) -> None:
         while not self._closing.is_set():
+            begin_us = monotonic_us()  # a reading that hung is as old as its begin
             try:
-                self.newest = self._read(), monotonic_us()
+                self.newest = self._read(), begin_us
             except PLUGIN_ERRORS:
                 if not self._failed and not self._closing.is_set():
                     _log.exception("the battery cannot be read")
@@ -325,6 +338,7 @@ class Driver:
                 self._command_acks.append(ack)
         elif message.channel is REQUEST:
             self._driver_core.on_request(message, monotonic_us())
+            self.latch_writer.want(self._driver_core.gate.state is State.STOPPED)  # the loop may end before its tick
         rejection = self._driver_core.gate.last_rejection
         if rejection is not None and rejection is not rejection_before:
             self._log_rejection(rejection)

@@ -10,6 +10,7 @@ import pty
 import random
 import subprocess
 import sys
+import threading
 import time
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -222,3 +223,48 @@ def test_ever_new_keys_take_no_memory_and_few_lines():
     assert sum(map(bool, counts)) == 18 and max(counts) == 1_000, "the others share one key"
     assert len(limiter._repeats) == 17
     assert limiter.due("later", 20 * SECOND_US) == 1, "an old key makes room"
+
+
+class Slow:
+    """An argument whose text takes its time."""
+
+    def __init__(self, begun, go_on):
+        self.begun, self.go_on = begun, go_on
+
+    def __str__(self):
+        self.begun.set()
+        self.go_on.wait(5.0)
+        return "slow"
+
+
+def handled(message, *arguments):
+    return logging.LogRecord("plugin", logging.INFO, "", 0, message, arguments, None)
+
+
+def test_no_caller_waits_while_a_line_of_another_thread_is_formatted():
+    handler, begun, go_on = QueueHandler(), threading.Event(), threading.Event()
+    other = threading.Thread(target=handler.handle, args=(handled("%s", Slow(begun, go_on)),), daemon=True)
+    other.start()
+    assert begun.wait(5.0)
+    began_s = time.monotonic()
+    handler.handle(handled("mine"))
+    assert time.monotonic() - began_s < 1.0
+    go_on.set()
+    other.join(5.0)
+
+
+def test_a_log_call_whose_arguments_do_not_fit_raises_nothing_and_is_named(capsys):
+    handler = QueueHandler()
+    handler.handle(handled("volts %d", "many"))
+    handler.flush()
+    assert capsys.readouterr().out == "plugin: invalid log call 'volts %d'\n"
+
+
+def test_without_a_thread_lines_are_dropped_and_nothing_is_raised(monkeypatch):
+    def fail(_thread):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", fail)
+    handler = QueueHandler()
+    handler.handle(handled("lost"))
+    assert handler._lines.empty()

@@ -61,7 +61,9 @@ class Publication:
 
 OPEN_S: Final = 2.0
 """Security limit: for connecting and the handshake, and once more for the hello."""
-PROTOCOL_OPTIONS: Final[dict[str, Any]] = {"extensions": None, "logger": logging.getLogger("sightline.websocket")}
+_LIBRARY_LOG: Final = logging.getLogger("websockets.sightline")
+_LIBRARY_LOG.setLevel(logging.CRITICAL + 1)  # it has lines for every connection, which is what a flood is made of
+PROTOCOL_OPTIONS: Final[dict[str, Any]] = {"extensions": None, "logger": _LIBRARY_LOG}
 """No compression: pictures do not shrink, and trying costs three times the CPU."""
 SILENT: Final = "SILENT"
 """Counted for a peer that left a ping unanswered, or took nothing for long."""
@@ -71,8 +73,6 @@ NOT_GRANTED: Final = "NOT_GRANTED"
 
 Promote = Callable[[str], None]
 """Gives a client of that role a place; raises PeerError if there is none."""
-
-logging.getLogger("sightline.websocket").addHandler(logging.NullHandler())  # else Python prints to the terminal
 
 _TICK_US: Final = 250_000  # how late a ping may be, and silence be noticed
 _COUNTED_FOR_CODE: Final = {1002: BAD_FRAMING, 1007: BAD_FRAMING, 1009: OVERSIZE}

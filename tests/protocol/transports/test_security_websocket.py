@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import logging
 import time
 
 import pytest
@@ -11,6 +12,7 @@ from websockets.sync.client import connect
 
 from sightline.protocol.channels import ACK, DETECTIONS, FRAME, REQUEST, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.log import start_log
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint, with_allowed
 from sightline.protocol.transports.security import (
     NO_TOKEN,
@@ -132,6 +134,19 @@ def test_who_is_not_listed_is_told_why_and_the_log_tells_of_few(caplog):
     lines = caplog.messages
     assert 1 <= len(lines) <= 10 * (1 + int(spent_s))
     assert "turned 127.0.0.1 away: 127.0.0.1 is not listed" in lines[0]
+
+
+def test_the_library_logs_nothing_of_a_connection_that_is_rejected(caplog, monkeypatch):
+    """A line for each would let a flood of connections fill the log, whatever level ours has."""
+    start_log("text", "robot")
+    caplog.set_level(logging.DEBUG)
+    endpoint, here = everywhere("ws-legacy")
+    with open_websocket("r1", listen=f"{endpoint}?from=10.1.2.3"):
+        for _ in range(40):
+            with pytest.raises(InvalidStatus):
+                connect(here.replace("ws-legacy", "ws"), compression=None)
+    assert len([one for one in caplog.records if one.name.startswith("sightline")]) <= 10
+    assert not [one for one in caplog.records if one.name.startswith("websockets.s")]
 
 
 def test_who_is_listed_comes_in():

@@ -4,19 +4,24 @@ verdict, and nobody woken by what can wait."""
 import select
 import signal
 import socket
+import threading
+import time
 
 import pytest
 
-from sightline.protocol.channels import TWIST
+from sightline.protocol.channels import REQUEST, TWIST
+from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
-from sightline.protocol.messages import AnswerHeader, Echo
+from sightline.protocol.messages import AnswerHeader, Echo, Request, RequestHeader, Verb
 from sightline.protocol.transports.link import Message
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.driver.process import Driver
+from sightline.robot_side.driver.persistence import StopLatch
+from sightline.robot_side.driver.process import BatteryReader, Driver
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
 from sightline.robot_side.pipe import DriverEnd, NetworkEnd
 from sightline.robot_side.safety.limits import SafetyConfig
+from tests.fixtures.links import until
 
 SEQ, T_US = 7, 1_000
 
@@ -141,3 +146,44 @@ def _arm(driver):
     from sightline.robot_side.safety.states import Event
 
     driver._driver_core.gate._go(Event.ARM, "armed for the test")
+
+
+def test_a_stop_is_on_its_way_to_disk_before_the_tick_that_it_did_not_wait_for(driver, ends, tmp_path):
+    """The loop may end before that tick, on a signal that came with it."""
+    status = Echo(channel="status", session=driver._driver_core.session, seq=0, t_us=monotonic_us())
+    driver._driver_core.gate.issued.add("status", status.seq, status.t_us)
+    header = RequestHeader(source="operator", session="0c0c0c0c", seq=1, echo=status)
+    ends[1].forward(Message(REQUEST, "operator", encode(header), encode(Request(id=1, verb=Verb.STOP))))
+    driver._drain()
+    driver.latch_writer.close()
+    assert StopLatch(tmp_path, driver._driver_core.config.robot).is_set()
+
+
+class HungBattery:
+    """Its second reading hangs until `go_on`, and then gives an old voltage."""
+
+    def __init__(self):
+        self.readings, self.go_on, self.closed_by = 0, threading.Event(), ""
+
+    def read(self):
+        self.readings += 1
+        if self.readings > 1:
+            assert self.go_on.wait(10.0)
+        return 7.4
+
+    def close(self):
+        self.closed_by = threading.current_thread().name
+
+
+def test_a_reading_that_hung_is_as_old_as_its_begin_and_its_device_is_closed_by_its_own_thread(monkeypatch):
+    monkeypatch.setattr("sightline.robot_side.driver.process._BATTERY_PERIOD_S", 0.01)
+    battery = HungBattery()
+    reader = BatteryReader(battery)
+    assert until(lambda: battery.readings == 2)
+    begun_us, first = monotonic_us(), reader.newest
+    time.sleep(0.2)
+    battery.go_on.set()
+    assert until(lambda: reader.newest != first)
+    assert reader.newest[1] <= begun_us
+    reader.close()
+    assert until(lambda: battery.closed_by == "battery")
