@@ -4,7 +4,7 @@ Frames that were answered go in again in the order they were answered, one pipel
 scan and the mission that its answer cites.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -102,6 +102,14 @@ def replay_steps(path: Path) -> Iterator[Step]:
     return _steps(path, answers)
 
 
+def _newest_camera(message: Message, camera: CameraModel, pipelines: Iterable[Pipeline]) -> CameraModel:
+    """The model in `message`; if it is another one, the pipelines continue with it."""
+    model = decode(CameraModel, message.payload, CAMERA.max_payload_bytes)
+    for pipeline in pipelines if model != camera else ():
+        pipeline.set_camera(model)
+    return model
+
+
 def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
     """Takes out of `answers` what it uses; what is left cites frames that were not recorded."""
     config = _vision_config(path)
@@ -110,11 +118,7 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
     for recorded in read_recording(path):
         message = recorded.message
         if message.channel is CAMERA:
-            model = decode(CameraModel, message.payload, CAMERA.max_payload_bytes)
-            if model != camera:
-                camera = model
-                for pipeline in pipelines.values():
-                    pipeline.set_camera(model)
+            camera = _newest_camera(message, camera, pipelines.values())
         if message.channel is not FRAME:
             continue
         frame = Frame(decode(FrameHeader, message.header), message.payload)
