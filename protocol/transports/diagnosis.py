@@ -23,8 +23,13 @@ _LISTEN: Final = "0A"
 def port_owner(port: int) -> str:
     """`python3 (pid 4711)` for the process listening on TCP `port`; "" where that cannot be found out."""
     sockets = {f"socket:[{row[9]}]" for row in _rows({port}) if row[3] == _LISTEN}
-    for process in Path("/proc").glob("[0-9]*") if sockets else ():
-        if any(_target(link) in sockets for link in _descriptors(process)):
+    return process_with_open(sockets) if sockets else ""
+
+
+def process_with_open(files: Collection[str], besides: int = 0) -> str:
+    """`python3 (pid 4711)` for a process that has one of `files` open, `besides` left out; "" where none is found."""
+    for process in Path("/proc").glob("[0-9]*"):
+        if process.name != str(besides) and any(_target(link) in files for link in _descriptors(process)):
             return f"{_name(process)} (pid {process.name})"
     return ""
 

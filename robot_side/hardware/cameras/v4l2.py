@@ -17,6 +17,7 @@ from pydantic import Field
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import CameraModel
+from sightline.protocol.transports.diagnosis import process_with_open
 from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
 from sightline.robot_side.hardware.cameras.timing import CaptureClock, LatestPicture, read_clocks
 from sightline.robot_side.ports import Picture, scaled_quality, scaled_size
@@ -48,11 +49,7 @@ def open_error(path: Path) -> HardwareError:
 
 def device_owner(path: Path) -> str:
     """`cheese (pid 4711)` for another process that has `path` open; "" where that cannot be found out."""
-    device = str(path.resolve())
-    for process in Path("/proc").glob("[0-9]*"):
-        if process.name != str(os.getpid()) and device in _open_files(process):
-            return f"{_name(process)} (pid {process.name})"
-    return ""
+    return process_with_open({str(path.resolve())}, besides=os.getpid())
 
 
 def _trouble(path: Path, error: OSError) -> HardwareError:
@@ -81,27 +78,6 @@ def _group(path: Path) -> str:
     except (OSError, KeyError):
         return "video"
     return group if group != "root" else "video"
-
-
-def _open_files(process: Path) -> set[str]:
-    try:
-        return {_target(link) for link in (process / "fd").iterdir()}
-    except OSError:  # gone, or not ours to look at
-        return set()
-
-
-def _target(link: Path) -> str:
-    try:
-        return str(link.readlink())
-    except OSError:  # closed meanwhile
-        return ""
-
-
-def _name(process: Path) -> str:
-    try:
-        return (process / "comm").read_text("utf-8", "replace").strip()
-    except OSError:
-        return "a process"
 
 
 # An open V4L2 device, through OpenCV: its format pinned, its JPEGs undecoded, its buffers' times. Shell.
