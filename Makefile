@@ -3,23 +3,25 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
+PYTEST := $(BIN)/python -m pytest
+# Where Python may not store what it compiled, each process compiles all tests anew: half of the time of `make test`.
+unexport PYTHONDONTWRITEBYTECODE
 READY := $(VENV)/.ready
 
-.PHONY: demo test kit mutation lint lock clean
+.PHONY: demo test test-all test-long mutation lint lock clean
 
 demo: $(READY)
 	$(BIN)/sightline demo $(ARGS)
 
-test: $(READY)  ## what is quick on all cores; then real processes in real time, one after the other; or just ARGS
-ifdef ARGS
-	$(BIN)/python -m pytest $(ARGS)
-else
-	$(BIN)/python -m pytest -m "not slow and not faults and not kit" --numprocesses auto; quick=$$?; \
-	$(BIN)/python -m pytest -m "slow and not faults and not kit" && exit $$quick
-endif
+test: $(READY)  ## at most two minutes: at least 90 % of all tests; or just ARGS
+	$(PYTEST) $(or $(ARGS),--numprocesses auto --dist worksteal)
 
-kit: $(READY)  ## what is long: the conformance kit against every broken peer, every scenario in real time
-	$(BIN)/python -m pytest -m kit $(ARGS)
+test-all: $(READY)  ## what is longer: first what can share the machine, then what measures real time
+	$(PYTEST) -m "slow and not long" --numprocesses auto --dist worksteal; shared=$$?; \
+	$(PYTEST) -m "alone and not long" && exit $$shared
+
+test-long: $(READY)  ## once before a release: the fault bench, the kit against every broken peer, all mutants
+	$(PYTEST) -m long; tests=$$?; $(BIN)/python -m tests.mutation && exit $$tests
 
 lint: $(READY)
 	$(BIN)/ruff check .

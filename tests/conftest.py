@@ -1,6 +1,7 @@
 """What every test begins with: Ctrl-C as Python has it, and no log of a command that an earlier test ran."""
 
 import logging
+import os
 import signal
 import threading
 
@@ -10,6 +11,11 @@ from sightline.protocol import log
 
 # A shell that starts the tests in its background has Ctrl-C ignored, and every child would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_xdist_auto_num_workers(config):
+    """Three workers for each processor: most tests wait for processes and sockets."""
+    return 3 * len(os.sched_getaffinity(0))
 
 
 @pytest.fixture(autouse=True)

@@ -36,7 +36,7 @@ def only(*cases):
 # --- at real robots --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.parametrize("scheme", ["tcp/", "ws://"])
 def test_a_real_robot_conforms(capsys, tmp_path, scheme):
     endpoint = free_endpoint().replace("tcp/", scheme)
@@ -50,7 +50,7 @@ def test_a_real_robot_conforms(capsys, tmp_path, scheme):
     assert json.loads((tmp_path / "r.json").read_text()) == report
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_a_broken_robot_does_not_and_every_report_says_why(capsys, tmp_path):
     files = {name: tmp_path / f"r.{name}" for name in ("junit", "save")}
     with SmallServer({"compresses"}) as server:
@@ -63,7 +63,7 @@ def test_a_broken_robot_does_not_and_every_report_says_why(capsys, tmp_path):
     assert json.loads(files["save"].read_text())["ok"] is False
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.parametrize("scheme", ["tls/", "wss://"])
 def test_a_robot_behind_keys_conforms(capsys, tmp_path, scheme):
     """Roles have keys of their own there, so the kit comes in as vision and as operator at once."""
@@ -114,7 +114,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(capsys, arguments, says):
     assert says in err and err.count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_a_robot_of_another_name_is_exit_code_4(capsys, tmp_path):
     endpoint = free_endpoint()
     with RobotProcess(tmp_path, endpoint=endpoint) as robot:

@@ -14,7 +14,7 @@ from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 from tests.sim.test_bus import started
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 FULL_RAD_S, HALF_RAD_S = 0.4 / 0.035, 0.25 / 0.035
 RANGE_M = 5.0

@@ -14,7 +14,7 @@ import pytest
 from sightline.evaluation.processes import ProcessError, Processes
 from sightline.protocol.errors import SightlineError
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "demo"]
 

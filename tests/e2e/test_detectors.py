@@ -21,7 +21,7 @@ from tests.fixtures.vision.onnx import brightness_model
 from tests.fixtures.vision.remote import Server, box, http_reply, said
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 RIGHT = [[250.0, 100.0, 300.0, 150.0]]
 
 

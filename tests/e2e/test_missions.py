@@ -20,7 +20,7 @@ from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import jpeg_of
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 QUIET = VisionConfig.model_validate({"search": {"enabled": False}})
 """Its pictures are grey: without a search the robot stands."""
 

@@ -11,7 +11,7 @@ from sightline.protocol.transports.open import open_link
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 PAYLOADS = {DETECTIONS.name: b'{"width_px":640,"height_px":480}', MISSION.name: b'{"id":1,"mission":"follow"}'}
 QUIET_S = 0.4
 

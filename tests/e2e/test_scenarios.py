@@ -1,4 +1,4 @@
-"""Every scenario by name in real time: four real processes over Zenoh, judged from world truth. `make kit` runs all."""
+"""Every scenario by name in real time: four real processes over Zenoh, judged from world truth. `make test-long` runs all."""
 
 import csv
 import math
@@ -17,7 +17,7 @@ IN_EVERY_TEST_RUN = "legs"
 
 
 def chosen(names: Iterable[str]) -> list[object]:
-    return [pytest.param(name, marks=pytest.mark.slow if name == IN_EVERY_TEST_RUN else pytest.mark.kit)
+    return [pytest.param(name, marks=pytest.mark.alone if name == IN_EVERY_TEST_RUN else pytest.mark.long)
             for name in names]
 
 

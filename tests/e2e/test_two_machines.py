@@ -17,7 +17,7 @@ from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B, why_impossible
 from tests.fixtures.links import until
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.alone,
     pytest.mark.skipif(bool(why_impossible()), reason=f"two namespaces: {why_impossible()}"),
 ]
 PAGE = (Path(__file__).parent.parent.parent / "docs" / "two-machines.md").read_text()

@@ -80,7 +80,7 @@ def test_a_service_says_its_errors_as_json_too():
     assert (said["level"], said["service"]) == ("error", "vision") and "nowhere" in said["message"]
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_both_processes_of_a_robot_speak_json(tmp_path, monkeypatch):
     """The driver says what it does by its command line; the network process by what it finds in its environment."""
     monkeypatch.setenv(LOG_FORMAT_VARIABLE, "json")

@@ -22,7 +22,7 @@ from sightline.sim.bus import MOTION, MOTION_SET, SimCamera, SimDrive, SimRange,
 from sightline.sim.process import SimConfig, SocketFolder, run
 from sightline.sim.robot import load_robot
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 SERVE = (
     "import sys; from sightline.protocol.log import start_log; from sightline.sim.process import SimConfig, run; "

@@ -78,7 +78,7 @@ def test_of_several_connections_to_a_port_the_busiest_counts():
     assert carried_between({}, {}) is None
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.parametrize("transport", ["zenoh", "websocket"])
 def test_a_short_race_of_the_services_over_each_transport(transport):
     race = run_race(replace(SMALL, transport=transport, peers=()), lambda _: None)
@@ -91,7 +91,7 @@ def test_a_short_race_of_the_services_over_each_transport(transport):
     assert race.figures[FLOOR].hot_ms is not None
 
 
-@pytest.mark.kit
+@pytest.mark.long
 def test_every_peer_answers(tmp_path):
     pytest.importorskip("zmq")
     race = run_race(replace(SMALL, detector_delay_ms=40.0), lambda _: None)
@@ -102,14 +102,14 @@ def test_every_peer_answers(tmp_path):
         assert name == FLOOR or one.bytes_per_picture > 1000, name
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_viewers_come_and_stall_and_the_loop_goes_on():
     checks = {check.name: check for check in measure_watchers(replace(SMALL, tries=1), 3, lambda _: None)}
     assert checks["not accepted"].value < 50
     assert checks["memory, more"].value < 50
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkeypatch):
     app = typer.Typer()
     register(app)
@@ -123,7 +123,7 @@ def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkey
     assert (tmp_path / "new" / "loop.png").read_bytes()[:4] == b"\x89PNG"
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_terminated_it_leaves_no_process_and_no_folder(tmp_path):
     code = """
 from pathlib import Path

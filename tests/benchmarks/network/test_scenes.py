@@ -137,7 +137,7 @@ def test_a_robot_that_is_missing_is_noticed():
 # --- for real ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.skipif(bool(why_impossible()), reason="needs root and /dev/net/tun")
 def test_a_standby_is_run_for_real():
     command = [

@@ -65,7 +65,7 @@ def test_each_case_finds_its_broken_robot(case):
     assert result_of(case, BROKEN[case.id]).outcome is Outcome.FAILED
 
 
-@pytest.mark.kit
+@pytest.mark.long
 @pytest.mark.parametrize("broken_id", BROKEN, ids=lambda name: f"{name} {BROKEN[name].__name__}")
 def test_a_broken_robot_fails_exactly_its_case(matrix, broken_id):
     failed = matrix[broken_id].result(timeout=MOST_S)

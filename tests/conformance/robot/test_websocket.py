@@ -67,7 +67,7 @@ def test_every_case_has_its_defect():
     assert len(set(DEFECTS.values())) == len(DEFECTS)
 
 
-@pytest.mark.kit
+@pytest.mark.long
 @pytest.mark.parametrize("guarded", [False, True], ids=["open", "behind tokens"])
 def test_a_small_server_without_defect_passes(guarded):
     assert failures_at("", guarded=guarded) == {}
@@ -80,14 +80,14 @@ def test_a_defect_behind_tokens_is_found(case_id):
     assert failures_at("", cases, guarded=True) == {}
 
 
-@pytest.mark.kit
+@pytest.mark.long
 def test_our_own_robot_passes(tmp_path):
     ends = [free_endpoint().replace("tcp/", scheme) for scheme in ("ws://", "ws-legacy://")]
     with RobotProcess(tmp_path, listen=ends, safety={"guests": True}):
         assert bad(run_at(*ends, cases=[case for case in REAL if case.id not in BEHIND_TOKENS])) == {}
 
 
-@pytest.mark.kit
+@pytest.mark.long
 @pytest.mark.parametrize("case_id", DEFECTS, ids=lambda name: f"{name} {DEFECTS[name]}")
 def test_a_defect_fails_exactly_its_case(matrix, case_id):
     failed = matrix[case_id].result(timeout=MOST_S)

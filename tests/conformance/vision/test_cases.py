@@ -55,7 +55,7 @@ def test_a_broken_vision_fails_its_case(name):
     assert result.reason and "\n" not in result.reason and "Error:" not in result.reason
 
 
-@pytest.mark.kit
+@pytest.mark.long
 @pytest.mark.parametrize("name", sorted(BROKEN))
 def test_a_broken_vision_fails_no_other_case(name):
     failed = {case.id for case in VIRTUAL if result_of(case, BROKEN[name][1]).outcome is Outcome.FAILED}

@@ -90,7 +90,7 @@ def test_a_broken_vision_fails_its_case(name):
     assert failed_of(name, [case for case in REAL if case.id == name]) == {name}
 
 
-@pytest.mark.kit
+@pytest.mark.long
 @pytest.mark.parametrize("name", sorted(SOCKETS))
 def test_a_broken_vision_fails_no_other_case(name):
     assert failed_of(name, REAL) == {name}

@@ -13,7 +13,7 @@ import pytest
 from tests.fixtures.javascript import Browser, JsProcess, JsRobot, chromium, free_port, node
 from tests.fixtures.links import until
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 PATIENCE_S = 20.0
 # Brightness of the canvas at a grid of points: a picture has several, an empty canvas one.

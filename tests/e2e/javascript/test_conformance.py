@@ -39,7 +39,7 @@ def test_their_codec_conforms():
     assert told["ok"] and len(told["checks"]) >= 390
 
 
-@pytest.mark.kit
+@pytest.mark.long
 def test_their_robot_conforms(tmp_path):
     with JsRobot(tmp_path, "--guests") as robot:
         told = report("robot", robot.endpoint, "--robot", "js1", "--json", seconds=580)
@@ -47,7 +47,7 @@ def test_their_robot_conforms(tmp_path):
     assert told["ok"] and len(told["checks"]) >= 60
 
 
-@pytest.mark.kit
+@pytest.mark.long
 def test_their_vision_conforms(tmp_path):
     endpoint = f"ws://127.0.0.1:{free_port()}"
     with JsVision(tmp_path, endpoint, "r1") as vision:

@@ -10,7 +10,7 @@ from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess, Vision
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from sightline.protocol.text import parse_twist
 from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess, driving, stop_after
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 STRANGERS = Path(__file__).parent
 FPS = 30
@@ -118,7 +118,7 @@ def test_the_older_vision_sees_the_pictures_and_is_obeyed_within_a_guests_limits
         assert 1.0 < max(wheels) <= fastest_rad_s * 1.01
 
 
-@pytest.mark.kit
+@pytest.mark.long
 def test_on_a_quiet_machine_the_older_vision_sees_95_percent_of_the_pictures(tmp_path, pictures):
     """A figure, and so no part of `make test`: beside others the older vision becomes too slow itself."""
     with old_vision_drives(tmp_path, pictures) as (_, _, log, _):

@@ -301,13 +301,13 @@ def run_once(row, tmp_path):
     assert all(check.value is not None and math.isfinite(check.value) for check in done.checks)
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.parametrize("row", chosen([], short=True), ids=lambda row: row.id)
 def test_the_short_set(row, tmp_path):
     run_once(row, tmp_path)
 
 
-@pytest.mark.faults
+@pytest.mark.long
 @pytest.mark.parametrize("row", [row for row in CASES if not row.short], ids=lambda row: row.id)
 def test_the_long_set(row, tmp_path):
     run_once(row, tmp_path)

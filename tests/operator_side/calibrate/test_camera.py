@@ -151,7 +151,7 @@ def test_a_ball_that_cannot_be_that_far_is_refused():
 # --- a live robot ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_a_live_robot_is_measured_and_keeps_its_mounting(tmp_path, capsys):
     (tmp_path / "boards").mkdir()
     mounted = guessed_model(SIZE, 60.0).model_dump(mode="json") | {"z_m": 0.11, "pitch_rad": -0.05}

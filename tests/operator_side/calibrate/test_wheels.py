@@ -142,7 +142,7 @@ def opened():
         terminal.close()
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
 def test_a_signal_in_the_middle_of_a_turn_is_zero_first(tmp_path, opened, number):
     log = tmp_path / "drive.csv"
@@ -156,7 +156,7 @@ def test_a_signal_in_the_middle_of_a_turn_is_zero_first(tmp_path, opened, number
     assert told(log)[-1] == (0.0, 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_a_drive_is_calibrated_at_a_terminal(tmp_path, opened, monkeypatch):
     pytest.importorskip("gpiozero")
     monkeypatch.setenv("CAR_TEST_BOARD", str(tmp_path / "board.csv"))

@@ -13,7 +13,7 @@ from sightline.operator_side.cli import app as cli
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 
 def _free_port():

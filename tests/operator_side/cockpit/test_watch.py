@@ -20,7 +20,7 @@ from tests.fixtures.javascript import Browser, chromium
 from tests.fixtures.links import free_endpoint, until
 from tests.operator_side.calibrate.test_color import ball_picture
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 
 class Site:

@@ -202,7 +202,7 @@ def test_the_rate_that_a_camera_delivers_is_measured(capsys):
     assert check["camera folder"]["ok"] and float(check["camera folder"]["value"]) == pytest.approx(10, rel=0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_a_robot_is_looked_at_and_its_frames_counted(capsys, tmp_path):
     with RobotProcess(tmp_path) as robot:
         assert until(lambda: port_owner(int(robot.endpoint.rpartition(":")[2])))

@@ -12,7 +12,7 @@ from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.fixtures.links import free_endpoint, until
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 
 @contextmanager

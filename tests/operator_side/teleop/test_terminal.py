@@ -15,7 +15,7 @@ from tests.fixtures.links import free_endpoint, until
 from tests.fixtures.robot_process import RobotProcess, Vision
 from tests.fixtures.terminal import Terminal
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 MOVING_S, ZERO_S = 0.120, 0.150
 """The issue's bounds: from a key to a moving wheel; from the end of its repeats, or of its terminal, to zero."""

@@ -19,7 +19,7 @@ def test_the_drive_to_copy(tmp_path):
     check_drive(lambda: MyDrive(MyDrive.Config(port=tmp_path / "port")))
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_the_simulated_drive(tmp_path):
     pytest.importorskip("pybullet")
     from sightline.sim.bus import SimDrive

@@ -14,7 +14,7 @@ from tests.fixtures.gpio import BOARD, LEFT, OPTIONS, RIGHT, board_events, board
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 LOW_WITHIN_US = 50_000
 """From the moment that the gate's zero reaches the drive; the issue's bound."""

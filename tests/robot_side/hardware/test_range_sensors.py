@@ -7,7 +7,7 @@ from tests.e2e.test_missions import FarSensor
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 
 def test_wheels_do_not_falter_with_every_scan(tmp_path):

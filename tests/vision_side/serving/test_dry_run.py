@@ -114,7 +114,7 @@ def test_an_option_that_is_none_is_said(text):
         pass
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_a_real_robot_that_would_obey_does_not_move(tmp_path):
     (tmp_path / "a.jpg").write_bytes(BALL)
     camera = {"kind": "still", "options": {"path": str(tmp_path / "a.jpg"), "hfov_deg": 80}}

@@ -134,7 +134,7 @@ def test_lines_are_said_per_change_and_never_per_frame(bench: Bench) -> None:
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_the_process_ends_within_a_second_of_a_signal(number: signal.Signals) -> None:
     with socket.socket() as free:

@@ -18,7 +18,7 @@ from sightline.protocol.transports.websocket.server import CROSS_SITE, TOO_MANY_
 from tests.fixtures.links import until
 from tests.fixtures.websocket import address_of, free_ws
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 STRANGERS = Path(__file__).parent.parent.parent.parent / "e2e" / "third_party"
 COUNT = 10_000
@@ -59,7 +59,7 @@ def round_trips_s(link, slot, seconds: float, ends=lambda: False) -> list[float]
     return sorted(took)
 
 
-@pytest.mark.parametrize(("dialect", "seed"), [("v1", 1), ("older", 3), pytest.param("v1", 2, marks=pytest.mark.kit)])
+@pytest.mark.parametrize(("dialect", "seed"), [("v1", 1), ("older", 3), pytest.param("v1", 2, marks=pytest.mark.long)])
 def test_ten_thousand_hostile_messages_harm_nobody(tmp_path, dialect, seed):
     with (tmp_path / "robot.log").open("w") as log:
         robot = EchoingRobot(log)

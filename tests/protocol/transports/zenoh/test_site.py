@@ -125,7 +125,7 @@ def _router(endpoint):
             process.kill()
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_a_robot_is_driven_again_when_its_router_comes_back(tmp_path, how):
     endpoint = free_endpoint()
@@ -141,7 +141,7 @@ def test_a_robot_is_driven_again_when_its_router_comes_back(tmp_path, how):
         assert driving(robot), robot.output()
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_a_second_robot_of_one_id_does_not_start_and_says_who_has_it(tmp_path):
     endpoint = free_endpoint()
     with _router(endpoint):

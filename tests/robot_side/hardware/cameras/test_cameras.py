@@ -47,7 +47,7 @@ def test_picamera(monkeypatch):
     assert seen.cameras[0].closed
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_simulation(tmp_path):
     pytest.importorskip("pybullet")
     from sightline.sim.bus import SimCamera

@@ -6,7 +6,7 @@ from tests.fixtures.cameras import jpeg, video
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.alone
 
 
 def test_a_video_that_ends_is_said_once_and_the_service_stays(tmp_path):
