@@ -160,8 +160,8 @@ def _scored(card: Card) -> list[str]:
         f"{report.frames} scenes a column, seeds {report.first_seed} to {last}: floors and walls of the families "
         f"{_families(JUDGED)}, and light from heights that training never saw. `sightline score detectors onnx:FILE "
         f"--frames {report.frames} --demand` shows it again (`onnx` is the file that comes along). What it all means: "
-        "docs/learned-detector.md. `ms p50` is of a machine that may have had other work: `sightline bench pipeline` "
-        "measures time.", "", markdown(report), "", *_demanded(report),
+        "docs/explanation/learned-detector.md. `ms p50` is of a machine that may have had other work: `sightline bench "
+        "pipeline` measures time.", "", markdown(report), "", *_demanded(report),
     ]
 
 

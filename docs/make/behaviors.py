@@ -1,4 +1,4 @@
-"""Writes docs/behaviours.md: every scenario with its baseline, in figures and pictures. Shell (processes, files).
+"""Write docs/reference/results/behaviors.md: every scenario with its baseline, in figures and pictures. Shell.
 
     python -m docs.make.behaviors --seeds 201,202,203,204,205,206
 """
@@ -40,7 +40,7 @@ from sightline.operator_side.terminal import progress_bar
 from sightline.sim.scenario import Scenario, Start, load_scenario
 from sightline.sim.truth import Truth
 
-PAGE: Final = Path(__file__).parents[1] / "behaviours.md"
+PAGE: Final = Path(__file__).parents[1] / "reference" / "results" / "behaviors.md"
 LATENCY_MS, LOSS = 50.0, 0.1
 LOOKS: Final = ("dim", "bright", "warm", "desaturated", "quality30")
 """The light in which a traffic light must be read, beside the ordinary."""
@@ -223,7 +223,7 @@ def _plot(axes: Axes, runs: Sequence[SpeedRun], label: str, values: Sequence[Seq
     axes.legend(loc="best")
 
 
-# The text of docs/behaviours.md, from the scores of its runs. Pure.
+# The text of docs/reference/results/behaviors.md, from the scores of its runs. Pure.
 
 
 Results = Mapping[ScoreCase, Score]
@@ -255,7 +255,8 @@ def page_lines(
         f"Every behaviour by name, in lockstep on {len(seeds)} starts (seeds {names}), +{LATENCY_MS:g} ms latency, "
         f"{LOSS:.0%} loss on each leg, judged from\nworld truth: the median over the starts, then the worst. A "
         "baseline is an older write-up's law with its own numbers, beside what drives\nby default; nothing is "
-        "demanded of it. [robots.md](robots.md) says what each robot and scenario is, and whose it was.\n"
+        "demanded of it. [Robots and scenarios](../robots-and-scenarios.md) says "
+        "what each robot and scenario is, and whose it was.\n"
     )
     yield (
         f"Written by `python -m docs.make.behaviors --seeds {names}`. See one with `sightline demo\n"
@@ -386,7 +387,7 @@ def _figure(value: float | None, unit: str) -> str:
     return "never" if value is None else f"{number(value)} {unit}"
 
 
-# docs/behaviours.md: every behaviour and its baseline in lockstep, with figures and a picture each. Shell (files).
+# docs/reference/results/behaviors.md: every behaviour and its baseline in lockstep. Shell (files).
 #
 # A picture is of the first seed. The page says which command wrote it; no figure in it is typed by hand.
 

@@ -1,4 +1,4 @@
-"""Runs the kit over every peer of this repository and rewrites docs/conformance.md.
+"""Runs the kit over every peer of this repository and rewrites docs/reference/results/conformance.md.
 
     python -m docs.make.conformance                    # all, one after another: most of an hour
     python -m docs.make.conformance "vision, Zenoh"    # one again; the others keep their last run
@@ -23,7 +23,7 @@ from tests.fixtures.robot_process import RobotProcess
 
 SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 KEPT = ROOT / "runs" / "conformance"
-PAGE = ROOT / "docs" / "conformance.md"
+PAGE = ROOT / "docs" / "reference" / "results" / "conformance.md"
 ADAPTER = EXAMPLES.parent / "codec_adapter.py"
 MARKS = {Outcome.PASSED: "ok", Outcome.FAILED: "FAIL", Outcome.SKIPPED: "n/a"}
 START_S = 90.0
@@ -31,7 +31,7 @@ TOKEN = "conformance-0123456789abcdef"
 
 PREFACE = """`python -m docs.make.conformance` runs the kit over these peers and writes this page. A case that a peer's
 choices leave nothing to test in (no guests, no scan, no port of the legacy protocol, no token, another transport)
-counts as not applicable. Clauses are those of [protocol/README.md](../protocol/README.md)."""
+counts as not applicable. Clauses are those of [protocol/README.md](https://github.com/sightline-robot/sightline/blob/main/protocol/README.md)."""
 
 LISTED_ELSEWHERE = ("codec",)
 """Sides without a table of every case: a codec's are the golden vectors, each of which says what it is for."""

@@ -1,9 +1,9 @@
-"""Writes docs/faults.md, and its worst values into docs/safety.md, from what `sightline faults --json` prints. Shell.
+"""Write docs/reference/results/faults.md, and its worst values into the safety page. Shell.
 
     python -m docs.make.faults --repeat 10 --jobs 3                     # all rows: about an hour
     python -m docs.make.faults --only wire.thin --repeat 10 --jobs 3    # these again; the other rows stay as they are
 
-docs/faults.json has the results. Both pages are made of it, so that they cannot disagree.
+docs/reference/results/faults.json has the results. Both pages are made of it, so that they cannot disagree.
 """
 
 import json
@@ -21,6 +21,8 @@ from docs.make.performance import CHECK_FAILED, processor
 from sightline.evaluation.faults.report import figure_text, value_text
 
 DOCS: Final = Path(__file__).parents[1]
+RESULTS: Final = Path("reference", "results")
+SAFETY: Final = Path("explanation", "safety.md")
 PACKAGES: Final = ("eclipse-zenoh", "pybullet", "opencv-python-headless", "pydantic")
 _SHOWN_IF_WRONG: Final = ("on old sight", "drives again", "reset refused", "exit code", "last speed told")
 """Yes or no: in the table they are in what was demanded."""
@@ -73,7 +75,7 @@ def merged(record: Record, newer: Record) -> Record:
 
 
 def report_page(record: Record) -> str:
-    """The whole of docs/faults.md."""
+    """The whole of docs/reference/results/faults.md."""
     ran = _ran(record)
     again = [f"run again by `{one['command']}`: {'; '.join(one['rows'])}" for one in record["again"]]
     return "\n".join([
@@ -148,12 +150,12 @@ def _passed(rows: Iterable[Record]) -> int:
 
 def main(arguments: Sequence[str], docs: Path = DOCS) -> int:
     """Run the command with `arguments` and write its result and both pages."""
-    file, safety = docs / "faults.json", docs / "safety.md"
+    file, safety = docs / RESULTS / "faults.json", docs / SAFETY
     record = measured(arguments)
     if "--only" in arguments and file.exists():
         record = merged(json.loads(file.read_text("utf-8")), record)
     file.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", "utf-8")
-    (docs / "faults.md").write_text(report_page(record), "utf-8")
+    (docs / RESULTS / "faults.md").write_text(report_page(record), "utf-8")
     safety.write_text(safety_page(safety.read_text("utf-8"), record), "utf-8")
     return 0 if all(row["ok"] for row in _ran(record)) else CHECK_FAILED
 

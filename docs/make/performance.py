@@ -1,4 +1,4 @@
-"""Writes docs/performance.md section by section from the JSON that its commands print. Shell (processes).
+"""Write docs/reference/results/performance.md from the JSON that its commands print. Shell.
 
     python -m docs.make.performance                  # all sections: over an hour
     python -m docs.make.performance loop watchers    # these; the other sections stay as they are
@@ -37,7 +37,7 @@ class Section:
 
 _SEEDS: Final = "201,202,203,204,205,206"
 _BALLS: Final = "behind,circle,eight,pushed,static,walls"
-"""All others are on docs/behaviours.md."""
+"""All others are on docs/reference/results/behaviors.md."""
 
 
 def _rows(*names: str, extra: tuple[str, ...] = (), seconds: int = 60) -> tuple[str, ...]:
@@ -168,14 +168,14 @@ SECTIONS: Final = (
 )
 
 
-# Writes docs/performance.md: runs the judging commands, one after the other, and sets down what each printed. Shell.
+# Writes docs/reference/results/performance.md: runs the commands, one after the other, and sets down what each printed.
 #
 # Nothing in the page is typed by hand: a figure is there because its command measured it, on the date and machine that
 # its section names.
 
 
 CHECK_FAILED: Final = 5
-PAGE: Final = Path(__file__).parents[1] / "performance.md"
+PAGE: Final = Path(__file__).parents[1] / "reference" / "results" / "performance.md"
 _HEADING: Final = "## "
 _HEAD: Final = (
     "# Performance\n\nWritten by `python -m docs.make.performance`, section by section; each says when and on what "

@@ -40,7 +40,7 @@ def _blob(one: Detection) -> Blob:
 # Band steering, a baseline: one of three fixed twists, by where the target is and how large it looks. Pure.
 #
 # The law of an older Gazebo robot, its numbers as defaults. `centre_share` is of the picture's whole width, as it was
-# there, so that the robot turns only when the target is almost out of sight; see docs/missions.md for sane numbers.
+# there, so that the robot turns only when the target almost leaves the image; docs/how-to/missions.md has sane numbers.
 
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -89,8 +89,8 @@ class Band:
 
 
 # P steering in pixels at five commands a second, a baseline. Pure.  The law of an older ball-chasing car, its numbers
-# as defaults: whatever it decided holds for 0.2 s, however the target moves meanwhile. See docs/missions.md for sane
-# numbers.
+# as defaults: whatever it decided holds for 0.2 s, however the target moves meanwhile. docs/how-to/missions.md has
+# sane numbers.
 
 
 Pixels = Annotated[float, Field(ge=0, le=1e4)]
@@ -147,7 +147,8 @@ class PixelP:
 # PI steering in pixels, a baseline: the nearer the target looks the slower, and an integral without time. Pure.  The
 # law of an older robot that was split over a WebSocket, its numbers as defaults: speed 200 / area, whatever that comes
 # to, and an integral per picture that nothing bounds. What else was wrong there (the position of another outline than
-# the largest, an integral that began anew with each picture) is not repeated. See docs/missions.md for sane numbers.
+# the largest, an integral that began anew with each picture) is not repeated.
+# docs/how-to/missions.md has sane numbers.
 
 
 Bound = Annotated[float | None, Field(gt=0, le=1e6)]

@@ -112,7 +112,7 @@ def list_detectors(as_json: Json = False) -> int:
         comes = f", comes with model {model}" if model else "; comes without a model: onnx:PATH"
         for name, why in rows:
             typer.echo(f"{name:<12} {why or 'ok'}{comes if name == 'onnx' and not why else ''}")
-        typer.echo("or package.module:Name; boxes: those of another publisher, see docs/detectors.md")
+        typer.echo("or package.module:Name; boxes: those of another publisher, see docs/how-to/detectors.md")
     return 0
 
 

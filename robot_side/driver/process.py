@@ -46,7 +46,7 @@ _STACK_BYTES, _PLUGIN_STACK_BYTES = 256 * 1024, 1024 * 1024
 _BATTERY_PERIOD_S = 1.0
 _WARNING = (
     "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
-    "(docs/safety.md)"
+    "(docs/explanation/safety.md)"
 )
 
 

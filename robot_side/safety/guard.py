@@ -146,7 +146,8 @@ def check_blind_zone(guard: GuardConfig, scan: Ranges) -> None:
     if reach_m >= guard.stop_m:
         raise BlindZoneError(
             f"guard.stop_m = {guard.stop_m:g}: the range sensor sees nothing nearer than {scan.range_min_m:.3g} m, "
-            f"which reaches {reach_m:.3f} m beyond the robot's outline; set guard.stop_m above that (docs/robots.md)"
+            f"which reaches {reach_m:.3f} m beyond the robot's outline; set guard.stop_m above that "
+            "(docs/reference/robots-and-scenarios.md)"
         )
 
 

@@ -1,4 +1,4 @@
-"""What stands on docs/behaviours.md follows from the runs: figures, verdicts, baselines beside defaults, pictures."""
+"""The behaviors page follows from the runs: figures, verdicts, baselines beside defaults, pictures."""
 
 from contextlib import contextmanager
 from dataclasses import replace
@@ -75,7 +75,7 @@ def test_every_row_has_a_picture_and_a_heading_of_its_own():
 
 
 def test_every_behaviour_and_every_baseline_has_its_row():
-    basics = {"static", "circle", "eight", "pushed", "behind", "walls"}  # docs/performance.md has these
+    basics = {"static", "circle", "eight", "pushed", "behind", "walls"}  # the performance page has these
     assert {row.scenario for row in ROWS} == set(scenario_names()) - basics
     assert {row.baseline for row in ROWS if row.baseline} == set(CHARACTER)
     assert all(CHARACTER.values())
@@ -119,11 +119,11 @@ def test_the_command_writes_the_page_and_a_picture_of_the_first_start(tmp_path, 
         yield lambda: advanced.append(total)
 
     monkeypatch.setattr("docs.make.behaviors.progress_bar", progress)
-    path = tmp_path / "behaviours.md"
+    path = tmp_path / "behaviors.md"
     ok = write_page(path, [905], 2, rows)
     text = path.read_text()
     assert ok == ("**not kept**" not in text) and advanced == [2, 2]
-    assert sorted(one.name for one in (tmp_path / "behaviours").iterdir()) == [
+    assert sorted(one.name for one in (tmp_path / "behaviors").iterdir()) == [
         "legs-slow-legs-baseline.png", "legs-slow.png"]
-    assert all(one.read_bytes().startswith(b"\x89PNG") for one in (tmp_path / "behaviours").iterdir())
+    assert all(one.read_bytes().startswith(b"\x89PNG") for one in (tmp_path / "behaviors").iterdir())
     assert load_scenario("legs-slow").summary[1:] in text and "## legs-slow, baseline `legs-baseline`" in text

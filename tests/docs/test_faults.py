@@ -6,7 +6,7 @@ import subprocess
 import pytest
 
 from docs.make import faults
-from docs.make.faults import DOCS, main, merged, report_page, safety_page
+from docs.make.faults import DOCS, RESULTS, SAFETY, main, merged, report_page, safety_page
 
 PAGE = "before\n<!-- worst values: x -->\nold\n<!-- /worst values -->\nafter\n"
 USUAL = "falls <= 340 ms, zero <= 700 ms, <= 0.25 m"
@@ -69,9 +69,9 @@ def test_the_report_has_a_row_for_each_fault_and_counts_rows_that_ran():
 
 
 def test_committed_pages_are_made_of_the_committed_results():
-    results = json.loads((DOCS / "faults.json").read_text())
-    safety = (DOCS / "safety.md").read_text()
-    assert report_page(results) == (DOCS / "faults.md").read_text()
+    results = json.loads((DOCS / RESULTS / "faults.json").read_text())
+    safety = (DOCS / SAFETY).read_text()
+    assert report_page(results) == (DOCS / RESULTS / "faults.md").read_text()
     assert safety_page(safety, results) == safety and "| vision |" in safety
 
 
@@ -99,13 +99,16 @@ def test_the_script_writes_results_and_both_pages(tmp_path, monkeypatch):
         return subprocess.CompletedProcess(command, 5, json.dumps(printed))
 
     monkeypatch.setattr(faults.subprocess, "run", run)
-    (tmp_path / "safety.md").write_text(PAGE)
+    (tmp_path / RESULTS).mkdir(parents=True)
+    (tmp_path / SAFETY).parent.mkdir()
+    (tmp_path / SAFETY).write_text(PAGE)
     assert main(["--repeat", "2"], tmp_path) == 5
     assert ran[0][-4:] == ["faults", "--repeat", "2", "--json"]
-    assert "| vision | 2 |" in (tmp_path / "safety.md").read_text()
-    assert "| vision: SIGKILL |" in (tmp_path / "faults.md").read_text()
+    assert "| vision | 2 |" in (tmp_path / SAFETY).read_text()
+    assert "| vision: SIGKILL |" in (tmp_path / RESULTS / "faults.md").read_text()
     main(["--only", "vision"], tmp_path)
-    assert json.loads((tmp_path / "faults.json").read_text())["again"][0]["command"] == "sightline faults --only vision"
+    results = json.loads((tmp_path / RESULTS / "faults.json").read_text())
+    assert results["again"][0]["command"] == "sightline faults --only vision"
 
 
 def test_a_command_without_a_result_changes_no_page(tmp_path, monkeypatch):

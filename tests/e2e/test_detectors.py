@@ -94,7 +94,7 @@ def test_a_shadow_is_compared_and_never_steers(tmp_path: Path) -> None:
 
 FAR_BALL = jpeg_of(scene(camera(), 2.2, 0.0))
 ZERO_US = 700_000
-"""From the last valid command, docs/safety.md; the detector's own deadline comes before it."""
+"""From the last valid command, docs/explanation/safety.md; the detector's own deadline comes before it."""
 DEADLINE_US = 100_000
 
 

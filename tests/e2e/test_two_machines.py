@@ -1,4 +1,4 @@
-"""docs/two-machines.md, executed as it stands, on two machines that share nothing but a wire."""
+"""docs/tutorials/two-machines.md, executed as it stands, on two machines that share nothing but a wire."""
 
 import os
 import re
@@ -20,7 +20,7 @@ pytestmark = [
     pytest.mark.alone,
     pytest.mark.skipif(bool(why_impossible()), reason=f"two namespaces: {why_impossible()}"),
 ]
-PAGE = (Path(__file__).parent.parent.parent / "docs" / "two-machines.md").read_text()
+PAGE = (Path(__file__).parent.parent.parent / "docs" / "tutorials" / "two-machines.md").read_text()
 SERVICES = ("sim", "robot", "vision", "router")
 READY = {"sim": "", "robot": "robot r1: on", "vision": "vision: frames from robot r1", "router": "router: on"}
 

@@ -1,4 +1,4 @@
-"""docs/build-the-car.md and docs/teleop.md: their commands parse, their tables are the code's, their files exist."""
+"""The pages build-the-car and teleop: their commands parse, their tables are the code's, their files exist."""
 
 import re
 import shlex
@@ -15,7 +15,8 @@ from sightline.robot_side.hardware.gpio import GpioDriveConfig
 
 ROOT = Path(__file__).parent.parent.parent
 DOCS = ROOT / "docs"
-CAR, TELEOP = ((DOCS / name).read_text() for name in ("build-the-car.md", "teleop.md"))
+SOURCE = "https://github.com/sightline-robot/sightline/blob/main/"
+CAR, TELEOP = ((DOCS / name).read_text() for name in ("tutorials/build-the-car.md", "how-to/teleop.md"))
 
 
 def commands(page):
@@ -47,7 +48,7 @@ def test_the_wiring_is_the_configurations_own():
     }
     positions = {10: 19, 9: 21, 8: 24, 7: 26}
     assert {int(number): int(position) for number, position, _, _ in rows} == positions
-    drawn = "".join(xml.etree.ElementTree.parse(DOCS / "car-wiring.svg").getroot().itertext())
+    drawn = "".join(xml.etree.ElementTree.parse(DOCS / "assets" / "car-wiring.svg").getroot().itertext())
     for number, position in {**positions, 17: 11}.items():
         assert f"GPIO {number} ({position})" in drawn
 
@@ -69,9 +70,10 @@ def test_vision_is_told_the_cars_own_limits():
 
 
 def test_the_files_that_they_name_exist():
-    for page in (CAR, TELEOP):
+    for folder, page in (("tutorials", CAR), ("how-to", TELEOP)):
         for name in re.findall(r"\]\(([^)#]+)\)", page):
-            assert (DOCS / name).resolve().exists(), name
+            target = ROOT / name.removeprefix(SOURCE) if name.startswith(SOURCE) else DOCS / folder / name
+            assert target.resolve().exists(), name
         for name in re.findall(r"tests/test_\w+\.py|robot_side/systemd/[\w.-]+|examples/[\w.-]+", page):
             assert (ROOT / name).exists(), name
 

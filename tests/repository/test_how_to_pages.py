@@ -8,6 +8,7 @@ import pytest
 ROOT = Path(__file__).parent.parent.parent
 PAGES = sorted((ROOT / "docs" / "how-to").glob("add-*.md"))
 NAMED = re.compile(r"`([a-z_]+/[\w/.-]*|pyproject\.toml)`")
+SOURCE = "https://github.com/sightline-robot/sightline/blob/main/"
 LINKED = re.compile(r"\]\(([^)]+)\)")
 
 
@@ -25,4 +26,4 @@ def test_page_has_at_most_ten_steps_and_names_what_exists(page):
     for path in NAMED.findall(text):
         assert (ROOT / path).exists(), path
     for link in LINKED.findall(text):
-        assert (page.parent / link).exists(), link
+        assert (ROOT / link.removeprefix(SOURCE) if link.startswith(SOURCE) else page.parent / link).exists(), link

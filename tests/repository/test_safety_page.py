@@ -1,4 +1,4 @@
-"""docs/safety.md takes states and limits from the code. `python -m tests.repository.test_safety_page` writes it."""
+"""The safety page takes states and limits from the code. `python -m tests.repository.test_safety_page` writes it."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from sightline.protocol.spec.generate import unit_of
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.safety.states import TRANSITIONS, Event
 
-PAGE = Path(__file__).parent.parent.parent / "docs" / "safety.md"
+PAGE = Path(__file__).parent.parent.parent / "docs" / "explanation" / "safety.md"
 MARKS = re.compile(r"(<!-- generated: (\w+)[^\n]*-->\n).*?(<!-- /generated -->)", re.DOTALL)
 BOUNDS = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to"}
 

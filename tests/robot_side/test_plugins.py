@@ -1,4 +1,4 @@
-"""The table of device groups: each row stands in the configuration, in pyproject.toml and in docs/configuration.md.
+"""The table of device groups: each row stands in the configuration, pyproject.toml and docs/reference/configuration.md.
 
 `python -m tests.robot_side.test_plugins` writes the page's table.
 """
@@ -16,7 +16,7 @@ from sightline.robot_side.plugins import DEVICE_GROUPS
 
 ROOT = Path(__file__).parent.parent.parent
 ENTRY_POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
-PAGE = ROOT / "docs" / "configuration.md"
+PAGE = ROOT / "docs" / "reference" / "configuration.md"
 MARKS = re.compile(r"(<!-- generated: devices[^\n]*-->\n).*?(<!-- /generated -->)", re.DOTALL)
 OF_DETECTION = {"sightline.detectors", "sightline.missions"}
 

@@ -178,7 +178,7 @@ def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tup
         raise ConfigError(f"detector {name!r} has no address: write e.g. {EXAMPLES[name]}")
     own = REGISTRY.settings(name, plugin, shared_options(plugin, given | dict(options), config))
     if not callable(getattr(plugin, "detect", None)):
-        raise ConfigError(f"detector {kind!r}: the class has no method detect; see docs/detectors.md")
+        raise ConfigError(f"detector {kind!r}: the class has no method detect; see docs/how-to/detectors.md")
     if hasattr(plugin, OLD_NOTICES) and not hasattr(plugin, "notices"):
         warn_renamed(f"detector {kind!r}: method", OLD_NOTICES, "notices")
     return plugin, own

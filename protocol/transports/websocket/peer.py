@@ -102,7 +102,8 @@ class Peer:
         refuse(NOT_GRANTED)
         if said[0] != ACK.name:  # a viewer that acknowledges
             who = self._wire.address[0] or "a client"
-            tell(f"rejected {'/'.join(said)} from {who}: the role of its token does not permit it (docs/security.md)")
+            tell(f"rejected {'/'.join(said)} from {who}: the role of its token does not permit it "
+                 "(docs/how-to/secure-the-link.md)")
         return False
 
     def offer(self, post: Publication) -> None:

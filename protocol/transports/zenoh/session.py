@@ -94,7 +94,7 @@ def open_session(
         import zenoh
     except ImportError:
         raise ConfigError("Zenoh is not installed: pip install 'sightline-robot[zenoh]'") from None
-    zenoh.init_log_from_env_or("off")  # RUST_LOG, see docs/security.md
+    zenoh.init_log_from_env_or("off")  # RUST_LOG, see docs/how-to/secure-the-link.md
     logging.getLogger("zenoh").addHandler(logging.NullHandler())  # else Python prints its warnings to the terminal
     try:
         return _open(session_config(listen, connect, timeout_s, secured))

@@ -1,7 +1,7 @@
 """What compose.yaml and the Dockerfile say, and the containers of one profile, run for real.
 
-A real run needs an engine (`docker version` answers) and docker-compose or `docker compose`; docs/compose.md says how
-to have one where no image can be pulled.
+A real run needs an engine (`docker version` answers) and docker-compose or `docker compose`;
+docs/how-to/containers.md says how to have one where no image can be pulled.
 """
 
 import json

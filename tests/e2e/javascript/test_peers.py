@@ -142,7 +142,7 @@ def test_the_adapter_says_what_it_does_not_know():
 
 def test_the_page_names_stop_what_it_is():
     """No network button is an emergency stop, and none is called one."""
-    for path in [*SOURCES, Path(ROOT / "docs" / "javascript.md")]:
+    for path in [*SOURCES, Path(ROOT / "docs" / "reference" / "javascript.md")]:
         text = path.read_text("utf-8").replace("no emergency stop", "")
         assert not re.search(r"emergency\s*stop|e-stop|not-?aus", text, re.IGNORECASE)
     assert ">STOP<" in (EXAMPLES / "viewer.html").read_text("utf-8")

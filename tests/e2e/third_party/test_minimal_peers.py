@@ -19,7 +19,7 @@ from tests.fixtures.robot_process import RobotProcess
 
 ROOT = Path(__file__).parent.parent.parent.parent
 PICTURES = str(ROOT / "examples/pictures")
-PAGE = (ROOT / "docs/implement-a-peer.md").read_text("utf-8")
+PAGE = (ROOT / "docs/tutorials/implement-a-peer.md").read_text("utf-8")
 SCHEMES = {"ws": "ws://127.0.0.1:{}", "zenoh": "tcp/127.0.0.1:{}"}
 STILL = (0.0, 0.0)
 

@@ -195,7 +195,7 @@ def test_pixel_p_decides_five_times_a_second():
 
 # --- the page --------------------------------------------------------------------------------------------------------
 
-PAGE = (ROOT / "docs" / "missions.md").read_text("utf-8")
+PAGE = (ROOT / "docs" / "how-to" / "missions.md").read_text("utf-8")
 
 
 def test_the_page_names_every_mission_and_shows_its_example_as_it_is(monkeypatch):

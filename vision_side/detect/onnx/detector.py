@@ -177,7 +177,7 @@ def read_onnx_model(config: OnnxDetector.Config) -> OnnxModel:
             path, engine, form, least, read_golden(header.metadata[KEY]), own, _least(None, header), digest
         )
     except ValueError as error:
-        raise ConfigError(f"model {path}: {error}; see docs/detectors.md") from None
+        raise ConfigError(f"model {path}: {error}; see docs/how-to/detectors.md") from None
 
 
 def _found(
@@ -207,7 +207,7 @@ def _bytes_of(path: Path) -> bytes:
     except OSError as error:
         if path == SHIPPED:
             raise ConfigError("this copy of Sightline comes without a model of its own: name one, e.g. --detector "
-                              "onnx:ball.onnx, or make it: docs/learned-detector.md") from None
+                              "onnx:ball.onnx, or make it: docs/explanation/learned-detector.md") from None
         why = error.strerror or "it cannot be read"
         raise ConfigError(f"model {path}: {why}; name an ONNX file, e.g. --detector onnx:ball.onnx") from None
 

@@ -115,7 +115,7 @@ def model_of(name: str, version: str, inputs: Sequence[TensorSlot], outputs: Seq
 
 
 def _unfit(name: str, why: str) -> NoAnswerError:
-    return NoAnswerError(NoAnswerReason.UNFIT, f"model {name!r}: {why}; see docs/remote-detectors.md")
+    return NoAnswerError(NoAnswerReason.UNFIT, f"model {name!r}: {why}; see docs/how-to/remote-detectors.md")
 
 
 def _layout(shape: tuple[int, ...]) -> tuple[int, int, bool] | None:

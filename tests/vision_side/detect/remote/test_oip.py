@@ -64,7 +64,7 @@ def test_metadata_tells_what_to_send():
 def test_a_model_that_does_not_fit_is_said_in_words(inputs, outputs, why):
     with pytest.raises(NoAnswerError, match=why) as error:
         read_metadata(_metadata(inputs, outputs))
-    assert error.value.reason is NoAnswerReason.UNFIT and "docs/remote-detectors.md" in error.value.detail
+    assert error.value.reason is NoAnswerReason.UNFIT and "docs/how-to/remote-detectors.md" in error.value.detail
 
 
 def test_a_jpeg_is_sent_as_one_bytes_element():

@@ -1,19 +1,19 @@
-"""docs/behaviours.md as it lies in the repository: every row, every picture, every bound kept, what laws are like."""
+"""The behaviors page as it lies in the repository: every row, every picture, every bound kept, what laws are like."""
 
 import re
 from pathlib import Path
 
 from docs.make.behaviors import CHARACTER, LATENCY_MS, LOOKS, LOSS, ROWS
 
-DOCS = Path(__file__).parent.parent.parent / "docs"
-PAGE = (DOCS / "behaviours.md").read_text()
+DOCS = Path(__file__).parent.parent.parent / "docs" / "reference" / "results"
+PAGE = (DOCS / "behaviors.md").read_text()
 
 
 def test_the_page_has_every_row_and_its_picture():
     assert re.findall(r"^## (.*)$", PAGE, re.MULTILINE) == [row.title for row in ROWS]
     shown = re.findall(r"!\[[^]]*\]\(([^)]+)\)", PAGE)
     assert len(shown) == len(ROWS) + 1 and all((DOCS / name).is_file() for name in shown)
-    assert {path.name for path in (DOCS / "behaviours").iterdir()} == {Path(name).name for name in shown}
+    assert {path.name for path in (DOCS / "behaviors").iterdir()} == {Path(name).name for name in shown}
 
 
 NOT_KEPT = {"thymio-slalom: least_clearance_m", "thymio-trap: least_clearance_m"}
