@@ -17,8 +17,9 @@ from typing import Any
 
 from sightline.conformance.runner import Outcome, printable
 from sightline.operator_side.setup import keys
-from tests.fixtures.javascript import EXAMPLES, ROOT, JsRobot, JsVision, free_port, node
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.javascript import EXAMPLES, ROOT, JsRobot, JsVision, node
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint, free_port
 from tests.fixtures.robot_process import RobotProcess
 
 SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
@@ -39,7 +40,7 @@ LISTED_ELSEWHERE = ("codec",)
 
 def end_at(scheme: str) -> str:
     """An endpoint on loopback that nobody listens on."""
-    return free_endpoint().replace("tcp/", scheme)
+    return free_endpoint(scheme)
 
 
 @contextmanager

@@ -17,7 +17,8 @@ from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli.conform import access_for
 from sightline.operator_side.setup import keys
 from tests.conformance.robot.small_server import SmallServer
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess
 
 QUICK = ("R-CAUS-02", "R-HEAD-17", "R-REQ-01", "R-STOP-03", "R-HOST-04")
@@ -39,7 +40,7 @@ def only(*cases):
 @pytest.mark.alone
 @pytest.mark.parametrize("scheme", ["tcp/", "ws://"])
 def test_a_real_robot_conforms(capsys, tmp_path, scheme):
-    endpoint = free_endpoint().replace("tcp/", scheme)
+    endpoint = free_endpoint(scheme)
     with RobotProcess(tmp_path, endpoint=endpoint, safety={}) as robot:
         assert until(lambda: f"on {endpoint}" in robot.output(), 20.0), robot.output()
         code, out, _err = run(capsys, "robot", endpoint, *only(*QUICK), "--json", "--save", tmp_path / "r.json")
@@ -67,7 +68,7 @@ def test_a_broken_robot_does_not_and_every_report_says_why(capsys, tmp_path):
 @pytest.mark.parametrize("scheme", ["tls/", "wss://"])
 def test_a_robot_behind_keys_conforms(capsys, tmp_path, scheme):
     """Roles have keys of their own there, so the kit comes in as vision and as operator at once."""
-    endpoint = free_endpoint().replace("tcp/", scheme)
+    endpoint = free_endpoint(scheme)
     keys.make(tmp_path / "keys", [])
     cases = (*QUICK, "R-STOP-02", *(("R-SOCK-34", "R-SOCK-40") if scheme == "wss://" else ()))
     with RobotProcess(tmp_path, endpoint=endpoint, secure=str(tmp_path / "keys"), safety={}) as robot:
@@ -82,7 +83,7 @@ def test_a_robot_behind_keys_conforms(capsys, tmp_path, scheme):
 
 
 def test_nobody_there_is_exit_code_4(capsys):
-    code, out, err = run(capsys, "robot", free_endpoint().replace("tcp/", "ws://"), "--only", "R-CAUS-02")
+    code, out, err = run(capsys, "robot", free_endpoint("ws://"), "--only", "R-CAUS-02")
     assert (code, out) == (4, "")
     assert err.startswith("error: nobody answers at ws://127.0.0.1:") and err.count("\n") == 1
 
@@ -126,7 +127,7 @@ def test_a_robot_of_another_name_is_exit_code_4(capsys, tmp_path):
 
 def test_no_vision_is_exit_code_4(capsys, monkeypatch):
     monkeypatch.setattr(vision, "_FIRST_US", 300_000)
-    endpoint = free_endpoint().replace("tcp/", "ws://")
+    endpoint = free_endpoint("ws://")
     code, out, err = run(capsys, "vision", endpoint)
     assert (code, out) == (4, "")
     assert f"sightline vision --connect {endpoint}" in err and err.count("\n") == 1

@@ -16,7 +16,8 @@ from sightline.protocol.transports.open import open_link
 from sightline.robot_side.ports import Ranges
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.process import serve
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import jpeg_of
 
@@ -65,7 +66,7 @@ def sightline(*arguments):
 
 @pytest.mark.parametrize("transport", ["zenoh", "websocket"])
 def test_a_person_sends_a_robot_somewhere_and_calls_it_off(tmp_path, transport):
-    zenoh, web = free_endpoint(), free_endpoint().replace("tcp/", "ws://")
+    zenoh, web = free_endpoint(), free_endpoint("ws://")
     of_vision = zenoh if transport == "zenoh" else web
     ending, said = threading.Event(), []
     with (

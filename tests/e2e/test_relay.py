@@ -8,7 +8,8 @@ import pytest
 
 from sightline.protocol.channels import CHANNELS, DETECTIONS, MISSION, OVERLAY, PREVIEW
 from sightline.protocol.transports.open import open_link
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess
 
 pytestmark = pytest.mark.alone
@@ -19,7 +20,7 @@ QUIET_S = 0.4
 @pytest.fixture(scope="module")
 def peers(tmp_path_factory):
     """Two peers on each transport of one robot, and what each has heard."""
-    ends = [free_endpoint(), free_endpoint().replace("tcp/", "ws://")]
+    ends = [free_endpoint(), free_endpoint("ws://")]
     with RobotProcess(tmp_path_factory.mktemp("robot"), listen=ends) as robot, ExitStack() as ending:
         assert until(lambda: ends[1] in robot.output(), 20.0), robot.output()
         found = {}
@@ -73,7 +74,7 @@ JPEG = b"\xff\xd8" + bytes(100_000)
 @pytest.fixture(scope="module")
 def ends(tmp_path_factory):
     """Where a robot listens, on both transports."""
-    ends = {"zenoh": free_endpoint(), "web": free_endpoint().replace("tcp/", "ws://")}
+    ends = {"zenoh": free_endpoint(), "web": free_endpoint("ws://")}
     with RobotProcess(tmp_path_factory.mktemp("robot"), listen=[*ends.values()]) as robot:
         assert until(lambda: ends["web"] in robot.output(), 20.0), robot.output()
         yield ends

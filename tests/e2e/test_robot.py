@@ -14,6 +14,7 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.messages import State
 from sightline.robot_side.driver.persistence import StopLatch
 from tests.fixtures.links import until
+from tests.fixtures.ports import port_of
 from tests.fixtures.robot_process import RobotProcess, Vision, driving, stop_after
 
 BOUND_S, BOUND_M = 0.7, 0.25
@@ -87,7 +88,7 @@ def test_shutdown_is_after_zero_and_leaves_nothing(tmp_path, number):
             os.kill(network, 0)
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(("127.0.0.1", int(robot.endpoint.rpartition(":")[2])))
+            probe.bind(("127.0.0.1", port_of(robot.endpoint)))
 
 
 def test_the_stop_latch_survives_a_restart(tmp_path):

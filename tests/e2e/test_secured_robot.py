@@ -15,7 +15,8 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
 pytestmark = pytest.mark.alone
@@ -24,7 +25,7 @@ pytestmark = pytest.mark.alone
 @pytest.fixture
 def robot(tmp_path):
     keys.make(tmp_path / "keys", [])
-    endpoint = free_endpoint().replace("tcp/", "tls/")
+    endpoint = free_endpoint("tls/")
     with RobotProcess(tmp_path, endpoint=endpoint, secure=str(tmp_path / "keys")) as running:
         assert until(lambda: "robot r1: on" in running.output(), 8)
         yield running
@@ -109,7 +110,7 @@ def test_rejected_peer_receives_the_reason_and_its_robot_goes_on(robot, name, tm
 def test_robot_with_a_certificate_for_another_name_is_rejected(tmp_path, monkeypatch):
     monkeypatch.setattr(keys, "LOOPBACK", ("elsewhere.local",))
     keys.make(tmp_path / "keys", [])
-    endpoint = free_endpoint().replace("tcp/", "tls/")
+    endpoint = free_endpoint("tls/")
     with RobotProcess(tmp_path, endpoint=endpoint, secure=str(tmp_path / "keys")) as robot:
         assert until(lambda: "robot r1: on" in robot.output(), 20)
         with pytest.raises(LinkError, match="names other addresses"):

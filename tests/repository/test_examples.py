@@ -5,7 +5,8 @@ from pathlib import Path
 from sightline.operator_side.config.loading import load_service
 from sightline.robot_side.plugins import DRIVES
 from sightline.robot_side.ports import WheelAngles
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision
 
 ROOT = Path(__file__).parent.parent.parent

@@ -14,7 +14,8 @@ from sightline.robot_side import pipe as ipc
 from sightline.robot_side import plugins
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.pipe import DriverEnd
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import JPEG, RobotProcess
 
 ROOT = Path(__file__).parent.parent.parent
@@ -44,7 +45,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", ["folder", "my_camera:MyCamera"])
 def test_the_folder_it_starts_in_has_cameras_and_stands_in_for_nothing_else(folder, kind):
     camera = PluginChoice(kind=kind, options={"path": "pictures"})
-    listen = (free_endpoint(), free_endpoint().replace("tcp/", "ws://"))
+    listen = (free_endpoint(), free_endpoint("ws://"))
     config = RobotConfig(camera=camera, listen=listen, state_dir=folder)
     child, packets = DriverEnd(config, "0000beef"), []
     try:

@@ -16,7 +16,8 @@ from sightline.protocol.transports.zenoh.session import open_session
 from sightline.vision_side import viewing
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.service import open_service
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
@@ -51,7 +52,7 @@ class Site:
 
 @pytest.fixture(params=["tcp", "ws"])
 def site(request):
-    end = free_endpoint().replace("tcp/", "ws://") if request.param == "ws" else free_endpoint()
+    end = free_endpoint("ws://") if request.param == "ws" else free_endpoint()
     with ExitStack() as ending:
         yield Site(ending, end)
 
@@ -155,7 +156,7 @@ def test_any_zenoh_tool_sees_the_overlay_as_a_jpeg():
 
 def test_with_keys_a_viewer_sees_it_and_only_vision_may_say_it(tmp_path):
     keys.make(tmp_path / "k", ["robot.local"])
-    end, folder = free_endpoint().replace("tcp/", "tls/"), str(tmp_path / "k")
+    end, folder = free_endpoint("tls/"), str(tmp_path / "k")
     with ExitStack() as ending:
         site = Site(ending, end, folder)
         operator = ending.enter_context(open_link("r1", connect=[end], role="operator", secure=folder))
@@ -170,7 +171,7 @@ def test_with_keys_a_viewer_sees_it_and_only_vision_may_say_it(tmp_path):
 
 @pytest.mark.parametrize("transport", ["tcp", "ws"])
 def test_somebody_elses_boxes_are_drawn_over_the_frame_that_they_name(transport):
-    end = free_endpoint().replace("tcp/", "ws://") if transport == "ws" else free_endpoint()
+    end = free_endpoint("ws://") if transport == "ws" else free_endpoint()
     with ExitStack() as ending:
         site = Site(ending, end, detector={"kind": "boxes"})
         guest = ending.enter_context(open_link("r1", connect=[end], role="guest"))

@@ -19,11 +19,12 @@ from sightline.benchmarks.loop.race import run_race
 from sightline.benchmarks.loop.viewers import measure_watchers
 from sightline.benchmarks.loop.vision import PipelineVision
 from sightline.benchmarks.peers.classic_detector import ClassicVision
-from sightline.evaluation.processes import children_of, free_port
+from sightline.evaluation.processes import children_of
 from sightline.operator_side.cli.bench import register
 from sightline.protocol.errors import HardwareError
 from sightline.robot_side.hardware.cameras.files import FolderCamera, FolderCameraConfig
 from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
 
 SMALL = LoopSetting(Path(), 160, 120, fps=30.0, seconds=2.0, tries=1)
 
@@ -60,7 +61,7 @@ def test_a_users_own_eyes_see_nothing_where_nothing_is_and_say_what_does_not_dec
 
 
 def test_the_kernel_counts_the_bytes_of_a_connection():
-    with socket.create_server(("127.0.0.1", 0)) as server:
+    with socket.create_server(("127.0.0.1", free_port())) as server:
         port = server.getsockname()[1]
         with socket.create_connection(("127.0.0.1", port)) as client, server.accept()[0] as accepted:
             before = carried_bytes([port])

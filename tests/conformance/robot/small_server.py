@@ -20,6 +20,7 @@ from sightline.protocol.channels import CHANNELS, Direction, key_for
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.transports.memory import MemoryNetwork
 from tests.conformance.robot.reference import ReferenceRobot
+from tests.fixtures.ports import free_port
 
 ENTRY = "sightline.token."
 GUID = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
@@ -55,7 +56,7 @@ class SmallServer:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def _listen(self, older):
-        door = socket.create_server(("127.0.0.1", 0))
+        door = socket.create_server(("127.0.0.1", free_port()))
         door.setblocking(False)
         self._selector.register(door, selectors.EVENT_READ, lambda: self._accept(door, older))
         return door.getsockname()[1]

@@ -15,7 +15,7 @@ from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.open import open_link
 from tests.conformance.robot.broken.websocket import BEHIND_TOKENS, DEFECTS
 from tests.conformance.robot.small_server import SmallServer
-from tests.fixtures.links import free_endpoint
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess
 
 REAL = [case for case in CASES if case.real]
@@ -82,7 +82,7 @@ def test_a_defect_behind_tokens_is_found(case_id):
 
 @pytest.mark.long
 def test_our_own_robot_passes(tmp_path):
-    ends = [free_endpoint().replace("tcp/", scheme) for scheme in ("ws://", "ws-legacy://")]
+    ends = [free_endpoint(scheme) for scheme in ("ws://", "ws-legacy://")]
     with RobotProcess(tmp_path, listen=ends, safety={"guests": True}):
         assert bad(run_at(*ends, cases=[case for case in REAL if case.id not in BEHIND_TOKENS])) == {}
 

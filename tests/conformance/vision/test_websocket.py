@@ -1,6 +1,5 @@
 """The kit's cases with sockets of their own: ours passes, a plain client passes, each broken one fails its own case."""
 
-import socket
 import threading
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -17,21 +16,16 @@ from sightline.protocol.transports.open import open_link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.process import serve
 from tests.conformance.vision.sockets import SOCKETS, SocketVision
+from tests.fixtures.ports import free_endpoint
 
 REAL = [case for case in CASES if case.real]
 TOKEN = "0123456789abcdefABCDEF_-"
 
 
-def free_endpoint():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return f"ws://127.0.0.1:{one.getsockname()[1]}"
-
-
 @contextmanager
 def bench_with(vision, endpoint=None):
     """A kit that listens, and `vision(endpoint)`, a context, that connects; it looks at the token and asks for none."""
-    endpoint = endpoint or free_endpoint()
+    endpoint = endpoint or free_endpoint("ws://")
 
     def open_it(role):
         return open_link("r1", listen=[endpoint], role=role)

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import yaml
 
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
 
 ROOT = Path(__file__).parent.parent.parent.parent
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())
@@ -95,7 +96,7 @@ class Containers:
 
     def __init__(self, profile: Profile, folder: Path) -> None:
         self.profile = profile
-        self.ports = {inside: free_endpoint().rpartition(":")[2] for inside in ("7447", "9091")}
+        self.ports = {inside: str(free_port()) for inside in ("7447", "9091")}
         self._folder = folder
         self._project = f"sightline-test-{profile.name}"
         self._containers: dict[str, str] = {}

@@ -19,7 +19,8 @@ from sightline.protocol.messages import Detections, DetectionsHeader
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.e2e.compose.fixture import ROOT
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess
 
 YELLOW_BGR = (13, 199, 242)
@@ -111,7 +112,7 @@ def test_boxes_reach_whoever_wants_them_and_name_a_frame_of_the_robot(tmp_path):
 def test_programs_without_a_robot_say_so():
     with (
         program("detector_service.py", free_endpoint()) as detector,
-        program("compose/older_client.py", free_endpoint().replace("tcp/", "ws://")) as client,
+        program("compose/older_client.py", free_endpoint("ws://")) as client,
     ):
         assert "refused" in client.stdout.readline()
         assert detector.stderr.readline().startswith("error: nobody answers at tcp/127.0.0.1:")

@@ -17,7 +17,7 @@ from sightline.operator_side.config.loading import load_service
 from sightline.robot_side.driver.process import _SHUTDOWN_US
 from sightline.robot_side.pipe import _END_S
 from tests.e2e.compose.fixture import COMPOSE, DEFAULT, HEAVY, PROFILES, ROOT, SERVICES, ask
-from tests.fixtures.links import free_endpoint
+from tests.fixtures.ports import free_endpoint
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 ROBOTS = {service for profile in PROFILES for service, _ in profile.robots.values()}

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.fixtures.javascript import Browser, JsProcess, JsRobot, chromium, free_port, node
+from tests.fixtures.javascript import Browser, JsProcess, JsRobot, chromium, node
 from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
 
 pytestmark = pytest.mark.alone
 SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from tests.fixtures.javascript import EXAMPLES, JsRobot, JsVision, free_port, node
+from tests.fixtures.javascript import EXAMPLES, JsRobot, JsVision, node
+from tests.fixtures.ports import free_port
 
 CONFORM = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "conform"]
 NOT_APPLICABLE = (

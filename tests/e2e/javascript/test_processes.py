@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
-from tests.fixtures.javascript import ROOT, JsProcess, JsRobot, JsVision, free_port, hello, json_payload
+from tests.fixtures.javascript import ROOT, JsProcess, JsRobot, JsVision, hello, json_payload
 from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
 from tests.fixtures.robot_process import RobotProcess, driving
 
 SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]

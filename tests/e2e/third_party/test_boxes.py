@@ -7,7 +7,8 @@ from sightline.protocol.channels import DETECTIONS, MAX_HEADER_BYTES
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import Detections, DetectionsHeader
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision
 
 pytestmark = pytest.mark.alone
@@ -15,7 +16,7 @@ pytestmark = pytest.mark.alone
 
 @pytest.fixture
 def robot(tmp_path):
-    older = free_endpoint().replace("tcp/", "ws-legacy://") + "?boxes"
+    older = free_endpoint("ws-legacy://") + "?boxes"
     with RobotProcess(tmp_path, listen=[zenoh := free_endpoint(), older], safety={"guests": True}) as running:
         running.endpoint = zenoh
         assert until(lambda: "robot r1: on" in running.output(), 8)

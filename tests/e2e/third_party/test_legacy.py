@@ -18,7 +18,8 @@ import websocket
 from sightline.benchmarks.loop.pictures import camera_of, write_pictures
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.text import parse_twist
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint, free_port
 from tests.fixtures.robot_process import RobotProcess, driving, stop_after
 
 pytestmark = pytest.mark.alone
@@ -68,7 +69,7 @@ def rows_of(path: Path) -> list[list[str]]:
 @contextmanager
 def old_vision_drives(folder: Path, pictures: Path):
     """Our robot, the older vision driving it, and what that one writes down."""
-    endpoint = free_endpoint().replace("tcp/", "ws-legacy://")
+    endpoint = free_endpoint("ws-legacy://")
     url = endpoint.replace("ws-legacy", "ws") + "/"
     camera = {"kind": "folder", "options": {"path": str(pictures), "fps": FPS}}
     safety = {"auto_arm": True, "guests": True}
@@ -175,7 +176,7 @@ def said(events: Path) -> list[tuple[int, str]]:
 
 
 def test_our_vision_answers_an_older_robot_at_once_and_finds_it_again(tmp_path, pictures):
-    port = int(free_endpoint().rpartition(":")[2])
+    port = free_port()
     with our_vision(tmp_path, f"ws-legacy://127.0.0.1:{port}") as vision:
         with old_robot(tmp_path, pictures, port) as (_, events):
             assert until(lambda: len(said(events)) > 2 * FPS, 15)

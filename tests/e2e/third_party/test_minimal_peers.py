@@ -14,7 +14,8 @@ from websockets.sync.client import connect
 from sightline.operator_side.client.requests import Operator
 from sightline.protocol.messages import State
 from sightline.protocol.transports.open import open_link
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
 from tests.fixtures.robot_process import RobotProcess
 
 ROOT = Path(__file__).parent.parent.parent.parent
@@ -68,10 +69,6 @@ def vision(endpoint: str) -> Process:
     return Process("-P", "-m", "sightline.operator_side.cli.app", "vision", "--connect", endpoint)
 
 
-def port_of(endpoint: str) -> str:
-    return endpoint.rpartition(":")[2]
-
-
 def check_driven(robot: Process, endpoint: str) -> None:
     """Our vision drives `robot`, which stands still soon after vision is killed."""
     with vision(endpoint) as eyes:
@@ -87,7 +84,7 @@ def test_the_robot_of_the_page_is_driven_by_our_vision(tmp_path):
     code = program_of_the_page()
     assert sum(bool(line.strip()) for line in code.splitlines()) < 70 and "sightline.v1" in code
     (tmp_path / "robot.py").write_text(code, "utf-8")
-    port = port_of(free_endpoint())
+    port = str(free_port())
     with Process(str(tmp_path / "robot.py"), port, PICTURES) as robot:
         assert until(lambda: robot.wheels() == STILL, 10), robot.lines
         check_driven(robot, f"ws://127.0.0.1:{port}")
@@ -95,7 +92,7 @@ def test_the_robot_of_the_page_is_driven_by_our_vision(tmp_path):
 
 @pytest.mark.parametrize("kind", SCHEMES)
 def test_the_minimal_robot_is_driven_by_our_vision_and_stopped_by_our_operator(kind):
-    port = port_of(free_endpoint())
+    port = str(free_port())
     endpoint = SCHEMES[kind].format(port)
     with Process("examples/minimal_robot.py", kind, port, PICTURES) as robot:
         check_driven(robot, endpoint)
@@ -111,7 +108,7 @@ JUNK = {"deep": "[" * 2_000, "list": "[]", "empty": "{}", "twist": "0.1|0", "byt
 
 @pytest.mark.parametrize("junk", JUNK.values(), ids=JUNK)
 def test_junk_keeps_nobody_out_of_the_minimal_robot(junk):
-    port = port_of(free_endpoint())
+    port = str(free_port())
     url = SCHEMES["ws"].format(port)
     options = {"subprotocols": ["sightline.v1"], "compression": None}
     with Process("examples/minimal_robot.py", "ws", port, PICTURES) as robot:
@@ -133,7 +130,7 @@ def answers(url: str) -> bool:
 
 @pytest.mark.parametrize("kind", SCHEMES)
 def test_the_minimal_vision_drives_our_robot(tmp_path, kind):
-    endpoint = SCHEMES[kind].format(port_of(free_endpoint()))
+    endpoint = SCHEMES[kind].format(free_port())
     with RobotProcess(tmp_path, endpoint=endpoint) as robot:
         assert until(lambda: f"robot r1: on {endpoint}" in robot.output(), 10)
         with Process("examples/minimal_vision.py", endpoint) as eyes:

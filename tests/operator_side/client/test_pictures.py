@@ -15,7 +15,8 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader, Stamp
 from sightline.protocol.spec.message_cases import jpeg
 from sightline.protocol.transports.open import open_link
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 
 PATIENCE_S = 0.3
 
@@ -44,7 +45,7 @@ class Site:
 @pytest.fixture(params=["tcp", "ws"])
 def site(request, monkeypatch):
     monkeypatch.setattr(pictures_module, "PATIENCE_S", PATIENCE_S)
-    end = free_endpoint().replace("tcp/", "ws://") if request.param == "ws" else free_endpoint()
+    end = free_endpoint("ws://") if request.param == "ws" else free_endpoint()
     with ExitStack() as ending:
         yield Site(ending, end)
 

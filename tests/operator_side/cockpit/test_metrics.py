@@ -11,15 +11,10 @@ from prometheus_client.parser import text_string_to_metric_families as parsed
 
 from sightline.operator_side.cli import app as cli
 from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
 pytestmark = pytest.mark.alone
-
-
-def _free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def _samples(port):
@@ -37,7 +32,7 @@ def _health(port):
 
 
 def test_a_robot_is_measured_and_its_end_is_seen(tmp_path):
-    port = _free_port()
+    port = free_port()
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
         command = [
             sys.executable,
@@ -76,7 +71,7 @@ def test_a_robot_is_measured_and_its_end_is_seen(tmp_path):
 
 
 def test_a_busy_port_is_said_with_its_owner(tmp_path):
-    with RobotProcess(tmp_path) as robot, socket.create_server(("127.0.0.1", 0)) as taken:
+    with RobotProcess(tmp_path) as robot, socket.create_server(("127.0.0.1", free_port())) as taken:
         command = [
             sys.executable,
             "-P",
@@ -95,7 +90,7 @@ def test_a_busy_port_is_said_with_its_owner(tmp_path):
 
 
 def test_a_vision_is_measured_and_its_health_is_whether_it_hears_a_robot(tmp_path):
-    port = _free_port()
+    port = free_port()
     with RobotProcess(tmp_path) as robot:
         assert until(lambda: "robot r1: on" in robot.output(), 40)
         command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "vision", "--connect", robot.endpoint]

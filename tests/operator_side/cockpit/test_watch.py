@@ -17,7 +17,8 @@ from sightline.operator_side.cli.app import run
 from sightline.operator_side.recording.film import Film
 from tests.e2e.javascript.test_browser import LEVELS, PATIENCE_S, Started
 from tests.fixtures.javascript import Browser, chromium
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.operator_side.calibrate.test_color import ball_picture
 
 pytestmark = pytest.mark.alone
@@ -28,7 +29,7 @@ class Site:
 
     def __init__(self, folder: Path, ending: ExitStack) -> None:
         self.folder = folder
-        self.zenoh, self.web = free_endpoint(), free_endpoint().replace("tcp/", "ws://")
+        self.zenoh, self.web = free_endpoint(), free_endpoint("ws://")
         sockets = f"/tmp/sl-{os.getpid()}-{self.zenoh.rpartition(':')[2]}"
         device = f'{{kind = "sim", options = {{socket_dir = "{sockets}"}}}}'
         (folder / "robot.toml").write_text(f'listen = ["{self.zenoh}", "{self.web}"]\nstate_dir = "{folder}/state"\n'

@@ -16,7 +16,8 @@ from sightline.operator_side.doctor.finding import Finding, as_object, histogram
 from sightline.operator_side.setup import keys
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint, free_port, port_of
 from tests.fixtures.robot_process import RobotProcess
 
 
@@ -120,7 +121,7 @@ def test_a_format_is_read_from_the_kernels_answer():
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
 def test_the_other_end_is_told_with_its_version_clock_and_round_trip(transport):
-    endpoint = free_endpoint().replace("tcp/", f"{transport}/")
+    endpoint = free_endpoint(f"{transport}/")
     with open_zenoh("r1", listen=[endpoint], role="robot"):
         found = {one.name: one for one in between.findings(endpoint, "r1", "")}
     assert found["version of robot"].ok and "sightline" in found["version of robot"].value
@@ -130,7 +131,7 @@ def test_the_other_end_is_told_with_its_version_clock_and_round_trip(transport):
 
 
 def test_a_busy_port_is_told_with_its_owner(capsys, monkeypatch):
-    with socket.create_server(("127.0.0.1", 0)) as server:
+    with socket.create_server(("127.0.0.1", free_port())) as server:
         monkeypatch.setattr(machine, "PORTS", {server.getsockname()[1]: "mine"})
         check = _checks(capsys)[f"port {server.getsockname()[1]}"]
     assert "in use by" in check["value"] and f"(pid {os.getpid()})" in check["value"]
@@ -171,7 +172,7 @@ def test_nobody_listening_is_told_apart_from_no_such_name(capsys, monkeypatch):
 
 
 def test_somebody_else_on_the_port_is_no_robot(capsys):
-    with socket.create_server(("127.0.0.1", 0)) as server:
+    with socket.create_server(("127.0.0.1", free_port())) as server:
         port = server.getsockname()[1]
         checks = _checks(capsys, "--peer", f"tcp/127.0.0.1:{port}")
     assert checks["round trip p50"]["ok"] and not checks["link"]["ok"]
@@ -205,7 +206,7 @@ def test_the_rate_that_a_camera_delivers_is_measured(capsys):
 @pytest.mark.alone
 def test_a_robot_is_looked_at_and_its_frames_counted(capsys, tmp_path):
     with RobotProcess(tmp_path) as robot:
-        assert until(lambda: port_owner(int(robot.endpoint.rpartition(":")[2])))
+        assert until(lambda: port_owner(port_of(robot.endpoint)))
         checks = _checks(capsys, "--peer", robot.endpoint)
     assert checks["frames"]["ok"] and checks["round trip p95"]["ok"] and checks["stream"]["ok"]
     assert checks["version of robot"]["ok"] and "robot's clock is" in checks["clock skew"]["value"]

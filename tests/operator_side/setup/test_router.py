@@ -10,7 +10,8 @@ import pytest
 from sightline.operator_side.setup import keys
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 
 pytestmark = pytest.mark.alone
 

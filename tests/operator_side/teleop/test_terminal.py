@@ -11,7 +11,8 @@ import pytest
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.messages import State
 from sightline.protocol.transports.zenoh.session import open_session
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision
 from tests.fixtures.terminal import Terminal
 
@@ -182,7 +183,7 @@ def test_vision_and_a_person_hand_over_to_one_another(seat):
 
 
 def test_over_websocket_it_drives_and_stops_too(tmp_path):
-    endpoint = free_endpoint().replace("tcp/", "ws://")
+    endpoint = free_endpoint("ws://")
     with RobotProcess(tmp_path, endpoint=endpoint, safety={"auto_arm": False}) as robot:
         assert until(lambda: "on ws://" in robot.output(), 10)
         terminal = Terminal("teleop", "r1", "--connect", endpoint)

@@ -9,6 +9,7 @@ from sightline.protocol.transports import diagnosis
 from sightline.protocol.transports.diagnosis import connections
 from sightline.protocol.transports.zenoh.session import MAX_SESSIONS, report_floods
 from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
 
 _ROWS = "  sl  local_address rem_address   st\n   0: {local} {remote} {state} 0 0 0 0\n"
 
@@ -27,7 +28,7 @@ def test_a_far_end_is_read_from_the_table(monkeypatch, tmp_path, table, local, r
 
 def test_a_flood_of_connections_is_reported_once_with_its_address():
     reported = []
-    with socket.create_server(("127.0.0.1", 0), backlog=MAX_SESSIONS * 2) as server, ExitStack() as ending:
+    with socket.create_server(("127.0.0.1", free_port()), backlog=MAX_SESSIONS * 2) as server, ExitStack() as ending:
         address = server.getsockname()
         ending.enter_context(report_floods([f"tls/127.0.0.1:{address[1]}"], reported.append))
         for _ in range(MAX_SESSIONS):

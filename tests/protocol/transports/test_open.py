@@ -5,15 +5,12 @@ import pytest
 from sightline.protocol.channels import FRAME, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.open import LinkGroup, open_link
-from tests.fixtures.links import free_endpoint, until
-
-
-def free_web_endpoint():
-    return free_endpoint().replace("tcp/", "ws://")
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 
 
 def test_peers_of_both_kinds_hear_and_are_heard():
-    zenoh, web = free_endpoint(), free_web_endpoint()
+    zenoh, web = free_endpoint(), free_endpoint("ws://")
     with open_link("r1", listen=[zenoh, web], role="robot") as robot:
         twists = robot.latest(TWIST)
         for endpoint in (zenoh, web):
@@ -27,7 +24,7 @@ def test_peers_of_both_kinds_hear_and_are_heard():
 
 
 def test_a_failure_on_one_endpoint_leaves_none_open():
-    zenoh, web = free_endpoint(), free_web_endpoint()
+    zenoh, web = free_endpoint(), free_endpoint("ws://")
     with open_link("r1", listen=[web]), pytest.raises(LinkError):
         open_link("r1", listen=[zenoh, web])
     with open_link("r1", listen=[zenoh, web]) as again:

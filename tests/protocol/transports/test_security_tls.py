@@ -15,7 +15,8 @@ from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.server import NO_TLS
 from tests.fixtures.links import until
-from tests.fixtures.websocket import V1, address_of, free_ws
+from tests.fixtures.ports import free_endpoint
+from tests.fixtures.websocket import V1, address_of
 
 AUTHORITY, STRANGER = trustme.CA(), trustme.CA()
 
@@ -33,7 +34,7 @@ def folder_of(path, authority=AUTHORITY, host="127.0.0.1"):
 
 @pytest.fixture
 def secured(tmp_path):
-    endpoint, folder = free_ws("wss"), folder_of(tmp_path / "keys")
+    endpoint, folder = free_endpoint("wss://"), folder_of(tmp_path / "keys")
     with open_websocket("r1", listen=endpoint, role="robot", secure=folder) as robot:
         yield robot, endpoint, folder
 
@@ -98,7 +99,7 @@ def test_a_robot_whose_authority_is_not_trusted_is_refused_in_one_line(secured, 
 
 
 def test_a_certificate_of_another_host_is_refused(tmp_path):
-    endpoint, folder = free_ws("wss"), folder_of(tmp_path / "keys", host="192.0.2.9")
+    endpoint, folder = free_endpoint("wss://"), folder_of(tmp_path / "keys", host="192.0.2.9")
     with (
         open_websocket("r1", listen=endpoint, role="robot", secure=folder),
         pytest.raises(LinkError, match="no TLS with it: IP address mismatch"),
@@ -149,7 +150,7 @@ def test_a_folder_without_what_is_needed_is_one_line(tmp_path, missing):
     folder = folder_of(tmp_path / "keys")
     (tmp_path / "keys" / missing).unlink()
     with pytest.raises(ConfigError, match=r"wss:// needs robot\.pem and robot\.key in a folder: give it with --s"):
-        open_websocket("r1", listen=free_ws("wss"), role="robot", secure=folder)
+        open_websocket("r1", listen=free_endpoint("wss://"), role="robot", secure=folder)
 
 
 @pytest.mark.parametrize("broken", ["robot.pem", "robot.key", "ca.pem"])
@@ -158,13 +159,13 @@ def test_a_broken_file_is_named_in_one_line(tmp_path, broken):
     (tmp_path / "keys" / broken).write_text("nonsense")
     end, role = ("connect", "vision") if broken == "ca.pem" else ("listen", "robot")
     with pytest.raises(ConfigError, match=broken.replace(".", r"\.")) as why:
-        open_websocket("r1", secure=folder, role=role, **{end: free_ws("wss")})
+        open_websocket("r1", secure=folder, role=role, **{end: free_endpoint("wss://")})
     assert "\n" not in str(why.value)
 
 
 def test_the_folder_of_sightline_keys_is_all_that_both_ends_need(tmp_path):
     keys.make(tmp_path, [])
-    endpoint = free_ws("wss").replace("127.0.0.1", "0.0.0.0")
+    endpoint = free_endpoint("wss://").replace("127.0.0.1", "0.0.0.0")
     with open_websocket("r1", listen=endpoint, role="robot", secure=str(tmp_path)) as robot:
         twists = robot.latest(TWIST)
         here = endpoint.replace("0.0.0.0", "127.0.0.1")

@@ -29,7 +29,8 @@ from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.peer import NOT_GRANTED
 from sightline.robot_side.config import RobotConfig
 from tests.fixtures.links import claim, until
-from tests.fixtures.websocket import V1, free_ws
+from tests.fixtures.ports import free_endpoint
+from tests.fixtures.websocket import V1
 
 TOKENS = {"vision": "vision-0123456789abcdef", "operator": "operator_0123456789abc", "viewer": "viewerviewerviewer"}
 
@@ -43,7 +44,7 @@ def keys(tmp_path):
 
 def everywhere(scheme: str = "ws") -> tuple[str, str]:
     """An endpoint on all addresses of this machine, and how it is reached from here."""
-    here = free_ws(scheme)
+    here = free_endpoint(f"{scheme}://")
     return here.replace("127.0.0.1", "0.0.0.0"), here
 
 
@@ -276,7 +277,7 @@ def test_the_seat_is_the_first_s_until_it_leaves_or_is_silent_for_a_second():
 
 
 def test_one_client_drives_and_the_rest_only_watch(caplog):
-    endpoint = free_ws("ws-legacy")
+    endpoint = free_endpoint("ws-legacy://")
     plain = endpoint.replace("ws-legacy", "ws")
     with open_websocket("r1", listen=endpoint) as robot, connect(plain) as viewer, connect(plain) as driver:
         twists, got = robot.latest(TWIST), []

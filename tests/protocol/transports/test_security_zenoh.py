@@ -33,7 +33,8 @@ from sightline.protocol.transports.security import (
 from sightline.protocol.transports.zenoh.discovery import list_robots
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.session import MAX_MESSAGE_BYTES, open_session
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 
 SAID = (TWIST, ACK, REQUEST, MISSION, REPORT)
 
@@ -47,7 +48,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def endpoint():
-    return free_endpoint().replace("tcp/", "tls/")
+    return free_endpoint("tls/")
 
 
 def test_only_the_listed_may_publish():

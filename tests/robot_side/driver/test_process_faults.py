@@ -17,7 +17,8 @@ from sightline.robot_side.driver.process import Driver, run
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
 from sightline.robot_side.ports import WheelAngles
 from sightline.robot_side.safety.limits import SafetyConfig
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
 

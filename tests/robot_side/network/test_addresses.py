@@ -6,6 +6,7 @@ import pytest
 
 from sightline.robot_side.network import process as addresses
 from sightline.robot_side.network.process import own_addresses, reachable_endpoints
+from tests.fixtures.ports import free_port
 
 
 @pytest.mark.parametrize(("endpoints", "said"), [
@@ -23,7 +24,7 @@ def test_they_are_this_machines_own():
     for address in own_addresses():
         assert not address.startswith("127.")
         with socket.socket() as probe:
-            probe.bind((address, 0))  # only an address of this machine can be bound
+            probe.bind((address, free_port()))  # only an address of this machine can be bound
 
 
 def test_a_machine_with_loopback_alone_says_nothing(monkeypatch):

@@ -14,7 +14,8 @@ from sightline.protocol.transports.link import LatestSlot
 from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.fleet import Fleet
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import JPEG
 
 

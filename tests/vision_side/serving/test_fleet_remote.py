@@ -19,7 +19,8 @@ from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.serving.detector_service import DetectorService, ServingOptions
 from sightline.vision_side.serving.fleet import Fleet
 from sightline.vision_side.serving.service import Service
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.vision.remote import BALL_JPEG, MODEL, Server, box, http_reply, said
 
 DEADLINE_S = 0.5

@@ -1,7 +1,6 @@
 """The service over a link in memory: every frame answered, bad ones counted, one line per change of state."""
 
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -19,6 +18,7 @@ from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.process import serve
 from sightline.vision_side.serving.service import Service
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
@@ -137,9 +137,7 @@ def test_lines_are_said_per_change_and_never_per_frame(bench: Bench) -> None:
 @pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_the_process_ends_within_a_second_of_a_signal(number: signal.Signals) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    endpoint = free_endpoint()
     code = (
         "from sightline.protocol.log import start_log; from sightline.vision_side.config import VisionConfig; "
         "from sightline.vision_side.serving.process import run; start_log(None, 'vision'); "

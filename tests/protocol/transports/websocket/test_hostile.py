@@ -16,7 +16,8 @@ from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.peer import SILENT
 from sightline.protocol.transports.websocket.server import CROSS_SITE, TOO_MANY_CLIENTS, WRONG_SUBPROTOCOL
 from tests.fixtures.links import until
-from tests.fixtures.websocket import address_of, free_ws
+from tests.fixtures.ports import free_endpoint
+from tests.fixtures.websocket import address_of
 
 pytestmark = pytest.mark.alone
 
@@ -30,7 +31,7 @@ class EchoingRobot:
     """The robot, in a process of its own."""
 
     def __init__(self, log) -> None:
-        self.endpoints = {"v1": free_ws(), "older": free_ws("ws-legacy")}
+        self.endpoints = {"v1": free_endpoint("ws://"), "older": free_endpoint("ws-legacy://")}
         command = [sys.executable, str(STRANGERS / "echoing_robot.py"), *self.endpoints.values()]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=log, text=True)

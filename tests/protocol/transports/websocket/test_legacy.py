@@ -21,17 +21,14 @@ from sightline.protocol.transports.link import OVERSIZE, Message
 from sightline.protocol.transports.websocket.framing import BAD_FRAMING
 from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.server import CROSS_SITE
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import JPEG as SMALL_JPEG
 from tests.fixtures.websocket import address_of, received, upgrade
 
 JPEG = bytes(range(256)) * 40
 TEXT = base64.encodebytes(JPEG).decode("ascii")
 OLD = {"compression": None, "legacy": True}
-
-
-def free_legacy() -> str:
-    return free_endpoint().replace("tcp/", "ws-legacy://")
 
 
 def plain(endpoint: str) -> str:
@@ -45,7 +42,7 @@ def header_of(seq: int) -> FrameHeader:
 @contextmanager
 def robot_and_client(options: str = ""):
     """A robot that listens for the older dialect, and one client that offers no sub-protocol."""
-    endpoint = free_legacy() + options
+    endpoint = free_endpoint("ws-legacy://") + options
     with open_websocket("r1", listen=endpoint, role="robot") as robot, connect(plain(endpoint), **OLD) as client:
         assert until(lambda: robot.connected)
         yield robot, client
@@ -69,7 +66,7 @@ def test_a_picture_goes_out_as_base64_lines_and_a_twist_comes_in_as_a_guests():
 
 @pytest.mark.parametrize("picture_bytes", [12_000, 46_000])
 def test_on_the_socket_a_picture_costs_at_most_1_36_times_its_bytes(picture_bytes):
-    endpoint = free_legacy()
+    endpoint = free_endpoint("ws-legacy://")
     with open_websocket("r1", listen=endpoint) as robot, socket.create_connection(address_of(endpoint)) as near:
         near.sendall(upgrade("127.0.0.1").replace(b"Sec-WebSocket-Protocol: sightline.v1\r\n", b""))
         assert received(near).startswith(b"HTTP/1.1 101 ")
@@ -99,7 +96,7 @@ def test_swapped_axes_are_another_option():
 
 
 def test_boxes_come_in_as_a_guests_detections_of_the_picture_it_was_sent_and_go_on_to_who_wants_them():
-    modern, older = free_endpoint().replace("tcp/", "ws://"), free_legacy() + "?boxes"
+    modern, older = free_endpoint("ws://"), free_endpoint("ws-legacy://") + "?boxes"
     with open_websocket("r1", listen=[modern, older]) as robot, open_websocket("r1", connect=modern) as vision:
         found, passed_on = robot.latest(DETECTIONS), vision.latest(DETECTIONS)
         twists, acks = robot.latest(TWIST), robot.latest(ACK)
@@ -230,7 +227,7 @@ def test_a_client_silent_for_its_first_second_gets_the_newest_picture():
 
 
 def test_another_sites_page_cannot_drive_through_the_older_port():
-    endpoint = free_legacy()
+    endpoint = free_endpoint("ws-legacy://")
     with open_websocket("r1", listen=endpoint) as robot:
         with pytest.raises(InvalidStatus):
             connect(plain(endpoint), origin="http://evil.example", **OLD)
@@ -240,7 +237,7 @@ def test_another_sites_page_cannot_drive_through_the_older_port():
 
 
 def test_both_dialects_may_be_listened_for_at_once():
-    modern, older = free_endpoint().replace("tcp/", "ws://"), free_legacy()
+    modern, older = free_endpoint("ws://"), free_endpoint("ws-legacy://")
     with open_websocket("r1", listen=[modern, older]) as robot, open_websocket("r1", connect=modern) as peer:
         frames = peer.latest(FRAME)
         with connect(plain(older), **OLD) as client:
@@ -281,7 +278,7 @@ class OldRobot:
 
 @contextmanager
 def old_robot_and_vision(options: str = ""):
-    endpoint = free_legacy() + options
+    endpoint = free_endpoint("ws-legacy://") + options
     robot = OldRobot(endpoint)
     try:
         with open_websocket("r1", connect=endpoint, role="vision", max_frame_bytes=20_000) as vision:
@@ -345,7 +342,7 @@ def test_a_text_that_is_no_picture_is_counted_and_skipped(text):
 
 
 def test_a_robot_that_restarts_is_found_again_and_has_a_new_session():
-    endpoint = free_legacy()
+    endpoint = free_endpoint("ws-legacy://")
     robot, sessions = OldRobot(endpoint), set()
     with open_websocket("r1", connect=endpoint, role="vision") as vision:
         frames = vision.latest(FRAME)

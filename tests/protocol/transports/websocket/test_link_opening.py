@@ -19,7 +19,8 @@ from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.websocket.framing import OTHER_ROBOT
 from sightline.protocol.transports.websocket.link import open_websocket
 from tests.fixtures.links import until
-from tests.fixtures.websocket import Robot, free_ws
+from tests.fixtures.ports import free_endpoint, free_port
+from tests.fixtures.websocket import Robot
 
 
 @pytest.fixture
@@ -77,7 +78,7 @@ def test_who_hangs_up_unheard_is_tried_again(kind, other, tmp_path):
                 tried.append(near)
                 near.close()
 
-    with socket.create_server(("127.0.0.1", 0)) as door:
+    with socket.create_server(("127.0.0.1", free_port())) as door:
         threading.Thread(target=hang_up, daemon=True).start()
         secure = {"secure": str(tmp_path / "keys")} if kind == "wss" else {}
         endpoint = f"{kind}://127.0.0.1:{door.getsockname()[1]}"
@@ -88,7 +89,7 @@ def test_who_hangs_up_unheard_is_tried_again(kind, other, tmp_path):
 
 
 def test_nobody_answering_is_said_in_time():
-    endpoint, begin_s = free_ws(), time.monotonic()
+    endpoint, begin_s = free_endpoint("ws://"), time.monotonic()
     said = f"nobody answers at {endpoint}; is the robot running? tried for 0.4 s"
     with pytest.raises(LinkError, match=re.escape(said)):
         open_websocket("r1", connect=endpoint, timeout_s=0.4)
@@ -108,7 +109,7 @@ def test_a_port_in_use_is_said_with_who_has_it(robot):
 
 
 def test_who_answers_but_is_no_websocket_is_said():
-    with socket.create_server(("127.0.0.1", 0)) as door:
+    with socket.create_server(("127.0.0.1", free_port())) as door:
         threading.Thread(target=_answer_with, args=(door, b"SSH-2.0-something\r\n"), daemon=True).start()
         with pytest.raises(LinkError, match="refused: what answers there is no Sightline WebSocket"):
             open_websocket("r1", connect=f"ws://127.0.0.1:{door.getsockname()[1]}", timeout_s=2)
@@ -129,7 +130,7 @@ def test_another_robots_listener_is_an_error_for_who_opens(robot):
 
 
 def test_a_robot_may_connect_to_a_listening_vision():
-    endpoint = free_ws()
+    endpoint = free_endpoint("ws://")
     with open_websocket("r1", listen=endpoint, role="vision") as vision:
         frames = vision.latest(FRAME)
         with open_websocket("r1", connect=endpoint, role="robot") as robot:
@@ -147,7 +148,7 @@ def _count(what: str) -> int:
 
 
 def test_no_thread_or_descriptor_is_left_behind():
-    endpoint = free_ws()
+    endpoint = free_endpoint("ws://")
 
     def open_and_close() -> None:
         with open_websocket("r1", listen=endpoint) as robot, open_websocket("r1", connect=endpoint) as peer:

@@ -16,7 +16,7 @@ from sightline.protocol.transports.websocket.legacy import DriverSlot, LegacyCli
 from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.peer import Publication
 from tests.fixtures.links import until
-from tests.fixtures.websocket import free_ws
+from tests.fixtures.ports import free_endpoint
 
 Queue = OutgoingQueue[Publication | str]
 VERBS = ("arm", "disarm", "stop", "reset", "acquire", "release")
@@ -123,7 +123,7 @@ def test_a_publication_is_written_once_for_all_who_are_sent_the_same():
 
 
 def test_a_stop_reaches_a_robot_that_was_not_reading_whatever_was_asked_after_it():
-    endpoint, go_on, asked = free_ws(), threading.Event(), []
+    endpoint, go_on, asked = free_endpoint("ws://"), threading.Event(), []
     with open_websocket("r1", listen=endpoint) as robot, open_websocket("r1", connect=endpoint, role="teleop") as peer:
         robot.subscribe(STATUS, lambda _message: None)
         robot.subscribe(TWIST, lambda _message: go_on.wait(5) and None)  # as if its process stood still

@@ -26,7 +26,8 @@ from sightline.protocol.transports.websocket.server import (
     may_control,
 )
 from tests.fixtures.links import hail, until
-from tests.fixtures.websocket import HELLO, V1, Robot, closed_with, free_ws
+from tests.fixtures.ports import free_endpoint, port_of
+from tests.fixtures.websocket import HELLO, V1, Robot, closed_with
 
 WATCHERS = MAX_CLIENTS - RESERVED_SLOTS
 TOKENS = {"operator": "operator_0123456789abc", "viewer": "viewerviewerviewer"}
@@ -123,7 +124,7 @@ def test_a_guest_may_steer_and_is_no_viewer(robot):
 
 
 def test_who_is_closed_unheard_for_idle_connections_beside_it_tries_again(robot):
-    address = ("127.0.0.1", int(robot.endpoint.rpartition(":")[2]))
+    address = ("127.0.0.1", port_of(robot.endpoint))
     with ExitStack() as ending:
         for _ in range(MAX_HANDSHAKES_PER_ADDRESS):
             ending.enter_context(socket.create_connection(address))
@@ -136,7 +137,7 @@ def test_who_is_closed_unheard_for_idle_connections_beside_it_tries_again(robot)
 
 
 def test_a_log_that_nobody_reads_shuts_nobody_out(robot, monkeypatch):
-    address = ("127.0.0.1", int(robot.endpoint.rpartition(":")[2]))
+    address = ("127.0.0.1", port_of(robot.endpoint))
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     with suppress(BlockingIOError):
@@ -163,7 +164,7 @@ def test_a_viewer_for_whom_there_is_no_place_is_told_and_tries_again(robot):
 
 
 def test_where_tokens_are_shown_a_viewer_too_many_is_told_by_http(keys):
-    endpoint = free_ws()
+    endpoint = free_endpoint("ws://")
     shown = {role: {"Authorization": f"Bearer {token}"} for role, token in TOKENS.items()}
     with open_websocket("r1", listen=endpoint, secure=keys) as robot, ExitStack() as ending:
         for _ in range(WATCHERS):  # whatever its hello claims

@@ -12,7 +12,8 @@ from sightline.protocol.transports.link import OVERSIZE
 from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.peer import SILENT
 from tests.fixtures.links import claim, until
-from tests.fixtures.websocket import Robot, bare_client, free_ws, never_reads, pause_until, resident_kib
+from tests.fixtures.ports import free_endpoint
+from tests.fixtures.websocket import Robot, bare_client, never_reads, pause_until, resident_kib
 
 FPS = 30
 
@@ -48,7 +49,7 @@ def test_who_never_reads_delays_nobody_costs_little_and_is_heard(robot):
 @pytest.mark.parametrize("picture_bytes", [3_000, 46_000, 200_000])
 def test_who_reads_a_picture_a_second_stays_and_is_never_far_behind_what_fits_its_sockets(picture_bytes):
     """Such a reader answers a ping only when it comes to it: seconds late."""
-    endpoint, ended, got = free_ws(), threading.Event(), []
+    endpoint, ended, got = free_endpoint("ws://"), threading.Event(), []
 
     def read_slowly(message) -> None:
         got.append(int(message.payload[:4]))
@@ -73,7 +74,7 @@ def test_who_reads_a_picture_a_second_stays_and_is_never_far_behind_what_fits_it
 
 
 def test_an_end_that_stands_still_is_noticed_within_three_seconds():
-    endpoint = free_ws()
+    endpoint = free_endpoint("ws://")
     with open_websocket("r1", listen=endpoint) as robot, bare_client(endpoint, wants=["status"]):
         assert until(lambda: robot.has_listener(STATUS))
         begin_s = time.monotonic()

@@ -7,13 +7,14 @@ from websockets.exceptions import ConnectionClosed
 
 from sightline.protocol.channels import DETECTIONS, OVERLAY, PREVIEW, STATUS, TWIST
 from sightline.protocol.transports.websocket.link import open_websocket
-from tests.fixtures.links import claim, free_endpoint, hail, until
+from tests.fixtures.links import claim, hail, until
+from tests.fixtures.ports import free_endpoint
 
 
 @pytest.fixture
 def site():
     """A robot's link, and how others open theirs."""
-    end = free_endpoint().replace("tcp/", "ws://")
+    end = free_endpoint("ws://")
     with ExitStack() as ending:
         robot = ending.enter_context(open_websocket("r1", listen=end, role="robot"))
         robot.latest(TWIST)

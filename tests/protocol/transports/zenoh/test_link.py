@@ -21,7 +21,8 @@ from sightline.protocol.transports.link import NOT_A_PUT
 from sightline.protocol.transports.zenoh.discovery import list_robots
 from sightline.protocol.transports.zenoh.link import MAX_KEPT_PUBLISHERS, ZenohLink, open_fleet, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint, free_port
 
 NO_ENDPOINTS = (
     "", "foo", "tcp", "tcp:/x", "tcp/", "tcp/127.0.0.1", "tcp/:7447", "tcp/127.0.0.1:", "tcp/127.0.0.1:0",
@@ -105,7 +106,7 @@ class _Counting:
     def __init__(self, endpoint: str) -> None:
         self.to = parse_zenoh_endpoint(endpoint)[1:]
         self.passed = 0
-        self._door = socket.create_server(("127.0.0.1", 0))
+        self._door = socket.create_server(("127.0.0.1", free_port()))
         self.endpoint = f"tcp/127.0.0.1:{self._door.getsockname()[1]}"
         threading.Thread(target=self._run, daemon=True).start()
 

@@ -13,7 +13,8 @@ import pytest
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.errors import LinkError
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 
 PRELUDE = """
 import sys, time

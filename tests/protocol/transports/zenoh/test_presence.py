@@ -25,7 +25,7 @@ from sightline.protocol.transports.zenoh.presence import (
     robot_with_same_id,
 )
 from sightline.protocol.transports.zenoh.session import open_session
-from tests.fixtures.links import free_endpoint
+from tests.fixtures.ports import free_endpoint
 
 ROBOT = Presence(role="robot", robot="r1", session="0000abcd", software="sightline 9", host="shed", up_us=5_000_000)
 
@@ -173,7 +173,7 @@ def test_a_robot_that_ends_while_its_successor_looks_is_no_namesake(router, monk
 
 
 def test_when_secured_each_role_is_listed_as_what_its_certificate_says(tmp_path):
-    folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
+    folder, endpoint = tmp_path / "keys", free_endpoint("tls/")
     keys.make(folder, [])
     roles = ["vision", "operator", "teleop", "detector", "viewer3"]
     with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)):
@@ -189,7 +189,7 @@ def test_when_secured_each_role_is_listed_as_what_its_certificate_says(tmp_path)
 
 def test_when_secured_nobody_is_believed_to_be_a_robot_by_another_certificate(tmp_path):
     """A viewer answers as robot r1, under a robot's key and under its own: neither is listed."""
-    folder, endpoint = tmp_path / "keys", free_endpoint().replace("tcp/", "tls/")
+    folder, endpoint = tmp_path / "keys", free_endpoint("tls/")
     keys.make(folder, [])
     with open_zenoh("r2", listen=[endpoint], role="robot", secure=str(folder)):
         from sightline.protocol.transports.security import load_role_keys

@@ -3,7 +3,6 @@
 import itertools
 import json
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -16,7 +15,8 @@ from sightline.operator_side.setup import keys
 from sightline.protocol.channels import ACK, FRAME, REQUEST, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
 TRANSPORTS = ("tcp", "tls", "quic", "udp", "ws")
@@ -29,17 +29,9 @@ def folder(tmp_path_factory):
     return str(made)
 
 
-def _free(transport):
-    """A free port of the transport's own kind."""
-    kind = socket.SOCK_STREAM if transport not in ("udp", "quic") else socket.SOCK_DGRAM
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"{transport}/127.0.0.1:{probe.getsockname()[1]}"
-
-
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_a_link_is_what_its_endpoint_says(transport, folder):
-    endpoint, secure = _free(transport), folder if transport in ("tls", "quic") else ""
+    endpoint, secure = free_endpoint(f"{transport}/"), folder if transport in ("tls", "quic") else ""
     with (
         open_zenoh("r1", listen=[endpoint], role="robot", secure=secure) as robot,
         open_zenoh("r1", connect=[endpoint], role="vision", secure=secure) as vision,
@@ -55,7 +47,7 @@ def test_a_link_is_what_its_endpoint_says(transport, folder):
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_nobody_there_is_said_in_time_with_what_was_tried(transport, folder):
-    endpoint, secure = _free(transport), folder if transport in ("tls", "quic") else ""
+    endpoint, secure = free_endpoint(f"{transport}/"), folder if transport in ("tls", "quic") else ""
     began_s = time.monotonic()
     with pytest.raises(LinkError) as refusal:
         open_zenoh("r1", connect=[endpoint], role="vision", secure=secure, timeout_s=0.5)
@@ -68,7 +60,7 @@ def test_nobody_there_is_said_in_time_with_what_was_tried(transport, folder):
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
 def test_with_keys_no_other_transport_is_taken(transport, folder):
     with pytest.raises(ConfigError, match="is not secured"):
-        open_zenoh("r1", connect=[_free(transport)], role="vision", secure=folder)
+        open_zenoh("r1", connect=[free_endpoint(f"{transport}/")], role="vision", secure=folder)
 
 
 def test_several_robots_and_visions_at_one_router_never_cross(tmp_path):

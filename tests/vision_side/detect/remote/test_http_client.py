@@ -12,6 +12,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.vision_side.detect.remote.client import ServerDetector, parse_address
 from sightline.vision_side.detect.remote.http_client import MAX_ANSWER_BYTES, RETRY_US, HttpJpeg, JpegServer
 from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
 from tests.fixtures.vision.remote import BALL_JPEG, GREY_JPEG, Server, box, frame, http_reply, said, within
 
 GOOD = http_reply(said(box()))
@@ -220,7 +221,7 @@ def test_a_killed_server_is_no_answer_by_the_deadline_and_back_by_itself():
 def test_a_server_that_hangs_while_connecting_is_no_answer_by_the_deadline():
     import socket
 
-    with socket.create_server(("127.0.0.1", 0), backlog=0) as listener:  # full at once: nobody accepts
+    with socket.create_server(("127.0.0.1", free_port()), backlog=0) as listener:  # full at once: nobody accepts
         port = listener.getsockname()[1]
         fill = [socket.socket() for _ in range(3)]
         for one in fill:

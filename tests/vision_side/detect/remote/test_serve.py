@@ -12,7 +12,8 @@ from sightline.evaluation.processes import Processes
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.vision_side.detect.remote.zenoh_detector import ZenohDetector
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.vision.remote import within
 from tests.vision_side.detect.remote.test_zenoh_detector import Robot
 

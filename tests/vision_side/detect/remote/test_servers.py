@@ -13,7 +13,8 @@ from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.contract import check_detector
 from sightline.vision_side.detect.registry import build_detector
 from tests.fixtures import demanded
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
 from tests.fixtures.vision import triton_server
 from tests.fixtures.vision.remote import (
     GREY_JPEG,
@@ -51,7 +52,7 @@ class Uvicorn:
     """`examples/http_detector.py`, as its first lines say how it is run."""
 
     def __init__(self):
-        self.port = int(free_endpoint().rpartition(":")[2])
+        self.port = free_port()
 
     def start(self):
         command = [sys.executable, "-m", "uvicorn", "--app-dir", str(ROOT / "examples"), "http_detector:app", "--port",

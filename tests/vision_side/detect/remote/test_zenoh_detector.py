@@ -30,7 +30,8 @@ from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.port import DetectFrame
 from sightline.vision_side.detect.remote.zenoh_detector import ZenohDetector
 from sightline.vision_side.serving.detector_service import ROLE, DetectorService, ServingOptions
-from tests.fixtures.links import free_endpoint, until
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
 from tests.fixtures.vision.remote import BALL_JPEG, GREY_JPEG, frame, within
 from tests.fixtures.vision.vision import jpeg_of
 
