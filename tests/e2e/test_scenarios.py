@@ -1,4 +1,4 @@
-"""Every scenario by name in real time: four real processes over Zenoh, scored from world truth. `test-long` runs all."""
+"""Every scenario by name in real time: real processes over Zenoh, scored from world truth. `test-long` runs all."""
 
 import csv
 import math
