@@ -28,7 +28,7 @@ from sightline.sim.scenes.plan import plan_scene, with_more_of_the_ball
 from sightline.sim.scenes.textures import SIDE, texture
 from sightline.sim.world.bodies import ball_visual
 from sightline.sim.world.camera import FAR_M, NEAR_M, NOTHING_DEPTH
-from sightline.sim.world.engine import pybullet
+from sightline.sim.world.engine import camera_arrays, pybullet
 
 Plane = npt.NDArray[np.float32]
 _SHADED = (0.7, 1.0)  # the wall's brightness, by its turn
@@ -125,14 +125,14 @@ class SceneRenderer:
     def _picture(self, plan: ScenePlan, bodies: list[list[tuple[int, str]]]) -> tuple[npt.NDArray[np.uint8], Mask]:
         axes = plan.lens.axes()
         forward, up = axes[:, 2].tolist(), (-axes[:, 1]).tolist()
-        image = pybullet.getCameraImage(
+        rgba, depth, segments = camera_arrays(pybullet.getCameraImage(
             WIDTH_PX, HEIGHT_PX, pybullet.computeViewMatrix([0, 0, 0], forward, up), _projection(plan.lens), shadow=0,
             lightDirection=plan.light_from, lightAmbientCoeff=plan.ambient, lightDiffuseCoeff=1.0 - 0.6 * plan.ambient,
             lightSpecularCoeff=0.0, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=self._client,
-        )
+        ))
         picture = backdrop(plan)
-        which = np.where(image[3] < NOTHING_DEPTH, image[4], -1)
-        cv2.copyTo(cv2.cvtColor(image[2], cv2.COLOR_RGBA2RGB), (which >= 0).astype(np.uint8), picture)
+        which = np.where(depth < NOTHING_DEPTH, segments, -1)
+        cv2.copyTo(cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB), (which >= 0).astype(np.uint8), picture)
         _shine(picture, which, bodies, plan)
         return picture, which
 

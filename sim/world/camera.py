@@ -14,7 +14,7 @@ import simplejpeg
 from sightline.protocol.messages import CameraModel
 from sightline.robot_side.ports import scaled_quality, scaled_size
 from sightline.sim.scenario import Look, Wall
-from sightline.sim.world.engine import pybullet
+from sightline.sim.world.engine import camera_arrays, pybullet
 
 PoseMatrix = npt.NDArray[np.float64]
 SUBPIXEL_BITS = 4
@@ -169,14 +169,14 @@ class SceneCamera:
             self._walls.paint(self._picture, np.array(lens), seen_axes)
         forward, up = axes[:, 0], axes[:, 2]
         view = pybullet.computeViewMatrix(lens, [a + b for a, b in zip(lens, forward, strict=True)], up.tolist())
-        image = pybullet.getCameraImage(
+        rgba, depth, _ = camera_arrays(pybullet.getCameraImage(
             self._model.width_px, self._model.height_px, view, self._projection, shadow=0, lightDirection=LIGHT_FROM,
             flags=pybullet.ER_NO_SEGMENTATION_MASK, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=self._client,
-        )
-        np.less(image[3], NOTHING_DEPTH, out=self._mask)
+        ))
+        np.less(depth, NOTHING_DEPTH, out=self._mask)
         if self._walls:
-            self._mask &= _nearness(image[3]) > self._walls.nearness
-        cv2.cvtColor(image[2], cv2.COLOR_RGBA2RGB, self._bodies)
+            self._mask &= _nearness(depth) > self._walls.nearness
+        cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB, self._bodies)
         cv2.copyTo(self._bodies, self._mask.view(np.uint8), self._picture)
         return self._picture
 

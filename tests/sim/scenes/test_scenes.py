@@ -41,6 +41,7 @@ from sightline.sim.scenes.textures import (
     VALIDATED,
     texture,
 )
+from tests.fixtures.sim import use_pybullet_without_numpy
 from tests.sim.scenes import judged_scenes
 
 ALL = [*COLUMNS.values(), THINGS, TRAINED_COLUMN]
@@ -64,6 +65,14 @@ def test_a_seed_is_a_scene_in_any_order(renderer):
     assert np.array_equal(first.rgb, again.rgb) and first.truths == again.truths
     assert as_seen(first) == as_seen(again)
     assert not np.array_equal(first.rgb, renderer.scene(JUDGED_FROM + 4, COLUMNS["all at once"]).rgb)
+
+
+def test_scene_with_pybullet_without_numpy_is_the_same(renderer, monkeypatch):
+    scene = renderer.scene(JUDGED_FROM + 3, COLUMNS["all at once"])
+    widths = use_pybullet_without_numpy(monkeypatch)
+    again = renderer.scene(JUDGED_FROM + 3, COLUMNS["all at once"])
+    assert set(widths) == {WIDTH_PX} and scene.truths
+    assert np.array_equal(scene.rgb, again.rgb) and (scene.truths, scene.unclear) == (again.truths, again.unclear)
 
 
 def test_the_judged_scenes_are_those_that_figures_were_published_of(monkeypatch):

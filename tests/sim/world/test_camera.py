@@ -12,7 +12,7 @@ import simplejpeg
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.sim.scenario import Wall, load_scenario, look_named
 from sightline.sim.world.world import World
-from tests.fixtures.sim import robot_with, seen_at
+from tests.fixtures.sim import robot_with, seen_at, use_pybullet_without_numpy
 
 BALL_RADIUS_M = 0.10
 
@@ -83,6 +83,22 @@ def test_a_wall_meets_the_floor_where_the_pinhole_model_has_it():
         rows = np.nonzero(picture(world)[:, 160, 0] < 60)[0]
     assert rows.min() == pytest.approx(model.cy_px - model.fy_px * (0.2 - model.z_m), abs=1.5)
     assert rows.max() + 1 == pytest.approx(model.cy_px + model.fy_px * model.z_m, abs=1.5)
+
+
+def test_image_with_pybullet_without_numpy_is_the_same(monkeypatch):
+    scenario = seen_at(1.0, 0.0)
+    with World(scenario, robot_with(), 1) as world:
+        truth = world.truth()
+    ahead = (truth.x_m + 2 * math.cos(truth.yaw_rad), truth.y_m + 2 * math.sin(truth.yaw_rad))
+    wall = Wall(start_m=ahead, end_m=(ahead[0] + 0.5, ahead[1] + 0.5))
+    walled = scenario.model_copy(update={"walls": (wall,)})
+    with World(walled, robot_with(), 1) as world:
+        expected = picture(world)
+    widths = use_pybullet_without_numpy(monkeypatch)
+    with World(walled, robot_with(), 1) as world:
+        rgb = picture(world)
+    assert widths == [rgb.shape[1]]
+    assert ball_mask(rgb).any() and np.array_equal(rgb, expected)
 
 
 @pytest.mark.parametrize("look", ["plain", "clean", "dim", "bright", "warm", "cold", "soft"])
