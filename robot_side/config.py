@@ -23,7 +23,7 @@ class PluginChoice(Config):
 
 
 class LegacyConfig(Config):
-    """Clients of the older text dialect, which carry no token."""
+    """Clients of the legacy protocol. They carry no token."""
 
     allow_from: Annotated[tuple[str, ...], Field(max_length=64)] = ()
     """Addresses and networks they may come from, e.g. 192.168.1.7 or 192.168.1.0/24; demanded beyond loopback."""
@@ -35,7 +35,7 @@ class LegacyConfig(Config):
             try:
                 ipaddress.ip_network(text, strict=False)
             except ValueError:
-                raise ValueError(f"{text!r} is no address or network, e.g. 192.168.1.7 or 192.168.1.0/24") from None
+                raise ValueError(f"invalid address {text!r}: expected e.g. 192.168.1.7 or 192.168.1.0/24") from None
         return value
 
 
@@ -66,18 +66,18 @@ class RobotConfig(Config):
 
     @property
     def doors(self) -> tuple[str, ...]:
-        """`listen`, with who may come in written into the endpoints of the older dialect."""
+        """Return `listen`, with the permitted addresses in the endpoints of the legacy protocol."""
         return tuple(with_allowed(endpoint, self.legacy.allow_from) for endpoint in self.listen)
 
     @property
     def devices(self) -> dict[str, PluginChoice | None]:
-        """The device in use of each kind, by its key; None where there is none."""
+        """Return the device in use of each kind by its key, or None where the robot has no such device."""
         return {"camera": self.camera, "drive": self.motors, "range_sensor": self.ranging,
                 "battery": self.battery}
 
     @property
     def motors(self) -> PluginChoice:
-        """The drive in use; `gpio`, whose calibration is in metres, is told the radius of the wheels."""
+        """Return the drive in use. The drive `gpio` also receives the wheel radius, because its table is in meters."""
         if self.drive.kind != "gpio":
             return self.drive
         options = {"wheel_radius_m": self.wheels.wheel_radius_m, **self.drive.options}

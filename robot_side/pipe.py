@@ -132,7 +132,7 @@ def _unpack_holder(source: bytes, session: bytes) -> Holder | None:
 
 
 def pack_rejected(counts: Mapping[str, int]) -> bytes:
-    """What never reached the driver, by reason."""
+    """Pack the counts of messages that never reached the driver, by reason."""
     return bytes([PacketKind.REJECTED]) + json.dumps(dict(counts)).encode()
 
 
@@ -250,7 +250,7 @@ may be called as one of Python's, nor in another copy of this package than the d
 
 
 class NetworkSetup(Config):
-    """What the network process receives at its start, as its first packet."""
+    """The first packet of the network process: its configuration."""
 
     config: RobotConfig
     session: SessionId
@@ -310,7 +310,7 @@ class DriverEnd:
         self.restarts += 1
 
     def _is_read(self, now_us: int) -> bool:
-        """Whether all is read that the dead process sent: its last packet may be a STOP."""
+        """Return True when all packets of the dead process are read. The last one may be a STOP."""
         self._gone_us = self._gone_us or now_us
         return self.socket is None or now_us - self._gone_us >= _DRAIN_US
 
@@ -334,11 +334,11 @@ class DriverEnd:
         _send_or_drop(self.socket, packet)
 
     def send_aside(self, packet: bytes) -> None:
-        """As `send`, without waking it: it looks when it needs to know."""
+        """Send a packet that does not wake the driver. The driver reads it when it needs it."""
         _send_or_drop(self._aside, packet)
 
     def packets(self) -> Iterator[bytes]:
-        """What it has sent, a bounded portion: first all that it sent aside before."""
+        """Yield a bounded number of packets, those that were sent aside first."""
         arrived = list(self._arrived())
         for _ in range(_PACKETS_ASIDE):
             packet = _receive(self._aside) if self._aside else None

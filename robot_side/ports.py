@@ -1,7 +1,7 @@
-"""What a robot is made of, as ports: `Camera`, `Drive`, `RangeSensor`, `Battery`. Pure.
+"""The ports of a robot's devices: `Camera`, `Drive`, `RangeSensor`, `Battery`. Pure.
 
 A plug-in is a class with a pydantic `Config` attribute, built as `Plugin(config)`. All times are microseconds of the
-robot's monotonic clock. Every method raises HardwareError, with the fix in its text, when the device is gone.
+robot's monotonic clock. Every method raises HardwareError when the device is gone. The error text contains the fix.
 """
 
 from __future__ import annotations
@@ -16,7 +16,13 @@ from sightline.protocol.messages import CameraModel
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One JPEG, when it was captured, and the share of the side lengths of the camera's model that it has."""
+    """One image with its capture time.
+
+    Args:
+        jpeg: the encoded image.
+        t_us: capture time on the robot's monotonic clock, us.
+        scale_percent: side lengths relative to the camera's model, 1 to 100.
+    """
 
     jpeg: bytes
     t_us: int
@@ -25,7 +31,13 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class WheelAngles:
-    """Total angle each wheel has turned, in radians, forward positive, and when it was read."""
+    """The total angle of each wheel, forward positive.
+
+    Args:
+        left_rad: angle of the left wheel since the start, rad.
+        right_rad: angle of the right wheel since the start, rad.
+        t_us: time of the reading, us.
+    """
 
     left_rad: float
     right_rad: float
@@ -34,19 +46,27 @@ class WheelAngles:
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """One turn of a range sensor: `ranges_m[i]` is what it meets at `angle_min_rad + i * angle_increment_rad`.
+    """One turn of a range sensor. `ranges_m[i]` is the distance at `angle_min_rad + i * angle_increment_rad`.
 
-    Angles are about the robot's x axis, counter-clockwise positive; distances from the sensor.
+    Angles start at the robot's x axis, counter-clockwise positive. Distances start at the sensor.
 
-        range_min_m to range_max_m    something, so far away
-        below range_min_m, but not 0  something, too close to measure: an obstacle at range_min_m
-        inf                           nothing, as far as the sensor sees: free
-        0, or above range_max_m       no echo; the ray says nothing: no obstacle, and no free way either
+        range_min_m to range_max_m    an obstacle at this distance
+        below range_min_m, but not 0  an obstacle too close to measure; it counts as one at range_min_m
+        inf                           no obstacle within the range of the sensor
+        0, or above range_max_m       no echo; neither an obstacle nor a free path
         nan                           a broken scan
 
-    A scan with a nan, or of which no ray says anything (one without rays, too), is none. A plug-in whose device tells
-    these cases otherwise translates: one that writes 0 also for what is too close gives half of `range_min_m` there.
-    Where the robot's own parts are in the way it gives 0.
+    A scan with a nan, without rays or without any echo is invalid. A plug-in translates the codes of its device to this
+    table. A device that writes 0 also for objects that are too close needs half of `range_min_m` there. A ray that hits
+    the robot itself is 0.
+
+    Args:
+        t_us: time of the scan, us.
+        angle_min_rad: angle of the first ray, rad.
+        angle_increment_rad: angle between two rays, rad.
+        range_min_m: smallest distance that the sensor measures, m.
+        range_max_m: largest distance that the sensor measures, m.
+        ranges_m: one distance per ray, m.
     """
 
     t_us: int
@@ -58,16 +78,26 @@ class Ranges:
 
 
 class Camera(Protocol):
-    """Gives JPEGs. A frame is captured only when `read` is called.
+    """A source of JPEG images. It captures an image only when `read` is called.
 
-    `live` is False for a source that may repeat a picture (files); a live one that does so is taken as frozen.
+    `live` is False for a source that may repeat an image (files). A live camera that repeats an image counts as frozen.
     """
 
     model: CameraModel
     live: bool
 
     def read(self, timeout_s: float) -> Picture | None:
-        """The next capture; None if none came in time."""
+        """Wait for the next image.
+
+        Args:
+            timeout_s: longest wait, s.
+
+        Returns:
+            The image, or None if no image came in time.
+
+        Raises:
+            HardwareError: the camera is gone.
+        """
         ...
 
     def close(self) -> None: ...
@@ -75,58 +105,84 @@ class Camera(Protocol):
 
 @runtime_checkable
 class Adjustable(Protocol):
-    """What a camera that encodes its pictures itself can do besides, so that they fit a thin link."""
+    """An optional port of a camera that encodes its images, so that they fit a slow link."""
 
     def adjust(self, quality_percent: int, scale_percent: int) -> bool:
-        """Encode so from the next capture on, within a few pictures: shares of the configured quality and side lengths.
+        """Change the encoding within a few images. `model` stays at the full size; each image names its own scale.
 
-        False, and nothing changes, where the device's own JPEGs are passed through. `model` stays that of the full
-        size; each picture says its own scale.
+        Args:
+            quality_percent: share of the configured JPEG quality, 1 to 100.
+            scale_percent: share of the configured side lengths, 1 to 100.
+
+        Returns:
+            False if the device encodes the images itself, so that nothing changes.
         """
         ...
 
 
 class Drive(Protocol):
-    """Two wheels. Motors latch: the last speeds given hold until others are given."""
+    """Two driven wheels. Motors latch: the last speeds hold until the next call of `set`."""
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
-        """Give wheel speeds; never blocks."""
+        """Set the wheel speeds. Never blocks.
+
+        Args:
+            left_rad_s: speed of the left wheel, rad/s, forward positive.
+            right_rad_s: speed of the right wheel, rad/s, forward positive.
+
+        Raises:
+            HardwareError: the drive failed; the gate enters FAULT.
+        """
         ...
 
     def wheels(self) -> WheelAngles | None:
-        """The newest encoder reading, None before the first; never blocks."""
+        """Return the newest encoder reading, or None before the first one. Never blocks."""
         ...
 
     def close(self) -> None: ...
 
 
 class RangeSensor(Protocol):
-    """Sees distances around the robot."""
+    """A sensor that measures distances around the robot."""
 
     def read(self) -> Ranges | None:
-        """The newest scan that was not yet read; never blocks."""
+        """Return the newest scan, or None if it was already read. Never blocks."""
         ...
 
     def close(self) -> None: ...
 
 
 class Battery(Protocol):
-    """Measures the voltage of the battery. It is called on a thread of its own and may take a second."""
+    """A sensor for the battery voltage. The driver calls it from a separate thread, so it may take a second."""
 
     def read(self) -> float:
-        """Volts now. The battery counts as low after 5 s without a reading."""
+        """Measure the voltage now, in V. The battery counts as low after 5 s without a reading."""
         ...
 
     def close(self) -> None: ...
 
 
 def scaled_size(width_px: int, height_px: int, scale_percent: int) -> JpegSize:
-    """The size of a picture of that scale."""
+    """Return the size of a scaled image.
+
+    Args:
+        width_px: full width, px.
+        height_px: full height, px.
+        scale_percent: share of the side lengths, 1 to 100.
+
+    Returns:
+        The size in px; each side is at least 16 px.
+    """
     return JpegSize(max(16, width_px * scale_percent // 100), max(16, height_px * scale_percent // 100), 3)
 
 
 def scaled_model(model: CameraModel, scale_percent: int) -> CameraModel:
-    """The model of a camera's pictures at that scale. Distortion is of the rays, not of the pixels."""
+    """Scale the intrinsics of a camera model. Distortion is a property of the rays and does not change with the size.
+
+    Args:
+        model: model at full size, px.
+        scale_percent: share of the side lengths, 1 to 100.
+    """
     if scale_percent == 100:
         return model
     size = scaled_size(model.width_px, model.height_px, scale_percent)
@@ -138,5 +194,5 @@ def scaled_model(model: CameraModel, scale_percent: int) -> CameraModel:
 
 
 def scaled_quality(quality: int, percent: int) -> int:
-    """That share of a configured JPEG quality, never below what decoders take."""
+    """Return a share of a configured JPEG quality, at least 1, which every decoder accepts."""
     return max(1, round(quality * percent / 100))

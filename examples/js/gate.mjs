@@ -81,7 +81,7 @@ export class Gate {
   /** Who sends, and how old the frame behind it is (steps 2 to 6 of the judging order). */
   identify(source, header, now_us) {
     if (!(source in RANKS) || (header !== null && header.source !== source)) {
-      throw new WireError("UNKNOWN_SOURCE", `no driver is called ${source}, or key and header disagree`);
+      throw new WireError("UNKNOWN_SOURCE", `unknown source ${source}, or different from the header`);
     }
     if (source === "guest" && !this.limits.guests) throw new WireError("UNKNOWN_SOURCE", "guests are switched off (--guests)");
     if (header === null) return { who: GUEST, age_us: 0 };
@@ -90,7 +90,7 @@ export class Gate {
     }
     this.issued.age_us(header.echo, now_us, this.limits.zeroSpeedAge_us);
     const age_us = now_us - this.pictures.shownSince_us(header.echo.t_us);
-    if (age_us > this.limits.zeroSpeedAge_us) throw new WireError("STALE", "the camera's picture does not change");
+    if (age_us > this.limits.zeroSpeedAge_us) throw new WireError("STALE", "the camera image does not change");
     this.sequence.check(header);
     return { who: { source, session: header.session }, age_us };
   }
@@ -134,7 +134,7 @@ export class Gate {
 
   goal(now_us) {
     const { command, limits } = this;
-    if (this.pictures.unchanged_us() > limits.zeroSpeedAge_us) return this.hold("the camera's picture does not change", now_us);
+    if (this.pictures.unchanged_us() > limits.zeroSpeedAge_us) return this.hold("the camera image does not change", now_us);
     if (command === null) return this.hold("armed; no command yet", now_us);
     if (now_us - command.arrival_us > command.life_us) {
       return this.hold(`no accepted command for more than ${command.life_us / 1000} ms`, now_us);
@@ -142,7 +142,7 @@ export class Gate {
     const factor = ageFactor(limits, now_us - command.echo_us);
     if (factor === 0) return this.hold("the frame behind the command is too old", now_us);
     this.state = factor === 1 ? "ACTIVE" : "DEGRADED";
-    this.reason = factor === 1 ? "driving" : "the frames are ageing; slower";
+    this.reason = factor === 1 ? "driving" : "the frame is aging; slower";
     return clampTwist(command.twist, factor * limits.maxLinear_mps, factor * limits.maxAngular_rad_s);
   }
 
@@ -208,7 +208,7 @@ export class Gate {
   reset(who, now_us) {
     this.refuseBesideHuman(who, now_us);
     if (this.state !== "STOPPED" && this.state !== "FAULT") return `nothing to reset: ${this.state}`;
-    if (!isStill(this.applied)) throw new WireError("NOT_ALLOWED", "the wheels are not at zero yet; ask again");
+    if (!isStill(this.applied)) throw new WireError("NOT_ALLOWED", "the wheels are not at zero yet; repeat the request");
     this.leave("DISARMED", `reset by ${who.source}; not armed`);
     return "reset; arm to drive";
   }
@@ -227,7 +227,7 @@ export class Gate {
   acquire(who, now_us) {
     const holder = this.lease.liveHolder(now_us);
     if (!(who.source in RANKS) || !this.lease.mayTake(who, now_us)) {
-      throw new WireError("NOT_HOLDER", `${holder?.source ?? "nobody"} drives`);
+      throw new WireError("NOT_HOLDER", holder ? `${holder.source} drives` : `${who.source} may not drive`);
     }
     if (same(holder, who)) return "already held";
     this.liveCommands = 0;
@@ -240,7 +240,7 @@ export class Gate {
     if (!same(this.lease.liveHolder(now_us), who)) return "not held";
     this.lease.drop();
     this.command = null;
-    if (isHuman(who.source)) this.loseHuman("the person driving let go; arm again");
+    if (isHuman(who.source)) this.loseHuman("the operator released control; arm again");
     return "released";
   }
 
@@ -258,15 +258,15 @@ export class Gate {
   /** What still stands against arming, "" if nothing. */
   missingToArm(now_us) {
     const needed = this.limits.liveCommandsToArm;
-    if (this.lease.liveHolder(now_us) === null) return "nobody sends valid commands yet; is vision running?";
-    if (this.liveCommands < needed) return `${this.liveCommands} of ${needed} live commands seen; ask again`;
-    return isStill(this.applied) ? "" : "the wheels are not at zero yet; ask again";
+    if (this.lease.liveHolder(now_us) === null) return "no valid commands yet; start the vision service";
+    if (this.liveCommands < needed) return `${this.liveCommands} of ${needed} live commands received; repeat the request`;
+    return isStill(this.applied) ? "" : "the wheels are not at zero yet; repeat the request";
   }
 
   noticeLostHuman(now_us) {
     if (!this.lease.lostHuman(now_us)) return;
     this.lease.drop();
-    this.loseHuman("the person driving was lost; arm again");
+    this.loseHuman("the operator who drove was lost; arm again");
   }
 
   loseHuman(reason) {

@@ -41,7 +41,7 @@ export class IssuedRecord {
   /** Age of what `echo` names. @throws {WireError} OTHER_SESSION, UNKNOWN_FRAME, FROM_FUTURE, STALE */
   age_us(echo, now_us, most_us) {
     if (echo.session !== this.session) throw new WireError("OTHER_SESSION", `cites robot session ${echo.session}, this is ${this.session}`);
-    if (!this.knows(echo)) throw new WireError("UNKNOWN_FRAME", `cites ${echo.channel} ${echo.seq}, which was not issued so`);
+    if (!this.knows(echo)) throw new WireError("UNKNOWN_FRAME", `cites ${echo.channel} ${echo.seq}, unknown to this robot`);
     const age_us = now_us - echo.t_us;
     if (age_us < 0) throw new WireError("FROM_FUTURE", `cites ${echo.channel} ${echo.seq} from ${-age_us} us ahead`);
     if (age_us > most_us) throw new WireError("STALE", `${echo.channel} ${echo.seq} is ${Math.round(age_us / 1000)} ms old, at most ${most_us / 1000}`);
@@ -55,9 +55,9 @@ export class IssuedRecord {
 
   /** @throws {WireError} unless `echo` names a young status from after the last STOP or disarm */
   checkRequest(echo, now_us, most_us) {
-    if (echo === null || echo.channel !== "status") throw new WireError("MALFORMED", "what lets a robot move again must cite a status");
+    if (echo === null || echo.channel !== "status") throw new WireError("MALFORMED", "a request that permits motion must cite a status");
     this.age_us(echo, now_us, most_us);
-    if (echo.seq <= this.deniedSeq) throw new WireError("STALE", "cites a status from before the last STOP or disarm; ask again");
+    if (echo.seq <= this.deniedSeq) throw new WireError("STALE", "cites a status from before the last STOP or disarm; repeat the request");
   }
 }
 

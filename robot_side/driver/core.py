@@ -138,7 +138,7 @@ class DriverCore:
         )
 
     def messages(self, now_us: int) -> Iterator[Message]:
-        """What is to be published now: replies and scans at once, status and odometry at their rates."""
+        """Yield the messages to publish now: replies and scans immediately, status and odometry at their rates."""
         if self._is_due(ODOMETRY, now_us):
             self._post(ODOMETRY, Odometry(pose=self.motion().pose, moving=self.motion().moving), now_us)
         if self._is_due(STATUS, now_us):
@@ -170,7 +170,7 @@ class DriverCore:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the commanded wheel speeds are zero."""
+        """Return True when the commanded wheel speeds are zero."""
         return self.gate.applied == STILL
 
     # --- inside --------------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ class StopLatch:
             raise ConfigError(f"state_dir {directory}: {error.strerror}; choose a writable directory") from None
 
     def is_set(self) -> bool:
-        """Whether the robot was STOPPED when it last ran."""
+        """Return True if the robot was STOPPED when it last ran."""
         return self._path.exists()
 
     def write(self, stopped: bool) -> None:

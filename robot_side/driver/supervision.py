@@ -47,7 +47,7 @@ class SystemdNotifier:
 
     @property
     def is_active(self) -> bool:
-        """Whether a service manager watches."""
+        """Return True if a service manager supervises this process."""
         return self._socket is not None
 
     def notify(self, state: str) -> None:

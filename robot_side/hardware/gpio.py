@@ -31,8 +31,8 @@ RimSpeed = Annotated[float, Field(gt=0, le=3)]
 Rows = Annotated[tuple[tuple[Duty, RimSpeed], ...], Field(min_length=1, max_length=32)]
 
 GUESSED_ROWS = ((0.40, 0.08), (0.60, 0.12), (1.00, 0.19))
-"""Until the car is measured: 60 rpm at 6 V (the older write-up's motors), about 2 V lost in an L298N on 7.4 V, wheels
-of 65 mm, and nothing below the 40 % at which that write-up turned."""
+"""Guess for a car that was not measured: 60 rpm at 6 V (the motors of the legacy article), about 2 V lost in an L298N
+on 7.4 V, 65 mm wheels, and no motion below the 40 % at which the legacy program turned."""
 
 
 class TableConfig(Config):
@@ -87,7 +87,7 @@ def table_of(text: str, where: str) -> tuple[tuple[float, float], ...]:
     try:
         return TableConfig.model_validate(tomllib.loads(text)).table
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{where}: is no TOML: {error}") from None
+        raise ConfigError(f"{where}: invalid TOML: {error}") from None
     except ValidationError as error:
         problem = first_problem(error, known=TableConfig.model_fields)
         raise ConfigError(f"{where}: {problem}; rows are [duty, m/s], e.g. [0.4, 0.08]") from None
@@ -126,7 +126,7 @@ class Pins(Protocol):
 
 
 class WiredPins(Protocol):
-    """What is asked of a configuration here."""
+    """A configuration that names the pins."""
 
     @property
     def pins(self) -> tuple[int, int, int, int]: ...
@@ -256,7 +256,7 @@ _REVERSAL_PERIODS = 2
 
 
 class GpioDriveConfig(TableConfig):
-    """The pins are BCM numbers; the defaults are the older write-up's car, its PWM of 2 kHz too."""
+    """Pins are BCM numbers. The defaults, also the PWM of 2 kHz, are those of the car in the legacy article."""
 
     left_forward_pin: BcmPin = 10
     left_backward_pin: BcmPin = 9
@@ -319,7 +319,7 @@ class GpioDrive:
         """Give wheel speeds; takes two PWM periods where a wheel reverses, else no time."""
         if not (math.isfinite(left_rad_s) and math.isfinite(right_rad_s)):
             self._all_low()
-            raise HardwareError(f"wheel speeds ({left_rad_s}, {right_rad_s}) are no numbers; the pins are low")
+            raise HardwareError(f"invalid wheel speeds ({left_rad_s}, {right_rad_s}): not finite; pins set low")
         radius_m, (left, right) = self._config.wheel_radius_m, self._shares
         duties = self.table.duty(left_rad_s * radius_m * left), self.table.duty(right_rad_s * radius_m * right)
         self.set_duty(*duties)
@@ -329,7 +329,7 @@ class GpioDrive:
         self._angles = self._expected()
         pins, moves = self._opened(), bool(left or right)
         if self._failed and moves:  # a gate that ramps down must not bring the wheels up again
-            raise HardwareError("GPIO has failed; its pins stay low until it is told zero")
+            raise HardwareError("GPIO has failed; its pins stay low until the next zero speed")
         try:
             wanted = list(zip(self._motors, (left, right), strict=True))
             reversing = [motor.let_go(pins, duty) for motor, duty in wanted]
@@ -346,7 +346,7 @@ class GpioDrive:
         self._expected_mps = self._speeds(left, right)
 
     def wheels(self) -> WheelAngles | None:
-        """How far the wheels should have turned, by the table: an expectation. None if the configuration wants none."""
+        """Return the wheel angles that the table predicts, or None without `odometry = "table"`."""
         return self._expected() if self._config.odometry == "table" else None
 
     def close(self) -> None:
@@ -392,7 +392,7 @@ class GpioDrive:
 
 
 class _Motor:
-    """One motor's two pins, and what they were last told."""
+    """The two pins of one motor, and their last values."""
 
     def __init__(self, pins: tuple[int, ...], is_reversed: bool) -> None:
         self._pins = (pins[1], pins[0]) if is_reversed else (pins[0], pins[1])
@@ -434,5 +434,5 @@ def _rows(config: GpioDriveConfig) -> tuple[tuple[float, float], ...]:
     try:
         return table_of(path.expanduser().read_text("utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
-        said = error.strerror if isinstance(error, OSError) else "is no text"
-        raise ConfigError(f"{path}: cannot be read: {said}; `sightline calibrate drive` writes one") from None
+        cause = error.strerror if isinstance(error, OSError) else "not text"
+        raise ConfigError(f"{path}: cannot be read: {cause}; write one with `sightline calibrate drive`") from None

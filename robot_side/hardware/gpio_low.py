@@ -3,7 +3,7 @@
     python -m sightline.robot_side.hardware.gpio_low 10 9 8 7
 
 Needs neither gpiozero nor a configuration. The internal pull-down (about 50 kilohms) stays when the program has gone,
-where the kernel makes an input of a pin that nobody holds.
+where the kernel turns a pin without an owner into an input.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""A drive without motors: writes what it is told to a file, and turns ideal wheels. Shell (a file and a clock)."""
+"""Write wheel speeds to a file in place of motors, and turn ideal wheels. Shell (a file and a clock)."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ class LogDrive:
             self._file.write(f"{self._angles.t_us},{left_rad_s:.4f},{right_rad_s:.4f}\n")
 
     def wheels(self) -> WheelAngles:
-        """Where ideal wheels would be now."""
+        """Return the angles of ideal wheels now."""
         now_us = monotonic_us()
         seconds = (now_us - self._angles.t_us) / 1e6
         left, right = self._speeds

@@ -1,4 +1,4 @@
-"""How many frames may be in flight, estimated from delays alone. Pure.
+"""Estimate from delays alone how many frames may be in flight. Pure.
 
 A frame sent while nothing is in flight shows the link's own delay. One sent behind another shows the same where the
 link is long, and waits where the link is thin or the peer slow. So the window grows while no frame waits, and what gets
@@ -71,14 +71,14 @@ class LinkCapacity:
 
 @dataclass(frozen=True, slots=True)
 class _MeasuredRate:
-    """What the link carried when a wider window made frames wait; by itself a frame took `own_us` then."""
+    """The rate of the link when a wider window made frames wait. A frame alone took `own_us` then."""
 
     bytes_per_s: float
     own_us: int
     until_us: int
 
     def frame_us(self, frame_bytes: float) -> float:
-        """How long a frame occupies the link."""
+        """Return the time in us for which a frame occupies the link."""
         return frame_bytes * 1e6 / self.bytes_per_s
 
 
@@ -101,7 +101,7 @@ class CongestionWindow:
 
     @property
     def own_delay_us(self) -> int | None:
-        """What the link itself takes, as far as it is known."""
+        """Return the delay of the link without a queue, or None before the first measurement."""
         return min(self._alone_us, default=None)
 
     def on_answer(self, answered: AckSample, now_us: int) -> LinkCapacity | None:
@@ -216,5 +216,5 @@ class CongestionWindow:
 
 
 def _slack_us(own_us: int) -> int:
-    """What may come and go without being a queue."""
+    """Return the change of delay that does not count as a queue."""
     return max(_JITTER_US, own_us // _JITTER_SHARE)

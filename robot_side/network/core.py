@@ -45,11 +45,11 @@ class NetworkCore:
         """What the camera does: unchanged where it passes its own JPEGs through."""
 
     def may_capture(self, now_us: int, listening: bool) -> bool:
-        """Whether to take a picture now."""
+        """Return True if the camera may capture now."""
         return self._stream.may_capture(now_us, listening)
 
     def wait_us(self, now_us: int) -> int:
-        """How long to wait for time alone to change `may_capture`."""
+        """Return the time in us after which `may_capture` can change without an answer."""
         return self._stream.wait_us(now_us)
 
     def on_camera(self, picture: Picture, now_us: int) -> tuple[FrameHeader, Message] | None:

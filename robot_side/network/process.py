@@ -116,7 +116,7 @@ class NetworkProcess:
             self._link.publish(message.channel, message.header, message.payload)
 
     def _may_capture(self) -> bool:
-        """Whether to take an image now; else wait a little for credit."""
+        """Return True if the camera may capture now. Otherwise wait briefly for credit."""
         listening = self._link.has_listener(FRAME)
         with self._lock:
             due = self._network_core.may_capture(monotonic_us(), listening)
@@ -184,7 +184,7 @@ class NetworkProcess:
         self._report_rejected()
 
     def _report_rejected(self) -> None:
-        """What never reached the driver is shown in `status` too."""
+        """Send the driver the counts of messages that never reached it, so that `status` shows them."""
         by_link: dict[str, int] = dict(self._link.rejected)  # copied at once: other threads count in it
         rejected = Counter(dict(self._rejected_acks)) + Counter(by_link)
         if rejected != self._rejected_reported and self._network_end.send(ipc.pack_rejected(rejected)):

@@ -83,13 +83,13 @@ class Stream:
 
     @property
     def encoding_target(self) -> EncodingTarget:
-        """How the next picture should be encoded."""
+        """Return the encoding of the next image."""
         return self._bitrate_control.target if self._config.adapt else EncodingTarget()
 
     # --- sending -------------------------------------------------------------------------------------------------
 
     def may_capture(self, now_us: int, listening: bool) -> bool:
-        """Whether to take the next picture now: a peer listens, it is time, and there is credit."""
+        """Return True if a peer listens, the frame interval is over and the stream has credit."""
         self._expire(now_us)
         if not listening or now_us < self._next_us:
             return False
@@ -98,7 +98,7 @@ class Stream:
         return free
 
     def wait_us(self, now_us: int) -> int:
-        """How long until time or a credit timeout could change `may_capture`; an answer may change it sooner."""
+        """Return the time in us after which the interval or a credit timeout can change `may_capture`."""
         blocked_until_us = min(self._in_flight.values(), default=0) if not self._has_credit else 0
         return max(0, max(self._next_us, blocked_until_us) - now_us)
 
@@ -191,7 +191,7 @@ class Stream:
         return min(longest_us, round(self._usual_us() * (1 << min(max(0, self._overdue - 1), 8))))
 
     def _usual_us(self) -> float:
-        """What takes longer is overdue."""
+        """Return the answer time in us above which a frame is overdue."""
         if self._answer_us is None:
             return float(_FIRST_TIMEOUT_US)
         patient_us = max(1.5 * self._answer_us, self._answer_us + 4 * self._spread_us)

@@ -1,4 +1,4 @@
-"""What the voltage of the battery permits: full speed, half of it, or none. Pure."""
+"""Derive a speed limit from the battery voltage: full speed, half of it, or zero. Pure."""
 
 import math
 from enum import Enum
@@ -33,7 +33,7 @@ class BatteryLimits(Config):
 
 
 class BatteryLevel(Enum):
-    """How full the battery is."""
+    """State of charge, from full to empty. SILENT: no valid reading for 5 s."""
 
     OK = "ok"
     LOW = "low"
@@ -49,9 +49,9 @@ _CAUSES: Final = {
 
 
 class BatteryMonitor:
-    """The level after the newest reading.
+    """Tracks the battery level from voltage readings.
 
-    Voltage recovers when the motors stop. A level therefore ends only `battery_hysteresis_v` above where it began.
+    A level ends only `battery_hysteresis_v` above the voltage at which it began.
     """
 
     def __init__(self, config: BatteryLimits) -> None:
@@ -60,13 +60,19 @@ class BatteryMonitor:
         self._newest: tuple[float, int] | None = None
 
     def see(self, volts: float, t_us: int) -> None:
-        """Take a reading made at `t_us`; nan and inf are not readings."""
+        """Take a reading. A value that is not finite is ignored.
+
+        Args:
+            volts: battery voltage, V.
+            t_us: time of the reading on the robot's clock, us.
+        """
         if math.isfinite(volts):
             self._level = self._after(volts)
             self._newest = volts, t_us
 
     def _after(self, volts: float) -> BatteryLevel:
         config = self._config
+        # The voltage recovers when the motors stop. Without hysteresis the robot would start again on an empty battery.
         empty_v, low_v = config.empty_battery_v, config.low_battery_v
         if self._level is BatteryLevel.EMPTY:
             empty_v += config.battery_hysteresis_v
@@ -77,17 +83,18 @@ class BatteryMonitor:
         return BatteryLevel.LOW if volts < low_v else BatteryLevel.OK
 
     def volts(self, now_us: int) -> float | None:
-        """The newest reading; None while the battery is silent."""
+        """Return the newest reading in V, or None if it is older than `SILENT_US`."""
         if self._newest is None or now_us - self._newest[1] > SILENT_US:
             return None
         return self._newest[0]
 
     def level(self, now_us: int) -> BatteryLevel:
-        """The level now. An empty battery that falls silent stays empty."""
+        """Return the level now."""
+        # Silence must not raise the limit of an empty battery from zero to half.
         silent = self.volts(now_us) is None and self._level is not BatteryLevel.EMPTY
         return BatteryLevel.SILENT if silent else self._level
 
     def causes(self, now_us: int) -> tuple[Cause, ...]:
-        """What limits the speed now, if anything."""
+        """Return the cause that limits the speed now, or an empty tuple."""
         cause = _CAUSES.get(self.level(now_us))
         return () if cause is None else (cause,)

@@ -1,7 +1,7 @@
-"""`SafetyGate`: accepts or rejects commands, and decides at every tick what the wheels do. Pure.
+"""Accept or reject commands, and decide at every tick how the wheels move. Pure.
 
-`offer` validates a command once, on arrival; `step` checks its age again each tick and decides what the wheels do.
-Liveness is the accepted command: rejected commands, acks and open connections refresh nothing.
+`offer` validates a command once, on arrival. `step` checks its age again at each tick and computes the twist.
+Only an accepted command proves liveness. Rejected commands, acks and open connections refresh nothing.
 """
 
 import math
@@ -35,12 +35,24 @@ from sightline.robot_side.safety.validation import (
 )
 
 _GUEST = Holder(source="guest", session="00000000")
-_MAX_REQUEST_AGE_US = 2_000_000  # an `arm` that a link kept back must not arm when it is delivered at last
+# A link that was cut delivers its messages later. An old `arm` must not arm (docs/decisions/0001).
+_MAX_REQUEST_AGE_US = 2_000_000
+# These verbs only take motion away, so they are safe at any age.
 _NEEDS_NO_ECHO = (Verb.STOP, Verb.DISARM, Verb.RELEASE)
 
 
 class SafetyGate:
-    """See the module. Times are the robot's monotonic clock and never go back; the caller steps it at 50 Hz."""
+    """The only path from a command to the wheels. The caller steps it at 50 Hz.
+
+    Args:
+        config: limits and times.
+        session: session id of this robot start, 8 hex digits. Commands that cite another session are rejected.
+        stopped: True if the STOP latch was set when the robot last ended.
+        guard: speed limits near obstacles, or None without a range sensor.
+        battery: speed limits of the battery, or None without one.
+
+    All times are microseconds of the robot's monotonic clock and never decrease.
+    """
 
     def __init__(
         self,
@@ -75,7 +87,17 @@ class SafetyGate:
     # --- commands ------------------------------------------------------------------------------------------------
 
     def offer(self, source: str, header: AnswerHeader | None, twist: Twist, now_us: int) -> CommandResult:
-        """Validate one command on arrival. Never raises; every rejection is typed and counted, the newest is kept."""
+        """Validate one command on arrival. Never raises: it counts each rejection and stores the newest.
+
+        Args:
+            source: role in the key of the message, e.g. "vision".
+            header: decoded header, or None for a guest without a header.
+            twist: m/s and rad/s, not yet limited.
+            now_us: arrival time on the robot's clock.
+
+        Returns:
+            The age of the cited frame in us if the command was accepted, otherwise the reason.
+        """
         try:
             age_us = self._validate(source, header, twist, now_us)
         except WireError as error:
@@ -84,7 +106,12 @@ class SafetyGate:
         return CommandResult(None, age_us=age_us)
 
     def reject(self, source: str, error: WireError) -> CommandResult:
-        """Count a rejection; also of what the decoder rejected before it could be offered."""
+        """Count a rejection. The driver core also calls this for a message that the decoder rejected.
+
+        Args:
+            source: role in the key of the message.
+            error: its reason and one line of detail for the operator.
+        """
         self.counters[error.reason] += 1
         self.last_rejection = LastRejection(source=source[:32], reason=error.reason, detail=error.detail[:200])
         return CommandResult(error.reason, error.detail)
@@ -99,6 +126,7 @@ class SafetyGate:
         holder = self._lease.live_holder(now_us)
         if not self._lease.may_take(who, now_us):
             raise WireError(RejectReason.NOT_HOLDER, f"{holder.source} {holder.session} drives" if holder else "")
+        # The lease is renewed in DISARMED too. Otherwise arming would never find a live driver.
         self._live_commands = self._live_commands + 1 if holder == who else 1
         self._lease.take(who, now_us)
         if not is_armed(self.state):
@@ -107,21 +135,22 @@ class SafetyGate:
         return age_us
 
     def _identify(self, source: str, header: AnswerHeader | None, now_us: int) -> tuple[Holder, int]:
-        """Who sends, and how old the frame behind it is."""
+        """Return the sender and the age of the cited frame in us."""
         if source not in RANKS or (header is not None and header.source != source):
-            raise WireError(RejectReason.UNKNOWN_SOURCE, f"no driver is called {source!r}, or key and header disagree")
+            raise WireError(RejectReason.UNKNOWN_SOURCE, f"unknown source {source!r}, or different from the header")
         if source == "guest" and not self.config.guests:
             raise WireError(RejectReason.UNKNOWN_SOURCE, "guests are switched off (safety.guests)")
         if header is None:
             if source != "guest":
-                raise WireError(RejectReason.MALFORMED, f"a twist of {source} needs a header that cites a frame")
+                raise WireError(RejectReason.MALFORMED, f"a twist from {source} needs a header that cites a frame")
             return _GUEST, 0
         if header.echo.channel == "status":
             raise WireError(RejectReason.UNKNOWN_FRAME, "a twist must cite a frame, not a status")
         self.issued.age_us(header.echo, now_us, self.config.max_age_us)
+        # A frozen camera delivers new frames with an old image. The image counts from its first appearance.
         age_us = now_us - self.pictures.shown_since_us(header.echo.t_us)
         if age_us > self.config.max_age_us:
-            raise WireError(RejectReason.STALE, f"the camera's picture has not changed for {age_us / 1e3:.0f} ms")
+            raise WireError(RejectReason.STALE, f"the camera image has not changed for {age_us / 1e3:.0f} ms")
         self._sequence.check(header)
         return Holder(source=header.source, session=header.session), age_us
 
@@ -135,6 +164,7 @@ class SafetyGate:
         if limited != twist:
             self.counters[CLAMPED] += 1
         life_ms = min(config.silence_ms, config.guest_life_ms) if guest else config.silence_ms
+        # A guest cites no frame, so its age counts from arrival and its life is shorter.
         self._command = AcceptedCommand(limited, now_us - age_us, now_us, life_ms * 1000)
         if not guest:
             self.latency_us = age_us
@@ -142,13 +172,21 @@ class SafetyGate:
     # --- the wheels ----------------------------------------------------------------------------------------------
 
     def step(self, now_us: int) -> Decision:
-        """Decide what the wheels do from now until the next step. Limits hold per elapsed time, not per call."""
+        """Compute the twist from now until the next step. Limits hold per elapsed time, not per call.
+
+        Args:
+            now_us: time on the robot's clock.
+
+        Returns:
+            The twist for the wheels, the state and its reason.
+        """
         self._notice_lost_human(now_us)
         self._arm_by_itself(now_us)
         goal = self._goal(now_us) if is_armed(self.state) else STILL
         elapsed_us = 0 if self._last_step_us is None else max(0, now_us - self._last_step_us)
         self._last_step_us = now_us
         twist = self._ramp.step(goal, elapsed_us)
+        # The guard comes last and cuts at once: a ramp toward an obstacle would still move the robot closer.
         if self._guard is not None:
             twist = self._guarded(self._guard, twist, now_us)
         self.applied = twist
@@ -157,29 +195,31 @@ class SafetyGate:
     def _guarded(self, guard: RangeGuard, twist: Twist, now_us: int) -> Twist:
         limited = guard.limit(twist, now_us)
         if limited != twist:
+            # The ramp must restart from the real speed. Otherwise the robot jumps when the obstacle is gone.
             self._ramp.force(limited)
             if is_armed(self.state):
                 self.reason = "an obstacle is near" if guard.is_fresh(now_us) else "the range sensor is silent"
         return limited
 
     def _goal(self, now_us: int) -> Twist:
-        """The commanded twist under the smallest limit that a cause leaves; HOLD and zero where that is zero."""
+        """Return the commanded twist under the smallest limit of all causes. A limit of zero means HOLD."""
         command = self._command
         cause = min(self._causes(command, now_us), key=lambda cause: cause.factor)
         if cause.event is Event.MUST_HOLD:
             self._hold(cause.reason, now_us)
         else:
             self._go(cause.event, cause.reason)
+        # One factor scales both axes, so that a slower robot still follows the commanded curve.
         twist, config = STILL if command is None else command.twist, self.config
         return clamp_twist(twist, cause.factor * config.max_linear_mps, cause.factor * config.max_angular_rad_s)
 
     def _causes(self, command: AcceptedCommand | None, now_us: int) -> Iterator[Cause]:
-        """Everything that may slow or hold the robot. The smallest factor wins, the first of equal ones."""
+        """Yield every cause that slows or holds the robot. The smallest factor wins, then the first cause."""
         config = self.config
         if self._battery is not None:
             yield from self._battery.causes(now_us)
         if self.pictures.unchanged_us() > config.max_age_us:
-            yield Cause(0.0, "the camera's picture does not change")
+            yield Cause(0.0, "the camera image does not change")
         if command is None:
             yield Cause(0.0, "armed; no command yet")
             return
@@ -189,7 +229,7 @@ class SafetyGate:
         if factor == 0.0:
             yield Cause(factor, f"the frame behind the command is {config.zero_speed_age_ms} ms old")
         else:
-            yield Cause(factor, "the frames are ageing; slower" if factor < 1.0 else "driving")
+            yield Cause(factor, "the frame is aging; slower" if factor < 1.0 else "driving")
 
     def _hold(self, reason: str, now_us: int) -> None:
         if self.state is not State.HOLD:
@@ -201,7 +241,19 @@ class SafetyGate:
     # --- requests ------------------------------------------------------------------------------------------------
 
     def request(self, header: RequestHeader, request: Request, now_us: int) -> str:
-        """Carry out a request and return what happened, in words. Raises WireError with the reason if it may not be."""
+        """Carry out a request.
+
+        Args:
+            header: sender and the cited status.
+            request: the verb.
+            now_us: arrival time on the robot's clock.
+
+        Returns:
+            One line for the operator.
+
+        Raises:
+            WireError: the request is rejected; `reason` and `detail` name the cause.
+        """
         if request.verb not in _NEEDS_NO_ECHO:
             self.issued.check_request(header.echo, now_us, _MAX_REQUEST_AGE_US)
         self._notice_lost_human(now_us)
@@ -214,38 +266,39 @@ class SafetyGate:
         return handlers[request.verb](who, now_us)
 
     def stop(self, reason: str = "STOP") -> str:
-        """Latch STOPPED: wheels to zero and held until `reset`. Always granted."""
+        """Latch STOPPED. The wheels ramp to zero and stay there until `reset`. Always granted."""
         self._end(Event.STOP, reason)
         return "STOPPED"
 
     def fault(self, reason: str) -> None:
-        """The drive failed: wheels to zero until `reset`."""
-        if next_state(self.state, Event.FAULT) is not self.state:  # once: one that lasts does not stand against a reset
+        """Enter FAULT after a failure of the drive. The wheels stay at zero until `reset`."""
+        # Only on entry: a drive that reports its fault at every tick must not invalidate each new reset request.
+        if next_state(self.state, Event.FAULT) is not self.state:
             self._end(Event.FAULT, reason)
 
     def halt(self, reason: str) -> None:
-        """As `fault`, and without a ramp: the caller, who could not step this, has set the wheels to zero."""
+        """Enter FAULT without a ramp. The caller could not step the gate and has set the wheels to zero."""
         self.fault(reason)
         self._ramp.force(STILL)
         self.applied = STILL
 
     def disarm(self, reason: str = "disarmed") -> str:
-        """Wheels to zero; commands are validated but not applied. Always granted."""
+        """Ramp the wheels to zero. Commands are validated but not applied. Always granted."""
         self._end(Event.DISARM, reason)
         return "disarmed"
 
     def reset(self, who: Holder, now_us: int) -> str:
-        """Leave STOPPED or FAULT for DISARMED: permits motion, never starts it."""
+        """Leave STOPPED or FAULT for DISARMED. This permits motion and never starts it."""
         self._reject_beside_human(who, now_us)
         if self.state not in (State.STOPPED, State.FAULT):
             return f"nothing to reset: {self.state}"
         if self.applied != STILL:
-            raise WireError(RejectReason.NOT_ALLOWED, "the wheels are not at zero yet; ask again")
+            raise WireError(RejectReason.NOT_ALLOWED, "the wheels are not at zero yet; repeat the request")
         self._leave(Event.RESET, f"reset by {who.source}; not armed")
         return "reset; arm to drive"
 
     def arm(self, who: Holder, now_us: int) -> str:
-        """Let the lease holder drive, once its commands are live and the wheels at zero."""
+        """Permit motion by the lease holder. Its commands must be live and the wheels at zero."""
         self._reject_beside_human(who, now_us)
         if is_armed(self.state):
             return "already armed"
@@ -259,32 +312,35 @@ class SafetyGate:
         return "armed"
 
     def acquire(self, who: Holder, now_us: int) -> str:
-        """Take the lease ahead of the first command. It is not renewed so: only commands do that."""
+        """Take the lease ahead of the first command. Only commands renew it."""
         if who.source not in RANKS or not self._lease.may_take(who, now_us):
             holder = self._lease.live_holder(now_us)
-            raise WireError(RejectReason.NOT_HOLDER, f"{holder.source if holder else 'nobody'} drives")
+            detail = f"{holder.source} drives" if holder else f"{who.source} may not drive"
+            raise WireError(RejectReason.NOT_HOLDER, detail)
         if self._lease.live_holder(now_us) == who:
             return "already held"
-        self._live_commands, self._command = 0, None  # the driver before neither arms nor drives for this one
+        # The commands of the previous driver must neither arm the robot nor move it for the new one.
+        self._live_commands, self._command = 0, None
         self._lease.take(who, now_us)
         return "acquired"
 
     def release(self, who: Holder, now_us: int) -> str:
-        """Give the lease back. A human who lets go stops the robot; it must be armed again."""
+        """Return the lease. After a human driver the robot stops and must be armed again."""
         if self._lease.live_holder(now_us) != who:
             return "not held"
         self._lease.drop()
         self._command = None
         if who.source in HUMANS:
-            self._end(Event.HUMAN_LOST, "the person driving let go; arm again")
+            # The robot never returns from a human to vision without an operator.
+            self._end(Event.HUMAN_LOST, "the operator released control; arm again")
         return "released"
 
     def holder(self, now_us: int) -> Holder | None:
-        """The driver of the moment."""
+        """Return the driver that holds the lease now, or None."""
         return self._lease.live_holder(now_us)
 
     def frame_age_us(self, now_us: int) -> int | None:
-        """Age of the frame behind the command in force; None without one."""
+        """Return the age in us of the frame behind the current command, or None without a command."""
         return None if self._command is None else max(0, now_us - self._command.echo_us)
 
     def _reject_beside_human(self, who: Holder, now_us: int) -> None:
@@ -293,19 +349,20 @@ class SafetyGate:
             raise WireError(RejectReason.NOT_ALLOWED, f"{holder.source} {holder.session} drives")
 
     def _missing_to_arm(self, now_us: int) -> str:
-        """What still stands against arming, "" if nothing."""
+        """Return the condition that still prevents arming, or an empty string."""
         needed = self.config.live_commands_to_arm
         if self._lease.live_holder(now_us) is None:
-            return "nobody sends valid commands yet; is vision running?"
+            return "no valid commands yet; start the vision service"
         if self._live_commands < needed:
-            return f"{self._live_commands} of {needed} live commands seen; ask again"
-        return "" if self.applied == STILL else "the wheels are not at zero yet; ask again"
+            return f"{self._live_commands} of {needed} live commands received; repeat the request"
+        return "" if self.applied == STILL else "the wheels are not at zero yet; repeat the request"
 
     def _notice_lost_human(self, now_us: int) -> None:
-        """Before anybody else may take the lease: a tick later a successor's command would have hidden the loss."""
+        """Stop after the loss of a human driver."""
+        # Before another driver may take the lease: one tick later the new holder hides the loss.
         if self._lease.lost_human(now_us):
             self._lease.drop()
-            self._end(Event.HUMAN_LOST, "the person driving was lost; arm again")
+            self._end(Event.HUMAN_LOST, "the operator who drove was lost; arm again")
 
     def _arm_by_itself(self, now_us: int) -> None:
         if self.arms_itself and self.state is State.DISARMED and not self._missing_to_arm(now_us):
@@ -316,13 +373,13 @@ class SafetyGate:
         self._go(Event.ARM, reason)
 
     def _end(self, event: Event, reason: str) -> None:
-        """As `_leave`; and, armed or not, neither a request from before nor auto_arm takes it up again."""
+        """Leave the armed states, and invalidate earlier requests and auto_arm, so that neither arms again."""
         self._leave(event, reason)
         self.issued.deny_earlier()
         self.arms_itself = False
 
     def _leave(self, event: Event, reason: str) -> None:
-        """Go where the wheels are off; auto_arm, where it is on, may take it up again."""
+        """Go to a state with the wheels off. With auto_arm the robot may arm again from there."""
         if next_state(self.state, event) is not self.state:
             self._command, self._live_commands = None, 0
             self._go(event, reason)

@@ -1,9 +1,9 @@
-"""Limits speed towards obstacles that the range sensor sees, and checks its blind zone. Pure.
+"""Limit the speed toward obstacles, and check the blind zone of the range sensor. Pure.
 
-Each near point of a scan becomes one inequality on the twist. With n the direction from the robot's outline to the
-point, the robot closes in on it at `linear * forward + angular * turning`, which may be at most
-sqrt(2 brake (clearance - stop)): what can still brake in time. Motion along a wall or away from it is free.
-A stale sensor counts as an obstacle all around.
+Each near point of a scan becomes one inequality on the twist. The robot approaches the point at
+`linear * forward + angular * turning`. This speed may be at most sqrt(2 brake (clearance - stop)), so that the robot
+still brakes in time. Motion along a wall or away from it is free. A stale sensor counts as an obstacle all around.
+docs/decisions/0003 compares this rule with a lane of free distance.
 """
 
 import math
@@ -17,13 +17,13 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, Twist
 from sightline.robot_side.ports import Ranges
 
-# First the speed gives way; without it a turn can come too close to a point looked at before, so it gives way in the
-# second pass, and for all points in the third. At zero speed a smaller turn is safe for every point: no fourth.
+# The first pass reduces the speed. A turn without that speed can approach an earlier point, so the second pass reduces
+# the turn, and the third applies it to all points. At zero speed a smaller turn is safe for every point.
 _PASSES = 3
 
 
 class GuardConfig(Config):
-    """Outline of the robot from its axle's midpoint, and the zones around it."""
+    """The outline of the robot, measured from the midpoint of its axle, and the zones around it."""
 
     front_m: float = Field(default=0.07, ge=0, le=2, description="outline ahead of the axle")
     rear_m: float = Field(default=0.10, ge=0, le=2, description="outline behind the axle")
@@ -33,13 +33,13 @@ class GuardConfig(Config):
         default=0.08,
         ge=0.02,
         le=5,
-        description="clearance at which no motion towards a point is left; keep it well below every stand-off",
+        description="clearance at which no motion toward a point remains; set it well below every stand-off",
     )
     brake_mps2: float = Field(
         default=0.5,
         gt=0,
         le=20,
-        description="braking that the slow zone assumes; well below what the robot can, for motor lag and scan age",
+        description="braking that the slow zone assumes; well below the real one, for motor lag and scan age",
     )
     max_scan_age_ms: int = Field(
         default=400, ge=50, le=5_000, description="an older scan counts as an obstacle all around"
@@ -48,14 +48,14 @@ class GuardConfig(Config):
 
 @dataclass(frozen=True, slots=True)
 class _Near:
-    """`linear * forward + angular * turning <= limit_mps`."""
+    """One near point as an inequality: `linear * forward + angular * turning <= limit_mps`."""
 
     forward: float
     turning: float
     limit_mps: float
 
     def cut(self, linear: float, angular: float) -> tuple[float, float]:
-        """The twist that holds it: speed gives way before turning, so that the robot can turn to where it is free."""
+        """Return a twist within the limit. Speed is reduced before turning, so that the robot can turn away."""
         if linear * self.forward + angular * self.turning <= self.limit_mps:
             return linear, angular
         left_mps = self.limit_mps - angular * self.turning
@@ -65,7 +65,7 @@ class _Near:
 
 
 def _met_m(scan: Ranges, range_m: float) -> float | None:
-    """How far away a ray met something: inf for nothing, None if it does not say. Too close to measure is as near."""
+    """Return the distance of a ray in m: inf without an obstacle, None without an echo, range_min_m if too close."""
     if range_m == math.inf:
         return range_m
     if range_m == 0 or range_m > scan.range_max_m:
@@ -74,7 +74,7 @@ def _met_m(scan: Ranges, range_m: float) -> float | None:
 
 
 class RangeGuard:
-    """Holds what the newest scan forbids, and cuts twists with it."""
+    """Limits twists by the newest scan."""
 
     def __init__(self, config: GuardConfig) -> None:
         self._config = config
@@ -82,7 +82,11 @@ class RangeGuard:
         self._near: list[_Near] = []
 
     def see(self, scan: Ranges) -> None:
-        """Take a scan. One with a nan, or of which no ray says anything, is none: soon it counts as an obstacle."""
+        """Take a scan, see `Ranges`. An invalid scan is ignored, so that the sensor soon counts as silent.
+
+        Args:
+            scan: one turn of the sensor, m and rad.
+        """
         met_m = [_met_m(scan, range_m) for range_m in scan.ranges_m]
         if any(map(math.isnan, scan.ranges_m)) or all(range_m is None for range_m in met_m):
             return
@@ -99,16 +103,25 @@ class RangeGuard:
         nearest_x_m = max(-config.rear_m, min(config.front_m, x_m))
         nearest_y_m = max(-config.half_width_m, min(config.half_width_m, y_m))
         clearance_m = math.hypot(x_m - nearest_x_m, y_m - nearest_y_m)
-        # A point inside the outline (noise, or the robot's own parts) is taken as straight ahead or behind.
+        # A point inside the outline is noise or a part of the robot and has no direction. Ahead or behind is the safe
+        # assumption: it blocks motion toward the point and permits motion away from it.
         inside = clearance_m < 1e-6
         forward = math.copysign(1.0, x_m) if inside else (x_m - nearest_x_m) / clearance_m
         sideways = 0.0 if inside else (y_m - nearest_y_m) / clearance_m
         limit_mps = math.sqrt(2 * config.brake_mps2 * max(0.0, clearance_m - config.stop_m))
-        # The outline's nearest spot moves at v + w x r: (linear - angular * y, angular * x).
+        # Rigid-body motion: the nearest spot of the outline moves at v + w x r = (linear - angular * y, angular * x).
         return _Near(forward, sideways * nearest_x_m - forward * nearest_y_m, limit_mps)
 
     def limit(self, twist: Twist, now_us: int) -> Twist:
-        """`twist` cut to what the scan allows; the same object when nothing was cut."""
+        """Limit a twist by the newest scan.
+
+        Args:
+            twist: m/s and rad/s, after the ramp.
+            now_us: time on the robot's clock.
+
+        Returns:
+            The same object if no limit applies. Zero if the scan is stale.
+        """
         if not self.is_fresh(now_us):
             return twist if twist == STILL else Twist(linear_mps=0.0, angular_rad_s=0.0)
         linear, angular = twist.linear_mps, twist.angular_rad_s
@@ -120,39 +133,43 @@ class RangeGuard:
         return Twist(linear_mps=linear, angular_rad_s=angular)
 
     def is_fresh(self, now_us: int) -> bool:
-        """Whether the newest scan is young enough to be believed."""
+        """Return True if the newest scan is younger than `max_scan_age_ms`."""
         return self._scan_us is not None and 0 <= now_us - self._scan_us <= self._config.max_scan_age_ms * 1000
 
 
-# A range sensor does not see into its blind zone: all of it must lie within the guard's stop zone. Pure.
-#
-# Otherwise a robot that creeps up to something loses sight of it before the guard has stopped it, and drives on.
+# The blind zone of a range sensor must lie within the stop zone of the guard. Otherwise an obstacle vanishes from the
+# scan before the guard has stopped a slow robot, and the robot continues.
 
 
 class BlindZoneError(ConfigError):
-    """A sensor that is blind beyond the stop zone."""
+    """The blind zone of the sensor is larger than the stop zone."""
 
 
 def check_blind_zone(guard: GuardConfig, scan: Ranges) -> None:
-    """Raise BlindZoneError unless whatever this sensor cannot see is nearer to the robot than `guard.stop_m`.
+    """Check that the blind zone of a sensor lies within `guard.stop_m`.
 
-    Of `scan`, what counts is where the sensor looks and its minimum, not what it saw. Raises ValueError where one of
-    these is no number: a bad reading, which a later one may mend.
+    Args:
+        guard: outline and stop zone, m.
+        scan: any scan of the sensor. Only its angles and its minimum range matter.
+
+    Raises:
+        BlindZoneError: the blind zone reaches beyond the stop zone.
+        ValueError: an angle or the minimum range is not finite. A later scan may be valid.
     """
-    said = (scan.range_min_m, scan.angle_min_rad, scan.angle_increment_rad)
-    if not all(map(math.isfinite, said)):
-        raise ValueError(f"the range sensor's least range and angles are {said}: no numbers")
+    geometry = (scan.range_min_m, scan.angle_min_rad, scan.angle_increment_rad)
+    if not all(map(math.isfinite, geometry)):
+        raise ValueError(f"invalid minimum range and angles {geometry} of the range sensor: not finite")
     reach_m = max(_blind(guard, scan), default=0.0)
     if reach_m >= guard.stop_m:
         raise BlindZoneError(
-            f"guard.stop_m = {guard.stop_m:g}: the range sensor sees nothing nearer than {scan.range_min_m:.3g} m, "
-            f"which reaches {reach_m:.3f} m beyond the robot's outline; set guard.stop_m above that "
+            f"guard.stop_m = {guard.stop_m:g}: the range sensor is blind below {scan.range_min_m:.3g} m, which reaches "
+            f"{reach_m:.3f} m beyond the outline of the robot; set guard.stop_m above {reach_m:.3f} "
             "(docs/reference/robots-and-scenarios.md)"
         )
 
 
 def _blind(guard: GuardConfig, scan: Ranges) -> Iterator[float]:
-    """Clearance of the furthest spots that each ray is blind for: both ends, for an outline that is convex."""
+    """Yield the clearance at both ends of the blind part of each ray. The outline is convex, so the ends suffice."""
     for index in range(len(scan.ranges_m)):
         angle_rad = scan.angle_min_rad + index * scan.angle_increment_rad
         for range_m in (0.0, scan.range_min_m):

@@ -1,39 +1,45 @@
-"""Who drives: one (role, session) at a time, by rank, for as long as its commands are accepted. Pure."""
+"""Grant the lease to one (role, session) at a time, by rank, while its commands are accepted. Pure."""
 
 from dataclasses import dataclass
 
 from sightline.protocol.messages import Holder
 
 RANKS = {"guest": 0, "vision": 1, "teleop": 2}
-"""Roles that may drive; STOP stands above all and is no driver."""
+"""Roles that may drive. STOP ranks above all of them and is not a role."""
 HUMANS = frozenset({"teleop"})
 
 
 @dataclass(slots=True)
 class Lease:
-    """Held until `expires_us`; renewed only by accepted commands."""
+    """The right to drive, valid until `expires_us`. Only accepted commands renew it.
+
+    Args:
+        life_us: time for which one command holds the lease.
+    """
 
     life_us: int
     holder: Holder | None = None
     expires_us: int = 0
 
     def live_holder(self, now_us: int) -> Holder | None:
-        """Who drives now."""
+        """Return the driver that holds the lease now."""
         return self.holder if now_us < self.expires_us else None
 
     def may_take(self, who: Holder, now_us: int) -> bool:
-        """Whether `who` holds it, or outranks the holder, or there is no holder."""
+        """Return True if `who` holds the lease or outranks the holder, or if the lease is free."""
         holder = self.live_holder(now_us)
+        # Equal ranks never succeed each other: two vision services would alternate at every command.
         return holder is None or holder == who or RANKS[who.source] > RANKS[holder.source]
 
     def take(self, who: Holder, now_us: int) -> None:
-        """Hold or renew."""
+        """Take or renew the lease for `life_us`."""
         self.holder, self.expires_us = who, now_us + self.life_us
 
     def drop(self) -> None:
-        """End it."""
+        """End the lease now."""
         self.holder, self.expires_us = None, 0
 
     def lost_human(self, now_us: int) -> bool:
-        """Whether a human held it and let it run out."""
+        """Return True if a human held the lease and it expired."""
+        # An expired holder stays stored for this question. `drop` ends it after the loss is handled.
         return self.holder is not None and self.holder.source in HUMANS and now_us >= self.expires_us

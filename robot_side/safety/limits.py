@@ -1,4 +1,4 @@
-"""Numbers the gate keeps, the ramp that keeps them, and the stopping bound they imply. Pure."""
+"""The limits of the gate, the ramp that applies them, and the stopping bound that follows from them. Pure."""
 
 import math
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from sightline.robot_side.safety.battery import BatteryLimits
 TICK_US = 20_000
 """The driver's period: 50 Hz."""
 MIN_TICK_US = 2_000
-"""It also ticks when commands arrive, but no more often: a flood of them must not become a flood of motor writes."""
+"""Shortest period. The driver also ticks when a command arrives; a flood of commands must not flood the motors."""
 STOP_TIME_BOUND_US = 700_000
 STOP_DISTANCE_BOUND_M = 0.25
 
 _AT_REST = 0.02
-"""Of top speed."""
+"""Share of the top speed below which the robot counts as at rest."""
 _SLICE_US = 20_000
 _LONGEST_STEP_US = 1_000_000
 
@@ -25,7 +25,7 @@ Millis = Annotated[int, Field(ge=20, le=5_000)]
 
 
 class SafetyConfig(BatteryLimits):
-    """Limits and times of the gate. Rejected where the stop they imply breaks 700 ms or 0.25 m."""
+    """Limits and times of the gate. Values that imply a stop above 700 ms or 0.25 m are rejected."""
 
     max_linear_mps: float = Field(default=0.5, gt=0, le=3.0, description="forward speed, at most")
     max_angular_rad_s: float = Field(default=2.5, gt=0, le=10.0, description="turn rate, at most")
@@ -64,24 +64,32 @@ class SafetyConfig(BatteryLimits):
                 f"with these limits the robot stops {bound.zero_us // 1000} ms and {bound.distance_m:.3f} m after its "
                 f"last command; allowed are {STOP_TIME_BOUND_US // 1000} ms and {STOP_DISTANCE_BOUND_M} m. Lower "
                 "max_linear_mps, max_angular_rad_s, full_speed_age_ms or silence_ms, or raise accelerations and jerks "
-                "if the robot can brake so"
+                "if the robot brakes faster"
             )
         return self
 
     @property
     def max_age_us(self) -> int:
-        """The oldest frame that a command may answer."""
+        """Return the age in us of the oldest frame that a command may cite."""
         return self.zero_speed_age_ms * 1000
 
 
 def age_factor(config: SafetyConfig, age_us: int) -> float:
-    """Share of the speed limit that a frame of `age_us` still allows: 1 when young, falling linearly to 0."""
+    """Return the share of the speed limit that a frame of this age permits.
+
+    Args:
+        config: `full_speed_age_ms` and `zero_speed_age_ms`.
+        age_us: frame age, us.
+
+    Returns:
+        1 up to the first age, then falling linearly to 0 at the second.
+    """
     full_us, zero_us = config.full_speed_age_ms * 1000, config.zero_speed_age_ms * 1000
     return min(1.0, max(0.0, (zero_us - age_us) / (zero_us - full_us)))
 
 
 def clamp_twist(twist: Twist, max_linear_mps: float, max_angular_rad_s: float) -> Twist:
-    """Scale both axes by one factor until both limits hold, so that the curve stays."""
+    """Scale both axes by one factor until both limits hold, so that the curve stays the same."""
     if max_linear_mps <= 0 or max_angular_rad_s <= 0:
         return STILL
     excess = max(1.0, abs(twist.linear_mps) / max_linear_mps, abs(twist.angular_rad_s) / max_angular_rad_s)
@@ -91,7 +99,7 @@ def clamp_twist(twist: Twist, max_linear_mps: float, max_angular_rad_s: float) -
 
 
 class AxisRamp:
-    """One speed brought to its goal within acceleration and jerk, without overshoot."""
+    """Moves one speed to its goal within limits of acceleration and jerk, without overshoot."""
 
     def __init__(self, max_acceleration: float, max_jerk: float) -> None:
         self._max_acceleration = max_acceleration
@@ -100,19 +108,30 @@ class AxisRamp:
         self._acceleration = 0.0
 
     def force(self, speed: float) -> None:
-        """Continue from `speed`: something stronger than the ramp has set it."""
+        """Continue from `speed`, after a stronger limit has set it."""
         self.speed, self._acceleration = speed, 0.0
 
     def step(self, goal: float, dt_s: float) -> float:
-        """Advance by `dt_s` (at most one slice) towards `goal`."""
+        """Advance toward `goal`.
+
+        Args:
+            goal: m/s or rad/s.
+            dt_s: elapsed time, at most one slice, s.
+
+        Returns:
+            The new speed.
+        """
         error = goal - self.speed
-        if self._acceleration * error < 0:  # letting go of the throttle is never held back by the jerk limit
+        # The jerk limit never delays the end of an acceleration away from the goal: braking starts at once.
+        if self._acceleration * error < 0:
             self._acceleration = 0.0
-        # The largest acceleration that can still be taken back to zero within jerk by the time the goal is reached.
+        # The largest acceleration that still returns to zero within the jerk limit when the goal is reached. A larger
+        # one would overshoot.
         wanted = math.copysign(min(self._max_acceleration, math.sqrt(2 * self._max_jerk * abs(error))), error)
         change = max(-self._max_jerk * dt_s, min(self._max_jerk * dt_s, wanted - self._acceleration))
         self._acceleration += change
         moved = self._acceleration * dt_s
+        # The last step lands exactly on the goal. Otherwise the speed would oscillate around it.
         reach = min(self._max_jerk * dt_s, self._max_acceleration) * dt_s
         if abs(error) <= max(abs(moved), reach):
             self.speed, self._acceleration = goal, 0.0
@@ -122,14 +141,24 @@ class AxisRamp:
 
 
 class Ramp:
-    """Both axes, per elapsed time: a late step is cut in slices, so it moves as far as punctual ones would have."""
+    """Ramps both axes per elapsed time."""
 
     def __init__(self, config: SafetyConfig) -> None:
         self._linear = AxisRamp(config.max_acceleration_mps2, config.max_jerk_mps3)
         self._angular = AxisRamp(config.max_acceleration_rad_s2, config.max_jerk_rad_s3)
 
     def step(self, goal: Twist, elapsed_us: int) -> Twist:
-        """The twist to apply after `elapsed_us` on the way to `goal`."""
+        """Advance both axes.
+
+        Args:
+            goal: m/s and rad/s.
+            elapsed_us: time since the last step, us.
+
+        Returns:
+            The twist to apply now.
+        """
+        # A late step is cut into slices, so that it changes the speed exactly as steps in time would. The bound keeps
+        # the time of one call bounded after a long pause.
         left_us = min(elapsed_us, _LONGEST_STEP_US)
         while left_us > 0:
             slice_us = min(left_us, _SLICE_US)
@@ -139,7 +168,7 @@ class Ramp:
         return Twist(linear_mps=self._linear.speed, angular_rad_s=self._angular.speed)
 
     def force(self, twist: Twist) -> None:
-        """Continue from `twist`."""
+        """Continue from `twist`, after a stronger limit has set it."""
         self._linear.force(twist.linear_mps)
         self._angular.force(twist.angular_rad_s)
 
@@ -169,10 +198,10 @@ def stop_bound(config: SafetyConfig) -> StopBound:
 
 
 def _stop(config: SafetyConfig, step_us: int) -> StopBound:
-    """The stop with a ramp that is stepped every `step_us`.
+    """Simulate the stop with a ramp that is stepped every `step_us`.
 
-    One tick is added for the phase of the driver's loop, and the motors follow with their lag. `zero_us` is when the
-    ramp is at zero and the robot, by that lag, below 2 % of top speed both ahead and in turning.
+    The result contains one tick for the phase of the driver's loop and the lag of the motors. `zero_us` is the time at
+    which the ramp is at zero and the robot is below 2 % of its top speed and its top turn rate.
     """
     ramp, top = Ramp(config), Twist(linear_mps=config.max_linear_mps, angular_rad_s=config.max_angular_rad_s)
     ramp.force(top)
@@ -184,12 +213,14 @@ def _stop(config: SafetyConfig, step_us: int) -> StopBound:
         twist != STILL or wheels_mps > _AT_REST * top.linear_mps or turning_rad_s > _AT_REST * top.angular_rad_s
     ):
         now_us += step_us
+        # The worst case is a command on a frame captured at its arrival: both age and silence count from then.
         factor = age_factor(config, now_us) if now_us <= config.silence_ms * 1000 else 0.0
         twist = ramp.step(clamp_twist(top, factor * top.linear_mps, factor * top.angular_rad_s), step_us)
         falls_us = falls_us or (now_us if twist.linear_mps < top.linear_mps else 0)
         ramped_us = ramped_us or (now_us if twist == STILL else 0)
         before_mps, wheels_mps = wheels_mps, twist.linear_mps + (wheels_mps - twist.linear_mps) * lags_on
         turning_rad_s = twist.angular_rad_s + (turning_rad_s - twist.angular_rad_s) * lags_on
+        # Exact integral of a first-order lag over one step with constant input.
         distance_m += twist.linear_mps * step_us / 1e6 + (before_mps - wheels_mps) * lag_s
     distance_m += top.linear_mps * TICK_US / 1e6
     return StopBound(falls_us + TICK_US, (ramped_us or now_us) + TICK_US, now_us + TICK_US, distance_m)

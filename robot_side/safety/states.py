@@ -1,4 +1,4 @@
-"""States of the gate and the table of their transitions. Pure.
+"""Define the states of the gate and their transitions. Pure.
 
     state      wheels                         left by
     DISARMED   zero; commands are validated   arm
@@ -16,7 +16,7 @@ from sightline.protocol.messages import State
 
 
 class Event(Enum):
-    """What moves the gate from state to state."""
+    """The events that change the state of the gate."""
 
     ARM = "arm"
     DISARM = "disarm"
@@ -30,6 +30,7 @@ class Event(Enum):
     HUMAN_LOST = "the human holder is lost"
 
 
+# HOLD counts as armed: a fresh command continues without a new request from the operator.
 _ARMED = (State.HOLD, State.ACTIVE, State.DEGRADED)
 _ANY = tuple(State)
 
@@ -50,24 +51,29 @@ TRANSITIONS: dict[tuple[State, Event], State] = {
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Something that limits the speed: the share of the limit that it leaves, and why."""
+    """A cause that limits the speed.
+
+    Args:
+        factor: share of the speed limit that remains, 0 to 1.
+        reason: one line for the operator.
+    """
 
     factor: float
     reason: str
 
     @property
     def event(self) -> Event:
-        """What it does to the state."""
+        """Return the event that this cause triggers."""
         if self.factor == 0.0:
             return Event.MUST_HOLD
         return Event.SLOWED if self.factor < 1.0 else Event.FREE
 
 
 def next_state(state: State, event: Event) -> State:
-    """The state that `event` leads to; pairs outside the table change nothing."""
+    """Return the state after `event`. Pairs outside the table change nothing."""
     return TRANSITIONS.get((state, event), state)
 
 
 def is_armed(state: State) -> bool:
-    """Whether the wheels may turn in `state`."""
+    """Return True if the wheels may turn in `state`."""
     return state in _ARMED

@@ -1,6 +1,6 @@
-"""Validates what a command cites against the robot's own record of issued frames. Pure.
+"""Validate the frame that a command cites against the robot's own record. Pure.
 
-Nothing here trusts a sender: a frame is known because this robot issued it, and its age is by the robot's clock.
+No rule trusts the sender. A frame is known because this robot issued it. Its age comes from the robot's own clock.
 """
 
 from collections import OrderedDict
@@ -9,13 +9,15 @@ from dataclasses import dataclass
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import AnswerHeader, Echo, State, Twist
 
-_KEPT_PER_CHANNEL = 256  # 8 s of 30 fps frames; anything older is STALE long before
+# 8 s of frames at 30 fps. An older frame is STALE long before it leaves the record.
+_KEPT_PER_CHANNEL = 256
+# A peer can invent any number of sessions, so the memory for them is bounded.
 _KEPT_SENDERS = 64
 
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
-    """The result of a command. `reason` is None when it was accepted."""
+    """The result of a command. `reason` is None for an accepted command. `age_us` is the age of the cited frame."""
 
     reason: RejectReason | None
     detail: str = ""
@@ -23,13 +25,20 @@ class CommandResult:
 
     @property
     def accepted(self) -> bool:
-        """Whether it may move the wheels."""
+        """Return True if the command may move the wheels."""
         return self.reason is None
 
 
 @dataclass(frozen=True, slots=True)
 class AcceptedCommand:
-    """An accepted command. `echo_us` is when the frame behind it was captured (arrival for a guest)."""
+    """An accepted command.
+
+    Args:
+        twist: limited twist, m/s and rad/s.
+        echo_us: capture time of the cited frame; for a guest the arrival time.
+        arrival_us: arrival time.
+        life_us: time after arrival for which the command is valid.
+    """
 
     twist: Twist
     echo_us: int
@@ -39,7 +48,7 @@ class AcceptedCommand:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What the wheels do now, and why."""
+    """The twist for the wheels now, with the state and the reason."""
 
     twist: Twist
     state: State
@@ -47,7 +56,7 @@ class Decision:
 
 
 class IssuedRecord:
-    """(channel, seq) -> capture time of what this robot session has issued, bounded per channel."""
+    """Stores the time of each message of this robot session by channel and sequence number, bounded per channel."""
 
     def __init__(self, session: str) -> None:
         self.session = session
@@ -55,39 +64,70 @@ class IssuedRecord:
         self._denied_seq = -1
 
     def add(self, channel: str, seq: int, t_us: int) -> None:
-        """Remember it; the caller calls this before it publishes."""
+        """Store a message. Call this before publishing it, so that no answer can arrive earlier.
+
+        Args:
+            channel: name of the channel, e.g. "frame".
+            seq: its sequence number.
+            t_us: capture time of a frame, otherwise the time of publication.
+        """
         times = self._times.setdefault(channel, OrderedDict())
         times[seq] = t_us
         if len(times) > _KEPT_PER_CHANNEL:
             times.popitem(last=False)
 
     def last_seq(self, channel: str) -> int:
-        """The newest seq issued on `channel`, -1 before the first."""
+        """Return the newest sequence number issued on `channel`, or -1 before the first."""
         return next(reversed(self._times.get(channel, OrderedDict({-1: 0}))))
 
     def deny_earlier(self) -> None:
-        """From now on no request may cite a status issued before: what it was for has just ended."""
+        """Reject requests that cite a status issued before this call."""
+        # Such a request answers a situation that has just ended. After a STOP it would arm the robot again.
         self._denied_seq = self.last_seq("status")
 
     def check_request(self, echo: Echo | None, now_us: int, max_age_us: int) -> None:
-        """Raise WireError unless `echo` names a status young enough, and issued since requests were last denied."""
+        """Check the status that a request cites.
+
+        Args:
+            echo: the cited status, or None.
+            now_us: time on the robot's clock.
+            max_age_us: largest age of the status.
+
+        Raises:
+            WireError: MALFORMED without a status, STALE before the last STOP or disarm, or any reason of `age_us`.
+        """
         if echo is None or echo.channel != "status":
-            raise WireError(RejectReason.MALFORMED, "what lets a robot move again must cite a status")
+            raise WireError(RejectReason.MALFORMED, "a request that permits motion must cite a status")
         self.age_us(echo, now_us, max_age_us)
         if echo.seq <= self._denied_seq:
-            raise WireError(RejectReason.STALE, "cites a status from before the last STOP or disarm; ask again")
+            raise WireError(
+                RejectReason.STALE, "cites a status from before the last STOP or disarm; repeat the request"
+            )
 
     def age_us(self, echo: Echo, now_us: int, max_age_us: int) -> int:
-        """Age of what `echo` names. Raises WireError OTHER_SESSION, UNKNOWN_FRAME, FROM_FUTURE or STALE."""
+        """Compute the age of a cited message from this robot's own record.
+
+        Args:
+            echo: channel, session, sequence number and time as the sender cites them.
+            now_us: time on the robot's clock.
+            max_age_us: largest permitted age.
+
+        Returns:
+            The age in us.
+
+        Raises:
+            WireError: OTHER_SESSION, UNKNOWN_FRAME, FROM_FUTURE or STALE.
+        """
         if echo.session != self.session:
             raise WireError(RejectReason.OTHER_SESSION, f"cites robot session {echo.session}, this is {self.session}")
         times = self._times.get(echo.channel, OrderedDict())
+        # The time must match too: a peer that guesses a sequence number must not choose the age.
         if times.get(echo.seq) != echo.t_us:
-            raise WireError(RejectReason.UNKNOWN_FRAME, f"cites {echo.channel} {echo.seq}, which was not issued so")
+            raise WireError(RejectReason.UNKNOWN_FRAME, f"cites {echo.channel} {echo.seq}, unknown to this robot")
         age_us = now_us - echo.t_us
         if age_us < 0:
             raise WireError(
-                RejectReason.FROM_FUTURE, f"cites {echo.channel} {echo.seq} of {-age_us / 1e3:.0f} ms from now"
+                RejectReason.FROM_FUTURE, f"cites {echo.channel} {echo.seq}, {-age_us / 1e3:.0f} ms in the future"
             )
         if age_us > max_age_us:
             raise WireError(
@@ -98,35 +138,45 @@ class IssuedRecord:
 
 
 class FreshnessRecord:
-    """Since when the camera's picture has been the same, byte for byte. A live sensor's noise never repeats."""
+    """Stores the time since which the camera image has been the same, byte for byte."""
 
     def __init__(self) -> None:
         self._fingerprint: int | None = None
         self._newest_us = self._changed_us = 0
 
     def add(self, t_us: int, fingerprint: int) -> None:
-        """A frame captured at `t_us` was issued; `fingerprint` 0 is never compared (a source that is not live)."""
+        """Record an issued frame.
+
+        Args:
+            t_us: capture time.
+            fingerprint: checksum of the image; 0 for a source that is not live and may repeat an image.
+        """
+        # The noise of a live sensor never repeats, so an equal image means a frozen camera.
         if fingerprint == 0 or fingerprint != self._fingerprint:
             self._changed_us = t_us
         self._fingerprint, self._newest_us = fingerprint, t_us
 
     def unchanged_us(self) -> int:
-        """For how long the picture has not changed."""
+        """Return the time in us for which the image has not changed."""
         return self._newest_us - self._changed_us
 
     def shown_since_us(self, t_us: int) -> int:
-        """Since when that has been seen which a frame captured at `t_us` shows: a repeated picture is old sight."""
+        """Return the time at which the image of the frame captured at `t_us` first appeared."""
         return t_us if self._fingerprint is None else min(t_us, self._changed_us)
 
 
 class SequenceRecord:
-    """The newest seq per (source, session); the longest silent sender is forgotten first."""
+    """Stores the newest sequence number of each (source, session), for a bounded number of senders."""
 
     def __init__(self) -> None:
         self._last: OrderedDict[tuple[str, str], int] = OrderedDict()
 
     def check(self, header: AnswerHeader) -> None:
-        """Raise WireError OUT_OF_ORDER unless `header.seq` is newer than all of its source and session; keep it."""
+        """Store the sequence number of a command.
+
+        Raises:
+            WireError: OUT_OF_ORDER if it is not newer than all others of this source and session.
+        """
         sender = (header.source, header.session)
         last = self._last.get(sender, -1)
         if header.seq <= last:

@@ -51,7 +51,7 @@ class FolderCamera:
 
 
 def jpegs_in(folder: Path) -> list[Path]:
-    """The .jpg and .jpeg files of `folder` in name order. Raises HardwareError if there is none."""
+    """Return the .jpg and .jpeg files of `folder` in name order. Raises HardwareError for an empty result."""
     paths = sorted(path for path in folder.expanduser().glob("*") if path.suffix.lower() in (".jpg", ".jpeg"))
     if not paths:
         raise HardwareError(f"no .jpg pictures in {folder}; name a folder that has some")
@@ -59,7 +59,7 @@ def jpegs_in(folder: Path) -> list[Path]:
 
 
 def jpeg_size(path: Path, jpeg: bytes) -> JpegSize:
-    """The size of `jpeg`, read from `path`. Raises HardwareError if it is no plain JPEG."""
+    """Return the size of `jpeg`, read from `path`. Raises HardwareError if it is not a plain JPEG."""
     try:
         return read_jpeg_size(jpeg)
     except WireError as error:
@@ -77,7 +77,7 @@ class StillCameraConfig(LensConfig):
 
 
 class StillCamera:
-    """Not live: its picture never changes, and that is no fault."""
+    """Repeat one image. The camera is not live, so an unchanged image is not a fault."""
 
     Config = StillCameraConfig
     live = False
@@ -111,7 +111,7 @@ _COUNT_SLACK = 0.05  # a container may only estimate how many pictures it holds
 
 
 class VideoCameraConfig(LensConfig):
-    """`fps` 0 is the video's own; without `loop` the end is an error that says so."""
+    """Settings of a video camera. `fps` 0 selects the rate of the video. Without `loop` the end raises an error."""
 
     path: Path
     loop: bool = True
@@ -155,7 +155,7 @@ class VideoCamera:
         return Picture(jpeg, t_us, scale)
 
     def adjust(self, quality_percent: int, scale_percent: int) -> bool:
-        """As `Adjustable` says."""
+        """Encode at these shares of the configured quality and size, see `Adjustable`."""
         self._quality = scaled_quality(self._config.quality, quality_percent)
         self._scale_percent = scale_percent
         return True
@@ -173,8 +173,8 @@ class VideoCamera:
         self._capture: Any = self._cv2.VideoCapture(str(path), self._cv2.CAP_FFMPEG)
         self._at = 0
         if not self._capture.isOpened() or min(self._size().width_px, self._size().height_px) < 1:
-            raise HardwareError(f"video {self._config.path} cannot be played: it is broken or no video; play it with "
-                                "another program, or record it anew")
+            raise HardwareError(f"video {self._config.path} cannot be played: damaged or not a video; try "
+                                "another player, or record it again")
 
     def _size(self) -> JpegSize:
         get, cv2 = self._capture.get, self._cv2
@@ -185,7 +185,7 @@ class VideoCamera:
         return fps if 0 < fps <= 240 else _USUAL_FPS
 
     def _due(self) -> int:
-        """How many pictures the video has moved on since the last one shown; at least one."""
+        """Return the number of images that the video advanced since the last one shown, at least one."""
         now_s = time.monotonic()
         ahead = math.floor((now_s - self._started_s) * self._fps + 0.5) - self._shown
         if ahead > _CATCH_UP_S * self._fps or ahead < 1:
@@ -216,8 +216,8 @@ class VideoCamera:
 
     def _broken(self) -> HardwareError:
         count = int(self._capture.get(self._cv2.CAP_PROP_FRAME_COUNT))
-        return HardwareError(f"video {self._config.path} breaks off at picture {self._at} of {count}; repair or "
-                             "record it anew")
+        return HardwareError(f"video {self._config.path} breaks off at image {self._at} of {count}; repair or "
+                             "record it again")
 
 
 def _packages() -> tuple[Any, Any]:

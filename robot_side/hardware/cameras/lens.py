@@ -20,7 +20,7 @@ from sightline.protocol.messages import CameraModel
 class LensConfig(Config):
     """`model_file` (TOML) or `model` (the same fields as a table); without them the lens is guessed from `hfov_deg`.
 
-    `hfov_deg` is the horizontal field of view; a model guessed from it says that it is not calibrated.
+    `hfov_deg` is the horizontal field of view. A model guessed from it is marked as not calibrated.
     """
 
     hfov_deg: Annotated[float, Field(gt=5, lt=175)] = 60.0
@@ -65,7 +65,7 @@ def read_model(path: Path) -> CameraModel:
             f"{path}: cannot be read: {error.strerror}; `sightline calibrate camera` writes one"
         ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is no TOML: {error}") from None
+        raise ConfigError(f"{path}: invalid TOML: {error}") from None
     return _checked(table, str(path))
 
 
@@ -74,7 +74,7 @@ def _checked(table: dict[str, Any], where: str) -> CameraModel:
     unknown = sorted(set(table) - set(CameraModel.model_fields))
     if unknown:
         known = ", ".join(CameraModel.model_fields)
-        raise ConfigError(f"{where}: {unknown[0]!r} is no field of a camera model; known: {known}")
+        raise ConfigError(f"{where}: unknown field {unknown[0]!r} of a camera model; known: {known}")
     try:
         return CameraModel.model_validate_json(json.dumps(table, default=str))
     except ValidationError as error:

@@ -84,7 +84,7 @@ class PiCamera:
         return picture
 
     def missed_captures(self) -> int:
-        """Pictures that nobody took before the next one came."""
+        """Return the number of images that the next image replaced before a reader took them."""
         return self._newest.dropped
 
     def close(self) -> None:
@@ -115,7 +115,7 @@ def _opened(config: PiCameraConfig) -> Any:
 
 
 def _output(camera: PiCamera) -> Any:
-    """What the encoder writes to; the class exists only where picamera2 does."""
+    """Return the output of the encoder. Its base class exists only where picamera2 is installed."""
     from picamera2.outputs import Output
 
     class ToCamera(Output):  # type: ignore[misc]

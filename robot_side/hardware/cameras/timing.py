@@ -27,7 +27,7 @@ class CaptureClock:
     """Which clock a device stamps with. One for each opening of a device: another may be plugged in."""
 
     def __init__(self, delay_us: int) -> None:
-        """`delay_us`: how old a picture is taken to be whose stamp tells nothing."""
+        """Take `delay_us`, the assumed age of an image without a usable stamp."""
         self._delay_us = delay_us
         self._known: int | None = None
 
@@ -48,7 +48,7 @@ class CaptureClock:
 
 
 class FrameTimer:
-    """Ticks `fps` times a second. Ticks that nobody waited for are not made up for, and who is late shifts none."""
+    """Tick `fps` times a second. Missed ticks are not repeated, and a late caller does not shift the next tick."""
 
     def __init__(self, fps: float) -> None:
         self._interval_s = 1 / fps
@@ -76,8 +76,8 @@ def read_clocks() -> Clocks:
 
 
 _JUST_NOW_S = 0.008
-"""A picture that arrived this long ago may still be handed over. Longer, and it is better to wait for the next: a
-stored picture is old sight. Shorter, and a reader late by a hair would get every second picture only."""
+"""Maximum age of a stored image that `read` still returns. A longer time returns old images instead of the next one.
+With a shorter time, a reader that is slightly late gets only every second image."""
 
 
 class LatestPicture:
@@ -88,7 +88,7 @@ class LatestPicture:
 
     @property
     def dropped(self) -> int:
-        """Pictures replaced before anybody took them."""
+        """Return the number of images that were replaced before a reader took them."""
         return self._slot.dropped
 
     def put(self, picture: Picture) -> None:

@@ -24,14 +24,14 @@ from sightline.robot_side.ports import Picture, scaled_quality, scaled_size
 
 
 def check_device(path: Path) -> None:
-    """Raise HardwareError if `path` is absent, no device, or not permitted; opening it would only say "failed"."""
+    """Raise HardwareError if `path` is absent, not a device, or not permitted. OpenCV reports only "failed"."""
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     except OSError as error:
         raise _trouble(path, error) from None
     try:
         if not stat.S_ISCHR(os.fstat(descriptor).st_mode):
-            raise HardwareError(f"{path} is no camera device{_others(path)}; set camera.options.device")
+            raise HardwareError(f"{path} is not a camera device{_others(path)}; set camera.options.device")
     finally:
         os.close(descriptor)
 
@@ -42,7 +42,7 @@ def open_error(path: Path) -> HardwareError:
     if owner:
         return HardwareError(f"camera {path} is busy: {owner} has it open; end that program")
     return HardwareError(
-        f"camera {path} does not open: it is busy, or no source of pictures as many cameras' second node is none"
+        f"camera {path} does not open: busy, or the second node of a camera, which delivers no images"
         f"{_others(path)}; set camera.options.device"
     )
 
@@ -58,7 +58,7 @@ def _trouble(path: Path, error: OSError) -> HardwareError:
     if error.errno in (errno.EACCES, errno.EPERM):
         return HardwareError(
             f"camera {path} may not be opened by this user, only by its group {_group(path)!r}: "
-            f"sudo usermod -aG {_group(path)} $USER, then log in anew"
+            f"sudo usermod -aG {_group(path)} $USER, then log in again"
         )
     if error.errno == errno.EBUSY:
         return open_error(path)
@@ -66,13 +66,13 @@ def _trouble(path: Path, error: OSError) -> HardwareError:
 
 
 def _others(path: Path) -> str:
-    """What could have been meant."""
+    """List the other video devices, for the error text."""
     there = [str(other) for other in sorted(Path("/dev").glob("video*")) if other != path]
     return f" (there are: {', '.join(there)})" if there else " (no /dev/video* is there)"
 
 
 def _group(path: Path) -> str:
-    """`video`, unless the device says otherwise."""
+    """Return the group of the device, or `video` if it has no name."""
     try:
         group = grp.getgrgid(path.stat().st_gid).gr_name
     except (OSError, KeyError):
@@ -102,7 +102,7 @@ class V4l2CameraConfig(LensConfig):
     delay_ms: Annotated[float, Field(ge=0, le=1000)] = 30.0
     """Age of a picture when it is read, for drivers that write no usable time on it."""
     frozen_after_s: Annotated[float, Field(ge=0.2, le=60)] = 2.0
-    """Without a picture for this long the camera is said to be frozen."""
+    """Time without an image after which the camera counts as frozen."""
 
 
 Capture = Any
@@ -112,11 +112,11 @@ Capture = Any
 def open_capture(path: Path) -> Capture:
     """A `cv2.VideoCapture` of a V4L2 device.
 
-    Raises HardwareError that says why not; ConfigError without OpenCV.
+    Raises HardwareError with the cause, and ConfigError without OpenCV.
     """
     check_device(path)
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(_SELECT_TIMEOUT_S))
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # its warnings say less than the errors here
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # the errors here replace its warnings
     cv2 = _opencv()
     capture = cv2.VideoCapture(str(path), cv2.CAP_V4L2)
     if not capture.isOpened():
@@ -133,7 +133,7 @@ def _opencv() -> Any:
 
 
 class V4l2Device:
-    """One opening of a device; raises HardwareError when it does not give what was asked for, or is gone."""
+    """One opening of a device. Raises HardwareError if it rejects the requested format, or is gone."""
 
     def __init__(self, config: V4l2CameraConfig, opening: Callable[[Path], Capture]) -> None:
         self._config = config
@@ -236,7 +236,7 @@ def _fourcc_text(code: int) -> str:
 
 
 # A USB or built-in camera through V4L2: its own JPEGs and times, its own thread, unplugged and plugged in. Shell.  The
-# thread takes every capture from the driver, so that nothing old waits there, but copies it only while somebody asks.
+# thread takes every capture from the driver, so that no old image waits there. It copies one only for a waiting reader.
 
 
 _RETRY_S = 0.5
@@ -293,12 +293,12 @@ class V4l2Camera:
         return picture
 
     def adjust(self, quality_percent: int, scale_percent: int) -> bool:
-        """As `Adjustable` says: with YUYV, which is encoded here; MJPG is the camera's own and stays as it is."""
+        """Adjust the encoding of YUYV images, see `Adjustable`. MJPG stays as the camera encodes it."""
         self._wish = (quality_percent, scale_percent)
         return self._config.format == "YUYV"
 
     def missed_captures(self) -> int:
-        """Pictures that nobody took before the next one came."""
+        """Return the number of images that the next image replaced before a reader took them."""
         return self._newest.dropped
 
     def close(self) -> None:

@@ -238,7 +238,7 @@ def test_leaving_is_zero_and_then_the_lease_is_given_back():
     rig.run(0.05)
     assert rig.commands[-1][1] == STILL and rig.asked[-1] is Verb.RELEASE
     assert rig.teleop.has_left and rig.holder is None and rig.state is State.DISARMED
-    assert rig.driving.gate.reason == "the person driving let go; arm again"
+    assert rig.driving.gate.reason == "the operator released control; arm again"
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -163,7 +163,7 @@ def test_a_person_killed_at_the_keyboard_stops_the_robot(seat):
     assert until(lambda: seat.robot.speed() == 0, 2)
     assert time.monotonic() - since_s <= 0.8
     seat.fingers.lift()
-    assert until(lambda: "the person driving was lost" in seat.robot.output(), 3)
+    assert until(lambda: "the operator who drove was lost" in seat.robot.output(), 3)
 
 
 def test_vision_and_a_person_hand_over_to_one_another(seat):

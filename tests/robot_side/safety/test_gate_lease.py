@@ -41,7 +41,7 @@ def test_acquire_takes_the_lease_ahead_of_the_first_command():
         error = refused(rig, Verb.ACQUIRE, source=source, session=session)
         assert (error.reason, error.detail) == (RejectReason.NOT_HOLDER, "teleop drives")
     error = refused(Rig(), Verb.ACQUIRE, source="operator")
-    assert (error.reason, error.detail) == (RejectReason.NOT_HOLDER, "nobody drives")
+    assert (error.reason, error.detail) == (RejectReason.NOT_HOLDER, "operator may not drive")
 
 
 def test_acquiring_again_renews_nothing():
@@ -73,7 +73,7 @@ def test_what_was_asked_before_a_stop_or_disarm_does_not_undo_it(verb, denial):
         try:
             rig.gate.request(header, Request(id=1, verb=verb), rig.now_us)
         except WireError as error:
-            assert reason is None or error.detail == "cites a status from before the last STOP or disarm; ask again"
+            assert reason is None or error.detail == "cites a status from before the last STOP or disarm; repeat the request"
             assert reason is None or error.reason is reason
         else:
             assert reason is None
@@ -92,7 +92,7 @@ def test_a_human_who_acquires_and_then_is_silent_was_lost():
     rig.request(Verb.ACQUIRE, source="teleop", session=HUMAN)
     rig.silence(980)
     assert rig.gate.state is H
-    assert rig.step(20) == Decision(STILL, D, "the person driving was lost; arm again")
+    assert rig.step(20) == Decision(STILL, D, "the operator who drove was lost; arm again")
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_human_lost_between_two_ticks_is_not_succeeded(silent_us, reason):
     rig.offer(source="teleop", session=HUMAN)
     rig.now_us += 1_000_000
     rig.request(Verb.ACQUIRE, source="vision", session=VISION)
-    assert (rig.gate.state, rig.gate.reason) == (D, "the person driving was lost; arm again")
+    assert (rig.gate.state, rig.gate.reason) == (D, "the operator who drove was lost; arm again")
 
 
 def test_the_commands_of_one_driver_do_not_arm_for_another_who_acquires():
@@ -136,7 +136,7 @@ def test_release_gives_the_lease_back():
 def test_a_human_who_lets_go_disarms():
     rig = driving(A).drive(60, source="teleop", session=HUMAN)
     assert rig.request(Verb.RELEASE, source="teleop", session=HUMAN, echo=False) == "released"
-    assert (rig.gate.state, rig.gate.reason) == (D, "the person driving let go; arm again")
+    assert (rig.gate.state, rig.gate.reason) == (D, "the operator released control; arm again")
     assert rig.gate.holder(rig.now_us) is None
 
 
@@ -147,7 +147,7 @@ def test_a_human_is_lost_when_the_lease_runs_out(silent_us, lost):
     rig.now_us += silent_us
     decision = rig.gate.step(rig.now_us)
     assert (decision.state is D) == lost
-    assert (decision.reason == "the person driving was lost; arm again") == lost
+    assert (decision.reason == "the operator who drove was lost; arm again") == lost
     vision = driving(A)
     vision.offer()
     vision.now_us += silent_us

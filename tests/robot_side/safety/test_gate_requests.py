@@ -19,7 +19,7 @@ def test_stop_disarm_and_release_need_no_echo(verb):
     else:
         error = refused(rig, verb, echo=False)
         assert (
-            error.reason is RejectReason.MALFORMED and error.detail == "what lets a robot move again must cite a status"
+            error.reason is RejectReason.MALFORMED and error.detail == "a request that permits motion must cite a status"
         )
 
 
@@ -109,9 +109,9 @@ def test_arm_and_reset_are_not_for_others_beside_a_human(verb):
 @pytest.mark.parametrize(
     ("commands", "missing"),
     [
-        (0, "nobody sends valid commands yet; is vision running?"),
-        (1, "1 of 5 live commands seen; ask again"),
-        (4, "4 of 5 live commands seen; ask again"),
+        (0, "no valid commands yet; start the vision service"),
+        (1, "1 of 5 live commands received; repeat the request"),
+        (4, "4 of 5 live commands received; repeat the request"),
         (5, None),
         (6, None),
     ],
@@ -162,7 +162,7 @@ def test_arming_waits_for_the_wheels():
         for _ in range(5):
             rig.offer()
         error = refused(rig, Verb.ARM)
-        assert (error.reason, error.detail) == (RejectReason.NOT_ALLOWED, "the wheels are not at zero yet; ask again")
+        assert (error.reason, error.detail) == (RejectReason.NOT_ALLOWED, "the wheels are not at zero yet; repeat the request")
         rig.step()
     for _ in range(5):
         rig.offer()

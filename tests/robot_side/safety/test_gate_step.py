@@ -29,9 +29,9 @@ from tests.fixtures.safety import (
     ("silent_us", "state", "reason"),
     [
         (150_000, A, "driving"),
-        (150_001, G, "the frames are ageing; slower"),
-        (299_999, G, "the frames are ageing; slower"),
-        (300_000, G, "the frames are ageing; slower"),
+        (150_001, G, "the frame is aging; slower"),
+        (299_999, G, "the frame is aging; slower"),
+        (300_000, G, "the frame is aging; slower"),
         (300_001, H, "no accepted command for more than 300 ms"),
     ],
 )
@@ -47,8 +47,8 @@ def test_silence_slows_and_then_holds(silent_us, state, reason):
     ("age_us", "state", "reason"),
     [
         (150_000, A, "driving"),
-        (150_001, G, "the frames are ageing; slower"),
-        (399_999, G, "the frames are ageing; slower"),
+        (150_001, G, "the frame is aging; slower"),
+        (399_999, G, "the frame is aging; slower"),
         (400_000, H, "the frame behind the command is 400 ms old"),
         (400_001, H, "the frame behind the command is 400 ms old"),
     ],
@@ -83,10 +83,10 @@ def test_a_frozen_picture_holds(unchanged_us, state):
     assert verdict.accepted == (unchanged_us <= 400_000)
     if not verdict.accepted:
         assert verdict.reason is RejectReason.STALE
-        assert verdict.detail == "the camera's picture has not changed for 400 ms"
+        assert verdict.detail == "the camera image has not changed for 400 ms"
     decision = rig.step(0)
     assert decision.state is state
-    assert (decision.reason == "the camera's picture does not change") == (unchanged_us > 400_000)
+    assert (decision.reason == "the camera image does not change") == (unchanged_us > 400_000)
 
 
 def test_without_a_command_an_armed_gate_holds():
@@ -241,7 +241,7 @@ def test_the_smaller_limit_wins_beside_a_low_battery(age_ms, factor):
         rig.offer(0.5, 0.0, age_ms=age_ms - 20 if age_ms else 0)
         rig.step()
     assert rig.gate.applied.linear_mps == pytest.approx(factor * 0.5)
-    assert rig.gate.reason == ("the battery is low; half speed" if factor == 0.5 else "the frames are ageing; slower")
+    assert rig.gate.reason == ("the battery is low; half speed" if factor == 0.5 else "the frame is aging; slower")
 
 
 def test_an_empty_battery_is_the_reason_also_without_a_command():

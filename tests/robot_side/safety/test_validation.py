@@ -55,7 +55,7 @@ def test_age_is_from_now_up_to_the_limit(age_us, reason):
 def test_the_refusal_of_an_age_says_the_milliseconds():
     record = issued((7, 1_000_000))
     assert refusal(record.age_us, echo(t_us=1_000_000), 999_000 - 1_000_000 + 1_000, 400).detail == (
-        "cites frame 7 of 1000 ms from now"
+        "cites frame 7, 1000 ms in the future"
     )
     assert refusal(record.age_us, echo(t_us=1_000_000), 1_500_000, 400_000).detail == (
         "frame 7 is 500 ms old, at most 400"
@@ -102,7 +102,7 @@ def test_a_request_cites_a_status(cited):
     with pytest.raises(WireError) as caught:
         record.check_request(cited, 0, 100)
     assert caught.value.reason is RejectReason.MALFORMED
-    assert caught.value.detail == "what lets a robot move again must cite a status"
+    assert caught.value.detail == "a request that permits motion must cite a status"
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_a_request_from_before_a_denial_is_stale(seq, denied):
         record.check_request(status(seq), 0, 100)
     except WireError as error:
         assert denied and error.reason is RejectReason.STALE
-        assert error.detail == "cites a status from before the last STOP or disarm; ask again"
+        assert error.detail == "cites a status from before the last STOP or disarm; repeat the request"
     else:
         assert not denied
 

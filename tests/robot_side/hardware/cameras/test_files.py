@@ -63,7 +63,7 @@ def test_a_video_that_breaks_off_is_said(tmp_path):
     path = video(tmp_path / "film.avi", pictures=20, size=(320, 240))
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     camera = VideoCamera(VideoCamera.Config(path=path, fps=120))
-    with pytest.raises(HardwareError, match=r"breaks off at picture \d+ of \d+"):
+    with pytest.raises(HardwareError, match=r"breaks off at image \d+ of \d+"):
         for _ in range(60):
             next_picture(camera)
 
@@ -140,7 +140,7 @@ def test_a_guessed_lens_is_as_wide_as_it_says_and_not_calibrated(width_px, heigh
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"fx": 3.0}, "'fx' is no field"),
+        ({"fx": 3.0}, "unknown field 'fx'"),
         ({"fx_px": "wide"}, "fx_px"),
         ({"fx_px": -1.0}, "fx_px"),
         ({"width_px": 640}, "640x240 pictures, the camera gives 320x240; calibrate at this size"),
@@ -152,7 +152,7 @@ def test_a_wrong_model_is_refused_by_name(changes, said):
         camera_model(LensConfig(model=MODEL | changes), SIZE)
 
 
-WRONG_FILES = [(None, "cannot be read"), ("= 3", "is no TOML"), ("fx_px = 3.0", "width_px")]
+WRONG_FILES = [(None, "cannot be read"), ("= 3", "invalid TOML"), ("fx_px = 3.0", "width_px")]
 
 
 @pytest.mark.parametrize(("text", "said"), WRONG_FILES)

@@ -269,7 +269,7 @@ def test_absent_device_lists_what_there_is(tmp_path):
 
 def test_a_plain_file_is_no_camera(tmp_path):
     (tmp_path / "video0").write_bytes(b"x")
-    with pytest.raises(HardwareError, match="is no camera device"):
+    with pytest.raises(HardwareError, match="is not a camera device"):
         check_device(tmp_path / "video0")
 
 
