@@ -18,9 +18,8 @@ def test_stop_disarm_and_release_need_no_echo(verb):
         assert rig.request(verb, echo=False)
     else:
         error = refused(rig, verb, echo=False)
-        assert (
-            error.reason is RejectReason.MALFORMED and error.detail == "a request that permits motion must cite a status"
-        )
+        assert error.reason is RejectReason.MALFORMED
+        assert error.detail == "a request that permits motion must cite a status"
 
 
 @pytest.mark.parametrize("verb", [Verb.ARM, Verb.RESET, Verb.ACQUIRE])
@@ -162,7 +161,8 @@ def test_arming_waits_for_the_wheels():
         for _ in range(5):
             rig.offer()
         error = refused(rig, Verb.ARM)
-        assert (error.reason, error.detail) == (RejectReason.NOT_ALLOWED, "the wheels are not at zero yet; repeat the request")
+        assert error.reason is RejectReason.NOT_ALLOWED
+        assert error.detail == "the wheels are not at zero yet; repeat the request"
         rig.step()
     for _ in range(5):
         rig.offer()
