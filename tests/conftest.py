@@ -8,9 +8,15 @@ import threading
 import pytest
 
 from sightline.protocol import log
+from tests.fixtures.cpu_times import CpuTimes
 
 # A shell that starts the tests in its background has Ctrl-C ignored, and every child would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_configure(config):
+    """Measure the CPU time of each test."""
+    config.pluginmanager.register(CpuTimes())
 
 
 def pytest_xdist_auto_num_workers(config):
