@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import shutil
 import sys
 import time
 from pathlib import Path
@@ -28,12 +27,12 @@ from sightline.conformance.codec import (
 from sightline.conformance.runner import Outcome
 from sightline.protocol.errors import ConfigError
 from tests.conformance.codec_broken import WRONG
+from tests.fixtures.javascript import node
 
 ROOT = Path(__file__).parent.parent.parent
 ADAPTER = [sys.executable, str(ROOT / "examples" / "codec_adapter.py")]
 BROKEN = [sys.executable, "-m", "tests.conformance.codec_broken"]
 FEW = [case for case in CASES if case.id.endswith("1") and case.id != END]
-NODE = shutil.which("node")
 
 
 @pytest.fixture(autouse=True)
@@ -53,9 +52,8 @@ def test_our_adapter_passes_every_case():
     assert {one.outcome for one in results} == {Outcome.PASSED}, failed(results)
 
 
-@pytest.mark.skipif(NODE is None, reason="Node is not installed")
 def test_the_javascript_codec_fails_no_case():
-    results = run_codec([NODE, "examples/js/codec_adapter.mjs"], CASES)
+    results = run_codec([node(), "examples/js/codec_adapter.mjs"], CASES)
     assert failed(results) == {}
     assert sum(one.outcome is Outcome.PASSED for one in results) > 200
 

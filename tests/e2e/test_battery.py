@@ -4,7 +4,9 @@ import time
 
 import pytest
 
-pytest.importorskip("pybullet")
+from tests.fixtures import demanded
+
+demanded.module("pybullet", "sim")
 
 from sightline.protocol.config import Config
 from sightline.protocol.messages import State

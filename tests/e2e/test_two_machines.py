@@ -18,7 +18,7 @@ from tests.fixtures.links import until
 
 pytestmark = [
     pytest.mark.alone,
-    pytest.mark.skipif(bool(why_impossible()), reason=f"two namespaces: {why_impossible()}"),
+    pytest.mark.skipif(bool(why_impossible()), reason=f"{why_impossible()}; run the tests as root with /dev/net/tun"),
 ]
 PAGE = (Path(__file__).parent.parent.parent / "docs" / "tutorials" / "two-machines.md").read_text()
 SERVICES = ("sim", "robot", "vision", "router")

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("pybullet")
+from tests.fixtures import demanded
+
+demanded.module("pybullet", "sim")
 
 from examples import older_range
 from sightline.evaluation.lockstep import Conditions, run_lockstep

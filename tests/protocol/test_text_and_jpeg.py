@@ -15,6 +15,7 @@ from sightline.protocol.jpeg import MAX_SEGMENTS, JpegSize, read_jpeg_size
 from sightline.protocol.messages import Twist
 from sightline.protocol.spec.message_cases import jpeg, segments
 from sightline.protocol.text import MAX_TWIST_BYTES, format_twist, parse_twist
+from tests.fixtures import demanded
 
 ABNF_NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
 GRAMMAR = re.compile(rf"{ABNF_NUMBER}\|{ABNF_NUMBER}", re.ASCII)
@@ -95,11 +96,11 @@ def _encoded(encoder: str, pixels: np.ndarray) -> bytes:
     if encoder == "simplejpeg":
         return simplejpeg.encode_jpeg(pixels, quality=80)
     if encoder == "pillow":
-        image = pytest.importorskip("PIL.Image").fromarray(pixels)
+        image = demanded.module("PIL.Image", "report").fromarray(pixels)
         with io.BytesIO() as buffer:
             image.save(buffer, "JPEG", comment="with a comment")
             return buffer.getvalue()
-    cv2 = pytest.importorskip("cv2")
+    cv2 = demanded.module("cv2", "vision")
     options = [cv2.IMWRITE_JPEG_PROGRESSIVE, int(encoder == "cv2-progressive")]
     return cv2.imencode(".jpg", pixels, options)[1].tobytes()
 

@@ -13,7 +13,9 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("pybullet")
+from tests.fixtures import demanded
+
+demanded.module("pybullet", "sim")
 
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import read_jpeg_size

@@ -5,7 +5,9 @@ import math
 
 import pytest
 
-pytest.importorskip("pybullet")
+from tests.fixtures import demanded
+
+demanded.module("pybullet", "sim")
 
 import numpy as np
 import simplejpeg

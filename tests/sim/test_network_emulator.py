@@ -186,7 +186,9 @@ def test_what_is_no_shape_is_refused_in_one_line(line):
 
 # --- real packets ------------------------------------------------------------------------------------------------
 
-needs_wire = pytest.mark.skipif(bool(why_impossible()), reason=why_impossible() or "can")
+needs_wire = pytest.mark.skipif(
+    bool(why_impossible()), reason=f"{why_impossible()}; run the tests as root with /dev/net/tun"
+)
 _PROBE = """
 import json, socket, sys, time
 s, started = socket.socket(), time.monotonic()

@@ -9,6 +9,7 @@ import pytest
 from sightline.protocol.errors import ConfigError
 from sightline.sim.robot import ROBOTS, load_robot, outline, robot_names, urdf_body, urdf_from_model
 from sightline.sim.urdf import Urdf
+from tests.fixtures import demanded
 
 WHEELS = ("left_wheel_joint", "right_wheel_joint")
 
@@ -139,7 +140,7 @@ def test_a_joint_that_lies_by_a_quarter_turn_is_measured_where_it_is():
 
 
 def test_a_xacro_file_is_expanded(tmp_path):
-    pytest.importorskip("xacrodoc")
+    demanded.module("xacrodoc", "xacro")
     text = (ROBOTS / "thymio.urdf").read_text().replace('radius="0.022"', 'radius="${wheel}"')
     head = '<robot name="mine" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:property name="wheel" value="0.03"/>'
     path = thymio_with(tmp_path, words=('urdf = "thymio.urdf"', 'urdf = "mine.urdf.xacro"'))

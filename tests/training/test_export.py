@@ -6,7 +6,9 @@ import pickle
 import numpy as np
 import pytest
 
-pytest.importorskip("pybullet")
+from tests.fixtures import demanded
+
+demanded.module("pybullet", "sim")
 
 import cv2
 
@@ -206,7 +208,7 @@ class TestGraph:
     @pytest.fixture(scope="class")
     @classmethod
     def made(cls, tmp_path_factory):
-        pytest.importorskip("onnx")
+        demanded.module("onnx", "dev")
         from sightline.training.export import onnx_bytes
 
         path = tmp_path_factory.mktemp("model") / "random.onnx"
@@ -243,7 +245,7 @@ class TestGraph:
         assert max((overlap(tuple(kept[i]), tuple(kept[j])) for i, j in pairs), default=0.0) <= 0.5 + 1e-6
 
     def test_both_engines_agree(self, made):
-        runtime = pytest.importorskip("onnxruntime")
+        runtime = demanded.module("onnxruntime", "vision")
         session = runtime.InferenceSession(str(made), providers=["CPUExecutionProvider"])
         image = self.picture(5)
         theirs = dict(zip(("boxes", "scores", "labels"), session.run(["boxes", "scores", "labels"], {"image": image}),

@@ -6,8 +6,10 @@ import multiprocessing
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("onnx")
+from tests.fixtures import demanded
+
+demanded.module("torch", "train")
+demanded.module("onnx", "dev")
 
 import cv2
 import onnx

@@ -3,9 +3,10 @@
 import hashlib
 
 import cv2
-import pytest
 
-pytest.importorskip("pybullet")
+from tests.fixtures import demanded
+
+demanded.module("pybullet", "sim")
 
 from sightline.evaluation.score.detector_report import MOST_WRONG, score_scenes, subjects
 from sightline.operator_side.cli import evaluate as cli_train

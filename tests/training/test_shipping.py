@@ -4,10 +4,10 @@ import hashlib
 from contextlib import contextmanager
 from functools import partial
 
-import pytest
+from tests.fixtures import demanded
 
-pytest.importorskip("pybullet")
-pytest.importorskip("onnx")
+demanded.module("pybullet", "sim")
+demanded.module("onnx", "dev")
 
 from sightline.sim.scenes.model import COLUMNS, LABELS
 from sightline.training.export import shifted

@@ -23,6 +23,7 @@ from sightline.evaluation.processes import children_of
 from sightline.operator_side.cli.bench import register
 from sightline.protocol.errors import HardwareError
 from sightline.robot_side.hardware.cameras.files import FolderCamera, FolderCameraConfig
+from tests.fixtures import demanded
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
 
@@ -94,7 +95,7 @@ def test_a_short_race_of_the_services_over_each_transport(transport):
 
 @pytest.mark.long
 def test_every_peer_answers(tmp_path):
-    pytest.importorskip("zmq")
+    demanded.module("zmq", "bench")
     race = run_race(replace(SMALL, detector_delay_ms=40.0), lambda _: None)
     assert set(race.figures) == {FLOOR, OURS, TCP, *PEERS, *(name + OUR_DETECTOR for name in WITH_OUR_DETECTOR)}
     for name, one in race.figures.items():

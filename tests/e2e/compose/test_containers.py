@@ -22,7 +22,7 @@ pytestmark = pytest.mark.compose
 def images(request, tmp_path_factory):
     """All images, built once."""
     if "compose" not in request.config.option.markexpr:
-        pytest.skip("builds images for minutes; ask for it with: pytest -m compose")
+        pytest.skip("builds images for minutes; run: make test ARGS='-m compose'")
     if reason := engine_missing():
         pytest.skip(reason)
     for profile in PROFILES:

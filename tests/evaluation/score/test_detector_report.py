@@ -8,7 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-pytest.importorskip("pybullet")
+from tests.fixtures import demanded
+
+demanded.module("pybullet", "sim")
 
 from sightline.evaluation.checks import check_lines
 from sightline.evaluation.score import detector_report as score_scenes_file

@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("pybullet")
+from tests.fixtures import demanded
+
+demanded.module("pybullet", "sim")
 
 
 from sightline.evaluation.score.detector_report import markdown, score_scenes, subjects, text

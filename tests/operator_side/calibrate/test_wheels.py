@@ -13,6 +13,7 @@ from sightline.operator_side.cli import calibrate as cli_robot_tools
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS
+from tests.fixtures import demanded
 from tests.fixtures.links import until
 from tests.fixtures.terminal import Terminal
 
@@ -158,7 +159,7 @@ def test_a_signal_in_the_middle_of_a_turn_is_zero_first(tmp_path, opened, number
 
 @pytest.mark.alone
 def test_a_drive_is_calibrated_at_a_terminal(tmp_path, opened, monkeypatch):
-    pytest.importorskip("gpiozero")
+    demanded.module("gpiozero", "robot-pi")
     monkeypatch.setenv("CAR_TEST_BOARD", str(tmp_path / "board.csv"))
     out = tmp_path / "drive.toml"
     terminal = opened(

@@ -9,6 +9,7 @@ from sightline.evaluation.processes import Processes
 from sightline.robot_side.hardware.log_drive import LogDrive
 from sightline.robot_side.ports import WheelAngles
 from tests.contracts.drives import check_drive
+from tests.fixtures import demanded
 
 
 def test_the_log_drive(tmp_path):
@@ -21,7 +22,7 @@ def test_the_drive_to_copy(tmp_path):
 
 @pytest.mark.alone
 def test_the_simulated_drive(tmp_path):
-    pytest.importorskip("pybullet")
+    demanded.module("pybullet", "sim")
     from sightline.sim.bus import SimDrive
 
     with Processes(tmp_path) as processes:

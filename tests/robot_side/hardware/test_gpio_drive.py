@@ -8,7 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-pytest.importorskip("gpiozero")
+from tests.fixtures import demanded
+
+demanded.module("gpiozero", "robot-pi")
 from gpiozero import Device
 from gpiozero.pins.mock import MockFactory
 

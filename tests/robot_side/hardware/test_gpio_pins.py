@@ -8,7 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-pytest.importorskip("gpiozero")
+from tests.fixtures import demanded
+
+demanded.module("gpiozero", "robot-pi")
 from gpiozero import Device
 from gpiozero.pins.mock import MockFactory
 
@@ -124,7 +126,7 @@ def test_the_end_of_a_real_factory_leaves_the_pins_pulled_down(monkeypatch):
 
 def test_lgpio_leaves_no_pipe_where_it_is_imported_and_nobody_is_moved(tmp_path):
     """The real one, in a process of its own: in a service's working directory it could not even be imported."""
-    pytest.importorskip("lgpio")
+    demanded.module("lgpio", "robot-pi")
     code = (
         "import os; from sightline.robot_side.hardware.gpio_low import import_lgpio; import_lgpio();"
         "print(os.getcwd(), os.listdir(), 'LG_WD' in os.environ)"

@@ -8,7 +8,9 @@ import time
 
 import pytest
 
-pytest.importorskip("gpiozero")
+from tests.fixtures import demanded
+
+demanded.module("gpiozero", "robot-pi")
 
 from tests.fixtures.gpio import BOARD, LEFT, OPTIONS, RIGHT, board_events, board_state
 from tests.fixtures.links import until

@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("pybullet")
+from tests.fixtures import demanded
+
+demanded.module("pybullet", "sim")
 
 import simplejpeg
 

@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-pytest.importorskip("pybullet")
+from tests.fixtures import demanded
+
+demanded.module("pybullet", "sim")
 
 import numpy as np
 import simplejpeg

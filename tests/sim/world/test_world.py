@@ -5,7 +5,9 @@ import math
 
 import pytest
 
-pytest.importorskip("pybullet")
+from tests.fixtures import demanded
+
+demanded.module("pybullet", "sim")
 
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import Start, Wall, load_scenario, scenario_names

@@ -8,6 +8,7 @@ from sightline.robot_side.hardware.cameras.picamera import PiCamera
 from sightline.robot_side.hardware.cameras.v4l2 import V4l2Camera
 from sightline.robot_side.plugins import CAMERAS
 from tests.contracts.cameras import check_camera
+from tests.fixtures import demanded
 from tests.fixtures.cameras import FakeDevice, install_fake_picamera2, jpeg, video
 
 KINDS = ("folder", "still", "video", "v4l2", "picamera")
@@ -49,7 +50,7 @@ def test_picamera(monkeypatch):
 
 @pytest.mark.alone
 def test_simulation(tmp_path):
-    pytest.importorskip("pybullet")
+    demanded.module("pybullet", "sim")
     from sightline.sim.bus import SimCamera
     from tests.sim.test_bus import started
 

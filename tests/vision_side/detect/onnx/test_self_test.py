@@ -85,7 +85,7 @@ def test_a_golden_output_is_of_the_models_own_labels_and_least_score(tmp_path: P
         detector(brightness_model(tmp_path / "w.onnx", BOXES, [0, 1], golden=wrong), names=("a", "b"))
 
 
-@pytest.mark.skipif(not onnx_detector.SHIPPED.is_file(), reason="this copy comes without a model")
+@pytest.mark.skipif(not onnx_detector.SHIPPED.is_file(), reason="no shipped model; run the tests in a whole clone")
 @pytest.mark.parametrize("options", [{"names": ("a",)}, {"min_score": 0.05}, {"min_score": 0.9}])
 def test_the_model_that_comes_along_opens_with_any_names_and_least_score(options: dict) -> None:
     config = onnx_detector.OnnxDetector.Config(device="cpu", **options)
