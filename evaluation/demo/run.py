@@ -104,7 +104,7 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
     """Run it. Raises ConfigError, LinkError or the failure of a process; nothing is left running in any case."""
     scenario = load_scenario(options.scenario)
     _check_vision(options, scenario)
-    run = DemoRun(options, scenario, _run_folder(options, scenario))
+    run = DemoRun(options, scenario, run_folder(options.out, f"{scenario.name}-{options.seed}"))
     with ExitStack() as ending:
         ending.enter_context(terminated_like_interrupted())
         sockets = ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
@@ -149,14 +149,14 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str]
     with (
         open_link(ROBOT, connect=[endpoint], role=SOURCE) as link,
         Recorder(link, run.folder / RECORDING, _about(run)) as recorder,
-        _truth(sockets) as truth,
+        open_truth(sockets) as truth,
         LiveBlock(is_progress=True) as block,
     ):
         operator = Operator(link)
         if run.scenario.labels:
             processes.start("labels", ["labels", ROBOT, "--connect", endpoint, "--socket-dir", sockets])
         processes.start("vision", _vision_arguments(run, for_vision))
-        _arm(operator, processes)
+        arm_robot(operator, processes)
         try:
             _watch(run, processes, operator, truth, block)
         finally:
@@ -164,7 +164,7 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str]
             run.dropped_by_recorder, run.recorder_failed = recorder.dropped, recorder.failed
 
 
-def _arm(operator: Operator, processes: Processes) -> None:
+def arm_robot(operator: Operator, processes: Processes) -> None:
     """As a person would: ask until the robot sees live commands, and give up with its own reason."""
     deadline_s = time.monotonic() + ARM_S
     while True:
@@ -241,21 +241,23 @@ def _about(run: DemoRun) -> dict[str, str]:
     return {VISION_CONFIG: loaded.config.model_dump_json(), "scenario": run.options.scenario}
 
 
-def _run_folder(options: DemoOptions, scenario: Scenario) -> Path:
-    name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{scenario.name}-{options.seed}"
-    folder = (options.out or Path("runs") / name).expanduser().absolute()
+def run_folder(out: Path | None, name: str) -> Path:
+    """Make the folder of a run: `out`, or a new one below `runs`. Raises ConfigError if it cannot be made."""
+    dated = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{name}"
+    folder = (out or Path("runs") / dated).expanduser().absolute()
     while True:
         try:
-            folder.mkdir(parents=True, exist_ok=options.out is not None)
+            folder.mkdir(parents=True, exist_ok=out is not None)
             return folder
         except OSError as error:
-            if options.out is not None or not isinstance(error, FileExistsError):
+            if out is not None or not isinstance(error, FileExistsError):
                 raise ConfigError(f"run folder {folder}: {error.strerror}; choose another with --out") from None
             folder = folder.with_name(folder.name + "-again")  # another run began in the same second
 
 
 @contextmanager
-def _truth(sockets: str) -> Iterator[TruthReader]:
+def open_truth(sockets: str) -> Iterator[TruthReader]:
+    """Read what is really so in the simulation of this folder."""
     reader = TruthReader(sockets)
     try:
         yield reader

@@ -4,7 +4,7 @@ import hashlib
 import os
 import tempfile
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +21,7 @@ from sightline.training.schedule import Training
 
 if TYPE_CHECKING:
     from sightline.evaluation.checks import Check
+    from sightline.evaluation.demo.run import DemoOptions
     from sightline.evaluation.faults.report import Results
     from sightline.evaluation.score.detector_report import DetectorReport, Subject
     from sightline.operator_side.config.loading import Loaded
@@ -54,6 +55,7 @@ def demo(
     transport: Annotated[str, typer.Option(help="How vision reaches the robot: zenoh, websocket, legacy.")] = "zenoh",
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Run folder [default: runs/TIME-...].")] = None,
     open_it: Annotated[bool, typer.Option("--open", help="Show the film when it is over.")] = False,
+    story: Annotated[bool, typer.Option("--story", help="Film of 27 s: stops, then a naive robot, a wall.")] = False,
     as_json: Json = False,
 ) -> int:
     """Follow a ball by sight, or what else a scenario is about: simulation, robot and vision as real processes over
@@ -64,6 +66,9 @@ def demo(
         from sightline.evaluation.demo.report import report, summary
         from sightline.evaluation.demo.run import DemoOptions, run_demo
     say = _to_stderr if as_json else typer.echo
+    if story:
+        _check_story(DemoOptions(scenario, seconds or 0.0, seed, latency_ms, loss, out, transport, mission, detector))
+        return _make_story(out, seed, say, as_json=as_json, open_it=open_it)
     lasting_s = _seconds(scenario, seconds)
     run = run_demo(DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission, detector), say)
     say("all three have ended; the run is being scored, replayed and filmed")
@@ -71,6 +76,28 @@ def demo(
     code = print_result(judged.to_dict(), summary(judged), as_json)
     if open_it:
         webbrowser.open((judged.run.folder / "run.mp4").as_uri())
+    return code
+
+
+def _check_story(options: "DemoOptions") -> None:
+    """Raise ConfigError for an option that the story has its own value for."""
+    from dataclasses import fields
+
+    for field in fields(options):
+        if field.name not in ("seed", "out", "seconds") and getattr(options, field.name) != field.default:
+            option = "--" + field.name.replace("_", "-")
+            raise ConfigError(f"--story and {option} exclude each other: the story has its own scene; omit {option}")
+    if options.seconds:
+        raise ConfigError("--story and --seconds exclude each other: the story has its own length; omit --seconds")
+
+
+def _make_story(out: Path | None, seed: int, say: Callable[[str], None], *, as_json: bool, open_it: bool) -> int:
+    from sightline.evaluation.demo.story_run import FILM, make_story
+
+    result = make_story(out, seed, say)
+    code = print_result(result.to_dict(), result.lines(), as_json)
+    if open_it:
+        webbrowser.open((result.folder / FILM).as_uri())
     return code
 
 

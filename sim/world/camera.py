@@ -147,10 +147,13 @@ def floor_tile(seed: int) -> Picture:
 class SceneCamera:
     """Draws one client's bodies and its floor, buffers allocated once."""
 
-    def __init__(self, client: int, model: CameraModel, walls: tuple[Wall, ...], seed: int) -> None:
+    def __init__(
+        self, client: int, model: CameraModel, walls: tuple[Wall, ...], seed: int, tile: Picture | None = None
+    ) -> None:
+        """`tile` is the floor, `TILE_TEXELS` square, in place of the boards that robots see."""
         self._client, self._model = client, model
         self._walls = WallPainter(walls, model, LIGHT_FROM, NEAR_M) if walls else None
-        self._tile = floor_tile(seed)
+        self._tile = floor_tile(seed) if tile is None else tile
         size = (model.height_px, model.width_px)
         self._picture = np.empty((*size, 3), np.uint8)
         self._bodies = np.empty((*size, 3), np.uint8)

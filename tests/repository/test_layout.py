@@ -63,6 +63,7 @@ SMALL_FILES = {  # with one importer, in their own folder: the reason why each i
     "benchmarks/network/stop_client.py": "a process of its own: python -m",
     "benchmarks/network/watch.py": "a process of its own: python -m",
     "benchmarks/peers/classic_detector.py": "what a rival would write, kept apart from what all are given",
+    "evaluation/demo/relay.py": "a process of its own: python -m",
     "evaluation/faults/camera.py": "a plug-in that the robot's process loads by its name",
     "robot_side/hardware/gpio_low.py": "runs in the guardian of the pins, without what gpio.py imports",
     "robot_side/driver/persistence.py": "the STOP latch on disk: the one place that a restart depends on",
