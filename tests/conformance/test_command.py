@@ -17,7 +17,6 @@ from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli.conform import access_for
 from sightline.operator_side.setup import keys
 from tests.conformance.robot.small_server import SmallServer
-from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess
 
@@ -37,12 +36,12 @@ def only(*cases):
 # --- at real robots --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["tcp/", "ws://"])
 def test_a_real_robot_conforms(capsys, tmp_path, scheme):
     endpoint = free_endpoint(scheme)
     with RobotProcess(tmp_path, endpoint=endpoint, safety={}) as robot:
-        assert until(lambda: f"on {endpoint}" in robot.output(), 20.0), robot.output()
+        robot.wait_until_on(f"on {endpoint}")
         code, out, _err = run(capsys, "robot", endpoint, *only(*QUICK), "--json", "--save", tmp_path / "r.json")
     report = json.loads(out)
     assert code == 0, [check["reason"] for check in report["checks"]]
@@ -51,7 +50,6 @@ def test_a_real_robot_conforms(capsys, tmp_path, scheme):
     assert json.loads((tmp_path / "r.json").read_text()) == report
 
 
-@pytest.mark.alone
 def test_a_broken_robot_does_not_and_every_report_says_why(capsys, tmp_path):
     files = {name: tmp_path / f"r.{name}" for name in ("junit", "save")}
     with SmallServer({"compresses"}) as server:
@@ -64,7 +62,7 @@ def test_a_broken_robot_does_not_and_every_report_says_why(capsys, tmp_path):
     assert json.loads(files["save"].read_text())["ok"] is False
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["tls/", "wss://"])
 def test_a_robot_behind_keys_conforms(capsys, tmp_path, scheme):
     """Roles have keys of their own there, so the kit comes in as vision and as operator at once."""
@@ -72,7 +70,7 @@ def test_a_robot_behind_keys_conforms(capsys, tmp_path, scheme):
     keys.make(tmp_path / "keys", [])
     cases = (*QUICK, "R-STOP-02", *(("R-SOCK-34", "R-SOCK-40") if scheme == "wss://" else ()))
     with RobotProcess(tmp_path, endpoint=endpoint, secure=str(tmp_path / "keys"), safety={}) as robot:
-        assert until(lambda: f"on {endpoint}" in robot.output(), 20.0), robot.output()
+        robot.wait_until_on(f"on {endpoint}")
         code, out, _err = run(capsys, "robot", endpoint, "--secure", tmp_path / "keys", *only(*cases), "--json")
     outcomes = {check["name"]: (check["value"], check["reason"]) for check in json.loads(out)["checks"]}
     assert (code, set(outcomes)) == (0, set(cases))
@@ -115,11 +113,11 @@ def test_a_mistake_is_one_line_and_exit_code_2(capsys, arguments, says):
     assert says in err and err.count("\n") == 1
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_a_robot_of_another_name_is_exit_code_4(capsys, tmp_path):
     endpoint = free_endpoint()
     with RobotProcess(tmp_path, endpoint=endpoint) as robot:
-        assert until(lambda: f"on {endpoint}" in robot.output(), 20.0), robot.output()
+        robot.wait_until_on(f"on {endpoint}")
         code, out, err = run(capsys, "robot", endpoint, "--robot", "r9")
     assert (code, out) == (4, "")
     assert "no robot r9 publishes its status there" in err and err.count("\n") == 1

@@ -16,8 +16,6 @@ from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 from tests.sim.test_bus import started
 
-pytestmark = pytest.mark.alone
-
 FULL_RAD_S, HALF_RAD_S = 0.4 / 0.035, 0.25 / 0.035
 RANGE_M = 5.0
 LATE_M = 0.8
@@ -39,12 +37,13 @@ def test_simulated_battery_keeps_the_contract(sim):
     check_battery(lambda: SimBattery(SimBattery.Config(socket_dir=sim.socket_dir)))
 
 
+@pytest.mark.slow
 def test_battery_drains_on_the_way_slows_the_robot_to_half_and_holds_it(sim, tmp_path):
     drive = {"kind": "sim", "options": {"socket_dir": sim.socket_dir}}
     battery = {"kind": "sim", "options": {"socket_dir": sim.socket_dir, "range_m": RANGE_M}}
     off = {"kind": "none"}
     with RobotProcess(tmp_path, drive=drive, battery=battery, range_sensor=off, safety=LIMITS) as robot:
-        assert until(lambda: "robot r1: on" in robot.output(), 20), robot.output()
+        robot.wait_until_on()
         with Vision(robot.endpoint, twist=b"0.4000|0.0000") as vision:
             assert until(lambda: "battery low" in robot.output(), 20), robot.output()
             assert until(lambda: "battery empty" in robot.output(), 30), robot.output()
@@ -86,10 +85,11 @@ class BrokenBattery:
         pass
 
 
+@pytest.mark.slow
 def test_battery_that_raises_returns_nan_or_hangs_slows_the_robot_and_delays_nothing(tmp_path):
     battery = {"kind": f"{__name__}:BrokenBattery"}
     with RobotProcess(tmp_path, battery=battery, safety=LIMITS) as robot:
-        assert until(lambda: "robot r1: on" in robot.output(), 20), robot.output()
+        robot.wait_until_on()
         with Vision(robot.endpoint, twist=b"0.4000|0.0000") as vision:
             assert driving(robot, HALF_RAD_S * 0.99)
             time.sleep(4)
@@ -105,7 +105,7 @@ def test_battery_that_raises_returns_nan_or_hangs_slows_the_robot_and_delays_not
 
 def test_robot_without_a_battery_has_none_in_its_status(tmp_path):
     with RobotProcess(tmp_path) as robot:
-        assert until(lambda: "robot r1: on" in robot.output(), 20), robot.output()
+        robot.wait_until_on()
         with Vision(robot.endpoint) as vision:
             assert driving(robot)
             assert vision.status().battery_v is None

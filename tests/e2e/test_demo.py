@@ -14,8 +14,6 @@ import pytest
 from sightline.evaluation.processes import ProcessError, Processes
 from sightline.protocol.errors import SightlineError
 
-pytestmark = pytest.mark.alone
-
 COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "demo"]
 
 
@@ -46,6 +44,7 @@ def driven(tmp_path_factory):
     return folder, demo(folder, "--scenario", "circle", "--seconds", "5", "--json", **about)
 
 
+@pytest.mark.slow
 def test_it_drives_and_says_so_to_a_script(driven):
     folder, result = driven
     said = json.loads(result.stdout)
@@ -58,6 +57,7 @@ def test_it_drives_and_says_so_to_a_script(driven):
     assert "ready: circle, raspberry, seed 1," in (folder / "sim.log").read_text(), "the environment chooses none"
 
 
+@pytest.mark.slow
 def test_the_twists_on_the_wire_come_again_from_the_recording(driven):
     folder, _ = driven
     script = (
@@ -70,6 +70,7 @@ def test_the_twists_on_the_wire_come_again_from_the_recording(driven):
     assert fresh.returncode == 0, fresh.stdout + fresh.stderr
 
 
+@pytest.mark.slow
 def test_it_leaves_pictures_that_open(driven):
     folder, _ = driven
     assert (folder / "trajectory.png").read_bytes().startswith(b"\x89PNG")
@@ -84,6 +85,7 @@ def test_it_leaves_pictures_that_open(driven):
         assert float(stream.duration * stream.time_base) == pytest.approx(5, abs=0.5)
 
 
+@pytest.mark.slow
 def test_the_motors_end_at_zero_in_their_own_log(driven):
     folder, _ = driven
     with (folder / "motors.csv").open() as file:
@@ -93,6 +95,7 @@ def test_the_motors_end_at_zero_in_their_own_log(driven):
     assert all((folder / f"{name}.log").stat().st_size for name in ("sim", "robot", "vision"))
 
 
+@pytest.mark.slow
 def test_injected_loss_is_counted_and_checked(tmp_path):
     result = demo(tmp_path / "run", "--seconds", "5", "--latency-ms", "50", "--loss", "0.1", "--json")
     said = json.loads(result.stdout)
@@ -101,6 +104,7 @@ def test_injected_loss_is_counted_and_checked(tmp_path):
     assert "injected_loss" in [check["name"] for check in said["checks"]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_all_and_the_run_is_still_scored(tmp_path, number):
     folder = tmp_path / "run"
@@ -117,6 +121,7 @@ def test_a_signal_ends_all_and_the_run_is_still_scored(tmp_path, number):
     assert running_in(folder) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("environment", "code", "expected"),
     [

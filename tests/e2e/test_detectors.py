@@ -21,7 +21,6 @@ from tests.fixtures.vision.onnx import brightness_model
 from tests.fixtures.vision.remote import Server, box, http_reply, said
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
-pytestmark = pytest.mark.alone
 RIGHT = [[250.0, 100.0, 300.0, 150.0]]
 
 
@@ -72,6 +71,7 @@ def ball_on_the_left(folder: Path) -> dict:
     return {"kind": "folder", "options": {"path": str(path)}}
 
 
+@pytest.mark.slow
 def test_a_shadow_is_compared_and_never_steers(tmp_path: Path) -> None:
     """Hsv sees the ball, to the left; the model says that there is one to the right."""
     model = brightness_model(tmp_path / "right.onnx", RIGHT, [0])
@@ -130,7 +130,7 @@ def _driving(tmp_path, detector, *options, beside=None):
         *options,
     ]
     with robot, log.open("wb") as out:
-        assert until(lambda: "on" in robot.output(), 10)
+        robot.wait_until_on("on")
         if beside is not None:
             beside(robot.endpoint)
         vision = subprocess.Popen(command, stdout=out, stderr=out)
@@ -151,6 +151,7 @@ def _wheels_us(robot, since_us):
     return next((t_us for t_us, left, right in robot.motor_rows() if t_us > since_us and left == right == 0), None)
 
 
+@pytest.mark.slow
 def test_a_killed_detector_is_silence_the_robot_holds_and_drives_again_within_three_seconds(tmp_path):
     with Server(_answer) as server, _driving(tmp_path, _at(server)) as (robot, log):
         port, killed_us = server.port, time.monotonic_ns() // 1000
@@ -163,6 +164,7 @@ def test_a_killed_detector_is_silence_the_robot_holds_and_drives_again_within_th
         assert "answers again" in log.read_text()
 
 
+@pytest.mark.slow
 def test_with_own_eyes_to_fall_back_on_it_drives_on_without_a_stop_and_goes_back(tmp_path):
     with Server(_answer) as server, _driving(tmp_path, _at(server), "--set", "detector.fallback=hsv") as (robot, log):
         port, killed_us = server.port, time.monotonic_ns() // 1000
@@ -176,6 +178,7 @@ def test_with_own_eyes_to_fall_back_on_it_drives_on_without_a_stop_and_goes_back
         assert robot.speed() > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hostile", [b"<html>", b"\0" * 100_000, None])
 def test_hostile_answers_do_not_move_the_robot(tmp_path, hostile):
     with Server(_answer) as server, _driving(tmp_path, _at(server)) as (robot, log):
@@ -188,6 +191,7 @@ def test_hostile_answers_do_not_move_the_robot(tmp_path, hostile):
         assert "no answer" in log.read_text()
 
 
+@pytest.mark.slow
 def test_a_killed_detector_service_is_the_same_over_zenoh(tmp_path):
     with Processes(tmp_path) as processes:
         def serve(endpoint):

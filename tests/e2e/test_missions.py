@@ -21,7 +21,6 @@ from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import jpeg_of
 
-pytestmark = pytest.mark.alone
 QUIET = VisionConfig.model_validate({"search": {"enabled": False}})
 """Its pictures are grey: without a search the robot stands."""
 
@@ -64,6 +63,7 @@ def sightline(*arguments):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transport", ["zenoh", "websocket"])
 def test_a_person_sends_a_robot_somewhere_and_calls_it_off(tmp_path, transport):
     zenoh, web = free_endpoint(), free_endpoint("ws://")
@@ -105,9 +105,10 @@ def _course(robot, connect, said):
     assert "mission   follow: lost" in sightline("status", "r1", *connect).stdout
 
 
+@pytest.mark.slow
 def test_without_a_vision_nobody_is_left_waiting(tmp_path):
     with RobotProcess(tmp_path) as robot:
-        assert until(lambda: "robot r1: on" in robot.output(), 8)
+        robot.wait_until_on()
         told = sightline("goto", "r1", "1", "1", "--connect", robot.endpoint)
         assert (told.returncode, told.stdout) == (4, "")
         assert "no vision of robot 'r1' is heard within 3 s" in told.stderr and len(told.stderr.splitlines()) == 1

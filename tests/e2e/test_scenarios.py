@@ -17,7 +17,7 @@ IN_EVERY_TEST_RUN = "legs"
 
 
 def chosen(names: Iterable[str]) -> list[object]:
-    return [pytest.param(name, marks=pytest.mark.alone if name == IN_EVERY_TEST_RUN else pytest.mark.long)
+    return [pytest.param(name, marks=pytest.mark.slow if name == IN_EVERY_TEST_RUN else pytest.mark.long)
             for name in names]
 
 

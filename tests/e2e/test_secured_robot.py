@@ -19,15 +19,13 @@ from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
-pytestmark = pytest.mark.alone
-
 
 @pytest.fixture
 def robot(tmp_path):
     keys.make(tmp_path / "keys", [])
     endpoint = free_endpoint("tls/")
     with RobotProcess(tmp_path, endpoint=endpoint, secure=str(tmp_path / "keys")) as running:
-        assert until(lambda: "robot r1: on" in running.output(), 8)
+        running.wait_until_on()
         yield running
 
 
@@ -69,6 +67,7 @@ def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, ro
         assert robot.speed() == 0.0, robot.output()
 
 
+@pytest.mark.slow
 def test_without_keys_nobody_even_watches(robot):
     with pytest.raises(LinkError, match="speaks TLS only"):
         open_zenoh("r1", connect=[robot.endpoint.replace("tls/", "tcp/")], role="vision", timeout_s=1.0)
@@ -112,14 +111,15 @@ def test_robot_with_a_certificate_for_another_name_is_rejected(tmp_path, monkeyp
     keys.make(tmp_path / "keys", [])
     endpoint = free_endpoint("tls/")
     with RobotProcess(tmp_path, endpoint=endpoint, secure=str(tmp_path / "keys")) as robot:
-        assert until(lambda: "robot r1: on" in robot.output(), 20)
+        robot.wait_until_on()
         with pytest.raises(LinkError, match="names other addresses"):
             open_zenoh("r1", connect=[endpoint], role="vision", secure=str(tmp_path / "keys"), timeout_s=0.3)
 
 
 def test_on_a_plain_network_a_rogue_gets_nothing_accepted_while_another_drives_and_that_is_said_at_once(tmp_path):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as driver:
-        assert until(lambda: "robot r1: on" in robot.output(), 20) and driving(robot)
+        robot.wait_until_on()
+        assert driving(robot)
         began_s, accepted_of = time.monotonic(), driver.status().holder
         with Vision(robot.endpoint, twist=b"-0.4000|1.0000") as rogue:
             assert until(lambda: "rejected NOT_HOLDER from vision" in robot.output(), 1.0), robot.output()

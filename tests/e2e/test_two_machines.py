@@ -17,7 +17,6 @@ from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B, why_impossible
 from tests.fixtures.links import until
 
 pytestmark = [
-    pytest.mark.alone,
     pytest.mark.skipif(bool(why_impossible()), reason=f"{why_impossible()}; run the tests as root with /dev/net/tun"),
 ]
 PAGE = (Path(__file__).parent.parent.parent / "docs" / "tutorials" / "two-machines.md").read_text()
@@ -106,6 +105,7 @@ def wire(tmp_path_factory):
         yield running
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("section", ["direct", "router", "secured"])
 def test_the_page_is_true(section, wire, tmp_path):
     with ExitStack() as ending:
@@ -117,6 +117,7 @@ def test_the_page_is_true(section, wire, tmp_path):
             assert until(lambda: _drives(said) or _drives(machines.again(section)), 20), said
 
 
+@pytest.mark.slow
 def test_every_command_of_the_page_is_known():
     names = set(re.findall(r"sightline ([a-z]\w*)", PAGE))
     command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "-h"]

@@ -26,7 +26,6 @@ from sightline.protocol.log import (
     TextFormatter,
     start_log,
 )
-from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 
 SECOND_US = 1_000_000
@@ -80,12 +79,11 @@ def test_a_service_says_its_errors_as_json_too():
     assert (said["level"], said["service"]) == ("error", "vision") and "nowhere" in said["message"]
 
 
-@pytest.mark.alone
 def test_both_processes_of_a_robot_speak_json(tmp_path, monkeypatch):
     """The driver says what it does by its command line; the network process by what it finds in its environment."""
     monkeypatch.setenv(LOG_FORMAT_VARIABLE, "json")
     with RobotProcess(tmp_path) as robot:
-        assert until(lambda: "robot r1: on" in robot.output(), 20)
+        robot.wait_until_on()
         network = next(line for line in robot.output().splitlines() if "robot r1: on" in line)
     assert json.loads(network)["service"] == "robot"
 

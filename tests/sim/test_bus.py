@@ -24,8 +24,6 @@ from sightline.sim.bus import MOTION, MOTION_SET, SimCamera, SimDrive, SimRange,
 from sightline.sim.process import SimConfig, SocketFolder, run
 from sightline.sim.robot import load_robot
 
-pytestmark = pytest.mark.alone
-
 SERVE = (
     "import sys; from sightline.protocol.log import start_log; from sightline.sim.process import SimConfig, run; "
     "start_log(None, 'sim'); sys.exit(run(SimConfig.model_validate_json(sys.argv[1])))"
@@ -95,6 +93,7 @@ def test_ready_line_and_ports(sim):
         port.close()
 
 
+@pytest.mark.alone
 def test_pictures_are_fresh_distinct_and_paced(sim):
     camera = SimCamera(sim.config())
     stamps, ages_us = [], []
@@ -167,6 +166,7 @@ def test_malformed_motor_packets_change_nothing(sim):
             SimDrive(sim.config()).set(bad, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_it_ends_cleanly_within_a_second_and_ports_say_so_and_come_back(sim, number, tmp_path):
     camera, drive, lidar = SimCamera(sim.config()), SimDrive(sim.config()), SimRange(sim.config())
@@ -188,6 +188,7 @@ def test_it_ends_cleanly_within_a_second_and_ports_say_so_and_come_back(sim, num
         again.process.wait(10)
 
 
+@pytest.mark.slow
 def test_a_dead_simulations_sockets_are_replaced_and_a_living_ones_are_not(sim, tmp_path):
     with pytest.raises(ConfigError, match=f"process {sim.process.pid}"):
         run(SimConfig(socket_dir=str(tmp_path)))

@@ -107,7 +107,6 @@ def assert_boxes_of_a_smaller_picture(labels, camera) -> None:
     assert [box.x1_px for box in found.boxes] == [pytest.approx(box["x1_px"] / 2) for box in whole]
 
 
-@pytest.mark.alone
 def test_a_running_simulation_labels_the_picture_that_it_sends(tmp_path):
     simulator = started(tmp_path, scenario="legs")
     try:

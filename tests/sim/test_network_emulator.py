@@ -206,7 +206,6 @@ def probe(wire, timeout_s=5.0):
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
-@pytest.mark.alone
 @needs_wire
 def test_real_packets_pass_are_late_and_are_cut_in_one_direction(tmp_path):
     with BenchWire(tmp_path / "wire.log") as wire:

@@ -179,7 +179,6 @@ def test_without_root_it_says_what_it_needs():
     assert done.returncode == 2 and "run it as root on Linux" in done.stderr
 
 
-@pytest.mark.alone
 @pytest.mark.skipif(bool(why_impossible()), reason=f"{why_impossible()}; run the tests as root with /dev/net/tun")
 def test_a_short_row_is_run_for_real():
     command = [*COMMAND, "--only", "near", "--seconds", "4", "--json"]

@@ -88,11 +88,11 @@ def program(name, *arguments):
 
 def wait_for(robot):
     """A robot's endpoint, once it listens."""
-    assert until(lambda: "robot r1: on" in robot.output(), 8)
+    robot.wait_until_on()
     return robot.endpoint
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_boxes_reach_whoever_wants_them_and_name_a_frame_of_the_robot(tmp_path):
     robot = RobotProcess(tmp_path)
     (tmp_path / "pictures" / "0.jpg").write_bytes(jpeg(160))
@@ -108,7 +108,6 @@ def test_boxes_reach_whoever_wants_them_and_name_a_frame_of_the_robot(tmp_path):
             assert until(lambda: decode(DetectionsHeader, heard.take(2.0).header).seq > header.seq)
 
 
-@pytest.mark.alone
 def test_programs_without_a_robot_say_so():
     with (
         program("detector_service.py", free_endpoint()) as detector,
@@ -119,7 +118,6 @@ def test_programs_without_a_robot_say_so():
         assert detector.wait(5) == 4
 
 
-@pytest.mark.alone
 @pytest.mark.parametrize("name", ["detector_service.py", "compose/older_client.py"])
 def test_a_program_that_is_told_no_endpoint_says_so(name):
     with program(name) as process:

@@ -14,7 +14,6 @@ from tests.fixtures.javascript import Browser, JsProcess, JsRobot, chromium, nod
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
 
-pytestmark = pytest.mark.alone
 SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 PATIENCE_S = 20.0
 # Brightness of the canvas at a grid of points: a picture has several, an empty canvas one.
@@ -94,6 +93,7 @@ def is_moving(page: Browser) -> bool:
     return re.search("^-?0.00 m/s.* 0.00 rad/s", page.text("wheels")) is None
 
 
+@pytest.mark.slow
 def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer: tuple[Browser, Started]) -> None:
     page, robot = our_viewer
     assert until(lambda: page.text("link") == "connected", PATIENCE_S), page.text("link")
@@ -117,6 +117,7 @@ def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer
     assert page.errors == []
 
 
+@pytest.mark.slow
 def test_a_page_whose_robot_is_gone_says_so_and_finds_it_again(tmp_path: Path) -> None:
     port = free_port()
     with JsRobot(tmp_path, port=port) as robot, Browser(tmp_path, f"http://127.0.0.1:{port}/") as page:
@@ -131,6 +132,7 @@ def test_a_page_whose_robot_is_gone_says_so_and_finds_it_again(tmp_path: Path) -
         assert page.errors == []
 
 
+@pytest.mark.slow
 def test_a_page_behind_a_token_comes_in_with_the_one_behind_the_hash(tmp_path: Path) -> None:
     (tmp_path / "token").write_text("0123456789abcdef")
     with JsRobot(tmp_path, "--token-file", str(tmp_path / "token")) as robot:

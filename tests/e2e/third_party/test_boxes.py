@@ -11,15 +11,13 @@ from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision
 
-pytestmark = pytest.mark.alone
-
 
 @pytest.fixture
 def robot(tmp_path):
     older = free_endpoint("ws-legacy://") + "?boxes"
     with RobotProcess(tmp_path, listen=[zenoh := free_endpoint(), older], safety={"guests": True}) as running:
         running.endpoint = zenoh
-        assert until(lambda: "robot r1: on" in running.output(), 8)
+        running.wait_until_on()
         yield running, older.replace("ws-legacy", "ws").removesuffix("?boxes")
 
 
@@ -43,6 +41,7 @@ def test_boxes_of_an_older_program_reach_zenoh_and_name_their_frame(robot):
         assert header.echo.channel == "frame"
 
 
+@pytest.mark.slow
 def test_a_detector_on_zenoh_does_not_hold_the_robot_up(robot):
     process, _older = robot
     found = Detections(width_px=16, height_px=16, boxes=())

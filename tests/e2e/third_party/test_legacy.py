@@ -22,8 +22,6 @@ from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint, free_port
 from tests.fixtures.robot_process import RobotProcess, driving, stop_after
 
-pytestmark = pytest.mark.alone
-
 STRANGERS = Path(__file__).parent
 FPS = 30
 WHEEL_RADIUS_M, TRACK_WIDTH_M = 0.035, 0.16
@@ -86,7 +84,7 @@ def old_vision_drives(folder: Path, pictures: Path):
 
 @contextmanager
 def _once_up(robot: RobotProcess):
-    assert until(lambda: "on ws-legacy://" in robot.output(), 10), robot.output()
+    robot.wait_until_on("on ws-legacy://")
     yield
 
 
@@ -107,6 +105,7 @@ def _rate_fps(log: Path, seconds: float) -> float:
     return sum(begin_us <= int(t_us) < end_us for t_us, *_ in rows_of(log)) / (end_us - begin_us) * 1e6
 
 
+@pytest.mark.slow
 def test_the_older_vision_sees_the_pictures_and_is_obeyed_within_a_guests_limits(tmp_path, pictures):
     with old_vision_drives(tmp_path, pictures) as (robot, _, log, _):
         assert best_rate_fps(log, 0.4 * FPS) >= 0.4 * FPS, "on any machine; on a quiet one see below"
@@ -126,6 +125,7 @@ def test_on_a_quiet_machine_the_older_vision_sees_95_percent_of_the_pictures(tmp
         assert best_rate_fps(log, 0.95 * FPS) >= 0.95 * FPS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
 def test_without_its_vision_the_robot_stands_within_700_ms(tmp_path, pictures, number):
     with old_vision_drives(tmp_path, pictures) as (robot, vision, _, _):
@@ -137,6 +137,7 @@ def test_without_its_vision_the_robot_stands_within_700_ms(tmp_path, pictures, n
         assert metres <= 0.25
 
 
+@pytest.mark.alone
 def test_who_never_reads_costs_the_robot_little_and_its_driver_nothing(tmp_path, pictures):
     with old_vision_drives(tmp_path, pictures) as (robot, _, log, url):
         memory = Path(f"/proc/{robot.network_pid()}/statm")
@@ -175,6 +176,7 @@ def said(events: Path) -> list[tuple[int, str]]:
     return [(int(t_us), text) for t_us, what, text in rows_of(events) if what == "said"]
 
 
+@pytest.mark.slow
 def test_our_vision_answers_an_older_robot_at_once_and_finds_it_again(tmp_path, pictures):
     port = free_port()
     with our_vision(tmp_path, f"ws-legacy://127.0.0.1:{port}") as vision:

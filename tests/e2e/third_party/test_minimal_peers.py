@@ -132,7 +132,7 @@ def answers(url: str) -> bool:
 def test_the_minimal_vision_drives_our_robot(tmp_path, kind):
     endpoint = SCHEMES[kind].format(free_port())
     with RobotProcess(tmp_path, endpoint=endpoint) as robot:
-        assert until(lambda: f"robot r1: on {endpoint}" in robot.output(), 10)
+        robot.wait_until_on(f"robot r1: on {endpoint}")
         with Process("examples/minimal_vision.py", endpoint) as eyes:
             assert until(lambda: robot.speed() > 0.3, 10), (robot.output(), eyes.lines)
         assert until(lambda: robot.speed() == 0.0, 0.7)

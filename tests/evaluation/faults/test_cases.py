@@ -301,7 +301,6 @@ def run_once(row, tmp_path):
     assert all(check.value is not None and math.isfinite(check.value) for check in done.checks)
 
 
-@pytest.mark.alone
 @pytest.mark.parametrize("row", chosen([], short=True), ids=lambda row: row.id)
 def test_the_short_set(row, tmp_path):
     run_once(row, tmp_path)

@@ -26,7 +26,6 @@ from sightline.protocol.jpeg import JpegSize
 from sightline.robot_side.hardware.cameras.files import StillCamera
 from sightline.robot_side.hardware.cameras.lens import guessed_model, read_model
 from sightline.vision_side.config import HsvConfig
-from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from tests.operator_side.calibrate.board import BOARD, TRUTH, draw_board, rays, tilted_views, turned
@@ -151,13 +150,13 @@ def test_a_ball_that_cannot_be_that_far_is_refused():
 # --- a live robot ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_a_live_robot_is_measured_and_keeps_its_mounting(tmp_path, capsys):
     (tmp_path / "boards").mkdir()
     mounted = guessed_model(SIZE, 60.0).model_dump(mode="json") | {"z_m": 0.11, "pitch_rad": -0.05}
     options = {"path": str(folder(tmp_path / "boards", views())), "model": mounted, "fps": 10}
     with RobotProcess(tmp_path, camera={"kind": "folder", "options": options}) as robot:
-        assert until(lambda: "on tcp" in robot.output())
+        robot.wait_until_on("on tcp")
         run("--robot", "r1", "--connect", robot.endpoint, "--board", "7x5", "--square-m", 0.03, "--views", 8,
             "--out", tmp_path / "camera.toml", "--seconds", 30)
     model = read_model(tmp_path / "camera.toml")

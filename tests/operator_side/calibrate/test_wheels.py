@@ -143,7 +143,6 @@ def opened():
         terminal.close()
 
 
-@pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
 def test_a_signal_in_the_middle_of_a_turn_is_zero_first(tmp_path, opened, number):
     log = tmp_path / "drive.csv"
@@ -157,7 +156,6 @@ def test_a_signal_in_the_middle_of_a_turn_is_zero_first(tmp_path, opened, number
     assert told(log)[-1] == (0.0, 0.0)
 
 
-@pytest.mark.alone
 def test_a_drive_is_calibrated_at_a_terminal(tmp_path, opened, monkeypatch):
     demanded.module("gpiozero", "robot-pi")
     monkeypatch.setenv("CAR_TEST_BOARD", str(tmp_path / "board.csv"))

@@ -248,7 +248,7 @@ def test_every_command_and_module_is_found_beside_files_of_our_names():
     assert done.stdout.count("Usage: sightline ") == len(COMMANDS)
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 @pytest.mark.usefixtures("shadowed")
 @pytest.mark.parametrize("arguments", [
     ("demo", "--seconds", "2", "--out", "run"),

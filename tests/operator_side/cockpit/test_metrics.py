@@ -14,8 +14,6 @@ from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
-pytestmark = pytest.mark.alone
-
 
 def _samples(port):
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as answer:
@@ -31,6 +29,7 @@ def _health(port):
         return error.code
 
 
+@pytest.mark.slow
 def test_a_robot_is_measured_and_its_end_is_seen(tmp_path):
     port = free_port()
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
@@ -70,6 +69,7 @@ def test_a_robot_is_measured_and_its_end_is_seen(tmp_path):
             assert exporter.wait(20) == 0
 
 
+@pytest.mark.slow
 def test_a_busy_port_is_said_with_its_owner(tmp_path):
     with RobotProcess(tmp_path) as robot, socket.create_server(("127.0.0.1", free_port())) as taken:
         command = [
@@ -82,17 +82,18 @@ def test_a_busy_port_is_said_with_its_owner(tmp_path):
             robot.endpoint,
             "--port",
         ]
-        assert until(lambda: "robot r1: on" in robot.output(), 20)
+        robot.wait_until_on()
         port = str(taken.getsockname()[1])
         done = subprocess.run([*command, port], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 4
     assert f"port {port} is in use by" in done.stderr and "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_a_vision_is_measured_and_its_health_is_whether_it_hears_a_robot(tmp_path):
     port = free_port()
     with RobotProcess(tmp_path) as robot:
-        assert until(lambda: "robot r1: on" in robot.output(), 40)
+        robot.wait_until_on()
         command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "vision", "--connect", robot.endpoint]
         vision = subprocess.Popen([*command, "--metrics", str(port)], stdout=subprocess.PIPE, text=True)
         try:

@@ -21,7 +21,7 @@ from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 from tests.operator_side.calibrate.test_color import ball_picture
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.slow  # all share a simulation and a vision service that compute throughout
 
 
 class Site:

@@ -203,7 +203,7 @@ def test_the_rate_that_a_camera_delivers_is_measured(capsys):
     assert check["camera folder"]["ok"] and float(check["camera folder"]["value"]) == pytest.approx(10, rel=0.2)
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_a_robot_is_looked_at_and_its_frames_counted(capsys, tmp_path):
     with RobotProcess(tmp_path) as robot:
         assert until(lambda: port_owner(port_of(robot.endpoint)))

@@ -13,8 +13,6 @@ from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 
-pytestmark = pytest.mark.alone
-
 
 @contextmanager
 def _router(*arguments):
@@ -26,6 +24,7 @@ def _router(*arguments):
             process.kill()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("secured", [False, True])
 def test_robot_and_vision_meet_at_a_router_that_ends_when_told(tmp_path, secured):
     endpoint, secure = free_endpoint(), ""

@@ -16,8 +16,6 @@ from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision
 from tests.fixtures.terminal import Terminal
 
-pytestmark = pytest.mark.alone
-
 MOVING_S, ZERO_S = 0.120, 0.150
 """The issue's bounds: from a key to a moving wheel; from the end of its repeats, or of its terminal, to zero."""
 REPEAT_S, DELAY_S = 0.033, 0.25
@@ -111,6 +109,7 @@ def seat(tmp_path):
     opened.close()
 
 
+@pytest.mark.alone
 def test_a_key_moves_the_wheels_soon_and_its_release_is_a_zero_command_soon(seat):
     seat.sit()
     moving_s, zero_s = [], []
@@ -130,6 +129,7 @@ def test_a_key_moves_the_wheels_soon_and_its_release_is_a_zero_command_soon(seat
     assert statistics.median(zero_s) <= ZERO_S
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["the terminal is closed", "SIGHUP", "SIGTERM", "Ctrl-C", "Ctrl-D"])
 def test_however_it_ends_zero_is_commanded_soon_and_the_robot_is_let_go(seat, how):
     seat.sit()
@@ -154,6 +154,7 @@ def test_however_it_ends_zero_is_commanded_soon_and_the_robot_is_let_go(seat, ho
     assert until(lambda: "let go" in seat.robot.output(), 2), "at once, not when its lease is over"
 
 
+@pytest.mark.slow
 def test_a_person_killed_at_the_keyboard_stops_the_robot(seat):
     seat.sit()
     seat.fingers.press("i")
@@ -166,6 +167,7 @@ def test_a_person_killed_at_the_keyboard_stops_the_robot(seat):
     assert until(lambda: "the operator who drove was lost" in seat.robot.output(), 3)
 
 
+@pytest.mark.slow
 def test_vision_and_a_person_hand_over_to_one_another(seat):
     seat.sit()
     with Vision(seat.robot.endpoint, twist=b"0.1000|0.0000") as vision:
@@ -182,10 +184,11 @@ def test_vision_and_a_person_hand_over_to_one_another(seat):
         assert until(lambda: vision.status().state is State.DISARMED, 3), "never back to autonomy by itself"
 
 
+@pytest.mark.slow
 def test_over_websocket_it_drives_and_stops_too(tmp_path):
     endpoint = free_endpoint("ws://")
     with RobotProcess(tmp_path, endpoint=endpoint, safety={"auto_arm": False}) as robot:
-        assert until(lambda: "on ws://" in robot.output(), 10)
+        robot.wait_until_on("on ws://")
         terminal = Terminal("teleop", "r1", "--connect", endpoint)
         try:
             assert terminal.shows("DISARMED"), terminal.text()
@@ -201,6 +204,7 @@ def test_over_websocket_it_drives_and_stops_too(tmp_path):
             terminal.close()
 
 
+@pytest.mark.slow
 def test_the_terminal_is_as_it_was_and_shows_the_robot(seat):
     seat.sit()
     assert seat.terminal.shows("you drive") and seat.terminal.shows("ACTIVE: driving")

@@ -55,7 +55,7 @@ def test_motors_are_zeroed_without_gate_or_network(tmp_path):
 
 def test_the_driver_keeps_its_scheduling_to_itself(tmp_path):
     with RobotProcess(tmp_path) as robot:
-        assert until(lambda: "on tcp/" in robot.output(), 8)
+        robot.wait_until_on("on tcp/")
         assert os.sched_getscheduler(robot.network_pid()) == os.SCHED_OTHER
         permitted = os.sched_getscheduler(robot.process.pid) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
         assert permitted != ("real-time scheduling is not permitted" in robot.output())

@@ -20,7 +20,7 @@ def test_the_drive_to_copy(tmp_path):
     check_drive(lambda: MyDrive(MyDrive.Config(port=tmp_path / "port")))
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_the_simulated_drive(tmp_path):
     demanded.module("pybullet", "sim")
     from sightline.sim.bus import SimDrive

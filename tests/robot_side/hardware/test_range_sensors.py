@@ -7,13 +7,12 @@ from tests.e2e.test_missions import FarSensor
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
-pytestmark = pytest.mark.alone
 
-
+@pytest.mark.alone
 def test_wheels_do_not_falter_with_every_scan(tmp_path):
     sensor = {"kind": f"{FarSensor.__module__}:{FarSensor.__name__}"}
     with RobotProcess(tmp_path, range_sensor=sensor) as robot:
-        assert until(lambda: "robot r1: on" in robot.output(), 10), robot.output()
+        robot.wait_until_on()
         with Vision(robot.endpoint):
             assert driving(robot), "0.4 m/s"
             since_us = monotonic_us()

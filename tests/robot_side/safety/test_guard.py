@@ -15,7 +15,6 @@ from sightline.protocol.messages import STILL, Twist
 from sightline.robot_side.ports import Ranges
 from sightline.robot_side.safety.guard import BlindZoneError, GuardConfig, RangeGuard, _Near, check_blind_zone
 from sightline.sim.robot import load_robot
-from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 
 DEFAULTS = {
@@ -438,7 +437,7 @@ def test_with_a_larger_stop_zone_it_does_and_a_sensor_that_turns_blind_ends_it(t
     fog = tmp_path / "fog"
     sensor = {"kind": f"{__name__}:NearSighted", "options": {"fog": str(fog)}}
     with RobotProcess(tmp_path, range_sensor=sensor, guard={"stop_m": 0.13}) as robot:
-        assert until(lambda: "robot r1: on" in robot.output(), 8)
+        robot.wait_until_on()
         fog.touch()
         assert robot.process.wait(10) == 2
         assert "below 1.13 m" in robot.output() and robot.speed() == 0.0

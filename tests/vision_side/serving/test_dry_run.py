@@ -12,7 +12,6 @@ from sightline.robot_side.ports import Picture
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.pipeline import Observation, PipelineAnswer
 from sightline.vision_side.serving.dry_run import AckingService, ProgressPrinter, watch_camera, watch_robot
-from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
@@ -114,13 +113,12 @@ def test_an_option_that_is_none_is_said(text):
         pass
 
 
-@pytest.mark.alone
 def test_a_real_robot_that_would_obey_does_not_move(tmp_path):
     (tmp_path / "a.jpg").write_bytes(BALL)
     camera = {"kind": "still", "options": {"path": str(tmp_path / "a.jpg"), "hfov_deg": 80}}
     said = []
     with RobotProcess(tmp_path, camera=camera) as robot:
-        assert until(lambda: "on tcp" in robot.output())
+        robot.wait_until_on("on tcp")
         assert watch_robot(VisionConfig(connect=(robot.endpoint,)), said.append, seconds=2.0) == 0
         assert {row[1:] for row in robot.motor_rows()} <= {(0.0, 0.0)}
     told = [line for line in said if line.startswith("tracking: bearing +11.")]

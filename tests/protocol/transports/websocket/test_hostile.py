@@ -19,8 +19,6 @@ from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.websocket import address_of
 
-pytestmark = pytest.mark.alone
-
 STRANGERS = Path(__file__).parent.parent.parent.parent / "e2e" / "third_party"
 COUNT = 10_000
 DOCUMENTED = {BAD_FRAMING, BAD_HELLO, OTHER_ROBOT, OVERSIZE, INEXACT_KEY, CROSS_SITE, TOO_MANY_CLIENTS}
@@ -60,6 +58,7 @@ def round_trips_s(link, slot, seconds: float, ends=lambda: False) -> list[float]
     return sorted(took)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dialect", "seed"), [("v1", 1), ("older", 3), pytest.param("v1", 2, marks=pytest.mark.long)])
 def test_ten_thousand_hostile_messages_harm_nobody(tmp_path, dialect, seed):
     with (tmp_path / "robot.log").open("w") as log:

@@ -67,7 +67,7 @@ def _can_have_a_network_of_its_own():
     return os.geteuid() == 0 and subprocess.run(["unshare", "-n", "true"], check=False).returncode == 0
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 @pytest.mark.skipif(not _can_have_a_network_of_its_own(), reason="no network namespaces; run the tests as root")
 def test_in_a_network_of_two_robots_both_are_found_and_a_taken_group_port_hinders_nobody():
     """A namespace with an address: two robots listen on it, one on loopback; then a stranger has the group's port."""

@@ -117,7 +117,7 @@ def _router(endpoint):
             process.kill()
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_a_robot_is_driven_again_when_its_router_comes_back(tmp_path, how):
     endpoint = free_endpoint()
@@ -125,7 +125,8 @@ def test_a_robot_is_driven_again_when_its_router_comes_back(tmp_path, how):
         first = ending.enter_context(_router(endpoint))
         robot = ending.enter_context(RobotProcess(tmp_path, listen=[], connect=[endpoint]))
         ending.enter_context(Vision(endpoint))
-        assert until(lambda: "robot r1: on" in robot.output(), 20) and driving(robot)
+        robot.wait_until_on()
+        assert driving(robot)
         first.send_signal(how)
         first.wait(5)
         assert until(lambda: robot.speed() == 0.0, 2.0)
@@ -133,14 +134,15 @@ def test_a_robot_is_driven_again_when_its_router_comes_back(tmp_path, how):
         assert driving(robot), robot.output()
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_a_second_robot_of_one_id_does_not_start_and_says_who_has_it(tmp_path):
     endpoint = free_endpoint()
     with _router(endpoint):
         (tmp_path / "a").mkdir()
         (tmp_path / "b").mkdir()
         with RobotProcess(tmp_path / "a", listen=[], connect=[endpoint]) as first, Vision(endpoint):
-            assert until(lambda: "robot r1: on" in first.output(), 20) and driving(first)
+            first.wait_until_on()
+            assert driving(first)
             with RobotProcess(tmp_path / "b", listen=[], connect=[endpoint]) as second:
                 assert second.process.wait(15) == 4
                 assert "error: robot id 'r1' is taken: a robot on " in second.output()

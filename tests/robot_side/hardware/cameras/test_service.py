@@ -6,9 +6,8 @@ from tests.fixtures.cameras import jpeg, video
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
-pytestmark = pytest.mark.alone
 
-
+@pytest.mark.slow
 def test_a_video_that_ends_is_said_once_and_the_service_stays(tmp_path):
     film = video(tmp_path / "film.avi", pictures=120)
     camera = {"kind": "video", "options": {"path": str(film), "loop": False}}

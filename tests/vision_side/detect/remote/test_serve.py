@@ -77,7 +77,6 @@ def test_it_ends_within_a_second_of_a_signal(tmp_path):
         process.stdout.close()
 
 
-@pytest.mark.alone
 def test_more_streams_than_it_can_look_at_are_served_fairly_and_in_time(tmp_path):
     load = measure_streams(free_endpoint(), tmp_path, streams=8, seconds=4)
     assert len(load.answered) == 8 and load.overload > 1.5

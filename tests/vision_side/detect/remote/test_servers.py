@@ -119,7 +119,7 @@ def _triton_detector(server, model):
     return _detector(f"oip+http://127.0.0.1:{server.http}/{model}", labels=("ball",))
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["ball_jpeg", "ball_pixels"])
 def test_triton_finds_the_ball_from_jpegs_and_from_pixels(triton, model):
     with _closing(_triton_detector(triton, model)) as detector:
@@ -129,20 +129,20 @@ def test_triton_finds_the_ball_from_jpegs_and_from_pixels(triton, model):
         assert detector.detect([frame(jpeg=GREY_JPEG)], within(1.0))[0].detections == ()
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_triton_says_no_to_a_model_it_has_not_and_that_is_counted(triton):
     with _closing(_triton_detector(triton, "cat")) as detector:
         assert until(lambda: not detector.detect([frame()], within(1.0))[0] and detector.rejected["REJECTED"])
         assert "cat" in " ".join(detector.notices())
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_a_detector_over_triton_keeps_the_contract(triton):
     verdicts = check_detector(lambda: _triton_detector(triton, "ball_jpeg"))
     assert not [one for one in verdicts if one.wrong]
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_a_killed_triton_is_no_answer_by_the_deadline_and_back_within_three_seconds_of_its_return(triton):
     with _closing(_triton_detector(triton, "ball_jpeg")) as detector:
         assert until(lambda: detector.detect([frame()], within(1.0))[0], 10)
