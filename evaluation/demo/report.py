@@ -2,18 +2,26 @@
 
 import json
 import math
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from sightline.evaluation.checks import Check, at_most, check_lines, to_dict
 from sightline.evaluation.demo.run import RECORDING, DemoRun
 from sightline.evaluation.demo.shaped_vision import INJECTED
 from sightline.evaluation.processes import last_line
+from sightline.evaluation.scenario_config import robot_config, robot_of
 from sightline.evaluation.score.figures import Score, checks_of, figures_of, score
+from sightline.operator_side.client.requests import read_report
 from sightline.operator_side.preflight import needs
+from sightline.operator_side.recording.recorder import read_recording
 from sightline.operator_side.recording.replay import Replayed, Step, replay
-from sightline.protocol.errors import SightlineError
+from sightline.protocol.channels import STATUS
+from sightline.protocol.errors import SightlineError, WireError
+
+if TYPE_CHECKING:
+    from sightline.evaluation.plots import StatusAt
 
 REAL_TIME_FACTOR: Final = 1.5
 """The bounds are those of lockstep; a real machine is granted this much more."""
@@ -72,11 +80,25 @@ def _printed(step: Step) -> tuple[int, str, str]:
 def _draw(run: DemoRun, recording: Path) -> None:
     with needs("report"):
         from sightline.evaluation.demo.video import film_run
-        from sightline.evaluation.plots import plot_run
-    options = run.options
+        from sightline.evaluation.plots import AgeLimits, plot_run
+    options, safety = run.options, robot_config(robot_of(run.scenario)).safety
+    limits, statuses = AgeLimits(safety.full_speed_age_ms, safety.zero_speed_age_ms), read_statuses(recording)
     title = f"{run.scenario.name}, seed {options.seed}, +{options.latency_ms:g} ms, {options.loss:.0%} loss"
-    plot_run(run.folder / "trajectory.png", run.samples, run.scenario, title)
-    film_run(run.folder / "run.mp4", recording, run.samples, run.scenario)
+    plot_run(run.folder / "trajectory.png", run.samples, run.scenario, title, statuses=statuses, limits=limits)
+    film_run(run.folder / "run.mp4", recording, run.samples, run.scenario, statuses)
+
+
+def read_statuses(recording: Path) -> "list[StatusAt]":
+    """Read state and frame age over time from a recording; an invalid message is left out."""
+    from sightline.evaluation.plots import StatusAt
+
+    statuses = []
+    for recorded in read_recording(recording):
+        if recorded.message.channel is STATUS:
+            with suppress(WireError):
+                report = read_report(recorded.message)
+                statuses.append(StatusAt(report.stamp.t_us, report.status.state.value, report.status.frame_age_us))
+    return sorted(statuses, key=lambda one: one.t_us)
 
 
 def _injected(run: DemoRun) -> dict[str, Any] | None:

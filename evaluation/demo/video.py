@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sightline.evaluation.plots import wall_corners
+from sightline.evaluation.plots import StatusAt, scale_length_m, wall_corners
 from sightline.operator_side.recording.film import Film
 from sightline.operator_side.recording.replay import Step, replay_steps
 from sightline.sim.scenario import Scenario, Static
@@ -21,6 +21,7 @@ Point = tuple[int, int]
 Colour = tuple[int, int, int]
 
 _PAPER, _WALL, _ROBOT, _TARGET = (245, 245, 245), (150, 150, 150), (180, 110, 30), (20, 170, 230)  # BGR
+_INK, _FONT = (40, 40, 40), cv2.FONT_HERSHEY_SIMPLEX
 _MARGIN_M = 0.4
 _SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 
@@ -45,6 +46,21 @@ class TopView:
         for thing in scenario.things:
             if isinstance(thing, Static):
                 self._disc(self._paper, thing.at_m, thing.reach_m, _WALL)
+        self._has_target = scenario.target.shape != "place"
+        self._key(scale_length_m(span_m))
+
+    def _key(self, length_m: float) -> None:
+        """Draw the legend in the margin above and the scale in the margin below."""
+        left_px, low_px, length_px = 14, self._size_px - 18, round(length_m * self._scale)
+        cv2.line(self._paper, (left_px, low_px), (left_px + length_px, low_px), _INK, 2)
+        for end_px in (left_px, left_px + length_px):
+            cv2.line(self._paper, (end_px, low_px - 5), (end_px, low_px + 5), _INK, 2)
+        cv2.putText(self._paper, f"{length_m:g} m", (left_px + length_px + 10, low_px + 5), _FONT, 0.5, _INK, 1, cv2.LINE_AA)
+        names = [("robot", _ROBOT), *([("target", _TARGET)] if self._has_target else [])]
+        for column, (name, color) in enumerate(names):
+            at_px = 20 + 90 * column
+            cv2.circle(self._paper, (at_px, 16), 6, color, -1, cv2.LINE_AA)
+            cv2.putText(self._paper, name, (at_px + 14, 21), _FONT, 0.5, _INK, 1, cv2.LINE_AA)
 
     def draw(self, index: int) -> Image:
         """The picture at sample `index`, which never goes back."""
@@ -91,14 +107,17 @@ HEIGHT_PX: Final = 480
 _BOX, _TEXT, _SHADOW = (60, 220, 60), (255, 255, 255), (0, 0, 0)
 
 
-def film_run(path: Path, recording: Path, samples: Sequence[Truth], scenario: Scenario) -> int:
+def film_run(
+    path: Path, recording: Path, samples: Sequence[Truth], scenario: Scenario, statuses: Sequence[StatusAt] = ()
+) -> int:
     """Write the film of a run (at least one sample) and return its frames. Raises ConfigError without PyAV."""
     view = TopView(samples, scenario, HEIGHT_PX)
     times_us = [truth.t_us for truth in samples]
     with Film(path, FPS) as film:
         for step in _thinned(recording, times_us[0]):
             index = min(bisect_right(times_us, step.frame.header.t_us), len(samples) - 1)
-            film.add(np.hstack([_robot_view(step), view.draw(index)]), step.frame.header.t_us)
+            status = newest_status(statuses, step.frame.header.t_us)
+            film.add(np.hstack([_robot_view(step, status), view.draw(index)]), step.frame.header.t_us)
     return film.frames
 
 
@@ -113,8 +132,22 @@ def _thinned(recording: Path, start_us: int) -> Iterator[Step]:
             yield step
 
 
-def _robot_view(step: Step) -> Image:
-    """The picture with detections, phase and twist, `HEIGHT_PX` high and an even number of pixels wide."""
+def newest_status(statuses: Sequence[StatusAt], t_us: int) -> StatusAt | None:
+    """Give the newest status by `t_us`; None before the first."""
+    index = bisect_right(statuses, t_us, key=lambda one: one.t_us)
+    return statuses[index - 1] if index else None
+
+
+def status_text(status: StatusAt | None) -> str:
+    """Describe state and frame age for the film; "" without a status."""
+    if status is None:
+        return ""
+    age = "no frame" if status.frame_age_us is None else f"frame age {status.frame_age_us / 1000:.0f} ms"
+    return f"{status.state}  {age}"
+
+
+def _robot_view(step: Step, status: StatusAt | None) -> Image:
+    """The image with detections, phase, state, frame age and twist; `HEIGHT_PX` high, an even number of pixels wide."""
     decoded = cv2.imdecode(np.frombuffer(step.frame.jpeg, np.uint8), cv2.IMREAD_COLOR)
     if decoded is None:
         decoded = np.zeros((HEIGHT_PX, HEIGHT_PX * 4 // 3, 3), np.uint8)
@@ -122,6 +155,7 @@ def _robot_view(step: Step) -> Image:
     width_px = round(decoded.shape[1] * scale / 2) * 2
     picture = np.asarray(cv2.resize(decoded, (width_px, HEIGHT_PX), interpolation=cv2.INTER_LINEAR), np.uint8)
     _overlay(picture, step, scale)
+    _write(picture, status_text(status), 54)
     return picture
 
 

@@ -12,9 +12,10 @@ from sightline.evaluation.scenario_config import robot_config, robot_of, vision_
 from sightline.evaluation.score.figures import AT_LEAST, EXACT
 from sightline.operator_side.recording.recorder import Recorder
 from sightline.operator_side.recording.replay import VISION_CONFIG
-from sightline.protocol.channels import CAMERA
+from sightline.protocol.channels import CAMERA, STATUS
 from sightline.protocol.codec import encode
-from sightline.protocol.messages import Stamp
+from sightline.protocol.messages import Stamp, State, Status
+from sightline.protocol.transports.link import Message
 from sightline.sim.scenario import load_scenario
 from sightline.sim.world.world import World
 
@@ -49,6 +50,29 @@ def test_whether_the_light_is_read_right_is_judged_from_the_recording(lights, mo
     assert misread(replace(lights, samples=[replace(one, light="off") for one in lights.samples])) == (100.0, False)
     first, late = lights.samples[0], lights.samples[len(lights.samples) // 2 :]
     assert misread(replace(lights, samples=[replace(first, light="off"), *late])) == (0.0, True), "nobody saw it change"
+
+
+class StatusLink:
+    """Publishes to the recorder what a test gives it."""
+
+    def __init__(self) -> None:
+        self.callbacks = {}
+
+    def subscribe(self, channel, callback) -> None:
+        self.callbacks[channel] = callback
+
+    def give(self, t_us: int, payload: bytes) -> None:
+        header = encode(Stamp(session="00000001", seq=t_us, t_us=t_us))
+        self.callbacks[STATUS](Message(STATUS, "", header, payload))
+
+
+def test_state_and_frame_age_come_from_the_recording_in_order(tmp_path):
+    link = StatusLink()
+    with Recorder(link, tmp_path / RECORDING, {}):
+        link.give(20, encode(Status(state=State.HOLD, reason="no command")))
+        link.give(30, b"{")
+        link.give(10, encode(Status(state=State.ACTIVE, reason="driving", frame_age_us=24_000)))
+    assert demo_report.read_statuses(tmp_path / RECORDING) == [(10, "ACTIVE", 24_000), (20, "HOLD", None)]
 
 
 # --- many demos ------------------------------------------------------------------------------------------------------
