@@ -55,7 +55,8 @@ class TopView:
         cv2.line(self._paper, (left_px, low_px), (left_px + length_px, low_px), _INK, 2)
         for end_px in (left_px, left_px + length_px):
             cv2.line(self._paper, (end_px, low_px - 5), (end_px, low_px + 5), _INK, 2)
-        cv2.putText(self._paper, f"{length_m:g} m", (left_px + length_px + 10, low_px + 5), _FONT, 0.5, _INK, 1, cv2.LINE_AA)
+        beside = (left_px + length_px + 10, low_px + 5)
+        cv2.putText(self._paper, f"{length_m:g} m", beside, _FONT, 0.5, _INK, 1, cv2.LINE_AA)
         names = [("robot", _ROBOT), *([("target", _TARGET)] if self._has_target else [])]
         for column, (name, color) in enumerate(names):
             at_px = 20 + 90 * column
