@@ -1,6 +1,6 @@
-"""Teleop's logic: keys held, speeds, hand-over to vision; messages for the robot out. Pure."""
+"""The logic of teleop: held keys, speeds, hand-over to vision, and the messages for the robot. Pure."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
@@ -8,7 +8,7 @@ from typing import Final
 from sightline.operator_side.client.requests import StatusReport, read_report
 from sightline.protocol.channels import ACK, REPLY, REQUEST, TWIST, Channel
 from sightline.protocol.codec import decode, encode
-from sightline.protocol.errors import RejectReason, WireError
+from sightline.protocol.errors import ConfigError, RejectReason, WireError
 from sightline.protocol.messages import (
     STILL,
     AnswerHeader,
@@ -32,13 +32,13 @@ _LEAST_RAD_S: Final = 0.1
 _RAMP_MPS2: Final = 0.8
 _RAMP_RAD_S2: Final = 5.0
 _FIRST_STEP_US: Final = 30_000
-"""A press moves the robot with the very first command."""
+"""The ramp takes its first step over this time, so that a press moves the robot with the first command."""
 _LONGEST_STEP_US: Final = 100_000
 
 
 @dataclass(slots=True)
 class Speeds:
-    """Wanted top speeds, within what the robot says it can do."""
+    """The operator's top speeds, within the limits of the robot."""
 
     linear_mps: float
     angular_rad_s: float
@@ -46,13 +46,13 @@ class Speeds:
     most_rad_s: float = 10.0
 
     def change(self, linear: int, angular: int) -> None:
-        """By 10 % up (1) or down (-1) each."""
+        """Raise (1), lower (-1) or keep (0) each speed by 10 %."""
         self.linear_mps *= _STEP**linear
         self.angular_rad_s *= _STEP**angular
         self._keep()
 
     def limit(self, status: Status) -> None:
-        """The robot's own limits; a robot that says none keeps what was."""
+        """Apply the limits of the robot's status; a zero leaves the old limit."""
         self.most_mps = status.max_linear_mps or self.most_mps
         self.most_rad_s = status.max_angular_rad_s or self.most_rad_s
         self._keep()
@@ -63,14 +63,14 @@ class Speeds:
 
 
 class SpeedUp:
-    """Brings the twist to its goal: up by a ramp, down at once. A release is zero in the very next command."""
+    """Moves the twist to its goal: up by a ramp, down immediately, so that a release is zero in the next command."""
 
     def __init__(self) -> None:
         self.twist = STILL
         self._stepped_us: int | None = None
 
     def step(self, goal: Twist, now_us: int) -> Twist:
-        """The twist to command now."""
+        """Return the twist to command now."""
         elapsed_us = _FIRST_STEP_US if self._stepped_us is None else min(_LONGEST_STEP_US, now_us - self._stepped_us)
         self._stepped_us = now_us
         self.twist = Twist(
@@ -81,52 +81,103 @@ class SpeedUp:
 
 
 def _towards(speed: float, goal: float, change: float) -> float:
-    """`goal` where that is slower the same way; else nearer to it by `change`, from zero where the way reverses."""
+    """Return `goal` if slower in the same direction, else a step of `change` towards it; a reversal starts at zero."""
     start = speed if speed * goal > 0 else 0.0
     if abs(goal) <= abs(start):
         return goal
     return min(goal, start + change) if goal > 0 else max(goal, start - change)
 
 
-# What keys mean to `sightline teleop`, and whether one is still held. Pure.  A terminal tells presses and repeats,
-# never releases. So a key counts as held for a little longer than its repeats are apart, which is learnt from the
-# repeats themselves; before the first repeat, a little longer than the terminal's delay.
+# --- keys --------------------------------------------------------------------------------------------------------
+#
+# A terminal reports presses and repeats, never releases. So a key counts as held for a little longer than the time
+# between its repeats, which is learned from the repeats; before the first repeat, a little longer than the delay.
+
+_ARROWS: Final = {"\x1b[A": (1, 0), "\x1b[B": (-1, 0), "\x1b[D": (0, 1), "\x1b[C": (0, -1)}
+_BOTH_SPEEDS: Final = {"+": (1, 1), "=": (1, 1), "-": (-1, -1)}
+_SPACE: Final = " "
+SWITCH: Final = "\t"
+QUIT: Final = "q"
 
 
-MOVES: Final[dict[str, tuple[int, int]]] = {
-    "u": (1, 1), "i": (1, 0), "o": (1, -1),
-    "j": (0, 1), "l": (0, -1),
-    "m": (-1, -1), ",": (-1, 0), ".": (-1, 1),
-    "\x1b[A": (1, 0), "\x1b[B": (-1, 0), "\x1b[D": (0, 1), "\x1b[C": (0, -1),
-}  # fmt: skip
-"""Key -> share of (linear, angular) speed. Back and to the left turns clockwise, as a car that backs up does."""
-SPEEDS: Final[dict[str, tuple[int, int]]] = {
-    "q": (1, 1), "z": (-1, -1), "w": (1, 0), "x": (-1, 0), "e": (0, 1), "c": (0, -1),
-}  # fmt: skip
-"""Key -> whether (linear, angular) speed goes up or down."""
-STOPS: Final = ("k", " ", "\x1b[E")
-HAND_OVER: Final = "a"
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The keys of one layout. Tab, Q, Space, the arrows, + and - are in all of them.
+
+    `moves` maps a key to its share of (linear, angular) speed. Back and left turns clockwise, as a car does.
+    `speeds` maps a key to a change of (linear, angular) speed, up (1) or down (-1).
+    `help` is what the terminal shows.
+    """
+
+    moves: Mapping[str, tuple[int, int]]
+    speeds: Mapping[str, tuple[int, int]]
+    stops: tuple[str, ...]
+    help: str
+
+
+_COMMON_HELP: Final = """\
+  Tab  switch between manual and vision         + -  both speeds 10 % up, down
+  q    quit; the robot stops                    {linear}  speed    {angular}  turn rate
+The first press arms the robot: make sure that it may move.
+"""
+
+WASD: Final = Layout(
+    moves={"w": (1, 0), "s": (-1, 0), "a": (0, 1), "d": (0, -1), **_ARROWS},
+    speeds={"r": (1, 0), "f": (-1, 0), "t": (0, 1), "g": (0, -1), **_BOTH_SPEEDS},
+    stops=(_SPACE,),
+    help="""\
+        w                  hold a key to drive, release it to stop
+     a  s  d               w s  forward, back    a d  turn left, right
+  or the arrow keys        Space  stop
+"""
+    + _COMMON_HELP.format(linear="r f", angular="t g"),
+)
+LEGACY: Final = Layout(
+    moves={
+        "u": (1, 1), "i": (1, 0), "o": (1, -1),
+        "j": (0, 1), "l": (0, -1),
+        "m": (-1, -1), ",": (-1, 0), ".": (-1, 1), **_ARROWS,
+    },
+    speeds={"w": (1, 0), "x": (-1, 0), "e": (0, 1), "c": (0, -1), **_BOTH_SPEEDS},
+    stops=("k", _SPACE, "\x1b[E"),
+    help="""\
+     u  i  o               hold a key to drive, release it to stop
+     j  k  l               i ,  forward, back    j l  turn    u o m .  curves
+     m  ,  .  or arrows    k or Space  stop
+"""
+    + _COMMON_HELP.format(linear="w x", angular="e c"),
+)  # fmt: skip
+LAYOUTS: Final = {"wasd": WASD, "legacy": LEGACY}
+
+
+def layout_of(name: str) -> Layout:
+    """Return the layout of `--keys`. Raises ConfigError for an unknown one."""
+    if name not in LAYOUTS:
+        raise ConfigError(f"unknown --keys '{name}'; expected {' or '.join(LAYOUTS)}")
+    return LAYOUTS[name]
+
+
 MOST_AT_ONCE: Final = 4
-"""Keys of one read that hands on a keyboard may bring: at 30 repeats a second, what comes in 130 ms."""
+"""The most keys of one read that a hand produces: at 30 repeats a second, those of 130 ms."""
 
 _FIRST_DELAY_US: Final = 500_000
-"""From a press to its first repeat on most desktops, until it is learnt."""
+"""From a press to its first repeat on most desktops, until it is learned."""
 _SLACK: Final = 1.3
 _LONGEST_FIRST_US: Final = 900_000
 _FIRST_INTERVAL_US: Final = 35_000
 _INTERVALS: Final = 3
 _SHORTEST_HOLD_US: Final = 80_000
 LONGEST_HOLD_US: Final = 120_000
-"""With the period of the commands on top, a release is a zero command within 150 ms."""
+"""Together with the period of the commands, a release is a zero command within 150 ms."""
 _REPEATS_WITHIN_US: Final = 150_000
-"""What comes later is another press."""
+"""A later key is another press."""
 _FORGOTTEN_US: Final = 1_000_000
 FRESH_US: Final = 300_000
-"""A press after this long without any is a new decision to drive: only such a one arms a robot."""
+"""A press after this time without any is a new decision to drive; only such a press arms a robot."""
 
 
 def split_keys(text: str) -> list[str]:
-    """The keys of what was read: an arrow is three characters. What is cut off or unknown stays as single ones."""
+    """Split text from a terminal into keys: an arrow has three characters. Incomplete or unknown ones stay single."""
     keys: list[str] = []
     at = 0
     while at < len(text):
@@ -138,7 +189,7 @@ def split_keys(text: str) -> list[str]:
 
 @dataclass(slots=True)
 class Hold:
-    """The movement key that is held, as far as repeats tell."""
+    """The movement key that is held, derived from its repeats."""
 
     key: str = ""
     delay_us: int = _FIRST_DELAY_US
@@ -148,7 +199,7 @@ class Hold:
     _last_us: int | None = None
 
     def press(self, key: str, now_us: int) -> bool:
-        """A movement key came, pressed or repeated. True for a fresh press, after a while without any."""
+        """Take a movement key, pressed or repeated. Returns True for a fresh press, after a while without any."""
         gap_us = _FORGOTTEN_US if self._last_us is None else now_us - self._last_us
         if gap_us == 0 and key == self.key:
             return False  # several repeats of one read
@@ -161,11 +212,11 @@ class Hold:
         return gap_us >= FRESH_US
 
     def _is_repeat(self, key: str, gap_us: int) -> bool:
-        """The first repeat comes after the terminal's delay, the others soon after one another."""
+        """Return whether the key is a repeat: the first follows the terminal's delay, the others short intervals."""
         return key == self.key and gap_us < (_FORGOTTEN_US if self._presses == 1 else _REPEATS_WITHIN_US)
 
     def _learn(self, gap_us: int) -> None:
-        """The delay is believed once a quick repeat has followed it: somebody who taps has none."""
+        """Learn the delay once a quick repeat follows it; single taps teach nothing."""
         if self._presses == 1:
             self._first_gap_us = gap_us
             return
@@ -174,68 +225,71 @@ class Hold:
         self.interval_us += (gap_us - self.interval_us) // 4
 
     def release(self) -> None:
-        """Nothing is held any more."""
+        """Forget the held key."""
         self.key, self._presses = "", 0
 
     def miss(self, now_us: int) -> None:
-        """Keys came that tell nothing of now; what follows them is no fresh press."""
+        """Take keys that are late: no key is held, and the next press is not fresh."""
         self.release()
         self._last_us = now_us
 
     def is_held(self, now_us: int) -> bool:
-        """Whether the key has to be taken as held."""
+        """Return whether the key counts as held."""
         return bool(self.key) and self._last_us is not None and now_us - self._last_us <= self.patience_us
 
     @property
     def patience_us(self) -> int:
-        """How long after the last press or repeat the key counts as held."""
+        """Return how long after the last press or repeat the key counts as held."""
         if self._presses <= 1:
             return min(_LONGEST_FIRST_US, round(self.delay_us * _SLACK))
         return max(_SHORTEST_HOLD_US, min(LONGEST_HOLD_US, _INTERVALS * self.interval_us))
 
 
-# `sightline teleop`: a person drives, holding a key. Keys, frames and status in; messages for the robot out. Pure.
-# Every command cites the newest frame seen, so the robot itself judges how old the link is, as it does with any
-# driver. A person who lets go sends zeros and keeps the lease; one who is gone loses it, and the robot stops.
+# --- driving -----------------------------------------------------------------------------------------------------
+#
+# Every command cites the newest received frame, so that the robot measures the age of the link as for any driver. An
+# operator that releases the keys sends zeros and holds the lease. An operator that is gone loses it: the robot stops.
 
 
 SOURCE: Final = "teleop"
 PERIOD_US: Final = 30_000
-"""Between commands, about one per frame. What a person does is sent at once."""
+"""Between commands, about one per frame. A change is sent immediately."""
 _REPEAT_AFTER_US: Final = 60_000
 _ARM_FOR_US: Final = 2_000_000
-"""A press arms for this long: five live commands and a request take a fraction of it."""
-_ASK_ON: Final = (RejectReason.NOT_ALLOWED, RejectReason.STALE, RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME)
-"""What only time mends: live commands that are still missing, a status from before the link or the robot came back."""
+"""A press requests arming for this time; five valid commands and a request take a fraction of it."""
+_RETRIED: Final = (RejectReason.NOT_ALLOWED, RejectReason.STALE, RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME)
+"""Rejections that end by themselves: missing valid commands, or a status from before the link or robot returned."""
 _HAND_OVER_FOR_US: Final = 5_000_000
-"""After that nobody is there to take over."""
+"""After this time there is no vision service to take over."""
 
 
 class Mode(Enum):
-    """Who is to drive."""
+    """The driver that the operator wants."""
 
-    LOOKING_ON = "looking on"
+    WATCHING = "watching"
     DRIVING = "you drive"
     HANDING_OVER = "handing over"
 
 
 class Teleop:
-    """One person's session at one robot."""
+    """The session of one operator at one robot."""
 
-    def __init__(self, session: str, speeds: Speeds) -> None:
+    def __init__(self, session: str, speeds: Speeds, layout: Layout = WASD) -> None:
         self.session = session
         self.speeds = speeds
-        self.mode = Mode.LOOKING_ON
+        self.layout = layout
+        self.mode = Mode.WATCHING
         self.report: StatusReport | None = None
-        self.heard_us = 0
-        """When a status came, understood or not."""
+        self.received_us = 0
+        """Time of the last status, valid or not."""
         self.note = ""
-        """What the person should know beside the robot's status."""
+        """A note for the operator next to the robot's status."""
+        self.wants_to_quit = False
         self._hold = Hold()
-        self._deaf_until_us = 0
+        self._ignored_until_us = 0
         self._stick: tuple[float, float] | None = None
         self._stick_waits = False
-        """Somebody stopped, or handed over, with the dead man's button held: it has to be let go of first."""
+        """A stop or a hand-over came with the dead man's button held: it must be released first."""
         self._speed_up = SpeedUp()
         self._echo: Echo | None = None
         self._unanswered = False
@@ -249,26 +303,31 @@ class Teleop:
     # --- what comes in -------------------------------------------------------------------------------------------
 
     def on_keys(self, text: str, now_us: int) -> None:
-        """What was read from the terminal at once. A pile of keys is what a link that stalled or a paste brings, and
-        tells of no key that is held now: only stopping counts, and so it is of what comes just behind it."""
+        """Take the keys of one read from the terminal.
+
+        Many keys at once come from a stalled link or a paste, and show no key that is held now. Of them, and of what
+        follows shortly after, only stopping counts.
+        """
         keys = split_keys(text)
         if len(keys) > MOST_AT_ONCE:
-            self._deaf_until_us = now_us + FRESH_US
-        if now_us < self._deaf_until_us:
-            keys = [key for key in keys if key in STOPS]
+            self._ignored_until_us = now_us + FRESH_US
+        if now_us < self._ignored_until_us:
+            keys = [key for key in keys if key in self.layout.stops]
             self._hold.miss(now_us)
         for key in keys:
-            if key in MOVES:
+            if key in self.layout.moves:
                 self._drive(self._hold.press(key, now_us), now_us)
-            elif key in STOPS:
+            elif key in self.layout.stops:
                 self.stop()
-            elif key == HAND_OVER:
-                self.hand_over(now_us)
-            elif key in SPEEDS:
-                self.speeds.change(*SPEEDS[key])
+            elif key == SWITCH:
+                self.switch(now_us)
+            elif key == QUIT:
+                self.wants_to_quit = True
+            elif key in self.layout.speeds:
+                self.speeds.change(*self.layout.speeds[key])
 
     def on_stick(self, shares: tuple[float, float] | None, now_us: int) -> None:
-        """A gamepad: shares (-1..1) of both speeds while its dead man's button is held, else None."""
+        """Take a gamepad's shares (-1..1) of both speeds while its dead man's button is held, else None."""
         self._stick_waits &= shares is not None
         if self._stick_waits:
             return
@@ -281,12 +340,12 @@ class Teleop:
             self._hold.release()
 
     @property
-    def sees(self) -> bool:
-        """Whether a picture has come: without one there is nothing to cite."""
+    def has_frame(self) -> bool:
+        """Return whether a frame has arrived; without one, a command has nothing to cite."""
         return self._echo is not None
 
     def on_frame(self, message: Message) -> None:
-        """The newest picture's header: what commands cite."""
+        """Take the newest frame, which commands cite."""
         try:
             frame = decode(FrameHeader, message.header)
         except WireError:
@@ -295,19 +354,19 @@ class Teleop:
         self._unanswered = True
 
     def on_status(self, message: Message, now_us: int) -> None:
-        """The newest status."""
-        self.heard_us = now_us
+        """Take the newest status."""
+        self.received_us = now_us
         try:
             self.report = read_report(message)
         except WireError as error:
-            self.note = f"the robot's status is not understood: {error.detail}"
+            self.note = f"invalid status from the robot: {error.detail}"
             return
         self.speeds.limit(self.report.status)
         if self.mode is Mode.HANDING_OVER and self._pending_request is not Verb.RELEASE and self._other_drives():
-            self.mode, self._pending_request, self.note = Mode.LOOKING_ON, None, ""
+            self.mode, self._pending_request, self.note = Mode.WATCHING, None, ""
 
     def on_reply(self, message: Message) -> None:
-        """An answer to what was asked."""
+        """Take the reply to a request."""
         try:
             reply = decode(Reply, message.payload, REPLY.max_payload_bytes)
         except WireError:
@@ -320,19 +379,27 @@ class Teleop:
             return
         elif reply.ok:
             self._granted()
-        elif not reply.detail.startswith(_ASK_ON):
-            self.note = f"{self._pending_request} refused: {reply.detail}"
+        elif not reply.detail.startswith(_RETRIED):
+            self.note = f"{self._pending_request} rejected: {reply.detail}"
             self._pending_request = None
 
-    # --- what a person wants -------------------------------------------------------------------------------------
+    # --- what the operator wants ---------------------------------------------------------------------------------
 
     def stop(self) -> None:
-        """Stand still, whoever drove; the robot stays armed, in this person's hands."""
+        """Take over and stand still; the robot stays armed, and this operator is the driver."""
         self._let_go()
         self.mode, self._pending_request, self._due_us = Mode.DRIVING, None, 0
 
+    def switch(self, now_us: int) -> None:
+        """Hand over to vision, or take over from it and stand still."""
+        is_manual = self.mode is Mode.DRIVING or (self.mode is Mode.WATCHING and not self._other_drives())
+        if is_manual:
+            self.hand_over(now_us)
+        else:
+            self.stop()
+
     def hand_over(self, now_us: int) -> None:
-        """Let go of the robot and arm whoever else sends commands: the one way back to autonomy, and a person's own."""
+        """Release the robot and arm it for the vision service: the one way back to autonomy."""
         self._let_go()
         self.mode, self.note = Mode.HANDING_OVER, ""
         self._repeat_request(Verb.RELEASE, now_us, _HAND_OVER_FOR_US)
@@ -343,24 +410,24 @@ class Teleop:
         self._stick = None
 
     def leave(self) -> Iterator[Message]:
-        """The last words: zero, then the lease given back, again until `has_left`. Nothing where another one drives."""
-        if self.mode is Mode.LOOKING_ON:
+        """Yield the last messages: zero, then the release of the lease, until `has_left`; none for another driver."""
+        if self.mode is Mode.WATCHING:
             self.has_left = True
             return
         if self.mode is Mode.DRIVING and self._echo is not None:
             yield self._command(STILL, self._echo)
         if not self._leaving:
-            self._leaving, self.mode = True, Mode.HANDING_OVER  # one zero: another would take the lease again
+            self._leaving, self.mode = True, Mode.HANDING_OVER  # one zero: a second would take the lease again
             self._requested_from_id = self._id + 1
         yield self._request(Verb.RELEASE)
 
     def _drive(self, fresh: bool, now_us: int) -> None:
-        """A movement key takes over; a fresh press arms."""
+        """Take over for a movement key; a fresh press arms."""
         took_over = self.mode is not Mode.DRIVING
         self.mode = Mode.DRIVING
         if fresh or took_over:
             self.note = ""
-            # Also if it seems armed: a status may be from before a release.
+            # Also if the robot seems armed: the status may precede a release.
             self._repeat_request(Verb.ARM, now_us, _ARM_FOR_US)
         if took_over:
             self._speed_up, self._sent = SpeedUp(), STILL
@@ -370,7 +437,7 @@ class Teleop:
     # --- what goes out -------------------------------------------------------------------------------------------
 
     def messages(self, now_us: int) -> Iterator[Message]:
-        """What is to be sent now; call it every few milliseconds, and after every input."""
+        """Yield the messages to send now; call it every few milliseconds and after every input."""
         if self._echo is None:
             return
         goal = self._goal(now_us)
@@ -385,10 +452,10 @@ class Teleop:
         yield from self._requests(now_us)
 
     def _goal(self, now_us: int) -> Twist:
-        """What is held, at the speeds of now."""
+        """Return the twist of the held key or stick at the present speeds."""
         if self.mode is not Mode.DRIVING:
             return STILL
-        held = MOVES[self._hold.key] if self._hold.is_held(now_us) else (0, 0)
+        held = self.layout.moves[self._hold.key] if self._hold.is_held(now_us) else (0, 0)
         linear, angular = held if self._stick is None else self._stick
         return Twist(
             linear_mps=linear * self.speeds.linear_mps, angular_rad_s=angular * self.speeds.angular_rad_s
@@ -418,7 +485,7 @@ class Teleop:
     def _gave_up(self) -> None:
         self._pending_request = None
         if self.mode is Mode.HANDING_OVER:
-            self.mode, self.note = Mode.LOOKING_ON, "nobody has taken over: is vision running?"
+            self.mode, self.note = Mode.WATCHING, "nobody has taken over: is vision running?"
         else:
             self.note = "it could not be armed; press again"
 

@@ -1,6 +1,6 @@
-"""A gamepad as shares of the speeds with a dead man's button, read from Linux's input devices. Shell.
+"""Reads a gamepad with a dead man's button from Linux's input devices, as shares of the speeds. Shell.
 
-Codes are those of the Linux input layer (linux/input-event-codes.h), which pads of all makers follow.
+Source of the codes: linux/input-event-codes.h, which gamepads of all makers use.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ EV_SYN: Final = 0
 EV_KEY: Final = 1
 EV_ABS: Final = 3
 SYN_DROPPED: Final = 3
-"""Events were lost: nobody had read for long. A release may be among them."""
+"""The kernel dropped events because the reader was slow. A release may be among them."""
 ABS_X, ABS_Y, ABS_RX = 0, 1, 3
 BTN_SOUTH, BTN_EAST, BTN_TL, BTN_TR = 0x130, 0x131, 0x136, 0x137
 _DEAD_MAN: Final = frozenset((BTN_TL, BTN_TR))
 _DEAD_ZONE: Final = 0.12
-"""Sticks rarely return to their exact middle."""
+"""Sticks rarely return to their exact center."""
 
 
 class PadKey(Enum):
@@ -38,7 +38,7 @@ _BUTTONS: Final = {BTN_EAST: PadKey.STOP, BTN_SOUTH: PadKey.HAND_OVER}
 class Pad:
     """Left stick: forward and back. Either stick sideways: turning. Hold a shoulder button to drive.
 
-    `ranges` are the (least, most) of each axis, as the device says them.
+    `ranges` are the (least, most) of each axis, as the device reports them.
     """
 
     ranges: dict[int, tuple[int, int]]
@@ -47,7 +47,7 @@ class Pad:
     _stopped: bool = False
 
     def on_event(self, kind: int, code: int, value: int) -> PadKey | None:
-        """Take one event; a button that acts is returned. STOP also asks for the shoulder button anew."""
+        """Take one event. Returns a button that acts. After STOP, the shoulder button must be pressed again."""
         if kind == EV_ABS and code in self.ranges:
             self._axes[code] = self._share(code, value)
         elif (kind, code) == (EV_SYN, SYN_DROPPED):
@@ -64,7 +64,7 @@ class Pad:
 
     @property
     def shares(self) -> tuple[float, float] | None:
-        """(linear, angular) shares, -1..1; None while no shoulder button is held. Stick left turns left."""
+        """Return (linear, angular) shares, -1..1, or None while no shoulder button is held. Stick left turns left."""
         if not self._held or self._stopped:
             return None
         sideways = [self._axes.get(code, 0.0) for code in (ABS_X, ABS_RX)]
@@ -78,7 +78,7 @@ class Pad:
         return (abs(share) - _DEAD_ZONE) / (1 - _DEAD_ZONE) * (1 if share > 0 else -1)
 
 
-# A gamepad through Linux's input devices, for `sightline teleop --gamepad`. Shell.
+# --- the device, for `sightline teleop --gamepad` ----------------------------------------------------------------
 
 
 _ANY: Final = "auto"
@@ -94,7 +94,7 @@ class Gamepad:
         self._device: Any = _first(evdev) if path == _ANY else _opened(evdev, path)
         axes = dict(self._device.capabilities(absinfo=True).get(EV_ABS, []))
         if ABS_Y not in axes:
-            raise HardwareError(f"{self._device.path} ({self._device.name}) has no stick; is it a gamepad?")
+            raise HardwareError(f"{self._device.path} ({self._device.name}) has no stick; name a gamepad")
         self.name: str = self._device.name
         known = (ABS_X, ABS_Y, ABS_RX)
         self.pad = Pad({code: (info.min, info.max) for code, info in axes.items() if code in known})
@@ -104,17 +104,19 @@ class Gamepad:
         return int(self._device.fd)
 
     def read(self) -> list[PadKey]:
-        """Take what has come. Raises HardwareError when the pad is gone."""
+        """Take the waiting events. Raises HardwareError when the gamepad is gone."""
         try:
             events = [(one.type, one.code, one.value) for one in self._device.read()]
         except BlockingIOError:
             return []
         except OSError as error:
-            raise HardwareError(f"gamepad {self.name}: {error.strerror}; the robot was told to stand still") from None
+            raise HardwareError(
+                f"gamepad {self.name}: {error.strerror}; the robot stops, connect the gamepad again"
+            ) from None
         return [key for event in events if (key := self.pad.on_event(*event)) is not None]
 
     def close(self) -> None:
-        """Give it back."""
+        """Close the device."""
         self._device.close()
 
 
@@ -122,7 +124,7 @@ def _opened(evdev: Any, path: str) -> Any:
     try:
         return evdev.InputDevice(path)
     except OSError as error:
-        raise HardwareError(f"gamepad {path}: {error.strerror}; its user must be in the group input") from None
+        raise HardwareError(f"gamepad {path}: {error.strerror}; add your user to the group input") from None
 
 
 def _first(evdev: Any) -> Any:
@@ -131,4 +133,4 @@ def _first(evdev: Any) -> Any:
         if {BTN_SOUTH, BTN_TL} <= set(device.capabilities().get(EV_KEY, [])):
             return device
         device.close()
-    raise HardwareError("no gamepad is found among /dev/input/event*: plug it in, and be in the group input")
+    raise HardwareError("no gamepad found in /dev/input/event*; connect it, and add your user to the group input")

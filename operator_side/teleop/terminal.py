@@ -1,4 +1,4 @@
-"""Teleop in a terminal: raw keys, one status line, an end that stops the robot. Shell."""
+"""Teleop in a terminal: raw keys, two status lines, and an end that stops the robot. Shell."""
 
 import os
 import select
@@ -22,78 +22,70 @@ from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import Status
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 
-KEYS: Final = """\
-      forward            hold a key to drive, let go to stop
-   u     i     o
- turn j  k  l turn       k or space   stop
-   m     ,     .         q z  both speeds 10 % up, down
-       back              w x  linear only    e c  turning only
-                         a    hand over to vision; any of u i o j l m , . takes back
-Ctrl-C ends it. The first press arms the robot: make sure that it may move.
-"""
-
-
 _SILENT_US: Final = 1_000_000
-"""Ten times as long as a robot is silent between two words."""
+"""Ten times the period of a robot's status."""
 
 
-def live_line(robot: str, teleop: Teleop, width: int, now_us: int) -> str:
-    """State, reason, who drives, speeds; cut to the terminal's width, so that it stays one line. Of a robot that has
-    fallen silent nothing is known any more."""
+def live_lines(robot: str, teleop: Teleop, width: int, now_us: int) -> tuple[str, str]:
+    """Format two lines, each cut to `width`: the state and its reason; the driver, frame age, wheels and speeds.
+
+    The state of a silent robot is unknown, so it is not shown.
+    """
+    first, second = _lines(robot, teleop, now_us)
+    return _cut(first, width), _cut(second, width)
+
+
+def _lines(robot: str, teleop: Teleop, now_us: int) -> tuple[str, str]:
     if teleop.report is None:
-        text = f"{robot}: {teleop.note or 'nothing heard yet'}"
-    elif (silent_us := now_us - teleop.heard_us) > _SILENT_US:
-        text = f"{robot}: nothing heard for {silent_us / 1e6:.0f} s; without commands it stops by itself"
-    else:
-        text = " | ".join(part for part in _parts(robot, teleop, teleop.report.status) if part)
-    return text if len(text) <= width else text[: max(0, width - 1)] + "…"
-
-
-def _parts(robot: str, teleop: Teleop, status: Status) -> list[str]:
-    """What matters most comes first: narrow terminals cut the rest."""
-    speeds = teleop.speeds
-    return [
-        f"{robot} {status.state}: {status.reason}",
-        "" if teleop.sees else "no picture yet, and a command must cite one: is its camera running?",
-        teleop.note,
-        _driver(teleop, status),
-        twist_text(status.applied),
+        return f"{robot}: {teleop.note or 'no status yet'}", ""
+    silent_us = now_us - teleop.received_us
+    if silent_us > _SILENT_US:
+        return f"{robot}: no status for {silent_us / 1e6:.0f} s; without commands the robot stops", ""
+    status, speeds = teleop.report.status, teleop.speeds
+    no_frame = "" if teleop.has_frame else "no image yet, and each command must cite one; check the camera"
+    first = (f"{robot} {status.state}: {status.reason}", no_frame, teleop.note)
+    second = (
+        _driver(teleop, status), f"frame {millis(status.frame_age_us)}", twist_text(status.applied),
         f"up to {speeds.linear_mps:.2f} m/s {speeds.angular_rad_s:.2f} rad/s",
-        f"frame {millis(status.frame_age_us)}",
-    ]
+    )  # fmt: skip
+    return " | ".join(part for part in first if part), " | ".join(second)
+
+
+def _cut(line: str, width: int) -> str:
+    return line if len(line) <= width else line[: max(0, width - 1)] + "…"
 
 
 def _driver(teleop: Teleop, status: Status) -> str:
     holder = status.holder
     if holder is None:
-        return "nobody drives" if teleop.mode is not Mode.HANDING_OVER else Mode.HANDING_OVER.value
+        return "no driver" if teleop.mode is not Mode.HANDING_OVER else Mode.HANDING_OVER.value
     if holder.session == teleop.session:
         return "you drive"
     return f"{holder.source} drives"
 
 
-# The terminal around `teleop.Teleop`: keys as they come, a line that follows the robot, an end that stops. Shell.
+# --- the terminal ------------------------------------------------------------------------------------------------
 #
-# One thread and one `select`: a key, a frame, a status or a reply wakes it; the transport's callbacks only store.
+# One thread and one `select`: a key, a frame, a status or a reply wakes it; the callbacks of the transport only store.
 
 
 _TICK_S: Final = 0.01
 _SHOW_US: Final = 100_000
-_ALL: Final = 4096  # what a terminal holds: a pile of keys must be seen as one
-_FAREWELL_S: Final = 0.25
-"""Last words are repeated this long, unless the robot answers."""
-_PRINT_AGAIN_S: Final = 0.03
+_ALL: Final = 4096  # the buffer of a terminal, so that many late keys are one read
+_LEAVE_S: Final = 0.25
+"""The last messages are repeated for this time, unless the robot answers."""
+_LEAVE_PERIOD_S: Final = 0.03
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def check_terminal() -> None:
-    """Raise ConfigError unless keys can be read and shown."""
+    """Raise ConfigError unless stdin and stdout are a terminal."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise ConfigError("teleop reads keys from a terminal and there is none; over ssh use `ssh -t`")
+        raise ConfigError("teleop needs a terminal to read keys; over ssh use `ssh -t`")
 
 
 class Cockpit:
-    """Wires a link, a terminal and maybe a gamepad to a `Teleop`."""
+    """Connects a link, a terminal and optionally a gamepad to a `Teleop`."""
 
     def __init__(self, link: Link, teleop: Teleop, gamepad: Gamepad | None = None) -> None:
         self._link, self._teleop, self._gamepad = link, teleop, gamepad
@@ -112,22 +104,22 @@ class Cockpit:
 
         def store(message: Message) -> None:
             slot.put(message)
-            with suppress(BlockingIOError):  # a full pipe wakes as well as one more byte
+            with suppress(BlockingIOError):  # a full pipe also wakes the thread
                 os.write(self._wake, b".")
 
         self._link.subscribe(channel, store)
         return slot
 
     def run(self) -> None:
-        """Until Ctrl-C, a signal, or a terminal that is gone; then zero, and the robot is let go."""
+        """Drive until Q, Ctrl-C, a signal or the end of the terminal; then command zero and release the robot."""
         with _signals(self._end), _cbreak(sys.stdin.fileno()):
-            _print(KEYS)
+            _print(self._teleop.layout.help)
             try:
                 while not self._ended:
                     self._turn()
             finally:
-                self._say_farewell()
-                _print("\n")
+                self._leave()
+                _print("\n\n")
 
     def _end(self, _number: int, _frame: FrameType | None) -> None:
         self._ended = True
@@ -150,9 +142,8 @@ class Cockpit:
             data = os.read(sys.stdin.fileno(), _ALL)
         except OSError:  # the terminal was closed
             data = b""
-        if not data or b"\x04" in data:
-            self._ended = True
         self._teleop.on_keys(data.decode("utf-8", "replace"), monotonic_us())
+        self._ended |= not data or b"\x04" in data or self._teleop.wants_to_quit
 
     def _read_gamepad(self, gamepad: Gamepad) -> None:
         try:
@@ -181,14 +172,15 @@ class Cockpit:
         if now_us - self._shown_us >= _SHOW_US:
             self._shown_us = now_us
             width = shutil.get_terminal_size().columns
-            _print("\r\x1b[K" + live_line(self._link.robot, self._teleop, width - 1, now_us))
+            first, second = live_lines(self._link.robot, self._teleop, width - 1, now_us)
+            _print(f"\r\x1b[K{first}\n\x1b[K{second}\r\x1b[1A")  # and back up, to redraw both in place
 
-    def _say_farewell(self) -> None:
-        """Zero and release, again until the robot has said that nobody drives, or for a moment."""
-        until_s = time.monotonic() + _FAREWELL_S
+    def _leave(self) -> None:
+        """Command zero and release the lease, until the robot confirms it or a short time is over."""
+        until_s = time.monotonic() + _LEAVE_S
         while True:
             self._publish(self._teleop.leave())
-            time.sleep(_PRINT_AGAIN_S)
+            time.sleep(_LEAVE_PERIOD_S)
             self._take_messages()
             if self._teleop.has_left or time.monotonic() > until_s:
                 return
@@ -200,7 +192,7 @@ def _drain(pipe: int) -> None:
 
 
 def _print(text: str) -> None:
-    """To a terminal that may be gone, or that nobody reads: neither may hold up a command."""
+    """Write to the terminal, unless it is gone or blocked: neither may delay a command."""
     terminal = sys.stdout.fileno()
     with suppress(OSError):
         if select.select([], [terminal], [], 0)[1]:
@@ -209,7 +201,7 @@ def _print(text: str) -> None:
 
 @contextmanager
 def _cbreak(terminal: int) -> Iterator[None]:
-    """Keys at once and unseen; Ctrl-C stays a signal. As it was at the end."""
+    """Read keys immediately and without echo; Ctrl-C stays a signal. Restores the terminal at the end."""
     before = termios.tcgetattr(terminal)
     tty.setcbreak(terminal, termios.TCSANOW)
     try:

@@ -1,10 +1,10 @@
-"""How teleop drives, hands over, takes back and lets go: against the robot's own gate in virtual time."""
+"""Teleop drives, hands over, takes over and releases: against the robot's own gate in virtual time."""
 
 import pytest
 
-from sightline.operator_side.teleop.control import MOVES, Mode
+from sightline.operator_side.teleop.control import LEGACY, WASD, Mode
 from sightline.protocol.messages import STILL, State, Twist, Verb
-from tests.operator_side.teleop.fixture import PERSON, VISION, TeleopRig, vision_drives
+from tests.operator_side.teleop.fixture import OPERATOR, VISION, TeleopRig, vision_drives
 
 MOVING_MS, ZERO_MS = 120, 150
 """The issue's bounds: a key held to a moving wheel, a key let go of to a zero command."""
@@ -16,7 +16,7 @@ MOVING_MS, ZERO_MS = 120, 150
 def test_nothing_is_commanded_before_a_key_and_frames_are_acknowledged():
     rig = TeleopRig()
     rig.run(1.0)
-    assert rig.commands == [] and rig.asked == [] and rig.acked > 25
+    assert rig.commands == [] and rig.requested == [] and rig.acked > 25
     assert rig.state is State.DISARMED
 
 
@@ -26,8 +26,8 @@ def test_the_first_press_arms_and_drives():
     rig.hold("i")
     assert rig.until(lambda: rig.applied.linear_mps > 0.0, 1.0) <= 400
     assert rig.until(lambda: rig.applied.linear_mps == pytest.approx(0.2)) is not None
-    assert rig.holder.session == PERSON and rig.state is State.ACTIVE
-    assert rig.asked.count(Verb.ARM) <= 6
+    assert rig.holder.session == OPERATOR and rig.state is State.ACTIVE
+    assert rig.requested.count(Verb.ARM) <= 6
 
 
 @pytest.mark.parametrize("key", [*"uiojlm,.", "\x1b[A", "\x1b[D"])
@@ -36,7 +36,7 @@ def test_a_held_key_moves_the_wheels_within_the_bound(key):
     rig.hold(key)
     assert rig.until(lambda: rig.applied != STILL) <= MOVING_MS
     rig.run(1.5)
-    linear, angular = MOVES[key]
+    linear, angular = LEGACY.moves[key]
     assert rig.applied == Twist(linear_mps=linear * 0.2, angular_rad_s=angular * 1.0)
 
 
@@ -52,7 +52,7 @@ def test_a_key_let_go_of_is_a_zero_command_within_the_bound(repeat_ms, offset_ms
     assert rig.until(lambda: rig.applied == STILL) <= 350
     rig.run(5)
     assert {twist for us, twist in rig.commands if us > rig.now_us - 4_000_000} == {STILL}
-    assert rig.state is State.ACTIVE, "still in this person's hands"
+    assert rig.state is State.ACTIVE, "the operator is still the driver"
 
 
 @pytest.mark.parametrize("key", ["k", " "])
@@ -64,6 +64,20 @@ def test_a_stop_key_is_zero_in_the_next_command(key):
     rig.tap(key)
     rig.step()
     assert rig.commands[-1] == (rig.now_us, STILL)
+
+
+def test_default_layout_drives_stops_and_quits():
+    rig = TeleopRig(layout=WASD).armed("w")
+    rig.hold("a")
+    rig.run(1.5)
+    assert rig.applied == Twist(linear_mps=0.0, angular_rad_s=1.0)
+    rig.let_go()
+    rig.tap(" ")
+    rig.step()
+    assert rig.commands[-1] == (rig.now_us, STILL)
+    assert not rig.teleop.wants_to_quit
+    rig.tap("q")
+    assert rig.teleop.wants_to_quit
 
 
 def test_commands_come_at_their_period_while_a_key_repeats():
@@ -84,8 +98,8 @@ def test_speeds_that_change_in_the_middle_are_driven():
     assert rig.applied.linear_mps == pytest.approx(0.22)
 
 
-def test_a_robot_that_started_anew_is_driven_by_a_new_press():
-    """Its frames are of another session, and of a status from before it will not hear."""
+def test_restarted_robot_is_driven_by_a_new_press():
+    """Its frames are of another session, and it rejects a request that cites an older status."""
     rig = TeleopRig().armed()
     rig.hold("i")
     rig.run(1.0)
@@ -102,49 +116,49 @@ def test_a_robot_that_started_anew_is_driven_by_a_new_press():
 # --- who drives ------------------------------------------------------------------------------------------------------
 
 
-def test_a_hands_over_to_vision_and_says_nothing_more():
+def test_tab_hands_over_to_vision_and_commands_end():
     rig = vision_drives()
-    assert rig.teleop.mode is Mode.LOOKING_ON and rig.state is State.ACTIVE
+    assert rig.teleop.mode is Mode.WATCHING and rig.state is State.ACTIVE
     count = len(rig.commands)
     rig.run(1.0)
     assert len(rig.commands) == count
 
 
-@pytest.mark.parametrize("key", ["u", ",", "k"])
-def test_any_movement_key_takes_back_and_a_stop_key_too(key):
+@pytest.mark.parametrize("key", ["u", ",", "k", "\t"])
+def test_movement_and_stop_keys_take_over(key):
     rig = vision_drives()
     rig.hold(key)
-    assert rig.until(lambda: rig.holder.session == PERSON) <= MOVING_MS
+    assert rig.until(lambda: rig.holder.session == OPERATOR) <= MOVING_MS
     rig.run(1.0)
-    linear, angular = MOVES.get(key, (0, 0))
+    linear, angular = LEGACY.moves.get(key, (0, 0))
     assert rig.applied == Twist(linear_mps=linear * 0.2, angular_rad_s=angular * 1.0)
 
 
-def test_without_anybody_to_hand_over_to_the_robot_stands_and_the_person_is_told():
+def test_hand_over_without_vision_stops_the_robot_and_notes_it():
     rig = TeleopRig().armed()
-    rig.tap("a")
+    rig.tap("\t")
     rig.run(6.0)
     assert rig.state is State.DISARMED and rig.applied == STILL
     assert "is vision running?" in rig.teleop.note
-    assert rig.teleop.mode is Mode.LOOKING_ON
+    assert rig.teleop.mode is Mode.WATCHING
 
 
 def test_a_movement_key_in_the_middle_of_handing_over_takes_back():
     rig = TeleopRig(vision=True).armed()
-    rig.tap("a")
+    rig.tap("\t")
     rig.run(0.03)
     rig.hold("i")
     rig.run(1.5)
-    assert rig.holder.session == PERSON and rig.applied.linear_mps == pytest.approx(0.2)
+    assert rig.holder.session == OPERATOR and rig.applied.linear_mps == pytest.approx(0.2)
 
 
-def test_a_movement_key_right_after_handing_over_arms_anew():
-    """The robot is being let go of already; no pause since the last key is needed to want it back."""
+def test_movement_key_right_after_a_hand_over_arms_again():
+    """The release is already sent; the next key needs no pause before it."""
     rig = TeleopRig(delay_us=20_000).armed()
     rig.hold("i")
     rig.run(1.0)
     rig.let_go()
-    rig.tap("a")
+    rig.tap("\t")
     rig.run(0.01)
     rig.hold("u")
     rig.run(1.5)
@@ -155,16 +169,16 @@ def test_handing_over_again_at_once_is_not_misled_by_an_old_status():
     rig = vision_drives()
     rig.tap("i")
     rig.run(0.01)
-    rig.tap("a")
+    rig.tap("\t")
     rig.teleop.on_status(rig.last_status, rig.now_us)
     rig.run(2.0)
-    assert rig.state is State.ACTIVE and rig.holder.session == VISION and rig.teleop.mode is Mode.LOOKING_ON
+    assert rig.state is State.ACTIVE and rig.holder.session == VISION and rig.teleop.mode is Mode.WATCHING
 
 
 def test_handing_over_works_on_a_long_link():
-    """Answers come later than the next question is asked."""
+    """Replies come later than the next request is sent."""
     rig = TeleopRig(vision=True, delay_us=60_000).armed()
-    rig.tap("a")
+    rig.tap("\t")
     assert rig.until(lambda: rig.holder is not None and rig.holder.session == VISION and rig.applied != STILL, 3.0)
 
 
@@ -173,7 +187,7 @@ def test_taking_over_begins_its_ramp_at_zero():
     rig.hold("i")
     rig.run(1.5)
     rig.let_go()
-    rig.tap("a")
+    rig.tap("\t")
     rig.run(2.0)
     count = len(rig.commands)
     rig.hold("i")
@@ -182,7 +196,7 @@ def test_taking_over_begins_its_ramp_at_zero():
     assert 0 < first.linear_mps < 0.05
 
 
-def test_looking_on_takes_nothing_from_who_drives():
+def test_watching_takes_nothing_from_the_driver():
     rig = TeleopRig(vision=True)
     rig.run(1.0)
     assert rig.holder.session == VISION
@@ -198,7 +212,7 @@ def test_a_stopped_robot_is_not_armed_by_any_key():
     rig.hold("i")
     rig.run(2.0)
     assert rig.state is State.STOPPED and rig.applied == STILL
-    assert rig.asked == [Verb.ARM] and "reset first" in rig.teleop.note, "asked once, and the person is told"
+    assert rig.requested == [Verb.ARM] and "reset first" in rig.teleop.note, "requested once, and noted"
 
 
 @pytest.mark.parametrize("what", ["stop", "disarm"])
@@ -234,9 +248,9 @@ def test_leaving_is_zero_and_then_the_lease_is_given_back():
     rig.run(1.5)
     rig.let_go()
     for message in rig.teleop.leave():
-        rig.say(message)
+        rig.send(message)
     rig.run(0.05)
-    assert rig.commands[-1][1] == STILL and rig.asked[-1] is Verb.RELEASE
+    assert rig.commands[-1][1] == STILL and rig.requested[-1] is Verb.RELEASE
     assert rig.teleop.has_left and rig.holder is None and rig.state is State.DISARMED
     assert rig.driving.gate.reason == "the operator released control; arm again"
 
@@ -252,7 +266,7 @@ def test_on_a_lossy_link_a_release_still_stops_the_robot(seed):
     assert rig.until(lambda: rig.applied == STILL) <= 700 + 500, "a key just pressed is held for its first delay"
 
 
-def test_another_person_is_not_driven_aside():
+def test_second_operator_does_not_take_over():
     rig, other = TeleopRig().armed(), TeleopRig()
     other.driving = rig.driving
     other.teleop.session = "000000dd"
@@ -262,4 +276,4 @@ def test_another_person_is_not_driven_aside():
         other.now_us = rig.now_us
         if rig.now_us % 1_000_000 < 4_000:
             other.teleop.on_keys("j", rig.now_us)
-    assert rig.holder.session == PERSON and rig.applied.linear_mps == pytest.approx(0.2)
+    assert rig.holder.session == OPERATOR and rig.applied.linear_mps == pytest.approx(0.2)

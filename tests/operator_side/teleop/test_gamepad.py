@@ -73,13 +73,13 @@ def test_what_it_reads_is_the_pads_own_and_its_end_is_an_error(plugged):
     assert gamepad.read() == [] and gamepad.fileno() == 7
     device.events = [(EV_KEY, BTN_TL, 1), (EV_ABS, ABS_Y, 0), (EV_KEY, BTN_EAST, 0), (EV_KEY, BTN_EAST, 1)]
     assert gamepad.read() == [PadKey.STOP] and gamepad.pad.shares is None
-    with pytest.raises(HardwareError, match="gamepad pad a: No such device; the robot was told to stand still"):
+    with pytest.raises(HardwareError, match="gamepad pad a: No such device; the robot stops"):
         gamepad.read()
 
 
 @pytest.mark.parametrize(("path", "says"), [
-    ("auto", "no gamepad is found"), ("/dev/input/event9", "Permission denied; its user must be in the group input"),
-    ("keys", "has no stick; is it a gamepad?"),
+    ("auto", "no gamepad found"), ("/dev/input/event9", "Permission denied; add your user to the group input"),
+    ("keys", "has no stick; name a gamepad"),
 ])  # fmt: skip
 def test_without_a_gamepad_it_is_one_line(plugged, path, says):
     plugged["keys"] = Device("keys", keys=(), axes=(ABS_X,))

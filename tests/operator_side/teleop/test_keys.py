@@ -1,10 +1,19 @@
-"""Teleop's keys and how long they are held, its speeds and ramp, a gamepad's buttons and sticks."""
+"""Teleop's keys and the time that they count as held, its speeds and ramp, a gamepad's buttons and sticks."""
 
 import itertools
 
 import pytest
 
-from sightline.operator_side.teleop.control import LONGEST_HOLD_US, MOVES, Hold, Speeds, SpeedUp, split_keys
+from sightline.operator_side.teleop.control import (
+    LEGACY,
+    LONGEST_HOLD_US,
+    WASD,
+    Hold,
+    Speeds,
+    SpeedUp,
+    layout_of,
+    split_keys,
+)
 from sightline.operator_side.teleop.gamepad import (
     ABS_RX,
     ABS_X,
@@ -16,19 +25,36 @@ from sightline.operator_side.teleop.gamepad import (
     Pad,
     PadKey,
 )
+from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, State, Status, Twist
 
 # --- keys ------------------------------------------------------------------------------------------------------------
 
 
-def test_keys_that_were_read_together_are_told_apart():
+def test_keys_of_one_read_are_split():
     assert split_keys("ii\x1b[A\x1bOBq\x1b") == ["i", "i", "\x1b[A", "\x1b[B", "q", "\x1b"]
 
 
-def test_the_keys_are_those_of_the_write_up_and_its_relatives():
-    assert [MOVES[key] for key in "uiojlm,."] == [
+def test_legacy_layout_has_the_keys_of_the_legacy_programs():
+    assert [LEGACY.moves[key] for key in "uiojlm,."] == [
         (1, 1), (1, 0), (1, -1), (0, 1), (0, -1), (-1, -1), (-1, 0), (-1, 1),
     ]  # fmt: skip
+    assert LEGACY.stops[:2] == ("k", " ")
+
+
+def test_default_layout_has_the_keys_of_games():
+    assert [WASD.moves[key] for key in "wsad"] == [(1, 0), (-1, 0), (0, 1), (0, -1)]
+    for layout in (WASD, LEGACY):
+        assert [layout.moves[f"\x1b[{key}"] for key in "ABDC"] == [(1, 0), (-1, 0), (0, 1), (0, -1)]
+        assert " " in layout.stops
+        for keys in (layout.moves, layout.speeds, layout.stops):
+            assert not {"q", "\t"} & set(keys)
+
+
+def test_unknown_layout_is_rejected():
+    assert layout_of("legacy") is LEGACY
+    with pytest.raises(ConfigError, match="unknown --keys 'dvorak'; expected wasd or legacy"):
+        layout_of("dvorak")
 
 
 @pytest.mark.parametrize("delay_ms", [150, 250, 500, 660])
@@ -95,7 +121,7 @@ def test_speeds_change_by_ten_percent_and_stay_within_the_robots():
     assert (slow.linear_mps, slow.angular_rad_s) == (0.01, 0.05), "a robot slower than the least keeps its limit"
 
 
-def test_speeding_up_is_a_ramp_and_slowing_down_is_at_once():
+def test_speeding_up_is_a_ramp_and_slowing_down_is_immediate():
     ramp, now_us = SpeedUp(), 0
     goal = Twist(linear_mps=0.5, angular_rad_s=-2.0)
     seen = []
@@ -133,7 +159,7 @@ def test_a_gamepad_drives_while_its_shoulder_button_is_held(events, shares):
     assert pad.shares == (shares if shares is None else pytest.approx(shares, abs=0.01))
 
 
-def test_a_gamepads_stop_needs_the_shoulder_button_anew():
+def test_gamepad_stop_needs_a_new_press_of_the_shoulder_button():
     pad = Pad(RANGES)
     pad.on_event(1, BTN_TL, 1)
     assert pad.on_event(1, BTN_EAST, 1) is PadKey.STOP and pad.shares is None

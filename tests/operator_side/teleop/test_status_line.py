@@ -1,56 +1,71 @@
-"""What teleop shows a person, and a gamepad's stick at the gate: in virtual time."""
+"""The status lines of teleop, and a gamepad's stick at the gate, in virtual time."""
+
+import re
 
 import pytest
 
-from sightline.operator_side.teleop.control import Speeds, Teleop
-from sightline.operator_side.teleop.terminal import live_line
+from sightline.operator_side.teleop.control import LAYOUTS, QUIT, SWITCH, Speeds, Teleop
+from sightline.operator_side.teleop.terminal import live_lines
 from sightline.protocol.channels import STATUS
 from sightline.protocol.messages import STILL, State, Twist, Verb
 from sightline.protocol.transports.link import Message
-from tests.operator_side.teleop.fixture import PERSON, TeleopRig, vision_drives
+from tests.operator_side.teleop.fixture import OPERATOR, TeleopRig, vision_drives
+
+ARROWS = ("\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D")
 
 
 def shown(rig, width):
-    return live_line("r1", rig.teleop, width, rig.now_us)
+    return "\n".join(live_lines("r1", rig.teleop, width, rig.now_us))
 
 
-def test_the_line_says_state_reason_driver_and_fits():
+def test_lines_show_state_reason_driver_and_fit_the_width():
     rig = TeleopRig()
-    assert shown(rig, 80) == "r1: nothing heard yet"
+    assert shown(rig, 80) == "r1: no status yet\n"
     rig.run(0.3)
-    assert shown(rig, 200).startswith("r1 DISARMED: not armed | nobody drives | ")
+    assert shown(rig, 200).startswith("r1 DISARMED: not armed\nno driver | ")
     rig.hold("i")
     rig.run(1.5)
-    line = shown(rig, 200)
-    assert line.startswith("r1 ACTIVE: driving | you drive | +0.20 m/s +0.00 rad/s | up to 0.20 m/s 1.00 rad/s | frame")
-    assert len(shown(rig, 30)) == 30
+    first, second = shown(rig, 80).split("\n")
+    assert first == "r1 ACTIVE: driving"
+    assert re.fullmatch(r"you drive \| frame \d+ ms \| \+0.20 m/s \+0.00 rad/s \| up to 0.20 m/s 1.00 rad/s", second)
+    assert [len(line) for line in shown(rig, 15).split("\n")] == [15, 15]
     assert "vision drives" in shown(vision_drives(), 200)
 
 
-def test_a_robot_that_fell_silent_is_not_shown_as_it_was():
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_help_names_every_key_and_fits_eighty_columns(layout):
+    layout = LAYOUTS[layout]
+    assert max(map(len, layout.help.splitlines())) < 80
+    names = {" ": "Space", "\t": "Tab", "=": "+", "\x1b[E": ""}
+    for key in (*layout.moves, *layout.speeds, *layout.stops, SWITCH, QUIT):
+        name = "arrow" if key in ARROWS else names.get(key, key)
+        assert re.search(rf"(^|\s){re.escape(name)}(\s|$)", layout.help.replace("arrows", "arrow")), key
+
+
+def test_silent_robot_is_not_shown_with_its_old_state():
     rig = TeleopRig()
     rig.hold("i")
     rig.run(1.0)
     assert "ACTIVE" in shown(rig, 200)
     rig.connected = False
     rig.run(2.0)
-    assert shown(rig, 200).startswith("r1: nothing heard for 2 s")
+    assert shown(rig, 200).startswith("r1: no status for 2 s")
     rig.connected = True
     rig.run(0.5)
     assert shown(rig, 200).startswith("r1 ")
 
 
-def test_a_robot_of_another_version_is_not_told_to_be_silent():
+def test_robot_of_another_version_is_not_reported_silent():
     rig = TeleopRig()
     rig.run(0.3)
     rig.teleop.on_status(Message(STATUS, "", b"{}", b"{}"), rig.now_us)
-    assert "the robot's status is not understood" in shown(rig, 200)
-    fresh = Teleop(PERSON, Speeds(0.2, 1.0))
+    assert "invalid status from the robot" in shown(rig, 200)
+    fresh = Teleop(OPERATOR, Speeds(0.2, 1.0))
     fresh.on_status(Message(STATUS, "", b"{}", b"{}"), 0)
-    assert live_line("r1", fresh, 200, 0).startswith("r1: the robot's status is not understood")
+    assert live_lines("r1", fresh, 200, 0)[0].startswith("r1: invalid status from the robot")
 
 
-def test_a_press_before_the_first_status_arms_once_it_has_come():
+def test_press_before_the_first_status_arms_after_it():
     rig = TeleopRig()
     rig.driving.tick(rig.now_us, None, None)
     rig._tick_due_us += 200_000
@@ -59,15 +74,15 @@ def test_a_press_before_the_first_status_arms_once_it_has_come():
     assert rig.until(lambda: rig.applied.linear_mps > 0, 1.0) is not None
 
 
-def test_without_a_picture_it_is_said_why_nothing_moves():
+def test_missing_image_is_reported():
     rig = TeleopRig()
     rig._frame = lambda: None
     rig.hold("i")
     rig.run(1.0)
-    assert rig.commands == [] and "no picture yet" in shown(rig, 200)
+    assert rig.commands == [] and "no image yet" in shown(rig, 200)
 
 
-def test_a_stick_drives_proportionally_and_its_release_is_zero_at_once():
+def test_stick_drives_proportionally_and_its_release_is_zero():
     rig = TeleopRig().armed()
     rig.teleop.on_stick((0.5, -0.25), rig.now_us)
     rig.run(1.0)
@@ -77,48 +92,50 @@ def test_a_stick_drives_proportionally_and_its_release_is_zero_at_once():
     assert rig.commands[-1] == (rig.now_us, STILL)
 
 
-@pytest.mark.parametrize("act", ["k", " ", "a"])
-def test_a_stick_that_was_held_when_a_key_stopped_it_drives_only_once_pressed_anew(act):
+@pytest.mark.parametrize("act", ["k", " ", "\t"])
+def test_stick_held_during_a_stop_key_drives_only_after_a_new_press(act):
     rig = TeleopRig(vision=True).armed()
     rig.teleop.on_stick((1.0, 0.0), rig.now_us)
     rig.run(0.5)
     rig.tap(act)
-    asked = len(rig.asked)
+    before = len(rig.requested)
     for _ in range(100):  # a stick that jitters, its button held or jammed
         rig.teleop.on_stick((0.99, 0.01), rig.now_us)
         rig.run(0.01)
     assert all(twist == STILL for us, twist in rig.commands if us > rig.now_us - 900_000)
-    assert act == "a" or Verb.ARM not in rig.asked[asked:], "handing over arms whoever else drives"
+    assert act == "\t" or Verb.ARM not in rig.requested[before:], "a hand-over arms the vision service"
     rig.teleop.on_stick(None, rig.now_us)
     rig.teleop.on_stick((1.0, 0.0), rig.now_us)
     assert rig.until(lambda: rig.applied.linear_mps == pytest.approx(0.2), 2.0) is not None
 
 
 @pytest.mark.parametrize("pile", ["i" * 90, "sightline arm", "iiiii", "\x1b[A" * 6])
-def test_a_pile_of_keys_of_one_read_neither_arms_nor_drives(pile):
-    """What a link that stalled hands over at once, or a paste."""
+def test_many_keys_of_one_read_neither_arm_nor_drive(pile):
+    """They come from a stalled link or a paste."""
     rig = TeleopRig()
     rig.run(0.5)
     rig.tap(pile)
     rig.run(2.0)
-    assert Verb.ARM not in rig.asked and {twist for _, twist in rig.commands} <= {STILL} and rig.state is State.DISARMED
+    assert Verb.ARM not in rig.requested and rig.state is State.DISARMED
+    assert {twist for _, twist in rig.commands} <= {STILL}
 
 
 @pytest.mark.parametrize("pile", ["x" * 256, "iiii k iii"])
-def test_what_comes_just_behind_a_pile_is_of_it(pile):
-    """A second read, or a second segment of the link that stalled."""
+def test_keys_shortly_after_many_keys_do_not_drive(pile):
+    """They are a second read, or a second segment of the stalled link."""
     rig = TeleopRig()
     rig.run(0.5)
     for text in (pile, "hi", "i"):
         rig.tap(text)
         rig.run(0.1)
     rig.run(1.0)
-    assert Verb.ARM not in rig.asked and {twist for _, twist in rig.commands} <= {STILL} and rig.state is State.DISARMED
+    assert Verb.ARM not in rig.requested and rig.state is State.DISARMED
+    assert {twist for _, twist in rig.commands} <= {STILL}
     rig.hold("i")
     assert rig.until(lambda: rig.applied.linear_mps > 0, 1.0) is not None, "hands on the keyboard drive"
 
 
-def test_a_pile_of_keys_lets_go_of_what_was_held_and_a_stop_in_it_stops():
+def test_many_keys_release_the_held_key_and_a_stop_among_them_stops():
     for pile in ("i" * 30, "iiii k iii"):
         rig = TeleopRig().armed()
         rig.hold("i")
@@ -131,11 +148,11 @@ def test_a_pile_of_keys_lets_go_of_what_was_held_and_a_stop_in_it_stops():
         assert rig.commands[-1][1] == STILL
 
 
-def test_a_key_still_held_after_a_pile_drives_without_arming():
+def test_key_still_held_after_many_keys_drives_without_arming():
     rig = TeleopRig().armed()
     rig.hold("i")
     rig.run(1.0)
-    asked = len(rig.asked)
+    before = len(rig.requested)
     rig.tap("i" * 30)
     rig.run(1.0)
-    assert rig.applied.linear_mps == pytest.approx(0.2) and rig.asked[asked:] == []
+    assert rig.applied.linear_mps == pytest.approx(0.2) and rig.requested[before:] == []
