@@ -1,6 +1,8 @@
 """Configuration errors as one line with the nearest valid name. Pure."""
 
 import difflib
+import json
+import math
 import types
 from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated, Any, Union, get_args, get_origin
@@ -11,7 +13,7 @@ Key = tuple[str, ...]
 
 
 def known_keys(model: type[BaseModel]) -> Iterator[Key]:
-    """Every key of `model` that holds a value, tables left out."""
+    """Yield every key of `model` that holds a value, without tables."""
     for name, field in model.model_fields.items():
         inner = table_of(field.annotation)
         if inner is None:
@@ -21,7 +23,7 @@ def known_keys(model: type[BaseModel]) -> Iterator[Key]:
 
 
 def is_known(model: type[BaseModel], key: Key) -> bool:
-    """Whether `key` names a value or a table of `model`; below a free-form table anything is."""
+    """Return whether `key` names a value or a table of `model`, or any key below a free-form table."""
     field = model.model_fields.get(getattr(model, "renamed_keys", {}).get(key[0], key[0]))
     if field is None:
         return False
@@ -32,12 +34,12 @@ def is_known(model: type[BaseModel], key: Key) -> bool:
 
 
 def is_free_form(annotation: Any) -> bool:
-    """Whether a field is a table of whatever a plug-in understands."""
+    """Return whether a field is a table of a plug-in's own options."""
     return get_origin(annotation) is dict
 
 
 def table_of(annotation: Any) -> type[BaseModel] | None:
-    """The model behind a field that is a table; None for values and lists."""
+    """Return the model of a field that is a table; None for values and lists."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     if get_origin(annotation) in (Union, types.UnionType, Annotated):
@@ -46,7 +48,7 @@ def table_of(annotation: Any) -> type[BaseModel] | None:
 
 
 def allowed(model: type[BaseModel], key: Key) -> str:
-    """What may stand at `key`, in words; "" where no plain bound says it."""
+    """Describe the values that `key` accepts; "" without a simple bound."""
     schema = model.model_json_schema()
     node: Any = schema
     for name in key:
@@ -76,7 +78,7 @@ def _in_words(node: dict[str, Any]) -> str:
     return " ".join([_TYPES.get(node.get("type", ""), ""), *bounds]).strip()
 
 
-# What is wrong with a configuration, as one line a person can act on. Pure.
+# --- a configuration error as one line ---------------------------------------------------------------------------
 
 
 _LONGEST_VALUE = 60
@@ -84,20 +86,20 @@ _MOST_NAMES = 12
 
 
 def no_such_name(kind: str, name: str, names: Iterable[str]) -> str:
-    """`name` is none of `names`: say so, with the nearest, or those there are, the first if they are many."""
+    """Report that `name` is not in `names`, with the nearest of them, or with the first of them."""
     names = list(names)
     nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     shown = [*names[:_MOST_NAMES], *([f"and {len(names) - _MOST_NAMES} more"] if len(names) > _MOST_NAMES else [])]
-    there_are = f"; there are: {', '.join(shown)}"
-    return f"no {kind} called {name!r}" + (f"; did you mean {nearest[0]!r}?" if nearest else there_are)
+    hint = f"did you mean '{nearest[0]}'?" if nearest else f"expected {', '.join(shown)}"
+    return f"unknown {kind} '{name}'; {hint}"
 
 
 def explain(
     model: type[BaseModel], error: ValidationError, typed: Callable[[Key], Key], label: Callable[[Key], str]
 ) -> str:
-    """The first problem in full, and how many more there are.
+    """Describe the first problem in full, with the number of the others.
 
-    `typed` completes an unknown key to what was given below it; `label` names a key as its giver wrote it.
+    `typed` completes an unknown key to the one given below it; `label` names a key as it was written.
     """
     problems = error.errors(include_url=False)
     first = problems[0]
@@ -111,16 +113,18 @@ def _problem(model: type[BaseModel], key: Key, problem: Any) -> str:
     if problem["type"] == "extra_forbidden":
         return f": unknown key{_nearest_key(model, key)}"
     if problem["type"] == "missing":
-        return ": is missing"
+        return ": missing"
     if problem["type"] == "value_error":
         return f": {problem['ctx']['error']}"
     may_be = allowed(model, key)
-    message = problem["msg"].replace("Input should be", "should be", 1)
+    message = problem["msg"].replace("Input should be", "expected", 1)
     return f" = {_shown(problem['input'])}: {message}" + (f"; allowed: {may_be}" if may_be else "")
 
 
 def _shown(value: Any) -> str:
-    text = repr(value)
+    """Format a value as it stands in TOML or JSON, not as Python does."""
+    is_plain = isinstance(value, str) or (isinstance(value, float) and not math.isfinite(value))
+    text = (f"'{value}'" if isinstance(value, str) else str(value)) if is_plain else json.dumps(value, default=str)
     return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 3] + "..."
 
 
@@ -128,9 +132,9 @@ def _nearest_key(model: type[BaseModel], key: Key) -> str:
     in_list = any(part.isdigit() for part in key)
     names = _list_keys(model) if in_list else [".".join(known) for known in known_keys(model)]
     nearest = difflib.get_close_matches(key[-1] if in_list else ".".join(key), names, n=1, cutoff=0.6)
-    return f"; did you mean {nearest[0]!r}?" if nearest else "; `sightline config show SERVICE` lists them"
+    return f"; did you mean '{nearest[0]}'?" if nearest else "; `sightline config show SERVICE` lists all"
 
 
 def _list_keys(model: type[BaseModel]) -> list[str]:
-    """Keys of all tables, for those that stand in a list."""
+    """Return the keys of all tables, for a key inside a list."""
     return [name for table in model.model_json_schema().get("$defs", {}).values() for name in table["properties"]]

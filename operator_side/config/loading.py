@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
+from sightline.operator_side.config.context import CONNECT_VARIABLE
 from sightline.operator_side.config.errors import explain, is_known, known_keys, no_such_name
 from sightline.operator_side.config.toml_text import key_and_text, toml_value
 from sightline.protocol.channels import check_robot_id
@@ -24,7 +25,8 @@ from sightline.protocol.transports.open import check_endpoint
 
 SERVICES: Final = ("robot", "vision", "sim")
 ENV_PREFIX: Final = "SIGHTLINE_"
-OTHER_ENV_NAMES: Final = ("SIGHTLINE_DEBUG", LOG_FORMAT_VARIABLE)
+OTHER_ENV_NAMES: Final = ("SIGHTLINE_DEBUG", LOG_FORMAT_VARIABLE, CONNECT_VARIABLE)
+"""Names that services accept and do not read as configuration; CONNECT_VARIABLE is for client commands."""
 PROFILES: Final = Path(__file__).parent / "profiles"
 
 Key = tuple[str, ...]
@@ -32,7 +34,7 @@ Key = tuple[str, ...]
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """One value somebody gave. `text` is what was typed, where it was typed; `origin` is where."""
+    """One given value. `text` is the typed text, if it was typed; `origin` names the source."""
 
     key: Key
     value: Any
@@ -42,20 +44,20 @@ class Given:
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """A checked configuration and where its values came from."""
+    """A checked configuration and the origin of its values."""
 
     service: str
     config: Config
     given: Mapping[Key, Given]
 
     def origin(self, key: Key) -> str:
-        """Who gave the value at `key`, "default" if nobody did."""
+        """Return the origin of the value at `key`, or "default"."""
         given = given_at(self.given, key)
         return given.origin if given else "default"
 
 
 def model_of(service: str) -> type[Config]:
-    """The configuration model of a service. Raises ConfigError for a service that is none."""
+    """Return the configuration model of a service. Raises ConfigError for an unknown service."""
     if service == "robot":
         from sightline.robot_side.config import RobotConfig
 
@@ -81,11 +83,14 @@ def load(
     environ: Mapping[str, str],
     implied: Sequence[Given] = (),
 ) -> Loaded:
-    """Merge all sources and check the whole. `options` maps dotted keys to values; None means not given.
+    """Merge all sources and check the result.
 
-    `implied` is what other values imply where nobody says otherwise; it yields to every source.
+    Args:
+        options: dotted keys and values; None means not given.
+        implied: values that others imply; every source replaces them.
 
-    Raises ConfigError, one line: the key, the value, where it came from and what is allowed.
+    Raises:
+        ConfigError: names the key, the value, its origin and the permitted values.
     """
     model = model_of(service)
     given: dict[Key, Given] = {}
@@ -103,7 +108,7 @@ def load(
 
 
 def given_at(given: Mapping[Key, Given], key: Key) -> Given | None:
-    """What was given for `key`, or for a list it lies in."""
+    """Return the value given for `key`, or for the list around it."""
     for length in range(len(key), 0, -1):
         if key[:length] in given:
             return given[key[:length]]
@@ -126,9 +131,9 @@ def _from_file(file: str, origin: str) -> Iterable[Given]:
     try:
         table = tomllib.loads(Path(file).expanduser().read_text("utf-8"))
     except OSError as error:
-        raise ConfigError(f"{file}: cannot be read: {error.strerror}; see --config") from None
+        raise ConfigError(f"cannot read {file}: {error.strerror}; check --config") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: is no TOML: {error}") from None
+        raise ConfigError(f"{file}: invalid TOML: {error}") from None
     return [Given(key, value, origin) for key, value in _leaves(table)]
 
 
@@ -172,7 +177,7 @@ def _from_options(options: Mapping[str, Any]) -> Iterable[Given]:
 
 
 def _put(given: dict[Key, Given], one: Given) -> None:
-    """The newer value replaces what was there, what is above it and what is below it."""
+    """Store a value in place of an older one at the same key, above it or below it."""
     key = one.key
     for other in [old for old in given if old[: len(key)] == key or key[: len(old)] == old]:
         del given[other]
@@ -180,11 +185,11 @@ def _put(given: dict[Key, Given], one: Given) -> None:
 
 
 def _check_names(given: Mapping[Key, Given], service: str) -> None:
-    """Robot id and endpoints are refused here in words, not as a pattern."""
-    robot = given.get(("robot",)) if service != "sim" else None  # there it is what the robot is made of
+    """Check robot id and endpoints here, for a clearer error than a pattern gives."""
+    robot = given.get(("robot",)) if service != "sim" else None  # there it names the robot model
     if robot is not None and isinstance(robot.text or robot.value, str):
         robot_id = str(robot.text or robot.value)
-        # A vision may name several by `*` and `?`.
+        # A vision service may name several by `*` and `?`.
         check_robot_id(robot_id.replace("*", "x").replace("?", "x") if service == "vision" else robot_id)
     for name in ("listen", "connect"):
         one = given.get((name,))
@@ -210,7 +215,7 @@ def _validated(model: type[Config], given: dict[Key, Given]) -> Config:
 
 
 def _tree(model: type[Config], given: Mapping[Key, Given]) -> dict[str, Any]:
-    """The defaults with everything given laid over them, so that one key of a table leaves its others as they are."""
+    """Lay the given values over the defaults, so that one key of a table does not change the others."""
     tree = model().model_dump()
     for key, one in given.items():
         table = tree
@@ -223,7 +228,7 @@ def _tree(model: type[Config], given: Mapping[Key, Given]) -> dict[str, Any]:
 
 
 def _reread_typed_text(given: dict[Key, Given], error: ValidationError) -> bool:
-    """Where text was typed and TOML read it as something else (`--set robot=1`, one endpoint), take it as meant."""
+    """Use typed text as text where TOML read it as another type (`--set robot=1`, a single endpoint)."""
     changed = False
     for problem in error.errors(include_url=False, include_context=False):
         key = tuple(str(part) for part in problem["loc"])
@@ -240,12 +245,12 @@ def _reread_typed_text(given: dict[Key, Given], error: ValidationError) -> bool:
 
 
 def _typed(given: Mapping[Key, Given], key: Key) -> Key:
-    """The key as it was given, where only its table was refused."""
+    """Return the key as it was given, where the error names only its table."""
     return next((typed for typed in given if typed[: len(key)] == key), key)
 
 
 def _label(given: Mapping[Key, Given], key: Key) -> str:
-    """How to name `key` to a person: as and where they wrote it; of what is missing, where its neighbours are."""
+    """Name `key` as and where it was written; for a missing one, name the file of its neighbors."""
     one, dotted = given_at(given, key), ".".join(key)
     if one is None:
         beside = (one.origin for at, one in given.items() if len(key) > 1 and at[: len(key) - 1] == key[:-1])
@@ -256,7 +261,7 @@ def _label(given: Mapping[Key, Given], key: Key) -> str:
     return one.origin if one.origin.startswith((ENV_PREFIX, "--")) else f"{one.origin}: {dotted}"
 
 
-# The configuration a service is started with: what was given, and what that implies. Shell.
+# --- the configuration of a service: the given values, and the values that they imply ----------------------------
 
 
 def load_service(
@@ -268,7 +273,7 @@ def load_service(
     sets: Sequence[str] = (),
     options: Mapping[str, Any] | None = None,
 ) -> Loaded:
-    """As `settings.load`, with the values implied by others filled in. Raises ConfigError as it does."""
+    """Load a configuration with the values that others imply. Raises ConfigError as `load` does."""
     given: dict[str, Any] = {
         "profile": profile, "file": file, "sets": sets, "options": options, "environ": environ,
     }
@@ -278,7 +283,7 @@ def load_service(
 
 
 def _implied(loaded: Loaded) -> Iterator[Given]:
-    """A robot told where to connect need not listen, nor a vision box told to listen connect."""
+    """Yield the implied values: a robot that connects need not listen, nor a vision service that listens connect."""
     service = loaded.service
     listens, connects = (loaded.origin((name,)) != "default" for name in ("listen", "connect"))
     if service == "robot" and connects and not listens:

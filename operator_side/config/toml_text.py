@@ -1,4 +1,4 @@
-"""TOML for configuration: one value from an option's text, and a table with the origin of each value as text. Pure."""
+"""Reads one TOML value from an option's text, and writes a table as TOML with the origin of each value. Pure."""
 
 import json
 import tomllib
@@ -11,7 +11,7 @@ Key = tuple[str, ...]
 
 
 def options_of(texts: Iterable[str], option: str = "--set", example: str = "linear_mps=0.2") -> dict[str, Any]:
-    """Several KEY=VALUE of one option. Raises ConfigError that shows `example`."""
+    """Read the KEY=VALUE texts of one option. Raises ConfigError that shows `example`."""
     return {key: toml_value(value) for key, value in (key_and_text(text, option, example) for text in texts)}
 
 
@@ -19,12 +19,12 @@ def key_and_text(text: str, option: str, example: str) -> tuple[str, str]:
     """Split KEY=VALUE. Raises ConfigError that shows `example`."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
-        raise ConfigError(f"invalid {option} {text!r}: write key=value, e.g. {option} {example}")
+        raise ConfigError(f"invalid {option} '{text}': expected KEY=VALUE, e.g. {option} {example}")
     return key.strip(), value
 
 
 def toml_value(text: str) -> Any:
-    """Read `text` as one TOML value; text that TOML does not accept is itself the value."""
+    """Read `text` as one TOML value; text that is not TOML is itself the value."""
     try:
         table = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
@@ -33,17 +33,17 @@ def toml_value(text: str) -> Any:
 
 
 def toml_text(table: Mapping[str, Any], comment: Callable[[Key], str] = lambda _key: "") -> str:
-    """`table` (JSON types) as TOML; a None is a comment, for TOML has none. `comment` says more of a key."""
+    """Format `table` (JSON types) as TOML. None becomes a comment, since TOML lacks it; `comment` adds one to a key."""
     return "\n".join(_lines(table, (), comment)).strip() + "\n"
 
 
 def _lines(table: Mapping[str, Any], above: Key, comment: Callable[[Key], str]) -> Iterator[str]:
-    """Values first, then tables: TOML's order."""
+    """Yield values first, then tables, as TOML requires."""
     for name, value in table.items():
         if not isinstance(value, dict):
-            said = comment((*above, name))
+            remark = comment((*above, name))
             line = f"# {name} is not set" if value is None else f"{_name(name)} = {_value(value)}"
-            yield f"{line:<50}  # {said}" if said else line
+            yield f"{line:<50}  # {remark}" if remark else line
     for name, value in table.items():
         if isinstance(value, dict) and value:
             yield f"\n[{'.'.join(_name(part) for part in (*above, name))}]"
@@ -63,5 +63,5 @@ def _value(value: Any) -> str:
 
 
 def _text(text: str) -> str:
-    """JSON's string is TOML's, but for DEL, which TOML wants escaped."""
+    """Quote `text` as JSON does, and escape DEL, which TOML requires."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007F")

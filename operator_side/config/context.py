@@ -1,0 +1,168 @@
+"""The robot address that a client command uses: its option, SIGHTLINE_CONNECT, the saved context, or the default.
+Shell (files).
+
+`sightline use` saves the context. The robot, the vision service and the router never read it.
+"""
+
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from sightline.protocol.channels import check_robot_id
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
+from sightline.protocol.transports.open import check_endpoint
+
+CONNECT_VARIABLE: Final = "SIGHTLINE_CONNECT"
+DEFAULT_ROBOT: Final = "r1"
+_KEYS: Final = ("connect", "robot", "secure")
+_CLEAR: Final = "run `sightline use --clear`"
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """A saved address: endpoint, robot id, and the folder of keys or ""."""
+
+    connect: str
+    robot: str = DEFAULT_ROBOT
+    secure: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotAddress:
+    """The robot that a command addresses, and where the address came from."""
+
+    robot: str
+    connect: tuple[str, ...]
+    secure: str
+    origin: str
+
+    def __str__(self) -> str:
+        return f"robot {self.robot} at {', '.join(self.connect)} (from {self.origin})"
+
+
+def find_address(
+    environ: Mapping[str, str], robot: str | None, connect: Sequence[str] | None, secure: str = ""
+) -> RobotAddress:
+    """Find the address of a client command.
+
+    The context's robot id and keys apply only together with its address.
+
+    Args:
+        environ: environment of the process.
+        robot: id from the command line, or None.
+        connect: endpoints from the command line, or None.
+        secure: folder of keys from the command line, or "".
+
+    Raises:
+        ConfigError: SIGHTLINE_CONNECT or the context file is invalid.
+    """
+    if connect:
+        return RobotAddress(robot or DEFAULT_ROBOT, tuple(connect), secure, "--connect")
+    if environ.get(CONNECT_VARIABLE):
+        return RobotAddress(robot or DEFAULT_ROBOT, _from_variable(environ[CONNECT_VARIABLE]), secure, CONNECT_VARIABLE)
+    path = context_path(environ)
+    saved = read_context(path) if path else None
+    if saved is not None:
+        return RobotAddress(robot or saved.robot, (saved.connect,), secure or saved.secure, shown(path))
+    default = DEFAULT_ENDPOINT.replace("tcp/", "tls/") if secure else DEFAULT_ENDPOINT
+    return RobotAddress(robot or DEFAULT_ROBOT, (default,), secure, "default")
+
+
+def _from_variable(text: str) -> tuple[str, ...]:
+    endpoints = tuple(part.strip() for part in text.split(","))
+    for endpoint in endpoints:
+        _check(check_endpoint, endpoint, CONNECT_VARIABLE, "correct or unset the variable")
+    return endpoints
+
+
+def context_path(environ: Mapping[str, str]) -> Path | None:
+    """Return the path of the context file; None where the user has no home folder."""
+    folder = environ.get("XDG_CONFIG_HOME", "")
+    if Path(folder).is_absolute():  # the XDG specification ignores a relative one
+        return Path(folder) / "sightline/context.toml"
+    try:
+        return Path("~/.config/sightline/context.toml").expanduser()
+    except RuntimeError:
+        return None
+
+
+def shown(path: Path | None) -> str:
+    """Return `path` with `~` for the home folder."""
+    try:
+        return str(path and Path("~") / path.relative_to(Path.home()))
+    except (RuntimeError, ValueError):
+        return str(path)
+
+
+def read_context(path: Path) -> Context | None:
+    """Read the context file; None if there is none. Raises ConfigError for a damaged or unreadable one."""
+    import tomllib
+
+    try:
+        table = tomllib.loads(path.read_text("utf-8"))
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}; {_CLEAR}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: invalid TOML: {error}; {_CLEAR}") from None
+    return _checked(table, path)
+
+
+def _checked(table: dict[str, Any], path: Path) -> Context:
+    for key, value in table.items():
+        if key not in _KEYS:
+            raise ConfigError(f"{path}: unknown key {key!r}; {_CLEAR}")
+        if not isinstance(value, str):
+            raise ConfigError(f"{path}: invalid {key}: expected text; {_CLEAR}")
+    if "connect" not in table:
+        raise ConfigError(f"{path}: connect is missing; {_CLEAR}")
+    context = Context(**table)
+    _check(check_endpoint, context.connect, str(path), _CLEAR)
+    _check(check_robot_id, context.robot, str(path), _CLEAR)
+    return context
+
+
+def _check(check: Any, value: str, place: str, fix: str) -> None:
+    try:
+        check(value)
+    except ConfigError as error:
+        raise ConfigError(f"{place}: {error}; {fix}") from None
+
+
+def write_context(path: Path, context: Context) -> None:
+    """Save the context: the file changes as a whole or not at all. Raises ConfigError if it cannot be written."""
+    from sightline.operator_side.config.toml_text import toml_text
+
+    table = {key: value for key in _KEYS if (value := getattr(context, key))}
+    text = f"# The default robot address of client commands, saved by `sightline use`.\n{toml_text(table)}"
+    part = ""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        number, part = tempfile.mkstemp(prefix=".context-", dir=path.parent)
+        with os.fdopen(number, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(part).replace(path)
+    except OSError as error:
+        if part:
+            Path(part).unlink(missing_ok=True)
+        raise ConfigError(
+            f"cannot write {path}: {error.strerror}; set XDG_CONFIG_HOME to a folder that you may write"
+        ) from None
+
+
+def clear_context(path: Path) -> bool:
+    """Remove the context file. Returns False if there was none. Raises ConfigError if it cannot be removed."""
+    try:
+        path.unlink()
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise ConfigError(f"cannot remove {path}: {error.strerror}; remove it by hand") from None
+    return True
